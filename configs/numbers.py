@@ -1,0 +1,27 @@
+"""Numbers as people type them: 64k, 1M, 11.5M."""
+
+import re
+from decimal import Decimal
+
+from configs.convert import ConfigError
+
+SCALES = {"": 1, "k": 1_000, "M": 1_000_000, "B": 1_000_000_000}
+PATTERN = re.compile(r"(\d+(?:\.\d+)?)([kMB]?)")
+LARGEST = 10**15  # beyond any budget or level count that could finish; stops typing errors
+
+
+def parse_count(text: str | int, what: str) -> int:
+    """The whole number that `text` means, exactly: `parse_count("11.5M", "levels") == 11_500_000`.
+
+    Raises:
+        ConfigError: `text` is no positive whole number, or too large; `what` names the setting.
+    """
+    match = PATTERN.fullmatch(str(text))
+    if not match:
+        raise ConfigError(f"{what} is {text!r}: write a whole number such as 500, 64k, 1M or 11.5M.")
+    number = Decimal(match[1]) * SCALES[match[2]]
+    if number != number.to_integral_value():
+        raise ConfigError(f"{what} is {text!r}, which is not a whole number: use fewer decimals.")
+    if not 0 < number <= LARGEST:
+        raise ConfigError(f"{what} is {text!r}: it must be at least 1 and at most {LARGEST:,}.")
+    return int(number)

@@ -1,0 +1,1 @@
+"""Where data goes: work units, shards, manifest fragments, Ray workers, the reader and the command line."""

@@ -1,0 +1,31 @@
+"""What can go wrong, as exit codes. Each message is one sentence: what is wrong, where, what to do."""
+
+from enum import IntEnum
+
+
+class Exit(IntEnum):
+    """Exit codes of `levelproof`."""
+
+    DONE = 0
+    FAILED = 1
+    INPUT = 2  # the user's input
+    QUARANTINED = 3  # done, but for work units that failed repeatedly
+    INTERRUPTED = 130  # Ctrl-C, as shells have it
+
+
+class LevelproofError(Exception):
+    """An error with a sentence for the user and an exit code."""
+
+    exit_code = Exit.FAILED
+
+
+class UserError(LevelproofError):
+    """Something in the command or its configuration has to change."""
+
+    exit_code = Exit.INPUT
+
+
+class Failure(LevelproofError):
+    """The command was fine; the disk, the data or the machine was not."""
+
+    exit_code = Exit.FAILED
