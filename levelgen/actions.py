@@ -1,0 +1,45 @@
+"""What an action does: one entry per binding, each obeyed by every actuator bound to it.
+
+An action is multi-discrete: MOTOR_BINDINGS entries for motors (0 off, 1 forward, 2 backward), then
+THRUSTER_BINDINGS entries for thrusters (0 off, 1 on). Facts: `kinetix.environment.utils` 3.0.2.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from levelgen.level import ACTIONS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
+
+MOTOR_CHOICES = 3
+THRUSTER_CHOICES = 2
+CHOICES = (MOTOR_CHOICES,) * MOTOR_BINDINGS + (THRUSTER_CHOICES,) * THRUSTER_BINDINGS  # of each entry
+
+
+def controls(
+    level: Level, action: Int[Array, "6 lane"]
+) -> tuple[Float[Array, "joint lane"], Float[Array, "thruster lane"]]:
+    """What the engine's motors (-1, 0 or 1) and thrusters (0 or 1) are told to do.
+
+    A joint that is `motor_auto` runs forward whatever the action says.
+    """
+    forward, backward = action[:MOTOR_BINDINGS] == 1, action[:MOTOR_BINDINGS] >= 2
+    motor = _bound(level.motor_binding, forward.astype(jnp.float32) - backward.astype(jnp.float32))
+    thrust = _bound(level.thruster_binding, (action[MOTOR_BINDINGS:] != 0).astype(jnp.float32))
+    return jnp.where(level.motor_auto, 1.0, motor), thrust
+
+
+def _bound(binding: Int[Array, "actuator lane"], entries: Float[Array, "binding lane"]) -> Float[Array, "actuator lane"]:
+    """The entry each actuator is bound to, picked by comparison: a gather per lane is slower."""
+    return sum((jnp.where(binding == k, entry, 0.0) for k, entry in enumerate(entries)), jnp.float32(0.0))
+
+
+def action_mask(level: Level) -> Bool[Array, "6 lane"]:
+    """Which entries of an action can have an effect: an active, non-fixed joint or active thruster obeys them.
+
+    As the reference counts: a joint whose motor is off or runs by itself still makes its entry live.
+    """
+    model = level.model
+    free = model.joint_active & ~model.joint_fixed
+    live = [(free & (level.motor_binding == k)).any(0) for k in range(MOTOR_BINDINGS)]
+    live += [(model.thruster_active & (level.thruster_binding == k)).any(0) for k in range(THRUSTER_BINDINGS)]
+    assert len(live) == ACTIONS
+    return jnp.stack(live)

@@ -1,0 +1,195 @@
+"""What an agent sees: the symbolic-flat observation, one row per feature.
+
+Rows, in this order: every polygon but the walls and the ceiling, circles, joints, thrusters, gravity. What is not
+active is zero. Most rows are constant within a level (`level_features`); only places and speeds of movable bodies
+change (`state_features`, at the rows `dynamic_features`), which a network's first layer can exploit.
+Facts: `kinetix.render.renderer_symbolic_flat` and `renderer_symbolic_common` 3.0.2.
+"""
+
+from functools import cache
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role
+from physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, Size, State
+
+LIMIT = 10.0  # features are clipped to +-LIMIT
+GRAVITY_UNIT = 10.0  # m/s^2
+SPIN_UNIT = 10.0  # rad/s; angular velocity w is seen as tanh(w / SPIN_UNIT)
+NO_VERTEX = -1.0  # coordinates of a triangle's fourth vertex
+UNSEEN_WALLS = range(1, FIXED_POLYGONS)  # left wall, right wall, ceiling
+
+# Rows of a body: position 0-1, velocity 2-3, inverse mass 4, inverse inertia 5, density 6, spin 7, role 8-11,
+# sine 12 and cosine 13 of the rotation, friction 14, restitution 15, then its shape.
+DYNAMIC_ROWS = (0, 1, 2, 3, 7, 12, 13)
+BODY_ROWS = 16
+POLYGON_ROWS = BODY_ROWS + 1 + 2 * MAX_VERTICES + 1  # 0 for "no circle", vertices, whether a triangle
+CIRCLE_ROWS = BODY_ROWS + 2  # radius, 1 for "circle"
+JOINT_ROWS = 18 + MOTOR_BINDINGS  # and a one-hot body twice
+THRUSTER_ROWS = 6 + THRUSTER_BINDINGS  # and a one-hot body
+
+
+def feature_count(size: Size) -> int:
+    """Rows of the observation: 140 for size s."""
+    polygons = (size.polygons - len(UNSEEN_WALLS)) * POLYGON_ROWS
+    joints = size.joints * (JOINT_ROWS + 2 * size.bodies)
+    return polygons + size.circles * CIRCLE_ROWS + joints + size.thrusters * (THRUSTER_ROWS + size.bodies) + 1
+
+
+@cache
+def dynamic_features(size: Size) -> Int[np.ndarray, "dynamic"]:
+    """Rows of the observation that can change within a level, ascending. The floor never moves."""
+    polygons = POLYGON_ROWS * (1 + np.arange(size.polygons - FIXED_POLYGONS))
+    circles = POLYGON_ROWS * (1 + len(polygons)) + CIRCLE_ROWS * np.arange(size.circles)
+    index = (np.concatenate([polygons, circles])[:, None] + np.array(DYNAMIC_ROWS)).reshape(-1)
+    index.setflags(write=False)
+    return index
+
+
+def symbolic_flat(
+    level: Level, state: State, constant: Float[Array, "feature lane"] | None = None
+) -> Float[Array, "feature lane"]:
+    """The whole observation of a state, clipped to +-LIMIT, NaN as 0.
+
+    `constant` is `level_features(level)` where the caller has it: computed once per rollout, not per step.
+    """
+    constant = level_features(level) if constant is None else constant
+    moving = state_features(level, state)
+    lanes = max(constant.shape[-1], moving.shape[-1])
+    constant, moving = (jnp.broadcast_to(x, (len(x), lanes)) for x in (constant, moving))
+    # The two are interleaved run by run: concatenated slices, where an indexed write would be a slow scatter.
+    pieces, seen = [], 0
+    for start, stop, is_dynamic in _runs(level.size):
+        pieces.append(moving[seen : seen + stop - start] if is_dynamic else constant[start:stop])
+        seen += (stop - start) * is_dynamic
+    return jnp.concatenate(pieces)
+
+
+@cache
+def _runs(size: Size) -> tuple[tuple[int, int, bool], ...]:
+    """(first row, row after the last, whether they are dynamic) of each run of rows of one kind."""
+    is_dynamic = np.isin(np.arange(feature_count(size)), dynamic_features(size))
+    edges = [0, *(np.flatnonzero(np.diff(is_dynamic)) + 1).tolist(), len(is_dynamic)]
+    return tuple((start, stop, bool(is_dynamic[start])) for start, stop in pairwise(edges))
+
+
+def state_features(level: Level, state: State) -> Float[Array, "dynamic lane"]:
+    """The rows `dynamic_features`: place, velocity, spin and heading of every movable body."""
+    at = slice(FIXED_POLYGONS, None)
+    rotation = state.rotation[at]
+    rows = [
+        *_split(state.position[at]),
+        *_split(state.velocity[at]),
+        jnp.tanh(state.angular_velocity[at] / SPIN_UNIT),
+        jnp.sin(rotation),
+        jnp.cos(rotation),
+    ]
+    return _blocks(rows, level.model.active[at])
+
+
+def level_features(level: Level) -> Float[Array, "feature lane"]:
+    """Everything that is constant within a level; zeros at the rows `dynamic_features`."""
+    model, size = level.model, level.size
+    floor, movable = slice(0, 1), slice(FIXED_POLYGONS, size.polygons)
+    blocks = [
+        _blocks(_body_rows(level, floor, seen_still=True) + _polygon_rows(model, floor), model.active[floor]),
+        _blocks(_body_rows(level, movable) + _polygon_rows(model, movable), model.active[movable]),
+    ]
+    if size.circles:
+        circles = slice(size.polygons, size.bodies)
+        shape = [model.radius, jnp.ones_like(model.radius)]
+        blocks.append(_blocks(_body_rows(level, circles) + shape, model.active[circles]))
+    if size.joints:
+        blocks.append(_blocks(_joint_rows(level), model.joint_active))
+    if size.thrusters:
+        blocks.append(_blocks(_thruster_rows(level), model.thruster_active))
+    blocks.append(_tidy(model.gravity[1:] / GRAVITY_UNIT))
+    lanes = max(block.shape[-1] for block in blocks)
+    return jnp.concatenate([jnp.broadcast_to(block, (len(block), lanes)) for block in blocks])
+
+
+def _body_rows(level: Level, at: slice, seen_still: bool = False) -> list[Array]:
+    """Rows of some bodies, each [body, lane]; zero where a state decides them, unless they are `seen_still`."""
+    model, state = level.model, level.state
+    if seen_still:
+        place = [*_split(state.position[at]), *_split(state.velocity[at])]
+        spin, heading = jnp.tanh(state.angular_velocity[at] / SPIN_UNIT), state.rotation[at]
+        turn = [jnp.sin(heading), jnp.cos(heading)]
+    else:
+        nothing = jnp.zeros_like(model.friction[at])
+        place, spin, turn = [nothing] * 4, nothing, [nothing] * 2
+    mass = [model.inverse_mass[at], model.inverse_inertia[at], level.density[at]]
+    surface = [model.friction[at], model.restitution[at]]
+    return [*place, *mass, spin, *_one_hot(level.role[at], len(Role)), *turn, *surface]
+
+
+def _polygon_rows(model: Model, at: slice) -> list[Array]:
+    count, vertices = model.n_vertices[at], model.vertices[at]
+    corners = [jnp.where(k < count[:, None], vertices[:, k], NO_VERTEX) for k in range(MAX_VERTICES)]
+    triangle = (count <= 3).astype(jnp.float32)
+    return [jnp.zeros_like(triangle), *(row for corner in corners for row in _split(corner)), triangle]
+
+
+def _joint_rows(level: Level) -> list[Array]:
+    """As seen from body b: its anchor and its number come first."""
+    model, bodies = level.model, level.size.bodies
+    limit = lambda x: x * model.joint_limited
+    motor = [
+        model.motor_speed,
+        model.motor_power,
+        model.motor_on,
+        model.joint_limited,
+        *_one_hot(level.motor_binding, MOTOR_BINDINGS),
+        limit(jnp.sin(model.joint_min)),
+        limit(jnp.cos(model.joint_min)),
+        limit(jnp.sin(model.joint_max)),
+        limit(jnp.cos(model.joint_max)),
+        limit(model.joint_min - model.joint_rotation),
+        limit(model.joint_max - model.joint_rotation),
+    ]
+    return [
+        model.joint_active,
+        model.joint_fixed,
+        *_split(model.joint_anchor_b),
+        *_split(model.joint_anchor_a),
+        jnp.sin(model.joint_rotation),
+        jnp.cos(model.joint_rotation),
+        *(jnp.where(model.joint_fixed, 0.0, row) for row in motor),
+        *_one_hot(model.joint_b, bodies),
+        *_one_hot(model.joint_a, bodies),
+    ]
+
+
+def _thruster_rows(level: Level) -> list[Array]:
+    model = level.model
+    return [
+        model.thruster_active,
+        *_split(model.thruster_position),
+        *_one_hot(level.thruster_binding, THRUSTER_BINDINGS),
+        jnp.sin(model.thruster_rotation),
+        jnp.cos(model.thruster_rotation),
+        model.thruster_power,
+        *_one_hot(model.thruster_body, level.size.bodies),
+    ]
+
+
+def _split(xy: Float[Array, "thing 2 lane"]) -> list[Array]:
+    return [xy[:, 0], xy[:, 1]]
+
+
+def _one_hot(number: Int[Array, "thing lane"], count: int) -> list[Array]:
+    return [number == k for k in range(count)]
+
+
+def _blocks(rows: list[Array], active: Array) -> Float[Array, "feature lane"]:
+    """Each thing's rows side by side, [row, thing, lane] to [thing * row, lane], blank where not active."""
+    rows = jnp.broadcast_arrays(*(row.astype(jnp.float32) for row in rows))
+    stacked = jnp.where(active[:, None], jnp.stack(rows, axis=1), 0.0)
+    return _tidy(stacked).reshape(-1, stacked.shape[-1])
+
+
+def _tidy(features: Array) -> Array:
+    return jnp.where(jnp.isnan(features), 0.0, jnp.clip(features, -LIMIT, LIMIT))
