@@ -6,9 +6,11 @@ Ours has it last. Numpy in, numpy out; nothing here imports the reference.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from levelgen.level import Level
 from physics.pairs import pairs_of
@@ -125,33 +127,33 @@ def state_to_kinetix(
     }
 
 
-def _last(values: np.ndarray) -> np.ndarray:
-    """Level axis from first to last, in the engine's 32-bit types, contiguous."""
+def _last(values: np.ndarray) -> Any:
+    """Level axis from first to last, in the engine's 32-bit types, contiguous (numpy, where types say jax)."""
     values = np.moveaxis(np.asarray(values), 0, -1)
     kind = values.dtype.kind
     return np.ascontiguousarray(values, bool if kind == "b" else np.int32 if kind in "iu" else np.float32)
 
 
-def _first(values: np.ndarray) -> np.ndarray:
+def _first(values: ArrayLike) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(np.asarray(values), -1, 0))
 
 
-def _bodies(fields: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+def _bodies(fields: Mapping[str, np.ndarray], name: str) -> Any:
     return _last(np.concatenate([fields[f"polygon/{name}"], fields[f"circle/{name}"]], 1))
 
 
-def _contacts(fields: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+def _contacts(fields: Mapping[str, np.ndarray], name: str) -> Any:
     """In the numbering of physics/pairs.py; the reference keeps a polygon pair's two points side by side."""
     polygon, circle_polygon, circle = (fields[f"{manifold}/{name}"] for manifold in MANIFOLDS)
     return _last(np.concatenate([polygon[:, :, 0], polygon[:, :, 1], circle_polygon, circle], 1))
 
 
-def _split_bodies(size: Size, values: np.ndarray, name: str) -> Fields:
-    values = _first(values)
-    return {f"polygon/{name}": values[:, : size.polygons], f"circle/{name}": values[:, size.polygons :]}
+def _split_bodies(size: Size, values: ArrayLike, name: str) -> Fields:
+    first = _first(values)
+    return {f"polygon/{name}": first[:, : size.polygons], f"circle/{name}": first[:, size.polygons :]}
 
 
-def _split_contacts(size: Size, values: np.ndarray, name: str) -> Fields:
+def _split_contacts(size: Size, values: ArrayLike, name: str) -> Fields:
     pairs = pairs_of(size)
     polygon, circle_polygon = len(pairs.polygon), len(pairs.circle_polygon)
     ends = np.cumsum([polygon, polygon, circle_polygon])
@@ -163,7 +165,8 @@ def _split_contacts(size: Size, values: np.ndarray, name: str) -> Fields:
 
 def _no_manifold(size: Size, lanes: int) -> Manifold:
     contacts = pairs_of(size).contacts
-    scalar, vector = np.zeros((contacts, lanes), np.float32), np.zeros((contacts, 2, lanes), np.float32)
+    scalar: Any = np.zeros((contacts, lanes), np.float32)
+    vector: Any = np.zeros((contacts, 2, lanes), np.float32)
     return Manifold(scalar.astype(bool), vector, scalar, vector, scalar)
 
 

@@ -119,8 +119,11 @@ def _solve_one(motion: Motion, joint: Joint, impulse: JointImpulse, params: Para
     v_a, v_b = (motion.velocity.map(lambda x, body=body: select(x, body)) for body in (joint.a, joint.b))
     w_a, w_b = (select(motion.angular_velocity, body) for body in (joint.a, joint.b))
 
-    gap = x_b + joint.arm_b - x_a - joint.arm_a
-    point = x_a + joint.arm_a + gap.scale(1 - joint.weight_a)
+    # anchors first, then their difference: a gap of exactly zero must come out as zero, because the
+    # angle correction below looks at signs
+    anchor_a, anchor_b = x_a + joint.arm_a, x_b + joint.arm_b
+    gap = anchor_b - anchor_a
+    point = anchor_a.scale(joint.weight_a) + anchor_b.scale(1 - joint.weight_a)
     drift = v_b + spin(w_b, point - x_b) - v_a - spin(w_a, point - x_a)
     direction = drift.scale(1 / nonzero(drift.norm()))
     mass = (

@@ -94,6 +94,7 @@ def test_derived_fields_are_given_or_zero() -> None:
     given = state_to_kinetix(level, level.state, time, distance, manifold, joint_point=points)
     bare = state_to_kinetix(level, level.state, time, distance)
     np.testing.assert_array_equal(given["acc_cc_manifolds/normal"][:, 0], manifold.normal[-1].T)
-    assert (given["joint/global_position"] == 1).all() and not bare["joint/global_position"].any()
+    assert (given["joint/global_position"] == 1).all()
+    assert not bare["joint/global_position"].any()
     assert not bare["acc_rr_manifolds/penetration"].any()
     np.testing.assert_array_equal(given["timestep"], time)
