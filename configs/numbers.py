@@ -6,7 +6,7 @@ from decimal import Decimal
 from configs.convert import ConfigError
 
 SCALES = {"": 1, "k": 1_000, "M": 1_000_000, "B": 1_000_000_000}
-PATTERN = re.compile(r"(\d+(?:\.\d+)?)([kMB]?)")
+PATTERN = re.compile(r"([0-9]+(?:\.[0-9]+)?)([kMB]?)")
 LARGEST = 10**15  # beyond any budget or level count that could finish; stops typing errors
 
 

@@ -1,0 +1,109 @@
+"""Hydra's edge: override strings in, one typed JobConfig out."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, Quote, QuotedString
+from hydra.errors import HydraException, OverrideParseException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from configs.convert import ConfigError, flat, plain, suggestion, typed
+from configs.schema import JobConfig
+from experts.train import ExpertConfig
+from levelgen.sampler import Distribution
+from levelgen.task import TaskParams
+
+JOB = "generate"
+WORDS = frozenset({"levels", "budget", "out"})  # kept as typed: 007 stays 007
+
+
+def compose_job(overrides: Sequence[str]) -> JobConfig:
+    """The job that `overrides` (Hydra's `key=value` strings) describe.
+
+    Raises:
+        ConfigError: an unknown setting or a wrong value, in one sentence.
+    """
+    return typed(JobConfig, settings(overrides))
+
+
+def settings(overrides: Sequence[str]) -> dict[str, Any]:
+    """The composed settings as nested plain mappings, not yet checked."""
+    parsed = [_parsed(text) for text in overrides]
+    _check_keys(parsed, flat(_composed([])))
+    return _composed([override.input_line or "" for override in parsed])
+
+
+def again(job: JobConfig) -> str:
+    """The shortest command, but for `first_level`, `levels` and `out`, with the same results as `job`."""
+    defaults = flat(compose_job([f"size={job.size}", f"budget={job.budget}"]).results)
+    changed = {key: value for key, value in flat(job.results).items() if defaults[key] != value}
+    words = [f"size={job.size}", f"budget={job.budget}", *(f"{key}={_hydra(value)}" for key, value in changed.items())]
+    return " ".join(["levelproof", "generate", *map(shlex.quote, words)])
+
+
+def _composed(overrides: list[str]) -> dict[str, Any]:
+    code = {"distribution": plain(Distribution()), "task": plain(TaskParams()), "expert": plain(ExpertConfig())}
+    ConfigStore.instance().store(name="code", node=code)
+    try:
+        with initialize_config_module("configs", version_base="1.3"):
+            composed = OmegaConf.to_container(compose(JOB, overrides), resolve=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(f"cannot use these settings: {str(error).splitlines()[0].rstrip('.')}.") from None
+    assert isinstance(composed, dict)
+    return {str(key): value for key, value in composed.items()}
+
+
+def _parsed(text: str) -> Override:
+    """One `key=value`; what Hydra's grammar cannot read (`out=my data/é`) is taken as a plain word."""
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise ConfigError(f"cannot read {text!r}: write settings as NAME=VALUE, as in levels=64.")
+    quoted = f"{key}={QuotedString(value, Quote.single).with_quotes()}"
+    try:
+        override = OverridesParser.create().parse_override(quoted if key in WORDS and value[:1] not in "'\"" else text)
+    except OverrideParseException:
+        try:
+            override = OverridesParser.create().parse_override(quoted)
+        except OverrideParseException:
+            raise ConfigError(f"cannot read {text!r}: write settings as NAME=VALUE, as in levels=64.") from None
+    if override.is_add() or override.is_force_add() or override.is_delete():
+        raise ConfigError(f"cannot use {text!r}: settings can be changed, not added or removed.")
+    if override.is_sweep_override():
+        raise ConfigError(f"{key} has several values in {text!r}: one command makes one split, so give one.")
+    return override
+
+
+def _choices() -> dict[str, list[str]]:
+    """The files to choose from in each folder of configs/."""
+    folders = [entry for entry in files("configs").iterdir() if entry.is_dir() and not entry.name.startswith("_")]
+    return {f.name: sorted(e.name.removesuffix(".yaml") for e in f.iterdir() if e.name.endswith(".yaml")) for f in folders}
+
+
+def _check_keys(overrides: Sequence[Override], known: Mapping[str, Any]) -> None:
+    parents = {key.rpartition(".")[0] for key in known}
+    choices = _choices()
+    for override in overrides:
+        key, value = override.key_or_group, override.value()
+        if key in choices and not isinstance(value, Mapping):
+            if str(value) not in choices[key]:
+                hint = suggestion(str(value), choices[key])
+                raise ConfigError(f"there is no {key} {value!s}{hint}: choose one of {', '.join(choices[key])}.")
+        elif key not in known and not any(parent == key or parent.startswith(f"{key}.") for parent in parents):
+            raise ConfigError(f"there is no setting {key}{suggestion(key, known)}: `levelproof generate --help` lists them.")
+
+
+def _hydra(value: Any) -> str:
+    """A value in Hydra's override grammar."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{','.join(map(_hydra, value))}]"
+    return QuotedString(value, Quote.single).with_quotes() if isinstance(value, str) else repr(value)

@@ -1,0 +1,74 @@
+"""A job's configuration: what to make, typed and frozen, and the hash of what decides its results."""
+
+import hashlib
+import json
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+from configs.convert import ConfigError, plain
+from configs.numbers import parse_count
+from experts.train import ExpertConfig
+from levelgen.identity import SAMPLER_VERSION
+from levelgen.sampler import Distribution
+from levelgen.task import TaskParams
+
+HASH_DIGITS = 16
+MAX_LEVEL_ID = 2**31 - 1  # level ids are folded into random keys as 32-bit integers
+
+# Where, how many and by whom: these change neither a level nor its expert, so one split may mix them.
+WITHOUT_EFFECT = frozenset({"levels", "first_level", "out", "unit", "executor", "workers"})
+
+
+@dataclass(frozen=True)
+class JobConfig:
+    """What `levelproof generate` makes."""
+
+    size: Literal["s", "m", "l"]
+    levels: str  # how many, as typed
+    first_level: int
+    budget: str  # as typed: it names the folder
+    out: str
+    unit: int  # levels per work unit
+    executor: Literal["ray", "inline"]
+    workers: int  # 0: one per core or GPU
+    distribution: Distribution
+    task: TaskParams
+    expert: ExpertConfig
+
+    def __post_init__(self) -> None:
+        last = self.first_level + parse_count(self.levels, "levels") - 1
+        if self.first_level < 0 or last > MAX_LEVEL_ID:
+            raise ConfigError(f"level ids {self.first_level} to {last} do not fit: they run from 0 to {MAX_LEVEL_ID}.")
+        parse_count(self.budget, "budget")
+        if self.unit < 1:
+            raise ConfigError(f"unit is {self.unit}: a work unit needs at least 1 level.")
+        if self.workers < 0:
+            raise ConfigError(f"workers is {self.workers}: use 0 for one per core or GPU, or a number from 1.")
+        if not self.out:
+            raise ConfigError("out is empty: name a folder, as in out=data.")
+
+    @property
+    def level_ids(self) -> range:
+        return range(self.first_level, self.first_level + parse_count(self.levels, "levels"))
+
+    @property
+    def env_steps(self) -> int:
+        """The budget as a number."""
+        return parse_count(self.budget, "budget")
+
+    @property
+    def results(self) -> dict[str, Any]:
+        """Everything that decides a level's results, as JSON's types."""
+        kept = {f.name: plain(getattr(self, f.name)) for f in fields(self) if f.name not in WITHOUT_EFFECT}
+        return kept | {"budget": self.env_steps, "sampler_version": SAMPLER_VERSION}
+
+    @property
+    def hash(self) -> str:
+        """Short hash of `results`: other hash, other split."""
+        return hash_of(self.results)
+
+
+def hash_of(results: dict[str, Any]) -> str:
+    """SHA-256 over canonical JSON, shortened to HASH_DIGITS hexadecimal digits."""
+    text = json.dumps(results, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:HASH_DIGITS]
