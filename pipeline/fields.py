@@ -1,0 +1,49 @@
+"""Named arrays out of nested dataclasses, and back: `Level` and `Record` as flat dictionaries of numpy arrays.
+
+Knows nothing of files. Names are paths: `state/position`, `model/joint_anchor_a`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar, get_type_hints
+
+import numpy as np
+
+T = TypeVar("T")
+
+
+def arrays_of(tree: Any, path: str = "") -> dict[str, np.ndarray]:
+    """Every leaf of a nested dataclass of arrays, by its path."""
+    arrays: dict[str, np.ndarray] = {}
+    for field in dataclasses.fields(tree):
+        value, name = getattr(tree, field.name), f"{path}{field.name}"
+        arrays |= arrays_of(value, f"{name}/") if dataclasses.is_dataclass(value) else {name: np.asarray(value)}
+    return arrays
+
+
+def tree_of(cls: type[T], arrays: Mapping[str, np.ndarray], path: str = "") -> T:
+    """The inverse of `arrays_of`; the annotations of `cls` say which fields are themselves dataclasses."""
+    hints = get_type_hints(cls)
+    values = {}
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        hint, name = hints[field.name], f"{path}{field.name}"
+        values[field.name] = tree_of(hint, arrays, f"{name}/") if dataclasses.is_dataclass(hint) else arrays[name]
+    return cls(**values)  # type: ignore[return-value]
+
+
+def map_arrays(change: Callable[[np.ndarray], np.ndarray], tree: T) -> T:
+    """`change` applied to every leaf."""
+    changes = {
+        field.name: map_arrays(change, value) if dataclasses.is_dataclass(value) else change(np.asarray(value))
+        for field in dataclasses.fields(tree)  # type: ignore[arg-type]
+        for value in [getattr(tree, field.name)]
+    }
+    return dataclasses.replace(tree, **changes)  # type: ignore[type-var]
+
+
+def same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Whether each level (last axis) has the same bits in `a` and `b`; NaN payloads and -0.0 count."""
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return np.zeros(a.shape[-1], bool)
+    raw_a, raw_b = (np.ascontiguousarray(x).view(np.dtype(f"u{x.dtype.itemsize}")) for x in (a, b))
+    return (raw_a == raw_b).reshape(-1, a.shape[-1]).all(0)

@@ -1,0 +1,54 @@
+"""What is left to do: work units, their attempts and their quarantine. Knows nothing of workers or files."""
+
+from collections import deque
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+from pipeline.layout import unit_name
+
+ATTEMPTS = 3  # at a unit before it is quarantined
+
+
+@dataclass(frozen=True)
+class WorkUnit:
+    """Level ids of one multiple of the job's `unit`, done together and committed together."""
+
+    level_ids: tuple[int, ...]  # ascending
+
+    @property
+    def name(self) -> str:
+        return unit_name(self.level_ids[0], self.level_ids[-1])
+
+
+def plan_units(wanted: range, done: Collection[int], unit: int) -> list[WorkUnit]:
+    """Units that cover what is wanted and not done.
+
+    A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same places.
+    """
+    left: dict[int, list[int]] = {}
+    for level_id in wanted:
+        if level_id not in done:
+            left.setdefault(level_id // unit, []).append(level_id)
+    return [WorkUnit(tuple(level_ids)) for level_ids in left.values()]
+
+
+@dataclass
+class Queue:
+    """Units waiting, each with the attempts it has had."""
+
+    waiting: deque[WorkUnit]
+    attempts: dict[WorkUnit, int] = field(default_factory=dict)
+    quarantined: list[WorkUnit] = field(default_factory=list)
+
+    def take(self) -> WorkUnit | None:
+        """The next unit to work on; None when no more wait."""
+        return self.waiting.popleft() if self.waiting else None
+
+    def failed(self, unit: WorkUnit) -> bool:
+        """Note a failed attempt; the unit waits again, or True when it is now quarantined."""
+        self.attempts[unit] = self.attempts.get(unit, 0) + 1
+        if self.attempts[unit] < ATTEMPTS:
+            self.waiting.append(unit)
+            return False
+        self.quarantined.append(unit)
+        return True
