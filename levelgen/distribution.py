@@ -1,0 +1,127 @@
+"""What random levels are like: every number the sampler uses.
+
+The defaults are the reference's random-level distribution, Kinetix 3.0.2: names in brackets are fields of its
+`UEDParams`, file names are modules of `kinetix.environment.ued`, where a number is written into the code.
+"""
+
+import math
+from dataclasses import dataclass, fields
+
+HALF_WORLD = 2.5  # m; green and blue bodies may be placed within one half of the world
+# Largest reach of a free body from its centre, so that it finds a place in half a world
+MAX_REACH = HALF_WORLD / 2
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """A distribution over levels (hashable: pass as a static argument). `*_chance` are probabilities.
+
+    Raises:
+        ValueError: a value out of its range; the message starts with the field's name.
+    """
+
+    # The floor's role; plain otherwise
+    floor_green_chance: float = 0.0  # [floor_prob_green]
+    floor_blue_chance: float = 0.02  # [floor_prob_blue]
+    floor_red_chance: float = 0.08  # [floor_prob_red]
+
+    # Shapes
+    max_size: float = 1.0  # m, across a shape before lengthening [max_shape_size]
+    goal_size_factor: float = 1.0  # times max_size for free green and blue bodies [goal_body_size_factor]
+    min_half_side: float = 0.05  # m, of a rectangle (util.sample_dimensions)
+    min_radius: float = 0.1  # m, of a circle (util.sample_dimensions)
+    circle_size_factor: float = 0.8  # times max_size for circles [circle_max_size_coeff]
+    long_side_chance: float = 0.3  # one side of a rectangle is lengthened [large_rect_dim_chance]
+    long_side_factor: float = 2.0  # [large_rect_dim_scale]
+
+    # Free bodies
+    opposite_sides_chance: float = (
+        0.5  # green starts in the left half, blue in the right [goal_body_opposide_side_chance]
+    )
+    fixed_chance: float = 0.02  # of a weightless body [fixate_chance_min]
+    fixed_chance_per_mass: float = 4.0  # 1/kg, added: big bodies rather are fixed [fixate_chance_scale]
+    max_fixed_chance: float = 1.0  # [fixate_chance_max]
+    lowered_chance: float = 0.0  # a fixed body of the upper half moves to the lower [fixate_shape_bottom_bias]
+    goal_lowered_chance: float = 0.6  # added for green, blue, red [fixate_shape_bottom_bias_special_role]
+    red_weight: float = 1 / 3  # of a new red body, while there is none, against 1 of a plain one (util.get_role)
+
+    # Connected bodies
+    fixed_target_weight: float = 0.05  # of a fixed body as the one to connect to [connect_to_fixated_prob_coeff]
+    polygon_connections: int = 2  # more joints only if all polygons have these (mutators.mutate_add_connected_shape)
+    min_revolute_joints: int = 2  # the first ones are revolute [min_rjoints_bias]
+    fixed_joint_chance: float = 0.5  # of each later one (mutators.mutate_add_connected_shape)
+    visible_margin: float = 0.05  # m a body must reach beyond its partner as they turn [connect_visibility_min]
+    hidden_penalty: float = 10.0  # contacts that a proposal counts as, if it does not [connect_no_visibility_bias]
+
+    # Motors
+    motor_chance: float = 0.8  # a revolute joint's motor is on [motor_on_chance]
+    min_motor_speed: float = 0.4  # of the engine's Params.motor_speed [motor_min_speed]
+    max_motor_speed: float = 3.0  # [motor_max_speed]
+    min_motor_power: float = 1.0  # of the engine's Params.motor_power [motor_min_power]
+    max_motor_power: float = 3.0  # [motor_max_power]
+    max_wheel_power: float = 1.0  # where a circle is joined: strong wheels upset the engine [wheel_max_power]
+    limit_chance: float = 0.4  # a revolute joint of two polygons has limits [joint_limit_chance]
+    max_limit: float = math.pi  # rad, to either side [joint_limit_max]
+
+    # Thrusters
+    extra_thruster_chance: float = 0.3  # of each one after the first [add_thruster_chance]
+    aligned_chance: float = 0.8  # points along the line through the centre [thruster_align_com_prob]
+    min_thruster_power: float = 0.5  # per unit of mass (mutators.mutate_add_thruster)
+    max_thruster_power: float = 2.0
+    thruster_power_factor: float = 2.0  # times that [thruster_power_multiplier]
+
+    # The places left after green, blue and the third body
+    connected_weight: float = 0.35  # [add_connected_shape_chance]
+    free_weight: float = 0.35  # [add_shape_chance]
+    empty_weight: float = 0.3  # [add_no_shape_chance]
+    proposals: int = 8  # of each body, the one that touches least is kept [add_shape_n_proposals]
+    small_world: int = 7  # bodies; up to this many: one proposal, no fixed bodies (distributions.sample_kinetix_level)
+
+    swap_chance: float = 0.5  # green and blue change roles if the floor is plain (distributions.sample_kinetix_level)
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            self._check(field.name, getattr(self, field.name))
+        self._check_sums()
+        for low, high in (
+            ("min_motor_speed", "max_motor_speed"),
+            ("min_motor_power", "max_motor_power"),
+            ("min_motor_power", "max_wheel_power"),
+            ("min_thruster_power", "max_thruster_power"),
+        ):
+            if getattr(self, low) > getattr(self, high):
+                raise ValueError(f"{low} is {getattr(self, low)}: it must be at most {high}, {getattr(self, high)}")
+        self._check_shapes()
+
+    @staticmethod
+    def _check(name: str, value: float) -> None:
+        if not math.isfinite(value):
+            raise ValueError(f"{name} is {value}: it must be a finite number")
+        if name.endswith("_chance") and not 0 <= value <= 1:
+            raise ValueError(f"{name} is {value}: it must be between 0 and 1")
+        if value < 0:
+            raise ValueError(f"{name} is {value}: it must be 0 or more")
+        if name in ("proposals", "min_half_side", "min_radius") and value <= 0:
+            raise ValueError(f"{name} is {value}: it must be more than 0")
+
+    def _check_sums(self) -> None:
+        floor = self.floor_green_chance + self.floor_blue_chance + self.floor_red_chance
+        if floor > 1 + 1e-6:
+            raise ValueError(
+                f"floor_red_chance is {self.floor_red_chance}: the floor's chances add up to {floor}, over 1"
+            )
+        if self.connected_weight + self.free_weight + self.empty_weight == 0:
+            raise ValueError("empty_weight is 0: one of connected_weight, free_weight and empty_weight must be more")
+
+    def _check_shapes(self) -> None:
+        for name, factor in (("max_size", 1.0), ("goal_size_factor", self.goal_size_factor)):
+            size = self.max_size * factor
+            if size / 2 / math.sqrt(2) < self.min_half_side or size / 2 * self.circle_size_factor < self.min_radius:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}: shapes would be smaller than min_half_side or min_radius"
+                )
+            reach = size / 2 * max(1.0, self.long_side_factor, self.circle_size_factor)
+            if reach > MAX_REACH:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}: shapes would reach {reach:.2f} m, over {MAX_REACH} m"
+                )
