@@ -1,0 +1,124 @@
+"""Proximal policy optimisation of one expert, on the experience of one rollout. Knows nothing of physics.
+
+Schulman et al. 2017 (arXiv:1707.06347) with clipped values and per-minibatch normalised advantages.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Key
+
+from experts.config import ExpertConfig
+from experts.policy import ActorCritic, entropy, log_probability
+from levelgen.actions import CHOICES
+
+ADVANTAGE_EPSILON = 1e-8
+
+
+class Expert(NamedTuple):
+    """What learns."""
+
+    params: optax.Params
+    optimiser: optax.OptState
+
+
+class Batch(NamedTuple):
+    """Samples as columns; targets and advantages from GAE."""
+
+    moving: Float[Array, "dynamic sample"]
+    action: Float[Array, "6 sample"]
+    log_probability: Float[Array, " sample"]
+    value: Float[Array, " sample"]
+    advantage: Float[Array, " sample"]
+
+
+def optimiser(config: ExpertConfig) -> optax.GradientTransformation:
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_gradient_norm),
+        optax.adam(config.learning_rate, eps=config.adam_epsilon),
+    )
+
+
+def init(key: Key[Array, ""], network: ActorCritic, features: int, dynamic: int, config: ExpertConfig) -> Expert:
+    """An expert that has seen nothing."""
+    params = network.init(key, jnp.zeros(features), jnp.zeros((dynamic, 1)))
+    return Expert(params, optimiser(config).init(params))
+
+
+def advantages(
+    value: Float[Array, "time ..."],
+    reward: Float[Array, "time ..."],
+    done: Array,
+    last_value: Float[Array, "..."],
+    config: ExpertConfig,
+) -> Float[Array, "time ..."]:
+    """Generalised advantage estimates (Schulman et al. 2016, arXiv:1506.02438)."""
+
+    def back(carry, now):
+        advantage, next_value = carry
+        value, reward, alive = now
+        surprise = reward + config.discount * next_value * alive - value
+        advantage = surprise + config.discount * config.gae_lambda * alive * advantage
+        return (advantage, value), advantage
+
+    start = (jnp.zeros_like(last_value), last_value)
+    _, estimates = jax.lax.scan(back, start, (value, reward, 1.0 - done), reverse=True)
+    return estimates
+
+
+def loss(
+    params: optax.Params, network: ActorCritic, constant: Float[Array, " feature"], batch: Batch, config: ExpertConfig
+) -> Float[Array, ""]:
+    """Clipped policy surrogate, clipped value error, entropy bonus; means over the minibatch."""
+    logits, value = network.apply(params, constant, batch.moving)  # type: ignore[misc]
+    ratio = jnp.exp(log_probability(logits, batch.action) - batch.log_probability)  # type: ignore[arg-type]
+    gain = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + ADVANTAGE_EPSILON)
+    clipped_ratio = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
+    surrogate = jnp.minimum(ratio * gain, clipped_ratio * gain).mean()
+
+    target = batch.value + batch.advantage
+    near = batch.value + jnp.clip(value - batch.value, -config.clip, config.clip)
+    error = 0.5 * jnp.maximum(jnp.square(value - target), jnp.square(near - target)).mean()
+    return config.value_weight * error - surrogate - config.entropy_weight * entropy(logits).mean()
+
+
+def update(
+    expert: Expert,
+    key: Key[Array, ""],
+    network: ActorCritic,
+    constant: Float[Array, " feature"],
+    samples: Float[Array, "sample column"],
+    config: ExpertConfig,
+) -> Expert:
+    """Several epochs of minibatches, shuffled anew each epoch. `samples` are rows as `as_samples` lays them."""
+    transform = optimiser(config)
+
+    def learn(expert, minibatch):
+        gradient = jax.grad(loss)(expert.params, network, constant, from_samples(minibatch.T), config)
+        change, state = transform.update(gradient, expert.optimiser, expert.params)
+        return Expert(optax.apply_updates(expert.params, change), state), None
+
+    def epoch(expert, key):
+        order = jnp.argsort(jax.random.bits(key, len(samples)))
+        minibatches = samples[order].reshape(config.minibatches, -1, samples.shape[1])
+        return jax.lax.scan(learn, expert, minibatches)
+
+    return jax.lax.scan(epoch, expert, jax.random.split(key, config.epochs))[0]
+
+
+def as_samples(batch: Batch) -> Float[Array, "sample column"]:
+    """Everything a sample needs side by side in one row: shuffling is then one copy of rows.
+
+    `batch` has [time, ..., environment] in place of samples, as a rollout gives them.
+    """
+    singles = [x[:, None] for x in (batch.log_probability, batch.value, batch.advantage)]
+    columns = jnp.concatenate([batch.moving, batch.action.astype(jnp.float32), *singles], axis=1)
+    return jnp.moveaxis(columns, 1, -1).reshape(-1, columns.shape[1])
+
+
+def from_samples(columns: Float[Array, "column sample"]) -> Batch:
+    dynamic = columns.shape[0] - len(CHOICES) - 3
+    action = columns[dynamic : dynamic + len(CHOICES)]
+    return Batch(columns[:dynamic], action, *columns[-3:])

@@ -1,0 +1,125 @@
+"""Witnesses: actions that solve a level, and the record that replaying them gives.
+
+A record is RECORD_STEPS env steps with automatic reset to the same level. Records are made by `replay` alone, from a
+level and its actions, always in blocks of LANES lanes of one compiled program: a level's bits do not depend on how
+many others are replayed with it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from levelgen import task
+from levelgen.level import Level
+from levelgen.task import TaskParams, TaskState
+from physics.motion import select
+from physics.pairs import pairs_of
+from physics.types import Manifold, State
+from physics.vector import unvec, vec
+
+RECORD_STEPS = 256
+LANES = 64
+
+T = TypeVar("T")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Record:
+    """What happened in 256 steps; time first, level last. Numpy arrays on the host."""
+
+    state: State  # [256, ..., level]: before each action
+    manifold: Manifold  # [256, contact, ..., level]: of the physics step that led there; zero at an episode's start
+    joint_point: Float[Array, "256 joint 2 level"]  # m, where the joint sits on its body a
+    thruster_point: Float[Array, "256 thruster 2 level"]  # m
+    timestep: Int[Array, "256 level"]  # env steps since the episode's start
+    last_distance: Float[Array, "256 level"]  # m; -1 at an episode's start
+    action: Int[Array, "256 6 level"]
+    reward: Float[Array, "256 level"]
+    done: Bool[Array, "256 level"]
+    goal: Bool[Array, "256 level"]
+
+
+def replay(level: Level, action: Int[Array, "256 6 level"], rules: TaskParams = TaskParams()) -> Record:
+    """The record of these actions, on the host. The same bits on the same machine and versions, at any count of levels."""
+    level = jax.tree.map(np.asarray, level)
+    action = np.asarray(action, np.int32)
+    count = action.shape[-1]
+    blocks = [
+        jax.device_get(_replay_block(_lanes(level, lanes), action[..., lanes], rules)) for lanes in _blocks(count)
+    ]
+    return jax.tree.map(lambda *xs: np.ascontiguousarray(np.concatenate(xs, -1)[..., :count]), *blocks)
+
+
+def succeeds(done: Bool[np.ndarray, "time ..."], goal: Bool[np.ndarray, "time ..."]) -> Bool[np.ndarray, "..."]:
+    """Whether episodes ended, and every one that did ended in the goal."""
+    return done.any(0) & (goal | ~done).all(0)
+
+
+def steps_to_goal(done: Bool[np.ndarray, "time level"]) -> Int[np.ndarray, " level"]:
+    """Length of the first episode, env steps."""
+    return np.argmax(done, axis=0) + 1
+
+
+def _blocks(count: int) -> Iterator[np.ndarray]:
+    """Lane numbers of each block; the last one is filled up with its last lane."""
+    for first in range(0, count, LANES):
+        yield np.minimum(np.arange(first, first + LANES), count - 1)
+
+
+def _lanes(tree: T, lanes: np.ndarray) -> T:
+    return jax.tree.map(lambda x: x[..., lanes], tree)
+
+
+@partial(jax.jit, static_argnames="rules")
+def _replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskParams) -> Record:
+    def act(carry: tuple[TaskState, Manifold], action):
+        now, manifold = carry
+        after, outcome, contacts = task.advance(level, now, action, rules)
+        record = Record(
+            now.state,
+            manifold,
+            joint_point(level, now.state),
+            thruster_point(level, now.state),
+            now.timestep,
+            now.last_distance,
+            action,
+            *outcome,
+        )
+        blank = lambda x: jnp.where(outcome.done, jnp.zeros_like(x), x)
+        return (task.restart(level, after, outcome.done), jax.tree.map(blank, contacts)), record
+
+    start = task.reset(level), _no_manifold(level)
+    return jax.lax.scan(act, start, action)[1]
+
+
+def joint_point(level: Level, state: State) -> Float[Array, "joint 2 lane"]:
+    """Where each joint sits on its body a, in the world, m."""
+    model = level.model
+    return _points(state, model.joint_a, model.joint_anchor_a)
+
+
+def thruster_point(level: Level, state: State) -> Float[Array, "thruster 2 lane"]:
+    """Where each thruster sits, in the world, m."""
+    model = level.model
+    return _points(state, model.thruster_body, model.thruster_position)
+
+
+def _points(state: State, body: Int[Array, "thing lane"], place: Float[Array, "thing 2 lane"]) -> Array:
+    """Points given in the frames of bodies, in the world."""
+    pick = lambda x: jnp.stack([select(x, b) for b in body])
+    rotation = pick(state.rotation)
+    centre = vec(state.position).map(pick)
+    return unvec(vec(place).rotate(jnp.cos(rotation), jnp.sin(rotation)) + centre)
+
+
+def _no_manifold(level: Level) -> Manifold:
+    contacts, lanes = pairs_of(level.size).contacts, level.state.rotation.shape[-1]
+    scalar, vector = jnp.zeros((contacts, lanes)), jnp.zeros((contacts, 2, lanes))
+    return Manifold(jnp.zeros((contacts, lanes), bool), vector, scalar, vector, scalar)
