@@ -1,18 +1,221 @@
-"""Random levels: the reference's distribution, step by step."""
+"""Random levels: from level ids, in the order of the reference's sampler.
 
-from jaxtyping import Array, Int
+The floor's role; a green and a blue body; a third body or a thruster or both, so that something can act; more
+bodies and thrusters while there is room; green and blue swapped at random; every kind's places shuffled. What is
+drawn at each step is in moves.py, every number in distribution.py.
+Facts: `kinetix.environment.ued.distributions.sample_kinetix_level` 3.0.2.
+"""
 
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int, Key
+
+from levelgen.chance import choose, draw
 from levelgen.distribution import Distribution
-from levelgen.level import Level
-from physics.types import Size
+from levelgen.identity import Stream, key_for
+from levelgen.level import Level, Role
+from levelgen.moves import (
+    BodyDraws,
+    Flag,
+    Lane,
+    Proposal,
+    ThrusterDraws,
+    add_thruster,
+    insert,
+    propose_connected,
+    propose_free,
+)
+from levelgen.scenery import empty_level
+from levelgen.shuffle import shuffle
+from physics.manifold import find_contacts
+from physics.types import FIXED_POLYGONS, Size
 
 __all__ = ["Distribution", "sample_levels"]
 
+BLOCK = 64  # levels sampled by one call of the compiled program, however many are asked for
+GOAL_BODIES = 2  # green and blue come first
+DEFAULT = Distribution()
 
-def sample_levels(
-    level_ids: Int[Array, "level"],
-    size: Size,
-    distribution: Distribution = Distribution(),  # noqa: B008
+
+class LevelDraws(NamedTuple):
+    """Decisions taken once a level, each [lane]."""
+
+    floor: Lane
+    first_moves: Lane
+    control: Lane
+    swap: Lane
+
+
+class PlaceDraws(NamedTuple):
+    kind: Lane
+
+
+class TryDraws(NamedTuple):
+    wanted: Lane
+
+
+class Plan(NamedTuple):
+    """What to do at each body's turn, each [turn, lane]."""
+
+    add: Flag
+    connect: Flag
+    revolute: Flag  # the joint must turn
+    may_be_fixed: Flag
+
+
+def sample_levels(level_ids: Int[Array, " level"], size: Size, distribution: Distribution = DEFAULT) -> Level:
+    """The levels with these ids, level axis last.
+
+    A level depends on its id, the size, `identity.SAMPLER_VERSION` and the distribution alone: whatever the number
+    of ids, they go through one compiled program in blocks of BLOCK. So call it outside `jax.jit`.
+
+    Raises:
+        ValueError: the size has no room for the scenery, a green and a blue body.
+    """
+    check_size(size)
+    ids = np.asarray(level_ids)
+    padded = np.concatenate([ids, np.zeros(-len(ids) % BLOCK or (BLOCK if not len(ids) else 0), ids.dtype)])
+    blocks = [
+        sample_block(padded[i : i + BLOCK].astype(np.uint32), size, distribution) for i in range(0, len(padded), BLOCK)
+    ]
+    return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts, -1)[..., : len(ids)]), *blocks)
+
+
+def check_size(size: Size) -> None:
+    """Raises ValueError where no level of this size can have a goal."""
+    if size.polygons < FIXED_POLYGONS or size.bodies < FIXED_POLYGONS + GOAL_BODIES or min(size) < 0:
+        raise ValueError(
+            f"a level with {size.polygons} polygons and {size.circles} circles has no room for the {FIXED_POLYGONS} "
+            f"polygons of the scenery, a green and a blue body"
+        )
+
+
+@partial(jax.jit, static_argnames=("size", "distribution"))
+def sample_block(level_ids: Int[Array, " lane"], size: Size, distribution: Distribution) -> Level:
+    """One block of levels."""
+    keys = jax.vmap(lambda level_id: key_for(level_id, Stream.LEVEL))(level_ids)
+    level_keys, place_keys, body_keys, thruster_keys, shuffle_keys = (_part(keys, i) for i in range(5))
+    once = draw(LevelDraws, level_keys)
+    level = set_floor(empty_level(size, len(level_ids)), once.floor, distribution)
+
+    motor, thruster = draw_control(once.control, size)
+    plan = plan_bodies(level, size, once.first_moves, motor, draw(PlaceDraws, place_keys, turns(size)), distribution)
+    level, active = add_bodies(level, plan, body_keys, distribution)
+    level = add_thrusters(level, thruster, active[min(GOAL_BODIES, len(active) - 1)], thruster_keys, distribution)
+    return shuffle(swap_roles(level, once.swap < distribution.swap_chance), shuffle_keys)
+
+
+def turns(size: Size) -> int:
+    """Bodies the sampler tries to add: one for every place."""
+    return size.bodies - FIXED_POLYGONS
+
+
+def set_floor(level: Level, u: Lane, dist: Distribution) -> Level:
+    chances = [0.0, dist.floor_green_chance, dist.floor_blue_chance, dist.floor_red_chance]
+    chances[Role.PLAIN] = 1 - sum(chances)
+    floor = choose(jnp.broadcast_to(jnp.array(chances)[:, None], (len(chances), len(u))), u)
+    return replace(level, role=level.role.at[0].set(jnp.argmax(floor, 0).astype(jnp.int32)))
+
+
+def draw_control(u: Lane, size: Size) -> tuple[Flag, Flag]:
+    """Whether there must be a motor and a thruster: one, the other or both, as far as the size has room for them."""
+    possible = (size.joints > 0 and turns(size) > GOAL_BODIES, size.thrusters > 0)
+    kinds = [kind for kind in ((False, True), (True, False), (True, True)) if np.all(np.array(possible) >= kind)]
+    table = jnp.array(kinds or [(False, False)])
+    motor, thruster = table[(u * len(table)).astype(jnp.int32)].T
+    return motor, thruster
+
+
+def plan_bodies(
+    level: Level, size: Size, first_moves: Lane, motor: Flag, places: PlaceDraws, dist: Distribution
+) -> Plan:
+    """Two free bodies, of which one can move; a third, joined where a motor must be; then what comes."""
+    turn = jnp.arange(turns(size))[:, None]
+    weights = jnp.array([dist.connected_weight, dist.free_weight, dist.empty_weight])[:, None]
+    kind = jax.vmap(lambda u: jnp.argmax(choose(jnp.broadcast_to(weights, (3, len(u))), u), 0))(places.kind)
+    later = turn > GOAL_BODIES
+    # A floor that is a goal cannot move: then the first body, which becomes the other goal, must
+    first = (first_moves < 0.5) | (level.role[0] == Role.GREEN) | (level.role[0] == Role.BLUE)
+    must_move = jnp.where(turn == 0, first, (turn == 1) & ~first) | (size.bodies <= dist.small_world)
+    return Plan(
+        add=~later | (kind != 2),
+        connect=jnp.where(later, kind == 0, (turn == GOAL_BODIES) & motor),
+        revolute=jnp.broadcast_to(turn == GOAL_BODIES, kind.shape),
+        may_be_fixed=~must_move,
+    )
+
+
+def add_bodies(
+    level: Level, plan: Plan, keys: Key[Array, " lane"], dist: Distribution
+) -> tuple[Level, Bool[Array, "turn body lane"]]:
+    """Also returns which bodies there were after each turn."""
+    small = level.size.bodies <= dist.small_world
+    proposals = 1 if small else dist.proposals
+    draws = draw(BodyDraws, keys, turns(level.size), proposals)
+
+    def turn(level: Level, now: tuple[Plan, BodyDraws]) -> tuple[Level, Bool[Array, "body lane"]]:
+        plan, d = now
+        added = insert(level, propose(level, plan, d, dist))
+        return added, added.model.active
+
+    return jax.lax.scan(turn, level, (plan, draws))
+
+
+def propose(level: Level, plan: Plan, d: BodyDraws, dist: Distribution) -> Proposal:
+    """The proposal that touches least, the first of equals. Draws are [proposal, lane]."""
+    proposals, lanes = d.role.shape
+    wide_level, wide_plan = jax.tree.map(lambda x: jnp.tile(x, proposals), (level, plan))
+    d = jax.tree.map(lambda x: x.reshape(-1), d)
+    free = propose_free(wide_level, d, wide_plan.may_be_fixed, dist)
+    connected = propose_connected(wide_level, d, wide_plan.revolute, dist)
+    both = jax.tree.map(lambda a, b: jnp.where(wide_plan.connect, a, b), connected, free)
+    both = both._replace(possible=both.possible & wide_plan.add, joined=both.joined & wide_plan.connect & wide_plan.add)
+    if proposals == 1:
+        return both
+    world = insert(wide_level, both)
+    touching = find_contacts(world.model, world.state).active.sum(0) + jnp.where(both.hidden, dist.hidden_penalty, 0.0)
+    best = jnp.argmin(touching.reshape(proposals, lanes), 0)
+    chosen = jnp.arange(proposals)[:, None] == best
+    return jax.tree.map(lambda x: _chosen(x.reshape(*x.shape[:-1], proposals, lanes), chosen), both)
+
+
+def add_thrusters(
+    level: Level, forced: Flag, early: Bool[Array, "body lane"], keys: Key[Array, " lane"], dist: Distribution
 ) -> Level:
-    """The levels with these ids, level axis last."""
-    raise NotImplementedError
+    """The first, if forced, on one of the `early` bodies, then others by chance."""
+    count = level.size.thrusters
+    if not count:
+        return level
+
+    draws = draw(ThrusterDraws, keys, count)
+    chance = draw(TryDraws, _part(keys, 0), count).wanted < dist.extra_thruster_chance
+    wanted = chance.at[0].set(forced)
+
+    def turn(level: Level, now: tuple[ThrusterDraws, Flag, Array]) -> tuple[Level, None]:
+        d, wanted, number = now
+        candidates = jnp.where(number == 0, early, level.model.active)
+        return add_thruster(level, d, wanted, candidates, dist), None
+
+    return jax.lax.scan(turn, level, (draws, wanted, jnp.arange(count)))[0]
+
+
+def swap_roles(level: Level, wanted: Flag) -> Level:
+    """Green and blue exchanged, unless the floor has a role."""
+    swapped = jnp.where(level.role == Role.GREEN, Role.BLUE, jnp.where(level.role == Role.BLUE, Role.GREEN, level.role))
+    return replace(level, role=jnp.where(wanted & (level.role[0] == Role.PLAIN), swapped, level.role))
+
+
+def _chosen(x: Array, chosen: Bool[Array, "proposal lane"]) -> Array:
+    """x [..., proposal, lane] at the chosen one."""
+    if x.dtype == bool:
+        return (x & chosen).any(-2)
+    return jnp.where(chosen, x, jnp.zeros((), x.dtype)).sum(-2)
+
+
+def _part(keys: Key[Array, " lane"], number: int) -> Key[Array, " lane"]:
+    return jax.vmap(lambda key: jax.random.fold_in(key, number))(keys)

@@ -1,0 +1,53 @@
+"""Decisions from uniform random numbers: lanes last, no branches.
+
+Every decision has a number of its own, named in a NamedTuple of draws, in [0, 1).
+"""
+
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+Draws = TypeVar("Draws", bound=NamedTuple)
+
+
+def draw(kind: type[Draws], keys: Key[Array, " lane"], *shape: int) -> Draws:
+    """A uniform number for each field of `kind`, each [*shape, lane]."""
+    numbers = jax.vmap(lambda key: jax.random.uniform(key, (len(kind._fields), *shape)), out_axes=-1)(keys)
+    return kind(*numbers)
+
+
+def choose(weights: Float[Array, "choice lane"], u: Float[Array, " lane"]) -> Bool[Array, "choice lane"]:
+    """One-hot choice with chances in proportion to the weights; the first where all are zero."""
+    upper = jnp.cumsum(weights, 0)
+    index = (upper < upper[-1] * (1 - u)).sum(0)
+    return jnp.arange(len(weights))[:, None] == index
+
+
+def first_of_two(a: Array, b: Array, u: Float[Array, " lane"]) -> Bool[Array, " lane"]:
+    """Whether a is taken: a fair choice among those that are True; a where neither is."""
+    return ~b | (a & (u >= 0.5))
+
+
+def between(u: Array, low: Array | float, high: Array | float) -> Array:
+    return low + u * (high - low)
+
+
+def first_free(taken: Bool[Array, "place lane"]) -> Bool[Array, "place lane"]:
+    """One-hot first place not taken; nothing where all are."""
+    return ~taken & (jnp.cumsum(~taken, 0) == 1)
+
+
+def at(x: Array, chosen: Bool[Array, "row lane"]) -> Array:
+    """The chosen row of x [row, ..., lane], zero where none is."""
+    spread = chosen.reshape(len(chosen), *[1] * (x.ndim - 2), chosen.shape[-1])
+    if x.dtype == bool:
+        return (x & spread).any(0)
+    return jnp.where(spread, x, jnp.zeros((), x.dtype)).sum(0)
+
+
+def put(x: Array, place: Bool[Array, "row lane"], value: Array | float) -> Array:
+    """x [row, ..., lane] with `value` [..., lane] in the chosen row."""
+    spread = place.reshape(len(place), *[1] * (x.ndim - 2), place.shape[-1])
+    return jnp.where(spread, jnp.asarray(value, x.dtype), x)
