@@ -15,8 +15,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from configs.convert import ConfigError, flat, plain, suggestion, typed
 from configs.schema import JobConfig
-from experts.train import ExpertConfig
-from levelgen.sampler import Distribution
+from experts.config import ExpertConfig
+from levelgen.distribution import Distribution
 from levelgen.task import TaskParams
 
 JOB = "generate"
@@ -37,6 +37,11 @@ def settings(overrides: Sequence[str]) -> dict[str, Any]:
     parsed = [_parsed(text) for text in overrides]
     _check_keys(parsed, flat(_composed([])))
     return _composed([override.input_line or "" for override in parsed])
+
+
+def listing() -> str:
+    """Every setting and its default, a line each, as one would type them."""
+    return "\n".join(f"  {key}={_hydra(value)}" for key, value in flat(settings([])).items())
 
 
 def again(job: JobConfig) -> str:
@@ -82,7 +87,9 @@ def _parsed(text: str) -> Override:
 def _choices() -> dict[str, list[str]]:
     """The files to choose from in each folder of configs/."""
     folders = [entry for entry in files("configs").iterdir() if entry.is_dir() and not entry.name.startswith("_")]
-    return {f.name: sorted(e.name.removesuffix(".yaml") for e in f.iterdir() if e.name.endswith(".yaml")) for f in folders}
+    return {
+        f.name: sorted(e.name.removesuffix(".yaml") for e in f.iterdir() if e.name.endswith(".yaml")) for f in folders
+    }
 
 
 def _check_keys(overrides: Sequence[Override], known: Mapping[str, Any]) -> None:
@@ -95,7 +102,9 @@ def _check_keys(overrides: Sequence[Override], known: Mapping[str, Any]) -> None
                 hint = suggestion(str(value), choices[key])
                 raise ConfigError(f"there is no {key} {value!s}{hint}: choose one of {', '.join(choices[key])}.")
         elif key not in known and not any(parent == key or parent.startswith(f"{key}.") for parent in parents):
-            raise ConfigError(f"there is no setting {key}{suggestion(key, known)}: `levelproof generate --help` lists them.")
+            raise ConfigError(
+                f"there is no setting {key}{suggestion(key, known)}: `levelproof generate --help` lists them."
+            )
 
 
 def _hydra(value: Any) -> str:

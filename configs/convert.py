@@ -78,14 +78,18 @@ def _value(hint: Any, value: Any, path: str) -> Any:
     origin, arguments = get_origin(hint), get_args(hint)
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, Mapping):
-            raise ConfigError(f"{path} is {value!r}, but it is a group of settings: set one of them, as in {path}.NAME=VALUE.")
+            raise ConfigError(
+                f"{path} is {value!r}, but it is a group of settings: set one of them, as in {path}.NAME=VALUE."
+            )
         return typed(hint, value, path)  # type: ignore[arg-type]
     if origin in (Union, types.UnionType):
         return _alternative(arguments, value, path)
     if origin is Literal:
         if value not in arguments:
             choices = ", ".join(map(str, arguments))
-            raise ConfigError(f"{path} is {value!r}: choose one of {choices}{suggestion(str(value), map(str, arguments))}.")
+            raise ConfigError(
+                f"{path} is {value!r}: choose one of {choices}{suggestion(str(value), map(str, arguments))}."
+            )
         return value
     if origin is tuple:
         return _tuple(arguments, value, path)

@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 from configs.convert import ConfigError, plain
 from configs.numbers import parse_count
-from experts.train import ExpertConfig
+from experts.config import ExpertConfig
+from levelgen.distribution import Distribution
 from levelgen.identity import SAMPLER_VERSION
-from levelgen.sampler import Distribution
 from levelgen.task import TaskParams
 
 HASH_DIGITS = 16
@@ -39,7 +39,11 @@ class JobConfig:
         last = self.first_level + parse_count(self.levels, "levels") - 1
         if self.first_level < 0 or last > MAX_LEVEL_ID:
             raise ConfigError(f"level ids {self.first_level} to {last} do not fit: they run from 0 to {MAX_LEVEL_ID}.")
-        parse_count(self.budget, "budget")
+        if self.env_steps < self.expert.steps_per_update:
+            raise ConfigError(
+                f"budget is {self.budget}: one update of an expert takes {self.expert.steps_per_update} env steps "
+                f"({self.expert.environments} environments x {self.expert.horizon}), so give at least that many."
+            )
         if self.unit < 1:
             raise ConfigError(f"unit is {self.unit}: a work unit needs at least 1 level.")
         if self.workers < 0:

@@ -1,16 +1,17 @@
 """Names of files and folders of a split `{out}/{budget}/{size}`. Knows nothing of what is in them.
 
-    manifest/000000000000-000000000015.parquet          a fragment: the commit marker of a work unit
-    shards/000000000000-000000000015-5f0c2a9b.zarr      data of one attempt at that unit
-    quarantine/000000000000-000000000015.txt            why a unit was given up
-    job.json                                            what the last command wanted
+manifest/000000000000-000000000015.parquet          a fragment: the commit marker of a work unit
+shards/000000000000-000000000015-5f0c2a9b.zarr      data of one attempt at that unit
+quarantine/000000000000-000000000015.txt            why a unit was given up
+job.json                                            what the last command wanted
+.writer.lock, .commit.lock                          see pipeline/locks.py
 """
 
 import secrets
 from pathlib import Path
 
 MANIFEST, SHARDS, QUARANTINE = "manifest", "shards", "quarantine"
-LOCK, JOB = ".lock", "job.json"
+WRITER_LOCK, COMMIT_LOCK, JOB = ".writer.lock", ".commit.lock", "job.json"
 DIGITS = 12  # of a level id in file names, so that names sort as ids do
 
 

@@ -14,9 +14,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from configs.convert import flat
 from pipeline.errors import Failure, UserError
 from pipeline.layout import MANIFEST
 from pipeline.schema import COLUMNS, CONFIG_KEY, HASH_KEY, MANIFEST_VERSION, VERSION_KEY
+
+SHOWN = 6  # differing settings that an error lists
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,7 @@ class Manifest:
     split: Path
     fragments: tuple[Fragment, ...]
     table: pa.Table
+    shards: frozenset[str]  # that any fragment names; paths below the split
 
     @property
     def level_ids(self) -> np.ndarray:
@@ -116,25 +120,26 @@ def read_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest
 
     Args:
         split: the folder `{out}/{budget}/{size}`.
-        columns: which to read (default: all); `level_id` is always among them.
+        columns: which to read (default: all); `level_id` and `shard` are always among them.
 
     Raises:
         Failure: a fragment is damaged, or fragments of several configurations lie side by side.
     """
-    names = None if columns is None else list(dict.fromkeys(["level_id", *columns]))
+    names = None if columns is None else list(dict.fromkeys(["level_id", "shard", *columns]))
     read = [read_fragment(path, names) for path in fragment_paths(split)]
     fragments = tuple(fragment for fragment, _ in read)
     for fragment in fragments[1:]:
         if fragment.config_hash != fragments[0].config_hash:
+            changes = told(differences(fragments[0].config, fragment.config))
             raise Failure(
-                f"{split} mixes two configurations: {fragments[0].path.name} has {fragments[0].config_hash} and "
-                f"{fragment.path.name} has {fragment.config_hash} ({first_difference(fragments[0].config, fragment.config)}): "
+                f"{split} mixes two configurations, {fragments[0].path.name} and {fragment.path.name} ({changes}): "
                 "move the fragments of one of them elsewhere."
             )
     schema = COLUMNS if names is None else pa.schema([COLUMNS.field(name) for name in names])
     table = pa.concat_tables([part.cast(schema) for _, part in read]) if read else schema.empty_table()
     _, first = np.unique(table.column("level_id").to_numpy(), return_index=True)  # sorts; a level counts once
-    return Manifest(split, fragments, table.take(first).replace_schema_metadata(None))
+    shards = frozenset(name for name in table.column("shard").unique().to_pylist() if name)
+    return Manifest(split, fragments, table.take(first).replace_schema_metadata(None), shards)
 
 
 def require_manifest(split: Path) -> Manifest:
@@ -145,20 +150,25 @@ def require_manifest(split: Path) -> Manifest:
         Failure: as `read_manifest`.
     """
     if not split.is_dir():
-        raise UserError(f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made.")
+        raise UserError(
+            f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
+        )
     manifest = read_manifest(split)
     if not manifest.fragments:
-        raise UserError(f"Nothing is committed in {split} yet: give a folder such as data/128k/s that `levelproof generate` made.")
+        raise UserError(
+            f"Nothing is committed in {split} yet: give a folder such as data/128k/s that `levelproof generate` made."
+        )
     return manifest
 
 
-def first_difference(theirs: Mapping[str, Any], ours: Mapping[str, Any], path: str = "") -> str:
-    """`'expert.envs is 32 there and 64 here'` for the first setting that differs, or `''`."""
-    for key in sorted(theirs.keys() | ours.keys()):
-        a, b, name = theirs.get(key), ours.get(key), f"{path}{key}"
-        if isinstance(a, Mapping) and isinstance(b, Mapping):
-            if text := first_difference(a, b, f"{name}."):
-                return text
-        elif a != b:
-            return f"{name} is {a} there and {b} here"
-    return ""
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Settings that differ, by their dotted names; `absent` where one side does not have it."""
+    a, b = flat(old), flat(new)
+    names = sorted(name for name in a.keys() | b.keys() if a.get(name, "absent") != b.get(name, "absent"))
+    return {name: (a.get(name, "absent"), b.get(name, "absent")) for name in names}
+
+
+def told(changes: Mapping[str, tuple[Any, Any]]) -> str:
+    """`differences` in words, the first SHOWN of them."""
+    shown = [f"{name} was {old}, now {new}" for name, (old, new) in list(changes.items())[:SHOWN]]
+    return "; ".join(shown) + (f" and {len(changes) - SHOWN} more" if len(changes) > SHOWN else "")

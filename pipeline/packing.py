@@ -46,7 +46,7 @@ def _unsigned(values: np.ndarray, place: FieldPlace) -> np.ndarray:
     bits = PACKED[place.array]
     if values.dtype.itemsize * 8 == bits:
         return np.ascontiguousarray(values).view(f"u{bits // 8}")
-    if values.size and not (0 <= values.min() and values.max() < 2**bits):
+    if values.size and not (values.min() >= 0 and values.max() < 2**bits):
         raise ValueError(f"{place.name} has values from {values.min()} to {values.max()}: they do not fit {bits} bits")
     return values.astype(f"u{bits // 8}")
 

@@ -1,7 +1,7 @@
 """What is left to do: work units, their attempts and their quarantine. Knows nothing of workers or files."""
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from pipeline.layout import unit_name
@@ -19,6 +19,11 @@ class WorkUnit:
     def name(self) -> str:
         return unit_name(self.level_ids[0], self.level_ids[-1])
 
+    @property
+    def text(self) -> str:
+        """For people: `16 to 31`."""
+        return f"{self.level_ids[0]} to {self.level_ids[-1]}"
+
 
 def plan_units(wanted: range, done: Collection[int], unit: int) -> list[WorkUnit]:
     """Units that cover what is wanted and not done.
@@ -32,6 +37,25 @@ def plan_units(wanted: range, done: Collection[int], unit: int) -> list[WorkUnit
     return [WorkUnit(tuple(level_ids)) for level_ids in left.values()]
 
 
+@dataclass(frozen=True)
+class Summary:
+    """What travels back from a committed unit."""
+
+    levels: int
+    solved: int
+    env_steps: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one attempt at a unit ended."""
+
+    unit: WorkUnit
+    summary: Summary | None = None  # None: it failed
+    reason: str = ""  # of the failure, for the quarantine file
+    fatal: str = ""  # a sentence, where no further attempt can succeed
+
+
 @dataclass
 class Queue:
     """Units waiting, each with the attempts it has had."""
@@ -39,6 +63,10 @@ class Queue:
     waiting: deque[WorkUnit]
     attempts: dict[WorkUnit, int] = field(default_factory=dict)
     quarantined: list[WorkUnit] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, units: Iterable[WorkUnit]) -> "Queue":
+        return cls(deque(units))
 
     def take(self) -> WorkUnit | None:
         """The next unit to work on; None when no more wait."""

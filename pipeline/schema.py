@@ -30,7 +30,9 @@ COLUMNS = pa.schema(
         pa.field("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: none
         pa.field("steps_to_first_success", pa.int64()),  # env steps of training; null: never
         pa.field("env_steps", pa.int64(), nullable=False),  # used of the budget
-        pa.field("learning_curve", pa.list_(pa.float32()), nullable=False),  # success rate per update, NaN: no episode ended
+        pa.field(
+            "learning_curve", pa.list_(pa.float32()), nullable=False
+        ),  # success rate per update, NaN: no episode ended
         pa.field("best_return", pa.float32(), nullable=False),
         pa.field("episodes", pa.int64(), nullable=False),
         pa.field("shard", pa.string()),  # path below the split; null: not solved
@@ -100,7 +102,7 @@ def array_for(name: str, dtype: np.dtype) -> str:
     """Which packed array holds a field."""
     if name == "record/action":
         return "act"
-    bits = 8 if dtype == bool or name in SMALL else 32
+    bits = 8 if dtype.kind == "b" or name in SMALL else 32
     if bits == 32 and dtype.itemsize != 4:
         raise TypeError(f"{name} is {dtype}: fields are bool, int32 or float32")
     return f"{'dyn' if name.startswith('record/') else 'lvl'}{bits}"

@@ -74,7 +74,10 @@ class Shard:
             attributes = self._group.attrs.asdict()
             version = attributes.get("version")
             if attributes.get("format") != FORMAT or version != SHARD_VERSION:
-                raise Failure(f"{path} is a shard of version {version}, this program reads version {SHARD_VERSION}: use the levelproof that wrote it.")
+                raise Failure(
+                    f"The shard {path} has version {version}, this program reads {SHARD_VERSION}: "
+                    "use the levelproof that wrote it."
+                )
             self.level_ids: list[int] = list(attributes["level_ids"])  # type: ignore[arg-type]
             self.table = [FieldPlace.from_json(entry) for entry in attributes["fields"]]  # type: ignore[union-attr, arg-type]
         except Failure:
@@ -129,5 +132,3 @@ def _flush(path: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
-
-

@@ -1,0 +1,190 @@
+"""The command `levelproof`. Jobs take Hydra overrides, questions take the path of a split.
+
+Imports nothing heavy before it knows the command: `levelproof --help` has to answer at once.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from configs.convert import ConfigError
+from pipeline.errors import Exit, LevelproofError
+
+EXITS = "exit codes: 0 done, 1 failed, 2 something to change in the command, 3 done but for quarantined units"
+SPLIT = "folder of a split, such as data/128k/s"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; its exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["bench"]:  # has a parser of its own
+        words, bench = ["bench"], words[1:]
+    else:
+        bench = []
+    arguments = _parser().parse_args(words)
+    arguments.bench = bench
+    try:
+        return int(arguments.run(arguments))
+    except (LevelproofError, ConfigError) as error:
+        if arguments.debug:
+            raise
+        return _refuse(str(error), getattr(error, "exit_code", Exit.INPUT))
+    except KeyboardInterrupt:
+        return Exit.INTERRUPTED
+    except BrokenPipeError:  # `levelproof inspect ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return Exit.DONE
+    except Exception as error:
+        if arguments.debug:
+            raise
+        what = str(error).strip().splitlines()
+        return _refuse(
+            f"{type(error).__name__}: {what[0] if what else 'no message'} (--debug shows where)", Exit.FAILED
+        )
+
+
+def _refuse(sentence: str, code: int) -> int:
+    end = "" if sentence.endswith((".", ")")) else "."
+    print(f"Error: {sentence[:1].upper()}{sentence[1:]}{end}", file=sys.stderr)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="levelproof",
+        description="Make physics levels, train an expert on each, and keep what provably solves them.",
+        epilog=f"Start with: levelproof generate\n{EXITS}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"levelproof {_version()}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    def command(
+        name: str, run: Callable[[argparse.Namespace], int], does: str, example: str, **options
+    ) -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name,
+            help=does,
+            description=f"{does[0].upper()}{does[1:]}.",
+            epilog=f"example: {example}\n{EXITS}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            **options,
+        )
+        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        sub.set_defaults(run=run)
+        return sub
+
+    sub = command(
+        "generate",
+        _generate,
+        "make levels and their experts",
+        "levelproof generate size=m levels=32 budget=64k out=data",
+        add_help=False,
+    )
+    sub.add_argument("settings", nargs="*", metavar="NAME=VALUE", help="settings to change; their defaults are below")
+    sub.add_argument("-h", "--help", action="store_true", help="show this help and every setting")
+    sub.set_defaults(parser=sub)
+
+    sub = command(
+        "inspect",
+        _inspect,
+        "show what is in a split",
+        "levelproof inspect data/128k/s --where \"label = 'solved' AND steps_to_goal < 64\"",
+    )
+    _split(sub)
+    sub.add_argument(
+        "--where", metavar="SQL", help="count only rows for which this condition on the manifest's columns holds"
+    )
+    sub.add_argument("--rows", type=int, default=10, help="rows to show (default: 10)")
+    _json(sub)
+
+    sub = command(
+        "show", _show, "draw a level's witness as a moving picture", "levelproof show data/128k/s 7 -o level.gif"
+    )
+    _split(sub)
+    sub.add_argument("level_id", type=int, metavar="LEVEL_ID")
+    sub.add_argument("-o", "--out", type=Path, default=Path("level.gif"), help="file to write (default: level.gif)")
+
+    sub = command("status", _status, "tell how far a split is", "levelproof status data/128k/s")
+    _split(sub)
+    _json(sub)
+
+    sub = command(
+        "verify", _verify, "read every shard of a split and replay every witness", "levelproof verify data/128k/s"
+    )
+    _split(sub)
+    _json(sub)
+
+    command("bench", _bench, "measure this program beside the reference", "levelproof bench physics --size s --json")
+    return parser
+
+
+def _split(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("split", type=Path, metavar="SPLIT", help=SPLIT)
+
+
+def _json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _version() -> str:
+    try:
+        return version("levelproof")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+def _generate(arguments: argparse.Namespace) -> int:
+    from configs.compose import compose_job, listing
+
+    if arguments.help:
+        arguments.parser.print_help()
+        print(f"\nevery setting and its default:\n{listing()}")
+        return Exit.DONE
+    job = compose_job(arguments.settings)
+
+    from rich.console import Console
+
+    from pipeline.generate import generate
+
+    return generate(job, arguments.settings, Console(stderr=True))
+
+
+def _inspect(arguments: argparse.Namespace) -> int:
+    from pipeline.inspect import inspect
+
+    inspect(arguments.split, arguments.where, arguments.rows, arguments.json)
+    return Exit.DONE
+
+
+def _show(arguments: argparse.Namespace) -> int:
+    from pipeline.show import show
+
+    show(arguments.split, arguments.level_id, arguments.out)
+    return Exit.DONE
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    from pipeline.status import status
+
+    status(arguments.split, arguments.json)
+    return Exit.DONE
+
+
+def _verify(arguments: argparse.Namespace) -> int:
+    from pipeline.verify import verify
+
+    return verify(arguments.split, arguments.json)
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from pipeline.bench import main as bench
+
+    return bench(arguments.bench)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,122 @@
+"""The job of `levelproof generate`: what is left to do, done by workers or in this process, and said to the user."""
+
+import shlex
+import signal
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pyarrow.compute as pc
+from rich.console import Console
+
+from configs.schema import JobConfig
+from pipeline.errors import Exit, Failure
+from pipeline.layout import quarantine_path
+from pipeline.manifest import Manifest, read_manifest
+from pipeline.progress import Board, Tally
+from pipeline.schedule import ATTEMPTS, Outcome, Queue, WorkUnit, plan_units
+from pipeline.split import note_job, writing
+
+Watch = Callable[[WorkUnit, int, int], None]  # unit, env steps so far, levels solved so far
+
+
+def generate(job: JobConfig, overrides: list[str], console: Console) -> Exit:
+    """Make what is missing of the job's levels, and commit it unit by unit.
+
+    Args:
+        job: what to make.
+        overrides: the settings as typed, for the hints of what to type next.
+        console: where progress is shown.
+
+    Raises:
+        UserError, Failure: see `pipeline.split.writing`; or the disk refuses.
+        KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; what is committed stays.
+    """
+    with writing(job) as (split, manifest):
+        wanted = set(job.level_ids)
+        done = wanted.intersection(manifest.level_ids.tolist())
+        queue = Queue.of(plan_units(job.level_ids, done, job.unit))
+        note_job(split, job, overrides)
+        if queue.waiting:
+            solved = _labels(manifest, job)["solved"]
+            board = Board(Tally(len(wanted), len(done), solved, job.env_steps), console)
+            board.say(_opening(job, split, len(done)))
+            try:
+                with board.shown(), _interruptible():
+                    _work(job, split, queue, board)
+            except KeyboardInterrupt:
+                board.say(
+                    f"Stopped: {board.tally.done} of {len(wanted)} levels are committed; the same command goes on."
+                )
+                raise
+            manifest = read_manifest(split, ["label"])
+        else:
+            print(f"Nothing to do: all {len(wanted)} levels are there.")
+        _closing(job, split, manifest, queue)
+    return Exit.QUARANTINED if queue.quarantined else Exit.DONE
+
+
+def _work(job: JobConfig, split: Path, queue: Queue, board: Board) -> None:
+    def settle(outcome: Outcome) -> None:
+        """Account for an attempt that ended."""
+        board.ended(outcome.unit, outcome.summary)
+        if outcome.fatal:
+            raise Failure(outcome.fatal)
+        note = quarantine_path(split, outcome.unit.name)
+        if outcome.summary:
+            note.unlink(missing_ok=True)
+            return
+        cause = outcome.reason.strip().splitlines()[-1]
+        last = queue.failed(outcome.unit)
+        board.say(f"Levels {outcome.unit.text} failed ({cause}){': given up.' if last else ': trying again.'}")
+        if last:
+            note.parent.mkdir(exist_ok=True)
+            note.write_text(f"Failed {ATTEMPTS} times, the last time with:\n\n{outcome.reason}\n")
+
+    if job.executor == "inline":
+        from pipeline.inline import run
+    else:
+        from pipeline.cluster import run
+    run(job, split, queue, settle, board)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM (a batch system's time limit) stops a job as Ctrl-C does."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _labels(manifest: Manifest, job: JobConfig) -> Counter[str]:
+    """How many of the job's levels have which label."""
+    wanted, ids = job.level_ids, manifest.table.column("level_id")
+    inside = pc.and_(pc.greater_equal(ids, wanted.start), pc.less(ids, wanted.stop))
+    return Counter(manifest.table.filter(inside).column("label").to_pylist())
+
+
+def _opening(job: JobConfig, split: Path, done: int) -> str:
+    there = f", {done} are there already" if done else ""
+    return f"{len(job.level_ids)} levels of size {job.size}, {job.budget} env steps each, into {split}{there}"
+
+
+def _closing(job: JobConfig, split: Path, manifest: Manifest, queue: Queue) -> None:
+    """Where it is, what came of it, and what to type next. On stdout."""
+    labels, folder = _labels(manifest, job), shlex.quote(str(split))
+    total = sum(labels.values())
+    counts = ", ".join(f"{count} {label}" for label, count in labels.most_common())
+    print(f"{split}: {total} levels, {counts}." if total else f"{split}: nothing is committed.")
+    for unit in queue.quarantined:
+        print(f"Given up: levels {unit.text}, for the reason in {quarantine_path(split, unit.name)}")
+    if total:
+        print(f"Next:  levelproof inspect {folder}")
+    solved = manifest.table.filter(pc.equal(manifest.table.column("label"), "solved")).column("level_id")
+    if len(solved):
+        print(f"       levelproof show {folder} {solved[0]} -o level.gif")

@@ -1,0 +1,24 @@
+"""The executor without Ray: units one after another in this process, for debugging."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from configs.schema import JobConfig
+from pipeline.progress import Board
+from pipeline.runtime import prepare_jax
+from pipeline.schedule import Outcome, Queue
+
+
+def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Outcome], None], board: Board) -> None:
+    """Work on the queue until it is empty."""
+    prepare_jax()
+    from pipeline.unit import attempt  # imports what reads the settings just made
+
+    while unit := queue.take():
+
+        def report(env_steps: int, solved: int, unit=unit) -> None:
+            board.tally.progress(unit, env_steps, solved)
+            board.refresh()
+
+        board.refresh()
+        settle(attempt(job, split, unit, report))

@@ -1,0 +1,126 @@
+"""What is in a split: counts, rates, quantiles and rows, by DuckDB over the manifest. Reads no shard's data."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pyarrow as pa
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.errors import UserError
+from pipeline.manifest import require_manifest
+from pipeline.schema import RECORD_STEPS
+from pipeline.shard import stored_bytes
+
+QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps", "shard", "row")
+
+
+def inspect(split: Path, where: str | None, rows: int, as_json: bool) -> None:
+    """Print what is in `split`, of the rows for which the SQL condition `where` holds.
+
+    Raises:
+        UserError: no split, or a condition that DuckDB cannot use.
+        Failure: a fragment is damaged.
+    """
+    facts = survey(split, where, rows)
+    if as_json:
+        json.dump(facts, sys.stdout, indent=2, allow_nan=False)
+        print()
+    else:
+        _print(facts, Console(highlight=False))
+
+
+def survey(split: Path, where: str | None = None, rows: int = 10) -> dict[str, Any]:
+    """The facts that `inspect` prints, as JSON's types."""
+    manifest = require_manifest(split)
+    chosen = select(manifest.table, where)
+    solved = chosen.filter(pa.compute.equal(chosen.column("label"), "solved"))
+    labels = {entry["values"]: entry["counts"] for entry in chosen.column("label").value_counts().to_pylist()}
+    stored = sum(stored_bytes(split / shard) for shard in manifest.shards)
+    kept = manifest.table.num_rows - manifest.table.column("shard").null_count
+    return {
+        "split": str(split),
+        "config_hash": manifest.config_hash,
+        "levels": chosen.num_rows,
+        "labels": dict(sorted(labels.items())),
+        "solve_rate": solved.num_rows / chosen.num_rows if chosen.num_rows else None,
+        "steps_to_goal": _quantiles(solved, "steps_to_goal"),
+        "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
+        "env_steps": sum(chosen.column("env_steps").to_pylist()),
+        "split_bytes": stored,  # of all the split's shards, whatever the condition
+        "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
+        "rows": [_plain(row) for row in chosen.slice(0, max(rows, 0)).to_pylist()],
+    }
+
+
+def select(table: pa.Table, where: str | None) -> pa.Table:
+    """The manifest's rows for which the SQL condition holds, sorted by level id.
+
+    Raises:
+        UserError: DuckDB cannot use the condition.
+    """
+    if where is None:
+        return table
+    with duckdb.connect() as connection:
+        connection.register("manifest", table)
+        connection.execute("SET enable_external_access = false")  # a condition reads the manifest, no other file
+        try:
+            return connection.sql(f"SELECT * FROM manifest WHERE ({where}\n) ORDER BY level_id").to_arrow_table()
+        except duckdb.Error as error:
+            reason = str(error).strip().splitlines()[0]
+            columns = ", ".join(table.column_names)
+            raise UserError(
+                f"cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
+            ) from None
+
+
+def _quantiles(table: pa.Table, column: str) -> dict[str, float] | None:
+    values = table.column(column).drop_null()
+    if not len(values):
+        return None
+    found = pa.compute.quantile(values, q=list(QUANTILES), interpolation="nearest").to_pylist()
+    return {f"{quantile:.0%}": value for quantile, value in zip(QUANTILES, found, strict=True)}
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN and no infinity: null."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    return value if not isinstance(value, float) or abs(value) < float("inf") else None
+
+
+def _print(facts: dict[str, Any], console: Console) -> None:
+    labels = ", ".join(f"{count} {label}" for label, count in facts["labels"].items()) or "none"
+    lines = {
+        "split": facts["split"],
+        "levels": f"{facts['levels']} ({labels})",
+        "solve rate": f"{facts['solve_rate']:.1%}" if facts["solve_rate"] is not None else None,
+        "steps to goal": _told(facts["steps_to_goal"]),
+        "training steps to first success": _told(facts["steps_to_first_success"]),
+        "training env steps": f"{facts['env_steps']:,}",
+        "shards": f"{facts['split_bytes']:,} bytes",
+        "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
+    }
+    for name, text in lines.items():
+        if text is not None:
+            console.print(f"{name + ':':33}{text}", markup=False, soft_wrap=True)
+    table = Table(*SHOWN, box=None, pad_edge=False)
+    for row in facts["rows"]:
+        table.add_row(*(_cell(row[name]) for name in SHOWN))
+    if facts["rows"]:
+        console.print()
+        console.print(table)
+
+
+def _told(quantiles: dict[str, float] | None) -> str | None:
+    return ", ".join(f"{name}: {value:,.0f}" for name, value in quantiles.items()) if quantiles else None
+
+
+def _cell(value: Any) -> str:
+    return "-" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)

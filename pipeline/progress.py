@@ -1,0 +1,129 @@
+"""What people see while a job runs: a bar on a terminal, plain lines elsewhere. On stderr. Knows nothing of workers."""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+from pipeline.schedule import Summary, WorkUnit
+
+LINE_EVERY = 30.0  # s between plain lines
+RATE_OVER = 20.0  # s over which env steps/s are averaged
+
+
+@dataclass
+class Tally:
+    """How far a job is."""
+
+    levels: int  # wanted
+    done: int  # committed, those of earlier runs included
+    solved: int
+    budget: int  # env steps per level at most
+    running: dict[WorkUnit, tuple[int, int]] = field(default_factory=dict)  # env steps, solved
+    env_steps: int = 0  # of this run's committed units
+    history: deque[tuple[float, int]] = field(default_factory=deque)  # time, env steps of this run
+
+    def __post_init__(self) -> None:
+        self.at_start = self.share
+
+    def progress(self, unit: WorkUnit, env_steps: int, solved: int) -> None:
+        self.running[unit] = env_steps, solved
+
+    def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
+        """A unit was committed, or an attempt at it failed (`None`)."""
+        self.running.pop(unit, None)
+        if summary:
+            self.done += summary.levels
+            self.solved += summary.solved
+            self.env_steps += summary.env_steps
+
+    def tick(self, now: float) -> None:
+        """Note where the job is at time `now`, s. The clock starts with the first env step: compiling is no pace."""
+        steps = self.env_steps + sum(steps for steps, _ in self.running.values())
+        if not steps:
+            self.first = now
+            self.history.clear()
+        self.history.append((now, steps))
+        while now - self.history[0][0] > RATE_OVER and len(self.history) > 2:
+            self.history.popleft()
+
+    @property
+    def share(self) -> float:
+        """Of the whole job, 0 to 1; units under way count by their env steps."""
+        under_way = sum(min(steps / self.budget, len(unit.level_ids)) for unit, (steps, _) in self.running.items())
+        return min(1.0, (self.done + under_way) / self.levels)
+
+    @property
+    def solved_so_far(self) -> int:
+        return self.solved + sum(solved for _, solved in self.running.values())
+
+    @property
+    def rate(self) -> float:
+        """Env steps per second, lately."""
+        (begin, low), (end, high) = self.history[0], self.history[-1]
+        return max(0.0, (high - low) / (end - begin)) if end > begin else 0.0
+
+    def left(self, now: float) -> float | None:
+        """Seconds left at this run's pace; None: unknown yet."""
+        gained = self.share - self.at_start
+        if gained <= 0 or now <= self.first:
+            return None
+        return (now - self.first) * (1 - self.share) / gained
+
+    def text(self, now: float) -> str:
+        left = self.left(now)
+        tail = f"about {duration(left)} left" if left is not None else "compiling" if not self.rate else "..."
+        return f"{self.done}/{self.levels} levels · {self.solved_so_far} solved · {self.rate:,.0f} env steps/s · {tail}"
+
+
+class Board:
+    """Shows a Tally."""
+
+    def __init__(self, tally: Tally, console: Console) -> None:
+        self.tally, self._console, self._lines_at = tally, console, 0.0
+        self._bar = Progress(
+            BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console
+        )
+        self._task = self._bar.add_task("starting", total=1.0)
+
+    @contextmanager
+    def shown(self) -> Iterator["Board"]:
+        if not self._console.is_terminal:
+            yield self
+            return
+        with self._bar:
+            yield self
+
+    def refresh(self) -> None:
+        """Draw anew; cheap enough to call often."""
+        now = time.monotonic()
+        self.tally.tick(now)
+        if self._console.is_terminal:
+            self._bar.update(self._task, completed=self.tally.share, description=self.tally.text(now))
+        elif now - self._lines_at > LINE_EVERY:
+            self._line(now)
+
+    def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
+        self.tally.ended(unit, summary)
+        self.refresh()
+        if summary and not self._console.is_terminal:
+            self._line(time.monotonic())
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def _line(self, now: float) -> None:
+        self._lines_at = now
+        self.say(self.tally.text(now))
+
+
+def duration(seconds: float) -> str:
+    """`45 s`, `3 min`, `2.5 h`."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

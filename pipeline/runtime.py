@@ -1,0 +1,56 @@
+"""How JAX computes in a process that runs work units: one thread, and compiled code kept for the next process.
+
+Called before JAX starts its backend; changes nothing after that.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
+# One process per core, each with one thread, is twice as fast as one process with XLA's own threads; and a sum
+# that is split over threads would make a level's bits depend on the machine's number of cores.
+XLA_FLAGS = ("--xla_cpu_multi_thread_eigen=false", "intra_op_parallelism_threads=1")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+MIN_COMPILE_SECONDS = 0.2  # what compiles faster is not worth a file
+
+
+def cache_folder() -> Path:
+    """Where compiled code is kept: LEVELPROOF_CACHE_DIR, else the user's cache folder."""
+    if chosen := os.environ.get(CACHE_VARIABLE):
+        return Path(chosen).expanduser()
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "levelproof"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "levelproof"
+
+
+def prepare_jax(core: int | None = None) -> None:
+    """Set this process up to run work units.
+
+    Args:
+        core: the CPU core to stay on; None leaves that to the system.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = " ".join([flags, *(flag for flag in XLA_FLAGS if flag not in flags)]).strip()
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    if core is not None:
+        _pin(core)
+    import jax  # reads the environment above
+
+    jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def own_cores() -> list[int]:
+    """The CPU cores this process may use."""
+    if sys.platform == "linux":
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
+def _pin(core: int) -> None:
+    """Every thread of this process, those yet to come included, on one core; only Linux can."""
+    if sys.platform == "linux":
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setaffinity(int(thread), {core})

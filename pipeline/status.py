@@ -1,0 +1,55 @@
+"""How far a split is: what the last command wanted, what is committed, what was given up, whether a run is at work."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import UserError
+from pipeline.layout import JOB, QUARANTINE
+from pipeline.locks import is_written
+from pipeline.manifest import read_manifest
+
+
+def status(split: Path, as_json: bool) -> None:
+    """Print how far `split` is.
+
+    Raises:
+        UserError: there is no split.
+        Failure: a fragment is damaged.
+    """
+    facts = look(split)
+    if as_json:
+        print(json.dumps(facts, indent=2))
+        return
+    print(f"{split}: {facts['done']} of {facts['wanted']} levels committed, {facts['solved']} solved.")
+    for note in facts["quarantined"]:
+        print(f"Given up: {split / QUARANTINE / note}")
+    if facts["running"]:
+        print("A run is at work now.")
+    elif facts["done"] < facts["wanted"]:
+        print(f"No run is at work. To go on: {facts['command']}")
+
+
+def look(split: Path) -> dict[str, Any]:
+    """The facts that `status` prints."""
+    try:
+        job = json.loads((split / JOB).read_text())
+        wanted = range(job["first_level"], job["first_level"] + job["levels"])
+    except FileNotFoundError:
+        raise UserError(
+            f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
+        ) from None
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{split / JOB} is damaged: run `levelproof generate` for this split again.") from None
+    manifest = read_manifest(split, ["label"])
+    labels = dict(zip(manifest.level_ids.tolist(), manifest.table.column("label").to_pylist(), strict=True))
+    inside = [labels[level_id] for level_id in labels if level_id in wanted]
+    return {
+        "split": str(split),
+        "wanted": len(wanted),
+        "done": len(inside),
+        "solved": inside.count("solved"),
+        "quarantined": sorted(path.name for path in (split / QUARANTINE).glob("*.txt")),
+        "running": is_written(split),
+        "command": job["command"],
+    }

@@ -1,0 +1,141 @@
+"""One work unit: sample its levels, train their experts, replay every witness, write the shard, commit the fragment.
+
+Idempotent: an attempt that dies anywhere leaves at most a shard that no fragment names. Knows nothing of workers.
+"""
+
+import errno
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from configs.compose import again
+from configs.schema import JobConfig
+from experts.labels import Label, Verdict
+from experts.train import UnitResult, train_levels
+from experts.witness import Record, replay, succeeds
+from levelgen.level import SIZES, Level
+from levelgen.sampler import sample_levels
+from levelgen.task import TaskParams
+from pipeline.errors import Failure
+from pipeline.fields import arrays_of, map_arrays, same_bits
+from pipeline.layout import attempt_path, fragment_path
+from pipeline.locks import committing
+from pipeline.manifest import write_fragment
+from pipeline.schedule import Outcome, Summary, WorkUnit
+from pipeline.shard import write_shard
+from pipeline.stack import device, versions
+
+Report = Callable[[int, int], None]  # env steps done so far, levels solved so far
+# The disk refuses: the next attempt would train for nothing.
+FATAL = {
+    errno.ENOSPC: "the disk is full: free some space",
+    errno.EDQUOT: "your disk quota is used up: free some space",
+    errno.EFBIG: "the disk refuses files this large: choose another folder or raise the limit",
+    errno.EROFS: "the disk is read-only: make it writable",
+    errno.EACCES: "writing is not permitted: check the folder's permissions",
+    errno.EPERM: "writing is not permitted: check the folder's permissions",
+}
+
+
+def attempt(job: JobConfig, split: Path, unit: WorkUnit, report: Report) -> Outcome:
+    """One attempt at a unit, with its failure as a value: exceptions do not travel between processes."""
+    try:
+        return Outcome(unit, run_unit(job, split, unit, report))
+    except OSError as error:
+        fatal = FATAL.get(error.errno or 0, "")
+        sentence = fatal and f"Cannot write to {split}, {fatal}, then run the same command again."
+        return Outcome(unit, reason=traceback.format_exc(), fatal=sentence)
+    except Exception:
+        return Outcome(unit, reason=traceback.format_exc())
+
+
+def run_unit(job: JobConfig, split: Path, unit: WorkUnit, report: Report) -> Summary:
+    """Make and commit one unit.
+
+    Raises:
+        Failure: a witness does not replay.
+        OSError: the disk refuses; nothing is committed.
+    """
+    ids = np.asarray(unit.level_ids, np.int32)
+    levels = sample_levels(jnp.asarray(ids), SIZES[job.size], job.distribution)
+    result = train_levels(levels, ids, job.env_steps, job.expert, job.task, report)
+    check_witnesses(result, job.task)
+    commit(job, split, unit, result)
+    labels = [verdict.label for verdict in result.verdicts]
+    return Summary(len(labels), labels.count(Label.SOLVED), sum(verdict.env_steps for verdict in result.verdicts))
+
+
+def check_witnesses(result: UnitResult, task: TaskParams) -> None:
+    """The commit gate: every witness, replayed from its level and its actions, is its record and reaches the goal.
+
+    Raises:
+        Failure: one is not, or does not.
+    """
+    again = replay(result.levels, result.record.action, task)
+    wrong, reached = unlike_fields(result.record, again), succeeds(again.done, again.goal)
+    for i, (level_id, verdict) in enumerate(zip(result.level_ids, result.verdicts, strict=True)):
+        if verdict.label != Label.SOLVED:
+            continue
+        if i in wrong:
+            raise Failure(f"The witness of level {level_id} does not replay: its {wrong[i]} differs.")
+        if not reached[i]:
+            raise Failure(f"The witness of level {level_id} does not reach the goal when replayed.")
+
+
+def unlike_fields(record: Record, again: Record) -> dict[int, str]:
+    """The first field whose bits differ, for each level (by its place) that is not the same in both."""
+    ours, theirs = arrays_of(record), arrays_of(again)
+    wrong: dict[int, str] = {}
+    for name, values in ours.items():
+        for i in np.flatnonzero(~same_bits(values, theirs[name])):
+            wrong.setdefault(int(i), name)
+    return wrong
+
+
+def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> None:
+    """The shard first, under this attempt's own name, then the fragment that names it.
+
+    Raises:
+        OSError: the disk refuses; nothing is committed.
+    """
+    kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label == Label.SOLVED]
+    shard = attempt_path(split, unit.name)
+    rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
+    for place, i in enumerate(kept):
+        rows[i] |= {"shard": str(shard.relative_to(split)), "row": place}
+    with committing(split):
+        if kept:
+            write_shard(
+                shard, [int(result.level_ids[i]) for i in kept], shard_arrays(result.levels, result.record, kept)
+            )
+        write_fragment(fragment_path(split, unit.name), rows, job.hash, job.results)
+
+
+def shard_arrays(levels: Level, record: Record, kept: list[int]) -> dict[str, np.ndarray]:
+    """Every field of the levels at these places, by its name in the shard."""
+    chosen = (map_arrays(lambda x: x[..., kept], tree) for tree in (levels, record))
+    return {
+        name: x
+        for tree, path in zip(chosen, ("level/", "record/"), strict=True)
+        for name, x in arrays_of(tree, path).items()
+    }
+
+
+def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, Any]:
+    """A level's row, without a shard."""
+    return asdict(verdict) | {
+        "level_id": level_id,
+        "size": job.size,
+        "budget": job.budget,
+        "shard": None,
+        "row": None,
+        "config_hash": job.hash,
+        "versions": versions(),
+        "device": device(),
+        "command": f"{again(job)} first_level={level_id} levels=1",
+    }
