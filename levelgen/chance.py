@@ -3,19 +3,24 @@
 Every decision has a number of its own, named in a NamedTuple of draws, in [0, 1).
 """
 
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from math import prod
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-Draws = TypeVar("Draws", bound=NamedTuple)
 
-
-def draw(kind: type[Draws], keys: Key[Array, " lane"], *shape: int) -> Draws:
-    """A uniform number for each field of `kind`, each [*shape, lane]."""
-    numbers = jax.vmap(lambda key: jax.random.uniform(key, (len(kind._fields), *shape)), out_axes=-1)(keys)
-    return kind(*numbers)
+def deal(keys: Key[Array, " lane"], hands: Sequence[tuple[Any, tuple[int, ...]]]) -> list[Any]:
+    """For every (NamedTuple of draws, shape) one such tuple of uniform numbers [*shape, lane], from one draw a lane."""
+    counts = [len(kind._fields) * prod(shape) for kind, shape in hands]
+    numbers = jax.vmap(lambda key: jax.random.uniform(key, (sum(counts),)), out_axes=-1)(keys)
+    dealt, start = [], 0
+    for (kind, shape), count in zip(hands, counts, strict=True):
+        dealt.append(kind(*numbers[start : start + count].reshape(len(kind._fields), *shape, len(keys))))
+        start += count
+    return dealt
 
 
 def choose(weights: Float[Array, "choice lane"], u: Float[Array, " lane"]) -> Bool[Array, "choice lane"]:

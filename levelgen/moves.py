@@ -62,6 +62,7 @@ class BodyDraws(NamedTuple):
 
 
 class ThrusterDraws(NamedTuple):
+    wanted: Lane
     body: Lane
     x: Lane
     y: Lane
@@ -125,7 +126,12 @@ def draw_shape(d: BodyDraws, is_polygon: Flag, size: Lane | float, dist: Distrib
 
 
 def corners(half: Vec) -> Float[Array, "vertex 2 lane"]:
-    return CORNERS[:, :, None] * unvec(half)[None]
+    return jnp.asarray(CORNERS)[:, :, None] * unvec(half)[None]
+
+
+def corners_in_world(p: Proposal) -> Float[Array, "vertex 2 lane"]:
+    """As if the body were a polygon."""
+    return unvec(_turned(vec(corners(p.shape.half)), p.rotation) + p.position)
 
 
 def shape_mass(shape: Shape) -> tuple[Lane, Lane]:

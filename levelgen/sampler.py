@@ -13,9 +13,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, Key
+from jaxtyping import Array, Bool, Int
 
-from levelgen.chance import choose, draw
+from levelgen.chance import at, choose, deal
 from levelgen.distribution import Distribution
 from levelgen.identity import Stream, key_for
 from levelgen.level import Level, Role
@@ -26,13 +26,14 @@ from levelgen.moves import (
     Proposal,
     ThrusterDraws,
     add_thruster,
+    corners_in_world,
     insert,
     propose_connected,
     propose_free,
 )
+from levelgen.overlap import Circles, count_contacts
 from levelgen.scenery import empty_level
-from levelgen.shuffle import shuffle
-from physics.manifold import find_contacts
+from levelgen.shuffle import OrderDraws, places, shuffle
 from physics.types import FIXED_POLYGONS, Size
 
 __all__ = ["Distribution", "sample_levels"]
@@ -53,10 +54,6 @@ class LevelDraws(NamedTuple):
 
 class PlaceDraws(NamedTuple):
     kind: Lane
-
-
-class TryDraws(NamedTuple):
-    wanted: Lane
 
 
 class Plan(NamedTuple):
@@ -99,15 +96,25 @@ def check_size(size: Size) -> None:
 def sample_block(level_ids: Int[Array, " lane"], size: Size, distribution: Distribution) -> Level:
     """One block of levels."""
     keys = jax.vmap(lambda level_id: key_for(level_id, Stream.LEVEL))(level_ids)
-    level_keys, place_keys, body_keys, thruster_keys, shuffle_keys = (_part(keys, i) for i in range(5))
-    once = draw(LevelDraws, level_keys)
+    once, kinds, bodies, thrusters, order = deal(keys, hands(size, distribution))
     level = set_floor(empty_level(size, len(level_ids)), once.floor, distribution)
-
     motor, thruster = draw_control(once.control, size)
-    plan = plan_bodies(level, size, once.first_moves, motor, draw(PlaceDraws, place_keys, turns(size)), distribution)
-    level, active = add_bodies(level, plan, body_keys, distribution)
-    level = add_thrusters(level, thruster, active[min(GOAL_BODIES, len(active) - 1)], thruster_keys, distribution)
-    return shuffle(swap_roles(level, once.swap < distribution.swap_chance), shuffle_keys)
+    plan = plan_bodies(level, once.first_moves, motor, kinds, distribution)
+    level, active = add_bodies(level, plan, bodies, distribution)
+    level = add_thrusters(level, thruster, active[min(GOAL_BODIES, len(active) - 1)], thrusters, distribution)
+    return shuffle(swap_roles(level, once.swap < distribution.swap_chance), order)
+
+
+def hands(size: Size, dist: Distribution) -> list[tuple[type, tuple[int, ...]]]:
+    """The random numbers that a level takes."""
+    proposals = 1 if size.bodies <= dist.small_world else dist.proposals
+    return [
+        (LevelDraws, ()),
+        (PlaceDraws, (turns(size),)),
+        (BodyDraws, (turns(size), proposals)),
+        (ThrusterDraws, (size.thrusters,)),
+        (OrderDraws, (places(size),)),
+    ]
 
 
 def turns(size: Size) -> int:
@@ -131,17 +138,15 @@ def draw_control(u: Lane, size: Size) -> tuple[Flag, Flag]:
     return motor, thruster
 
 
-def plan_bodies(
-    level: Level, size: Size, first_moves: Lane, motor: Flag, places: PlaceDraws, dist: Distribution
-) -> Plan:
+def plan_bodies(level: Level, first_moves: Lane, motor: Flag, places: PlaceDraws, dist: Distribution) -> Plan:
     """Two free bodies, of which one can move; a third, joined where a motor must be; then what comes."""
-    turn = jnp.arange(turns(size))[:, None]
+    turn = jnp.arange(len(places.kind))[:, None]
     weights = jnp.array([dist.connected_weight, dist.free_weight, dist.empty_weight])[:, None]
     kind = jax.vmap(lambda u: jnp.argmax(choose(jnp.broadcast_to(weights, (3, len(u))), u), 0))(places.kind)
     later = turn > GOAL_BODIES
     # A floor that is a goal cannot move: then the first body, which becomes the other goal, must
     first = (first_moves < 0.5) | (level.role[0] == Role.GREEN) | (level.role[0] == Role.BLUE)
-    must_move = jnp.where(turn == 0, first, (turn == 1) & ~first) | (size.bodies <= dist.small_world)
+    must_move = jnp.where(turn == 0, first, (turn == 1) & ~first) | (level.size.bodies <= dist.small_world)
     return Plan(
         add=~later | (kind != 2),
         connect=jnp.where(later, kind == 0, (turn == GOAL_BODIES) & motor),
@@ -151,12 +156,9 @@ def plan_bodies(
 
 
 def add_bodies(
-    level: Level, plan: Plan, keys: Key[Array, " lane"], dist: Distribution
+    level: Level, plan: Plan, draws: BodyDraws, dist: Distribution
 ) -> tuple[Level, Bool[Array, "turn body lane"]]:
-    """Also returns which bodies there were after each turn."""
-    small = level.size.bodies <= dist.small_world
-    proposals = 1 if small else dist.proposals
-    draws = draw(BodyDraws, keys, turns(level.size), proposals)
+    """Draws are [turn, proposal, lane]. Also returns which bodies there were after each turn."""
 
     def turn(level: Level, now: tuple[Plan, BodyDraws]) -> tuple[Level, Bool[Array, "body lane"]]:
         plan, d = now
@@ -166,35 +168,36 @@ def add_bodies(
     return jax.lax.scan(turn, level, (plan, draws))
 
 
-def propose(level: Level, plan: Plan, d: BodyDraws, dist: Distribution) -> Proposal:
+def propose(level: Level, plan: Plan, draws: BodyDraws, dist: Distribution) -> Proposal:
     """The proposal that touches least, the first of equals. Draws are [proposal, lane]."""
-    proposals, lanes = d.role.shape
-    wide_level, wide_plan = jax.tree.map(lambda x: jnp.tile(x, proposals), (level, plan))
-    d = jax.tree.map(lambda x: x.reshape(-1), d)
-    free = propose_free(wide_level, d, wide_plan.may_be_fixed, dist)
-    connected = propose_connected(wide_level, d, wide_plan.revolute, dist)
-    both = jax.tree.map(lambda a, b: jnp.where(wide_plan.connect, a, b), connected, free)
-    both = both._replace(possible=both.possible & wide_plan.add, joined=both.joined & wide_plan.connect & wide_plan.add)
-    if proposals == 1:
-        return both
-    world = insert(wide_level, both)
-    touching = find_contacts(world.model, world.state).active.sum(0) + jnp.where(both.hidden, dist.hidden_penalty, 0.0)
-    best = jnp.argmin(touching.reshape(proposals, lanes), 0)
-    chosen = jnp.arange(proposals)[:, None] == best
-    return jax.tree.map(lambda x: _chosen(x.reshape(*x.shape[:-1], proposals, lanes), chosen), both)
+
+    def one(d: BodyDraws) -> Proposal:
+        free = propose_free(level, d, plan.may_be_fixed, dist)
+        connected = propose_connected(level, d, plan.revolute, dist)
+        p: Proposal = jax.tree.map(lambda a, b: jnp.where(plan.connect, a, b), connected, free)
+        return p._replace(possible=p.possible & plan.add, joined=p.joined & plan.connect & plan.add)
+
+    def score(p: Proposal) -> Lane:
+        body = Circles(p.position.map(lambda x: x[None]), p.shape.radius[None])
+        contacts = count_contacts(level.model, level.state, corners_in_world(p), body, p.shape.is_polygon)
+        return contacts + jnp.where(p.hidden, dist.hidden_penalty, 0.0)
+
+    proposals = jax.vmap(one)(draws)
+    if len(draws.role) == 1:
+        return jax.tree.map(lambda x: x[0], proposals)
+    scores = jax.vmap(score)(proposals)
+    best = jnp.arange(len(scores))[:, None] == jnp.argmin(scores, 0)
+    return jax.tree.map(lambda x: at(x, best), proposals)
 
 
 def add_thrusters(
-    level: Level, forced: Flag, early: Bool[Array, "body lane"], keys: Key[Array, " lane"], dist: Distribution
+    level: Level, forced: Flag, early: Bool[Array, "body lane"], draws: ThrusterDraws, dist: Distribution
 ) -> Level:
-    """The first, if forced, on one of the `early` bodies, then others by chance."""
+    """The first, if forced, on one of the `early` bodies, then others by chance. Draws are [turn, lane]."""
     count = level.size.thrusters
     if not count:
         return level
-
-    draws = draw(ThrusterDraws, keys, count)
-    chance = draw(TryDraws, _part(keys, 0), count).wanted < dist.extra_thruster_chance
-    wanted = chance.at[0].set(forced)
+    wanted = jnp.where(jnp.arange(count)[:, None] == 0, forced, draws.wanted < dist.extra_thruster_chance)
 
     def turn(level: Level, now: tuple[ThrusterDraws, Flag, Array]) -> tuple[Level, None]:
         d, wanted, number = now
@@ -208,14 +211,3 @@ def swap_roles(level: Level, wanted: Flag) -> Level:
     """Green and blue exchanged, unless the floor has a role."""
     swapped = jnp.where(level.role == Role.GREEN, Role.BLUE, jnp.where(level.role == Role.BLUE, Role.GREEN, level.role))
     return replace(level, role=jnp.where(wanted & (level.role[0] == Role.PLAIN), swapped, level.role))
-
-
-def _chosen(x: Array, chosen: Bool[Array, "proposal lane"]) -> Array:
-    """x [..., proposal, lane] at the chosen one."""
-    if x.dtype == bool:
-        return (x & chosen).any(-2)
-    return jnp.where(chosen, x, jnp.zeros((), x.dtype)).sum(-2)
-
-
-def _part(keys: Key[Array, " lane"], number: int) -> Key[Array, " lane"]:
-    return jax.vmap(lambda key: jax.random.fold_in(key, number))(keys)

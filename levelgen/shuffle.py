@@ -7,9 +7,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.chance import draw
 from levelgen.level import Level
 from physics.types import FIXED_POLYGONS, Model, Size
 
@@ -34,9 +33,14 @@ class Order(NamedTuple):
     thrusters: Int[Array, "thruster lane"]
 
 
-def shuffle(level: Level, keys: Key[Array, " lane"]) -> Level:
+def places(size: Size) -> int:
+    """How many can change their place."""
+    return sum(_places(size))
+
+
+def shuffle(level: Level, draws: OrderDraws) -> Level:
     """Movable polygons, circles, joints and thrusters in a random order each; the scenery stays."""
-    order = draw_order(level.size, keys)
+    order = draw_order(level.size, draws.order)
     place_of = jnp.argsort(order.bodies, 0)  # where each body went
     model, state, polygons = level.model, level.state, level.size.polygons
     model = replace(
@@ -61,15 +65,20 @@ def shuffle(level: Level, keys: Key[Array, " lane"]) -> Level:
     )
 
 
-def draw_order(size: Size, keys: Key[Array, " lane"]) -> Order:
-    places = (size.polygons - FIXED_POLYGONS, size.circles, size.joints, size.thrusters)
-    numbers, parts, start = draw(OrderDraws, keys, sum(places)).order, [], 0
-    for count in places:
+def draw_order(size: Size, numbers: Float[Array, "place lane"]) -> Order:
+    parts, start = [], 0
+    for count in _places(size):
         parts.append(jnp.argsort(numbers[start : start + count], 0).astype(jnp.int32))
         start += count
     polygons, circles, joints, thrusters = parts
-    scenery = jnp.broadcast_to(jnp.arange(FIXED_POLYGONS, dtype=jnp.int32)[:, None], (FIXED_POLYGONS, len(keys)))
+    scenery = jnp.broadcast_to(
+        jnp.arange(FIXED_POLYGONS, dtype=jnp.int32)[:, None], (FIXED_POLYGONS, numbers.shape[-1])
+    )
     return Order(jnp.concatenate([scenery, polygons + FIXED_POLYGONS, circles + size.polygons]), joints, thrusters)
+
+
+def _places(size: Size) -> tuple[int, int, int, int]:
+    return size.polygons - FIXED_POLYGONS, size.circles, size.joints, size.thrusters
 
 
 def separate(model: Model) -> Bool[Array, "body body lane"]:

@@ -1,0 +1,96 @@
+"""How much a body touches the others: the number of contacts the engine would find.
+
+The sampler asks this of every proposal, so only pairs with the new body are looked at. Contacts count as in
+physics/manifold.py: up to two of a pair of polygons, one where a circle is concerned; joined bodies count too.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from physics.manifold import FLIP_BIAS
+from physics.types import Model, State
+from physics.vector import Vec, nonzero, vec
+
+
+class Polygons(NamedTuple):
+    """In the world, clockwise, all with four vertices."""
+
+    vertex: Vec  # components [vertex, polygon, lane]
+    normal: Vec  # outward unit normal of the face from a vertex to the next
+
+
+class Circles(NamedTuple):
+    centre: Vec  # components [circle, lane]
+    radius: Float[Array, "circle lane"]
+
+
+def count_contacts(
+    model: Model, state: State, corners: Float[Array, "vertex 2 lane"], body: Circles, is_polygon: Bool[Array, " lane"]
+) -> Int[Array, " lane"]:
+    """Contacts of a new body with the active bodies: a polygon with these corners in the world, or a circle `body`."""
+    n = model.size.polygons
+    polygons = place(model, state)
+    new = with_normals(vec(corners).map(lambda x: x[:, None]))
+    position = vec(state.position)
+    circles = Circles(position.map(lambda x: x[n:]), model.radius)
+    touching = jnp.where(
+        is_polygon,
+        jnp.concatenate([polygon_contacts(polygons, new), touch(new, circles).astype(jnp.int32)]),
+        jnp.concatenate([touch(polygons, body), circles_touch(circles, body)]).astype(jnp.int32),
+    )
+    return jnp.where(model.active, touching, 0).sum(0)
+
+
+def place(model: Model, state: State) -> Polygons:
+    """All polygons in the world."""
+    n = model.size.polygons
+    cos, sin = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n])
+    local = vec(model.vertices).map(lambda x: x.swapaxes(0, 1))
+    return with_normals(local.rotate(cos, sin) + vec(state.position).map(lambda x: x[:n]))
+
+
+def with_normals(vertex: Vec) -> Polygons:
+    edge = vertex.map(lambda x: jnp.roll(x, -1, 0)) - vertex
+    return Polygons(vertex, Vec(-edge.y, edge.x).scale(1 / nonzero(edge.norm())))
+
+
+def polygon_contacts(a: Polygons, b: Polygons) -> Int[Array, "polygon lane"]:
+    """0, 1 or 2 of each pair: the two deepest vertices beyond the face that separates most."""
+    (first_a, second_a), (first_b, second_b) = deepest(a, b), deepest(b, a)
+    second = jnp.where(first_a + FLIP_BIAS < first_b, second_b, second_a)
+    touching = jnp.maximum(first_a, first_b) < 0
+    return touching.astype(jnp.int32) + (touching & (second < 0))
+
+
+def deepest(a: Polygons, b: Polygons) -> tuple[Float[Array, "polygon lane"], Float[Array, "polygon lane"]]:
+    """Distances of b's two deepest vertices from the face of a that separates most (negative: inside)."""
+    reach = [
+        a.normal.dot(Vec(b.vertex.x[k] - a.vertex.x, b.vertex.y[k] - a.vertex.y)) for k in range(4)
+    ]  # of b's vertex k from each face
+    low, high = jnp.minimum(reach[0], reach[1]), jnp.maximum(reach[0], reach[1])
+    low2, high2 = jnp.minimum(reach[2], reach[3]), jnp.maximum(reach[2], reach[3])
+    first = jnp.minimum(low, low2)
+    second = jnp.minimum(jnp.minimum(high, high2), jnp.maximum(low, low2))
+    best, runner_up = first[0], second[0]
+    for k in range(1, 4):
+        better = first[k] > best
+        best, runner_up = jnp.where(better, first[k], best), jnp.where(better, second[k], runner_up)
+    return best, runner_up
+
+
+def touch(polygons: Polygons, circles: Circles) -> Bool[Array, "pair lane"]:
+    """Whether the circle's centre is inside the polygon or within its radius of an edge."""
+    vertex, normal = polygons
+    edge = vertex.map(lambda x: jnp.roll(x, -1, 0)) - vertex
+    length = edge.norm()
+    along = edge.scale(1 / nonzero(length))
+    offset = circles.centre - vertex
+    clipped = along.scale(jnp.clip(along.dot(offset), 0.0, length))
+    inside = (normal.dot(offset) < 0).all(0)
+    return inside | ((offset - clipped).norm().min(0) <= circles.radius)
+
+
+def circles_touch(a: Circles, b: Circles) -> Bool[Array, "circle lane"]:
+    return (a.centre - b.centre).norm() < a.radius + b.radius
