@@ -1,0 +1,293 @@
+"""The engine from first principles: what rigid bodies have to keep, and what this engine promises of its lanes."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from physics.step import step
+from physics.types import Params
+from tests.golden.load import HERE, load
+from tests.physics.worlds import (
+    BALL,
+    BOX,
+    FLOOR_TOP,
+    HALF,
+    MASS,
+    OTHER,
+    PARAMS,
+    RADIUS,
+    changed,
+    idle,
+    room,
+)
+
+speeds = st.floats(-5, 5, width=32)
+turns = st.floats(-20, 20, width=32)
+few = settings(max_examples=40, deadline=None)
+
+
+@functools.cache
+def _compiled(params: Params):
+    """`count` steps; the number is traced, so that one compilation serves all tests."""
+
+    def run(model, state, motor, thrust, count):
+        def body(_, now):
+            return step(model, now[0], motor, thrust, params)
+
+        shapes = jax.eval_shape(body, 0, (state, None))
+        return jax.lax.fori_loop(0, count, body, (state, jax.tree.map(jnp.zeros_like, shapes[1])))
+
+    return jax.jit(run)
+
+
+def play(model, state, motor, thrust, steps: int = 1, params: Params = PARAMS):
+    """State and manifold after some physics steps, on the host."""
+    return host(_compiled(params)(model, state, motor, thrust, steps))
+
+
+def host(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+def momentum(state) -> np.ndarray:
+    """Linear momentum of the three movable bodies, kg m/s."""
+    return MASS * np.asarray(state.velocity)[[BOX, BALL, OTHER]].sum(0)[..., 0]
+
+
+class TestFreeFlight:
+    @few
+    @given(st.lists(st.tuples(speeds, speeds, turns), min_size=3, max_size=3))
+    def test_bodies_that_touch_nothing_fall_freely(self, motions) -> None:
+        model, state = room()
+        for body, (x, y, w) in zip((BOX, BALL, OTHER), motions, strict=True):
+            state = changed(state, velocity={body: (x, y)}, angular_velocity={body: w})
+        after, manifold = play(model, state, *idle())
+        assert not manifold.active.any()
+        fall = np.array([0, -9.81 / 60], np.float32)
+        for body, (x, y, w) in zip((BOX, BALL, OTHER), motions, strict=True):
+            np.testing.assert_allclose(after.velocity[body, :, 0], np.array([x, y]) + fall, atol=1e-5)
+            np.testing.assert_allclose(after.angular_velocity[body, 0], w, atol=1e-5)
+            moved = state.position[body, :, 0] + after.velocity[body, :, 0] / 60
+            np.testing.assert_allclose(after.position[body, :, 0], moved, atol=1e-5)
+            np.testing.assert_allclose(after.rotation[body, 0], w / 60, atol=1e-5)
+
+    @few
+    @given(speeds, speeds, turns, st.booleans())
+    def test_a_joint_keeps_the_momentum_of_its_bodies(self, x, y, w, fixed) -> None:
+        model, state = room(gravity=0.0)
+        model = changed(model, joint_active={0: True}, joint_fixed={0: fixed}, joint_anchor_a={0: (0.7, 0.0)})
+        model = changed(model, joint_anchor_b={0: (-0.8, 0.0)}, collides={(BOX, BALL): False, (BALL, BOX): False})
+        state = changed(state, velocity={BOX: (x, y)}, angular_velocity={BALL: w})
+        after, _ = play(model, state, *idle(), steps=8)
+        np.testing.assert_allclose(momentum(after), momentum(state), atol=2e-4)
+
+    @few
+    @given(speeds, speeds)
+    def test_a_collision_keeps_momentum(self, x, y) -> None:
+        model, state = room(gravity=0.0)
+        state = changed(state, position={OTHER: (2.5 + 2 * RADIUS - 0.005, 2.05)}, velocity={BALL: (abs(x) + 0.1, y)})
+        after, manifold = play(model, state, *idle())
+        assert manifold.active.any()
+        np.testing.assert_allclose(momentum(after), momentum(state), atol=1e-4)
+
+    def test_a_motor_turns_both_bodies_and_moves_none(self) -> None:
+        model, state = room(gravity=0.0)
+        model = changed(model, joint_active={0: True}, collides={(BOX, BALL): False, (BALL, BOX): False})
+        state = changed(state, position={BALL: (1.0, 2.0)})
+        motor, thrust = idle()
+        after, _ = play(model, state, motor + 1, thrust)
+        spins = after.angular_velocity[:, 0]
+        assert spins[BALL] > 0 > spins[BOX]  # forward: b turns counterclockwise against a
+        angular = spins[[BOX, BALL]] / model.inverse_inertia[[BOX, BALL], 0]
+        np.testing.assert_allclose(angular.sum(), 0, atol=1e-5)
+        np.testing.assert_allclose(after.velocity[[BOX, BALL], :, 0], 0, atol=1e-5)
+
+    def test_a_thruster_pushes_along_itself(self) -> None:
+        model, state = room(gravity=0.0)
+        model = changed(model, thruster_active={0: True}, thruster_rotation={0: np.pi / 2})
+        motor, thrust = idle()
+        after, _ = play(model, state, motor, thrust + 1)
+        np.testing.assert_allclose(after.velocity[BOX, :, 0], [0, 10.0 / 60 / MASS], atol=1e-6)
+        assert (after.velocity[BALL] == 0).all()
+
+
+class TestRest:
+    @pytest.mark.parametrize(("body", "height"), [(BOX, HALF), (BALL, RADIUS)])
+    def test_a_body_on_the_floor_stays(self, body, height) -> None:
+        model, state = room()
+        state = changed(state, position={body: (2.0, FLOOR_TOP + height - 0.005)})
+        if body == BOX:
+            state = changed(state, position={BALL: (3.0, 2.0)})
+        after, _ = play(model, state, *idle(), steps=240)  # four seconds
+        np.testing.assert_allclose(after.position[body, :, 0], [2.0, FLOOR_TOP + height], atol=0.02)
+        np.testing.assert_allclose(after.velocity[body, :, 0], 0, atol=0.02)
+        np.testing.assert_allclose(after.rotation[body, 0], 0, atol=0.02)
+
+    def test_everything_comes_down_and_nothing_leaves_the_room(self) -> None:
+        model, state = room()
+        after, _ = play(model, state, *idle(), steps=240)
+        lowest = np.array([HALF, RADIUS, RADIUS])
+        np.testing.assert_allclose(after.position[[BOX, BALL, OTHER], 1, 0], FLOOR_TOP + lowest, atol=0.02)
+
+    def test_what_cannot_move_never_does(self) -> None:
+        model, state = room()
+        state = changed(state, position={BALL: (2.0, FLOOR_TOP), BOX: (0.1, 2.0)})
+        after, _ = play(model, state, *idle(), steps=8)
+        for name in ("position", "rotation", "velocity", "angular_velocity"):
+            np.testing.assert_array_equal(getattr(after, name)[:4], getattr(state, name)[:4])
+
+
+class TestInactive:
+    @few
+    @given(st.sampled_from([BOX, BALL, OTHER]), speeds, turns)
+    def test_an_inactive_body_moves_nothing(self, ghost, speed, turn) -> None:
+        """Placed into another body, thrown at it, whatever: the others move as if it were far away."""
+        victim = BALL if ghost != BALL else OTHER
+        model, state = room()
+        model = changed(model, active={ghost: False})
+        there = changed(
+            state,
+            position={ghost: state.position[victim, :, 0] + 0.05},
+            velocity={ghost: (speed, speed)},
+            angular_velocity={ghost: turn},
+        )
+        near, _ = play(model, there, *idle())
+        far, _ = play(model, state, *idle())
+        others = [body for body in range(7) if body != ghost]
+        for name in ("position", "rotation", "velocity", "angular_velocity"):
+            np.testing.assert_array_equal(getattr(near, name)[others], getattr(far, name)[others])
+
+    def test_an_inactive_joint_or_thruster_does_nothing(self) -> None:
+        model, state = room()
+        motor, thrust = idle()
+        plain, _ = play(model, state, motor, thrust)
+        driven, _ = play(model, state, motor + 1, thrust + 1)
+        for name in ("position", "rotation", "velocity", "angular_velocity"):
+            np.testing.assert_array_equal(getattr(plain, name), getattr(driven, name))
+
+    def test_modes_and_groups_pass_through_each_other(self) -> None:
+        """Collision modes leave no contact; `collides` leaves the contact without its impulse."""
+        model, state = room(gravity=0.0)
+        state = changed(state, position={OTHER: (2.6, 2.0)})
+        thin = changed(model, collision_mode={BALL: 0})
+        after, manifold = play(thin, state, *idle())
+        assert not manifold.active.any()
+        assert (after.velocity == 0).all()
+        grouped = changed(model, collides={(BALL, OTHER): False, (OTHER, BALL): False})
+        after, manifold = play(grouped, state, *idle())
+        assert manifold.active.any()
+        assert (after.velocity == 0).all()
+        thick = changed(model, collision_mode={BALL: 0, OTHER: 2})
+        after, manifold = play(thick, state, *idle())
+        assert manifold.active.any()
+        assert after.velocity[OTHER, 0, 0] > 0 > after.velocity[BALL, 0, 0]
+
+
+class TestBounds:
+    @few
+    @given(st.floats(-1e4, 1e4, width=32), st.floats(-1e4, 1e4, width=32), st.floats(-1e4, 1e4, width=32))
+    def test_places_and_speeds_are_bounded(self, x, y, w) -> None:
+        model, state = room()
+        state = changed(state, velocity={BALL: (x, y)}, angular_velocity={BALL: w})
+        after, _ = play(model, state, *idle())
+        assert np.abs(after.position).max() <= PARAMS.max_position
+        assert np.abs(after.velocity).max() <= PARAMS.max_velocity
+        assert np.abs(after.angular_velocity).max() <= PARAMS.max_angular_velocity
+        assert np.isfinite(after.position).all()
+
+
+class TestLanes:
+    """A lane's bits depend on its own world alone, as long as lanes come in whole vectors (docs/physics.md)."""
+
+    VECTORS = (8, 64, 128)  # lane counts
+    BROKEN = (1, 129)
+    STEPS = 16
+
+    @classmethod
+    def after(cls, lanes):
+        """Golden states of size s, those of `lanes` in a batch of their own, some physics steps later."""
+        of = load(HERE / "s.npz")
+        take = lambda tree: jax.tree.map(lambda x: np.ascontiguousarray(x[..., lanes]), tree)
+        return play(take(of.level.model), take(of.state), of.motor[:, lanes], of.thrust[:, lanes], cls.STEPS)[0]
+
+    @classmethod
+    @functools.cache
+    def together(cls):
+        return cls.after(np.arange(256))
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("count", VECTORS)
+    def test_the_number_of_lanes_changes_no_bits(self, count: int) -> None:
+        alone = self.after(np.arange(count))
+        for field in dataclasses.fields(alone):
+            whole = getattr(self.together(), field.name)[..., :count]
+            np.testing.assert_array_equal(getattr(alone, field.name), whole, field.name)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("count", BROKEN)
+    def test_a_broken_vector_changes_rounding_only(self, count: int) -> None:
+        """The compiler contracts the left-over lanes of a loop in another way than its vectors."""
+        alone = self.after(np.arange(count))
+        worst = np.zeros(count)
+        for name in ("position", "velocity"):
+            gap = np.abs(getattr(alone, name) - getattr(self.together(), name)[..., :count])
+            worst = np.maximum(worst, gap.max((0, 1)))
+        assert (worst < 1e-3).mean() > 0.97  # rounding grows over 16 steps
+
+    @pytest.mark.slow
+    def test_the_order_of_lanes_changes_no_bits(self) -> None:
+        order = np.random.default_rng(1).permutation(256)
+        mixed = self.after(order)
+        for field in dataclasses.fields(mixed):
+            whole = getattr(self.together(), field.name)[..., order]
+            np.testing.assert_array_equal(getattr(mixed, field.name), whole, field.name)
+
+    def test_one_model_serves_many_lanes(self) -> None:
+        """A model with one lane broadcasts over the lanes of its states."""
+        model, state = room()
+        single, _ = room(lanes=1)
+        state = changed(state, velocity={BALL: (1.0, 2.0)})
+        whole, _ = play(model, state, *idle())
+        shared, _ = play(single, state, *idle())
+        for field in dataclasses.fields(whole):
+            np.testing.assert_array_equal(getattr(whole, field.name), getattr(shared, field.name), field.name)
+
+
+class TestPadding:
+    """The reference forgets the accumulated impulses of the last pair of each kind; see docs/physics.md."""
+
+    @staticmethod
+    def resting_on_the_other(params: Params):
+        """The last circle-circle pair, pressed together for some steps without gravity's help."""
+        model, state = room()
+        state = changed(state, position={BALL: (2.5, FLOOR_TOP + RADIUS), OTHER: (2.5, FLOOR_TOP + 3 * RADIUS - 0.005)})
+        return play(model, state, *idle(), steps=4, params=params)[0]
+
+    def test_the_last_pair_remembers_nothing(self) -> None:
+        after = self.resting_on_the_other(Params(faithful_padding=True))
+        assert after.contact_active[-1].all()
+        assert (after.contact_normal_impulse[-1] == 0).all()
+
+    def test_the_fix_remembers(self) -> None:
+        after = self.resting_on_the_other(Params(faithful_padding=False))
+        assert (after.contact_normal_impulse[-1] > 0).all()
+        weight = MASS * 9.81 / 60
+        np.testing.assert_allclose(after.contact_normal_impulse[-1], weight, rtol=0.2)
+
+    def test_other_pairs_are_not_touched(self) -> None:
+        """A box on the floor is not the last pair of its kind in a room with a ceiling."""
+        model, state = room()
+        state = changed(state, position={BOX: (2.0, FLOOR_TOP + HALF - 0.005), BALL: (3.4, 2.0)})
+        faithful, _ = play(model, state, *idle(), steps=4)
+        fixed, _ = play(model, state, *idle(), steps=4, params=Params(faithful_padding=False))
+        assert faithful.contact_normal_impulse.max() > 0
+        for field in dataclasses.fields(faithful):
+            np.testing.assert_allclose(
+                getattr(faithful, field.name), getattr(fixed, field.name), atol=1e-5, err_msg=field.name
+            )
