@@ -13,6 +13,7 @@ from jaxtyping import Array, Int, Key
 SAMPLER_VERSION = 1  # raise it when the same id would give another level, or other random streams
 GENERATOR = "threefry2x32"  # named, not JAX's default: the same numbers everywhere
 ROOT_SEED = 0
+MAX_LEVEL_ID = 2**31 - 1
 
 
 class Stream(IntEnum):
@@ -26,7 +27,7 @@ class Stream(IntEnum):
 def level_key(level_id: Int[Array, ""] | int) -> Key[Array, ""]:
     """The key all of a level's streams derive from.
 
-    `level_id` is 0 .. 2**31 - 1 (32 bits are folded in); it may be traced, and mapped with `jax.vmap`.
+    `level_id` is 0 .. MAX_LEVEL_ID; it may be traced, and mapped with `jax.vmap`.
     """
     root = jax.random.key(ROOT_SEED, impl=GENERATOR)
     return jax.random.fold_in(jax.random.fold_in(root, SAMPLER_VERSION), jnp.asarray(level_id, jnp.uint32))

@@ -1,8 +1,7 @@
-"""The sampler's moves: propose a free body, propose a body joined to another, put a proposal into a level, add a
-thruster.
+"""The sampler's moves: a free body, a body joined to another, a thruster.
 
-All lanes last; one-hot choices stand for indices. Facts: `kinetix.environment.ued.mutators` 3.0.2
-(mutate_add_shape, mutate_add_connected_shape, mutate_add_thruster); numbers are fields of `Distribution`.
+Facts: `kinetix.environment.ued.mutators` 3.0.2 (mutate_add_shape, mutate_add_connected_shape,
+mutate_add_thruster); numbers are fields of `Distribution`.
 """
 
 import math
@@ -10,55 +9,31 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from levelgen.chance import at, between, choose, first_free, first_of_two, put
 from levelgen.distribution import HALF_WORLD, Distribution
 from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role
+from levelgen.proposal import (
+    BodyDraws,
+    Flag,
+    Joint,
+    Lane,
+    Proposal,
+    Shape,
+    draw_role,
+    draw_shape,
+    no_joint,
+    origin,
+    shape_mass,
+    turned,
+)
 from levelgen.scenery import FLOOR_TOP
-from physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
-from physics.types import FIXED_POLYGONS, MAX_VERTICES
+from physics.mass import inverse
+from physics.types import FIXED_POLYGONS
 from physics.vector import Vec, unvec, vec, where
 
-CORNERS = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)], np.float32)  # of a rectangle, clockwise
-TURN = 2 * math.pi
-Lane = Float[Array, " lane"]
-Flag = Bool[Array, " lane"]
-
-
-class BodyDraws(NamedTuple):
-    """Random numbers of one proposal, each [lane]."""
-
-    is_polygon: Lane
-    half_x: Lane
-    half_y: Lane
-    long: Lane
-    long_x: Lane
-    radius: Lane
-    rotation: Lane
-    role: Lane
-    # free
-    x: Lane
-    y: Lane
-    opposite: Lane
-    fixed: Lane
-    lowered: Lane
-    # connected
-    target_is_polygon: Lane
-    target: Lane
-    anchor_x: Lane
-    anchor_y: Lane
-    target_anchor_x: Lane
-    target_anchor_y: Lane
-    joint_fixed: Lane
-    motor: Lane
-    motor_binding: Lane
-    motor_speed: Lane
-    motor_power: Lane
-    limited: Lane
-    limit_min: Lane
-    limit_max: Lane
+TURN = 2 * math.pi  # rad
 
 
 class ThrusterDraws(NamedTuple):
@@ -71,90 +46,6 @@ class ThrusterDraws(NamedTuple):
     angle: Lane
     power: Lane
     binding: Lane
-
-
-class Shape(NamedTuple):
-    """A rectangle or a circle; what the other kind would need is at its minimum."""
-
-    is_polygon: Flag
-    half: Vec  # m, half width and half height
-    radius: Lane  # m
-
-
-class Joint(NamedTuple):
-    """From the proposed body to its target."""
-
-    target: Bool[Array, "body lane"]
-    anchor: Vec  # in the frame of the proposed body
-    target_anchor: Vec
-    fixed: Flag
-    limited: Flag
-    limit_min: Lane
-    limit_max: Lane
-    motor_on: Flag
-    motor_speed: Lane
-    motor_power: Lane
-    motor_binding: Int[Array, " lane"]
-
-
-class Proposal(NamedTuple):
-    """A body to add, with a joint where `joined`; nothing where not `possible`."""
-
-    possible: Flag
-    shape: Shape
-    position: Vec
-    rotation: Lane
-    role: Int[Array, " lane"]
-    fixed: Flag
-    joined: Flag
-    joint: Joint
-    hidden: Flag  # one of the joined bodies may lie within the other whatever the joint's angle
-
-
-def draw_shape(d: BodyDraws, is_polygon: Flag, size: Lane | float, dist: Distribution) -> Shape:
-    """Uniform half sides or radius; one side of some rectangles is longer (util.sample_dimensions)."""
-    longest = size / 2 / math.sqrt(2)
-    half = [
-        jnp.where(is_polygon, between(u, dist.min_half_side, longest), dist.min_half_side) for u in (d.half_x, d.half_y)
-    ]
-    long, long_x = d.long < dist.long_side_chance, d.long_x < 0.5
-    stretch = [jnp.where(long & side, dist.long_side_factor, 1.0) for side in (long_x, ~long_x)]
-    radius = between(d.radius, dist.min_radius, size / 2 * dist.circle_size_factor)
-    return Shape(
-        is_polygon, Vec(half[0] * stretch[0], half[1] * stretch[1]), jnp.where(is_polygon, dist.min_radius, radius)
-    )
-
-
-def corners(half: Vec) -> Float[Array, "vertex 2 lane"]:
-    return jnp.asarray(CORNERS)[:, :, None] * unvec(half)[None]
-
-
-def corners_in_world(p: Proposal) -> Float[Array, "vertex 2 lane"]:
-    """As if the body were a polygon."""
-    return unvec(_turned(vec(corners(p.shape.half)), p.rotation) + p.position)
-
-
-def shape_mass(shape: Shape) -> tuple[Lane, Lane]:
-    """kg and kg m^2 at the density of 1 kg/m^2 that all bodies have."""
-    vertices, four = corners(shape.half)[None], jnp.full((1, *shape.radius.shape), MAX_VERTICES)
-    mass = jnp.where(shape.is_polygon, polygon_area(vertices, four)[0], circle_area(shape.radius))
-    inertia = jnp.where(shape.is_polygon, polygon_inertia(vertices, four)[0], circle_inertia(shape.radius))
-    return mass, inertia
-
-
-def room(level: Level) -> tuple[Flag, Flag]:
-    """Whether a polygon and a circle more would fit."""
-    polygons = level.size.polygons
-    return ~level.model.active[:polygons].all(0), ~level.model.active[polygons:].all(0)
-
-
-def draw_role(level: Level, u: Lane, red_allowed: Flag | bool, dist: Distribution) -> Int[Array, " lane"]:
-    """Green and blue come first, then plain, and at most one red (util.get_role)."""
-    there = [(level.model.active & (level.role == role)).any(0) for role in (Role.GREEN, Role.BLUE, Role.RED)]
-    complete = there[0] & there[1]
-    red = jnp.where(complete & ~there[2] & red_allowed, dist.red_weight, 0.0)
-    chosen = choose(jnp.stack([1.0 * complete, 1.0 * ~there[0], 1.0 * ~there[1], red]), u)
-    return at(jnp.arange(len(Role))[:, None], chosen)
 
 
 def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, dist: Distribution) -> Proposal:
@@ -181,7 +72,7 @@ def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, dist: Distribut
         role=role,
         fixed=fixed,
         joined=no,
-        joint=_no_joint(level),
+        joint=no_joint(level),
         hidden=no,
     )
 
@@ -207,29 +98,22 @@ def propose_connected(level: Level, d: BodyDraws, revolute: Flag, dist: Distribu
     shape = draw_shape(d, is_polygon, dist.max_size, dist)
     target = choose_target(level, weight, target_is_polygon, d.target)
 
+    half = shape.half.scale(1.0 * is_polygon)  # circles are joined at their centres
+    anchor = spot(d.anchor_x, d.anchor_y, -half, half)
     low, high = extent(level, target)
-    anchor = where(
-        is_polygon,
-        Vec(between(d.anchor_x, -shape.half.x, shape.half.x), between(d.anchor_y, -shape.half.y, shape.half.y)),
-        _origin(d.x),
-    )
-    target_anchor = where(
-        target_is_polygon,
-        Vec(between(d.target_anchor_x, low.x, high.x), between(d.target_anchor_y, low.y, high.y)),
-        _origin(d.x),
-    )
+    target_anchor = spot(d.target_anchor_x, d.target_anchor_y, low, high)
     rotation = d.rotation * TURN
-    meet = vec(at(level.state.position, target)) + _turned(target_anchor, at(level.state.rotation, target))
+    meet = vec(at(level.state.position, target)) + turned(target_anchor, at(level.state.rotation, target))
     role = draw_role(level, d.role, at(level.role, target) == Role.PLAIN, dist)
     joint = draw_joint(level, d, target, is_polygon & target_is_polygon, revolute, dist)._replace(
         anchor=anchor, target_anchor=target_anchor
     )
-    partner = Shape(target_is_polygon, (high - low).scale(0.5), at(_radius(level), target))
+    partner = Shape(target_is_polygon, (high - low).scale(0.5), at(radii(level), target))
     possible = (room_polygon | room_circle) & model.active[FIXED_POLYGONS:].any(0) & ~model.joint_active.all(0)
     return Proposal(
         possible=possible,
         shape=shape,
-        position=meet - _turned(anchor, rotation),
+        position=meet - turned(anchor, rotation),
         rotation=rotation,
         role=role,
         fixed=jnp.zeros_like(possible),
@@ -268,11 +152,9 @@ def choose_target(
     return jnp.concatenate(parts)
 
 
-def extent(level: Level, chosen: Bool[Array, "body lane"]) -> tuple[Vec, Vec]:
-    """Lower left and upper right corner of the chosen polygon in its own frame; zero for circles."""
-    vertices = level.model.vertices
-    polygon = chosen[: level.size.polygons]
-    return vec(at(vertices.min(1), polygon)), vec(at(vertices.max(1), polygon))
+def spot(x: Lane, y: Lane, low: Vec, high: Vec) -> Vec:
+    """A point between two corners."""
+    return Vec(between(x, low.x, high.x), between(y, low.y, high.y))
 
 
 def draw_joint(
@@ -287,8 +169,8 @@ def draw_joint(
     top = jnp.where(polygons, dist.max_motor_power, dist.max_wheel_power)
     return Joint(
         target=target,
-        anchor=_origin(d.x),
-        target_anchor=_origin(d.x),
+        anchor=origin(d.x),
+        target_anchor=origin(d.x),
         fixed=fixed,
         limited=limited,
         limit_min=jnp.where(limited, between(d.limit_min, -dist.max_limit, 0.0), 0.0),
@@ -322,62 +204,6 @@ def _shows(small: Shape, big: Shape, small_anchor: Vec, big_anchor: Vec, margin:
     return (reach > cover + margin) & (small.is_polygon | big.is_polygon)
 
 
-def insert(level: Level, p: Proposal) -> Level:
-    """The level with the proposed body, and its joint, in the first free places."""
-    polygons, model, state = level.size.polygons, level.model, level.state
-    polygon = first_free(model.active[:polygons]) & p.shape.is_polygon & p.possible
-    circle = first_free(model.active[polygons:]) & ~p.shape.is_polygon & p.possible
-    body = jnp.concatenate([polygon, circle])
-    mass, inertia = shape_mass(p.shape)
-    model = replace(
-        model,
-        active=model.active | body,
-        inverse_mass=put(model.inverse_mass, body, jnp.where(p.fixed, 0.0, inverse(mass))),
-        inverse_inertia=put(model.inverse_inertia, body, jnp.where(p.fixed, 0.0, inverse(inertia))),
-        vertices=put(model.vertices, polygon, corners(p.shape.half)),
-        radius=put(model.radius, circle, p.shape.radius),
-    )
-    state = replace(
-        state,
-        position=put(state.position, body, unvec(p.position)),
-        rotation=put(state.rotation, body, p.rotation),
-    )
-    level = replace(level, model=model, state=state, role=put(level.role, body, p.role))
-    return _insert_joint(level, p, body) if level.size.joints else level
-
-
-def _insert_joint(level: Level, p: Proposal, body: Bool[Array, "body lane"]) -> Level:
-    """The joint's first body is the one with the smaller number."""
-    model, joint = level.model, p.joint
-    place = first_free(model.joint_active) & p.joined
-    numbers = jnp.arange(level.size.bodies)[:, None]
-    own, target = at(numbers, body), at(numbers, joint.target)
-    target_first = target < own
-    first, second = (
-        where(target_first, joint.target_anchor, joint.anchor),
-        where(target_first, joint.anchor, joint.target_anchor),
-    )
-    rotation = p.rotation - at(level.state.rotation, joint.target)
-    rotation = jnp.where(joint.fixed, jnp.where(target_first, rotation, -rotation), 0.0)
-    model = replace(
-        model,
-        joint_active=model.joint_active | place,
-        joint_a=put(model.joint_a, place, jnp.minimum(own, target)),
-        joint_b=put(model.joint_b, place, jnp.maximum(own, target)),
-        joint_anchor_a=put(model.joint_anchor_a, place, unvec(first)),
-        joint_anchor_b=put(model.joint_anchor_b, place, unvec(second)),
-        joint_fixed=put(model.joint_fixed, place, joint.fixed),
-        joint_rotation=put(model.joint_rotation, place, rotation),
-        joint_limited=put(model.joint_limited, place, joint.limited),
-        joint_min=put(model.joint_min, place, joint.limit_min),
-        joint_max=put(model.joint_max, place, joint.limit_max),
-        motor_on=put(model.motor_on, place, joint.motor_on),
-        motor_speed=put(model.motor_speed, place, joint.motor_speed),
-        motor_power=put(model.motor_power, place, joint.motor_power),
-    )
-    return replace(level, model=model, motor_binding=put(level.motor_binding, place, joint.motor_binding))
-
-
 def add_thruster(
     level: Level, d: ThrusterDraws, wanted: Flag, candidates: Bool[Array, "body lane"], dist: Distribution
 ) -> Level:
@@ -386,8 +212,8 @@ def add_thruster(
     candidates &= model.inverse_mass != 0
     body = choose(1.0 * candidates, d.body) & candidates
     low, high = extent(level, body)
-    in_polygon = Vec(between(d.x, low.x, high.x), between(d.y, low.y, high.y))
-    angle, radius = d.x * TURN, d.y * at(_radius(level), body)
+    in_polygon = spot(d.x, d.y, low, high)
+    angle, radius = d.x * TURN, d.y * at(radii(level), body)
     position = where(body[:polygons].any(0), in_polygon, Vec(radius * jnp.cos(angle), radius * jnp.sin(angle)))
     outward = position.scale(jnp.where(d.outward > 0.5, 1.0, -1.0))
     centred = (position.x == 0) & (position.y == 0)
@@ -408,22 +234,20 @@ def add_thruster(
     return replace(level, model=model, thruster_binding=put(level.thruster_binding, place, binding))
 
 
-def _radius(level: Level) -> Float[Array, "body lane"]:
+def room(level: Level) -> tuple[Flag, Flag]:
+    """Whether a polygon and a circle more would fit."""
+    polygons = level.size.polygons
+    return ~level.model.active[:polygons].all(0), ~level.model.active[polygons:].all(0)
+
+
+def extent(level: Level, chosen: Bool[Array, "body lane"]) -> tuple[Vec, Vec]:
+    """Lower left and upper right corner of the chosen polygon in its own frame; zero for circles."""
+    vertices = level.model.vertices
+    polygon = chosen[: level.size.polygons]
+    return vec(at(vertices.min(1), polygon)), vec(at(vertices.max(1), polygon))
+
+
+def radii(level: Level) -> Float[Array, "body lane"]:
     """Of all bodies, zero for polygons."""
     lanes = level.model.radius.shape[-1]
     return jnp.concatenate([jnp.zeros((level.size.polygons, lanes)), level.model.radius])
-
-
-def _origin(like: Lane) -> Vec:
-    return Vec(jnp.zeros_like(like), jnp.zeros_like(like))
-
-
-def _turned(v: Vec, angle: Lane) -> Vec:
-    return v.rotate(jnp.cos(angle), jnp.sin(angle))
-
-
-def _no_joint(level: Level) -> Joint:
-    lanes = level.role.shape[-1]
-    zero, no = jnp.zeros(lanes), jnp.zeros(lanes, bool)
-    nobody = jnp.zeros((level.size.bodies, lanes), bool)
-    return Joint(nobody, Vec(zero, zero), Vec(zero, zero), no, no, zero, zero, no, zero, zero, no.astype(jnp.int32))

@@ -17,28 +17,18 @@ from jaxtyping import Array, Bool, Int
 
 from levelgen.chance import at, choose, deal
 from levelgen.distribution import Distribution
-from levelgen.identity import Stream, key_for
+from levelgen.identity import MAX_LEVEL_ID, Stream, key_for
 from levelgen.level import Level, Role
-from levelgen.moves import (
-    BodyDraws,
-    Flag,
-    Lane,
-    Proposal,
-    ThrusterDraws,
-    add_thruster,
-    corners_in_world,
-    insert,
-    propose_connected,
-    propose_free,
-)
+from levelgen.moves import ThrusterDraws, add_thruster, propose_connected, propose_free
 from levelgen.overlap import Circles, count_contacts
+from levelgen.proposal import BodyDraws, Flag, Lane, Proposal, corners_in_world, insert
 from levelgen.scenery import empty_level
 from levelgen.shuffle import OrderDraws, places, shuffle
 from physics.types import FIXED_POLYGONS, Size
 
 __all__ = ["Distribution", "sample_levels"]
 
-BLOCK = 64  # levels sampled by one call of the compiled program, however many are asked for
+BLOCK = 256  # levels sampled by one call of the compiled program, however many are asked for
 GOAL_BODIES = 2  # green and blue come first
 DEFAULT = Distribution()
 
@@ -72,15 +62,15 @@ def sample_levels(level_ids: Int[Array, " level"], size: Size, distribution: Dis
     of ids, they go through one compiled program in blocks of BLOCK. So call it outside `jax.jit`.
 
     Raises:
-        ValueError: the size has no room for the scenery, a green and a blue body.
+        ValueError: the size has no room for the scenery, a green and a blue body; an id is not 0 .. MAX_LEVEL_ID.
     """
     check_size(size)
     ids = np.asarray(level_ids)
-    padded = np.concatenate([ids, np.zeros(-len(ids) % BLOCK or (BLOCK if not len(ids) else 0), ids.dtype)])
-    blocks = [
-        sample_block(padded[i : i + BLOCK].astype(np.uint32), size, distribution) for i in range(0, len(padded), BLOCK)
-    ]
-    return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts, -1)[..., : len(ids)]), *blocks)
+    if len(ids) and not 0 <= ids.min() <= ids.max() <= MAX_LEVEL_ID:
+        raise ValueError(f"level ids {ids.min()} to {ids.max()} do not fit: they run from 0 to {MAX_LEVEL_ID}")
+    padded = np.resize(ids, (max(1, -(-len(ids) // BLOCK)), BLOCK)).astype(np.uint32)
+    blocks = [sample_block(block, size, distribution) for block in padded]
+    return jax.device_put(jax.tree.map(lambda *parts: np.concatenate(parts, -1)[..., : len(ids)], *blocks))
 
 
 def check_size(size: Size) -> None:
