@@ -223,7 +223,9 @@ def judge(
         verdicts.append(
             Verdict(
                 label=Label.SOLVED if solved else Label.UNSOLVED,
-                label_reason=solved_reason(attempt > 0, episodes) if solved else unsolved_reason(config.attempts, first != NEVER),
+                label_reason=solved_reason(attempt > 0, episodes)
+                if solved
+                else unsolved_reason(config.attempts, first != NEVER),
                 success_rate=float(goal[:, i].sum() / ended) if ended else float("nan"),
                 steps_to_goal=int(steps_to_goal(record.done)[i]) if solved else None,
                 steps_to_first_success=None if first == NEVER else first,

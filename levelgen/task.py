@@ -98,7 +98,9 @@ class Frame(NamedTuple):
     manifold: Manifold
 
 
-def advance(level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams) -> tuple[TaskState, Outcome, Manifold]:
+def advance(
+    level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
+) -> tuple[TaskState, Outcome, Manifold]:
     """One env step without reset.
 
     Returns:
@@ -139,7 +141,9 @@ def restart(level: Level, state: TaskState, done: Bool[Array, " lane"]) -> TaskS
     return jax.tree.map(lambda fresh, x: jnp.where(done, fresh, x), reset(level), state)
 
 
-def step(level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams = TaskParams()) -> tuple[TaskState, Outcome]:
+def step(
+    level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams = TaskParams()
+) -> tuple[TaskState, Outcome]:
     """One env step with automatic reset to the same level.
 
     Args:
@@ -150,4 +154,3 @@ def step(level: Level, now: TaskState, action: Int[Array, "6 lane"], params: Tas
     """
     after, outcome, _ = advance(level, now, action, params)
     return restart(level, after, outcome.done), outcome
-

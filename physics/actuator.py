@@ -1,23 +1,28 @@
 """Motors turn the bodies of a revolute joint, thrusters push one body. Facts: `jax2d.joint.apply_motor`, `jax2d.engine`."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from physics.joint import can_act, joint_angle
-from physics.motion import Motion, select, spread
+from physics.motion import inverse_masses, one_hot, select
 from physics.types import Model, Params, State
 from physics.vector import Vec, vec
 
 
 def drive_motors(
-    model: Model, state: State, motion: Motion, control: Float[Array, "joint lane"], params: Params
-) -> Motion:
+    model: Model,
+    state: State,
+    velocity: Float[Array, "body 3 lane"],
+    control: Float[Array, "joint lane"],
+    params: Params,
+) -> Float[Array, "body 3 lane"]:
     """Angular impulses that bring each motor's joint to its speed, weakened near the joint limits.
 
     `control` is in [-1, 1], one per joint.
     """
-    w, joints = motion.angular_velocity, range(model.size.joints)
-    each = lambda x, body: jnp.stack([select(x, body[j]) for j in joints])
+    w = velocity[:, 2]
+    each = lambda x, body: jnp.stack([select(x, b) for b in body])
     inertia_a, inertia_b = each(model.inverse_inertia, model.joint_a), each(model.inverse_inertia, model.joint_b)
     both = inertia_a + inertia_b
     power = params.motor_power * params.dt * model.motor_power / jnp.where(both == 0, 1.0, both)
@@ -31,30 +36,29 @@ def drive_motors(
 
     runs = can_act(model) & model.motor_on & (control != 0) & ~model.joint_fixed
     turn = jnp.where(runs, power * jnp.tanh(excess * params.motor_decay), 0.0)
-    terms = [(model.joint_a[j], (turn * inertia_a)[j]) for j in joints]
-    terms += [(model.joint_b[j], (-turn * inertia_b)[j]) for j in joints]
-    return Motion(motion.position, motion.velocity, w + spread(w.shape[0], terms))
+    gained = _total(model.joint_a, turn * inertia_a, len(w)) - _total(model.joint_b, turn * inertia_b, len(w))
+    return jnp.concatenate([velocity[:, :2], (w + gained)[:, None]], axis=1)
 
 
 def fire_thrusters(
-    model: Model, state: State, motion: Motion, control: Float[Array, "thruster lane"], params: Params
-) -> Motion:
+    model: Model,
+    state: State,
+    velocity: Float[Array, "body 3 lane"],
+    control: Float[Array, "thruster lane"],
+    params: Params,
+) -> Float[Array, "body 3 lane"]:
     """A force on one body, along the thruster, at its place. `control` is in [0, 1], one per thruster."""
-    thrusters = range(model.size.thrusters)
-    each = lambda x: jnp.stack([select(x, model.thruster_body[t]) for t in thrusters])
-    rotation = each(state.rotation)
+    rotation = jnp.stack([select(state.rotation, body) for body in model.thruster_body])
     arm = vec(model.thruster_position).rotate(jnp.cos(rotation), jnp.sin(rotation))
     heading = model.thruster_rotation + rotation
     direction = Vec(jnp.cos(heading), jnp.sin(heading))
     force = model.thruster_power * model.thruster_active * params.thruster_power * control * params.dt
     push = direction.scale(force)
+    impulse = jnp.stack([push.x, push.y, arm.cross(push)], axis=1)
+    return velocity + inverse_masses(model) * _total(model.thruster_body, impulse, len(velocity))
 
-    def moved(x, change):
-        return x + spread(x.shape[0], [(model.thruster_body[t], change[t]) for t in thrusters])
 
-    mass, v = each(model.inverse_mass), motion.velocity
-    return Motion(
-        motion.position,
-        Vec(moved(v.x, mass * push.x), moved(v.y, mass * push.y)),
-        moved(motion.angular_velocity, each(model.inverse_inertia) * arm.cross(push)),
-    )
+def _total(body, change: Float[Array, "actuator *row lane"], bodies: int) -> Float[Array, "body *row lane"]:
+    """The sum of changes at each body, for bodies that differ by lane."""
+    placed = lambda held, x: jnp.where(held.reshape(bodies, *[1] * (x.ndim - 1), -1), x, 0.0)
+    return jax.vmap(placed)(one_hot(body, bodies), change).sum(0)

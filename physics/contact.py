@@ -9,24 +9,16 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.motion import Motion, add_rows
+from physics.motion import incidence
 from physics.pairs import PairKind
 from physics.types import Manifold, Model, Params, State
 from physics.vector import Vec, nonzero, rows, vec
-
-
-class Impulse(NamedTuple):
-    """Accumulated over the iterations of a step, N s."""
-
-    normal: Float[Array, "pair lane"]
-    tangent: Float[Array, "pair lane"]
 
 
 class Contact(NamedTuple):
     """One contact of every pair of a kind; constant over a step. Zero where it may not act."""
 
     pair: PairKind
-    acts: Bool[Array, "pair lane"]
     batch: Int[Array, "pair lane"] | None  # solver batch; None where there is only one
     normal: Vec
     point: Vec
@@ -35,21 +27,27 @@ class Contact(NamedTuple):
 
 
 class Arms(NamedTuple):
-    """Geometry of a contact for the present positions: r x n, r . n, effective masses."""
+    """Geometry of a contact for the present positions; r goes from a body's centre to the contact point."""
 
-    cross_a: Array
+    cross_a: Array  # r x n
     cross_b: Array
-    dot_a: Array
+    dot_a: Array  # r . n; the tangent is (n.y, -n.x), so r x t = -(r . n)
     dot_b: Array
-    mass_normal: Array
+    mass_normal: Array  # effective masses
     mass_tangent: Array
     coupling: Array  # how a normal impulse changes the tangential velocity
 
 
 def prepare(
-    model: Model, state: State, manifold: Manifold, pair: PairKind, at: slice, touching: Bool[Array, "pair lane"], params: Params
-) -> tuple[Contact, Impulse]:
-    """The contacts `at` of a manifold as constraints, with their warm-start impulses.
+    model: Model,
+    state: State,
+    manifold: Manifold,
+    pair: PairKind,
+    at: slice,
+    touching: Bool[Array, "pair lane"],
+    params: Params,
+) -> tuple[Contact, Float[Array, "2 pair lane"]]:
+    """The contacts `at` of a manifold as constraints, with their warm-start impulses (normal, tangent; N s).
 
     `touching` says which pairs have any active contact: they decide the solver batches.
     """
@@ -63,19 +61,15 @@ def prepare(
     rough = lambda body: jnp.square(rows(model.friction, body) * params.base_friction)
     contact = Contact(
         pair=pair,
-        acts=acts,
         batch=_batch(touching, pair) if pair.batches > 1 else None,
         normal=vec(manifold.normal[at]).map(keep),
         point=vec(manifold.point[at]).map(keep),
         target=keep(target),
-        friction=jnp.sqrt(rough(pair.a) + rough(pair.b)),
+        friction=keep(jnp.sqrt(rough(pair.a) + rough(pair.b))),
     )
     remembered = acts & state.contact_active[at]
-    impulse = Impulse(
-        jnp.where(remembered, state.contact_normal_impulse[at], 0.0),
-        jnp.where(remembered, state.contact_tangent_impulse[at], 0.0),
-    )
-    return contact, impulse
+    impulses = jnp.stack([state.contact_normal_impulse[at], state.contact_tangent_impulse[at]])
+    return contact, jnp.where(remembered, impulses, 0.0)
 
 
 def _batch(touching: Bool[Array, "pair lane"], pair: PairKind) -> Int[Array, "pair lane"]:
@@ -89,22 +83,11 @@ def _batch(touching: Bool[Array, "pair lane"], pair: PairKind) -> Int[Array, "pa
     return place % pair.batches
 
 
-def warm_start(model: Model, motion: Motion, contact: Contact, impulse: Impulse) -> Motion:
-    """Apply the impulses that the last step ended with."""
-    return _apply(model, motion, contact, _arms_only(motion, contact), impulse)
-
-
-def _arms_only(motion: Motion, contact: Contact) -> tuple[Array, Array, Array, Array]:
-    n, pair = contact.normal, contact.pair
-    r_a = contact.point - motion.position.map(lambda x: rows(x, pair.a))
-    r_b = contact.point - motion.position.map(lambda x: rows(x, pair.b))
-    return r_a.cross(n), r_b.cross(n), r_a.dot(n), r_b.dot(n)
-
-
-def arms(model: Model, motion: Motion, contact: Contact) -> Arms:
+def arms(model: Model, position: Float[Array, "body 2 lane"], contact: Contact) -> Arms:
     """Geometry for the present positions (joints move bodies inside an iteration)."""
-    cross_a, cross_b, dot_a, dot_b = _arms_only(motion, contact)
-    pair = contact.pair
+    n, pair = contact.normal, contact.pair
+    r_a, r_b = (contact.point - vec(rows(position, body)) for body in (pair.a, pair.b))
+    cross_a, cross_b, dot_a, dot_b = r_a.cross(n), r_b.cross(n), r_a.dot(n), r_b.dot(n)
     mass = rows(model.inverse_mass, pair.a) + rows(model.inverse_mass, pair.b)
     turn_a, turn_b = rows(model.inverse_inertia, pair.a), rows(model.inverse_inertia, pair.b)
     return Arms(
@@ -118,47 +101,48 @@ def arms(model: Model, motion: Motion, contact: Contact) -> Arms:
     )
 
 
-def sweep(model: Model, motion: Motion, contact: Contact, arm: Arms, impulse: Impulse, params: Params) -> tuple[Motion, Impulse]:
+def sweep(
+    inverse_masses: Float[Array, "body 3 lane"],
+    velocity: Float[Array, "body 3 lane"],
+    contact: Contact,
+    arm: Arms,
+    impulse: Float[Array, "2 pair lane"],
+    params: Params,
+) -> tuple[Float[Array, "body 3 lane"], Float[Array, "2 pair lane"]]:
     """One pass over all solver batches of a kind."""
     for batch in range(contact.pair.batches):
-        now = _solve(motion, contact, arm, impulse)
+        now = _solve(velocity, contact, arm, impulse)
         if contact.batch is not None:
-            mine = contact.batch == batch
-            now = Impulse(jnp.where(mine, now.normal, impulse.normal), jnp.where(mine, now.tangent, impulse.tangent))
-        change = Impulse(now.normal - impulse.normal, now.tangent - impulse.tangent)
-        motion = _apply(model, motion, contact, arm[:4], change)
+            now = jnp.where(contact.batch == batch, now, impulse)
+        velocity = velocity + inverse_masses * push(contact, arm, now - impulse, len(velocity))
         impulse = now
     if params.faithful_padding and contact.pair.padded:
-        impulse = Impulse(*(x.at[-1].set(0.0) for x in impulse))
-    return motion, impulse
+        impulse = jnp.where(jnp.arange(len(contact.pair))[:, None] == len(contact.pair) - 1, 0.0, impulse)
+    return velocity, impulse
 
 
-def _solve(motion: Motion, contact: Contact, arm: Arms, impulse: Impulse) -> Impulse:
+def _solve(
+    velocity: Float[Array, "body 3 lane"], contact: Contact, arm: Arms, impulse: Float[Array, "2 pair lane"]
+) -> Float[Array, "2 pair lane"]:
     """The accumulated impulses that bring each contact to its target, clamped to push and to the friction cone."""
-    n, pair, w = contact.normal, contact.pair, motion.angular_velocity
-    v = motion.velocity.map(lambda x: rows(x, pair.b) - rows(x, pair.a))
-    w_a, w_b = rows(w, pair.a), rows(w, pair.b)
+    n, pair = contact.normal, contact.pair
+    a, b = rows(velocity, pair.a), rows(velocity, pair.b)
+    v, w_a, w_b = Vec(b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]), a[:, 2], b[:, 2]
     approach = v.dot(n) + w_b * arm.cross_b - w_a * arm.cross_a
-    normal = jnp.maximum(impulse.normal + arm.mass_normal * (contact.target - approach), 0.0)
-    # the tangent is (n.y, -n.x), so r x t = -(r . n)
-    slide = v.x * n.y - v.y * n.x - w_b * arm.dot_b + w_a * arm.dot_a - (normal - impulse.normal) * arm.coupling
+    normal = jnp.maximum(impulse[0] + arm.mass_normal * (contact.target - approach), 0.0)
+    slide = v.x * n.y - v.y * n.x - w_b * arm.dot_b + w_a * arm.dot_a - (normal - impulse[0]) * arm.coupling
     limit = contact.friction * normal
-    tangent = jnp.clip(impulse.tangent - arm.mass_tangent * slide, -limit, limit)
-    return Impulse(normal, tangent)
+    tangent = jnp.clip(impulse[1] - arm.mass_tangent * slide, -limit, limit)
+    return jnp.stack([normal, tangent])
 
 
-def _apply(model: Model, motion: Motion, contact: Contact, arm: tuple, impulse: Impulse) -> Motion:
-    """Push both bodies of every contact apart by an impulse; changes add up."""
-    n, pair, bodies = contact.normal, contact.pair, model.inverse_mass.shape[0]
-    cross_a, cross_b, dot_a, dot_b = arm
-    push = Vec(impulse.normal * n.x + impulse.tangent * n.y, impulse.normal * n.y - impulse.tangent * n.x)
-    turn_a = impulse.tangent * dot_a - impulse.normal * cross_a
-    turn_b = impulse.normal * cross_b - impulse.tangent * dot_b
-    total = lambda at_a, at_b: add_rows(bodies, [(pair.a, at_a), (pair.b, at_b)])
-    return Motion(
-        motion.position,
-        motion.velocity + push.map(lambda p: model.inverse_mass * total(-p, p)),
-        motion.angular_velocity + model.inverse_inertia * total(turn_a, turn_b),
-    )
-
-
+def push(contact: Contact, arm: Arms, impulse: Float[Array, "2 pair lane"], bodies: int) -> Float[Array, "body 3 lane"]:
+    """What each body gets when both bodies of every contact are pushed apart; contributions add up."""
+    n, pair = contact.normal, contact.pair
+    normal, tangent = impulse
+    force = Vec(normal * n.x + tangent * n.y, normal * n.y - tangent * n.x)
+    on_a = jnp.stack([-force.x, -force.y, tangent * arm.dot_a - normal * arm.cross_a], axis=1)
+    on_b = jnp.stack([force.x, force.y, normal * arm.cross_b - tangent * arm.dot_b], axis=1)
+    each = jnp.concatenate([on_a, on_b])
+    total = incidence(bodies, (*pair.a, *pair.b)) @ each.reshape(len(each), -1)
+    return total.reshape(bodies, 3, -1)

@@ -2,14 +2,17 @@
 
 Geometry of Jax2D 1.0.1 (`jax2d.collision`): separating axes over the face normals of both polygons,
 two contact points clipped to the reference face; a circle is clipped to the nearest edge.
-Polygons are clockwise; a face goes from a vertex to the next one.
+Polygons are clockwise; face k goes from vertex k to vertex k + 1. A triangle's fourth vertex repeats its first, so
+that its third face closes it; its fourth face does not exist.
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from physics.motion import incidence
 from physics.pairs import PairKind, pairs_of
 from physics.types import MAX_VERTICES, Manifold, Model, State
 from physics.vector import Vec, nonzero, rows, spin, unvec, vec, where
@@ -28,13 +31,12 @@ class Contacts(NamedTuple):
 
 
 class Polygons(NamedTuple):
-    """Polygons in the world, vertex by vertex; components [polygon, lane]."""
+    """Polygons in the world; components [vertex, polygon, lane]."""
 
-    centre: Vec
-    vertex: list[Vec]  # MAX_VERTICES of them
-    normal: list[Vec]  # outward unit normal of the face that starts at the vertex
-    support: list[Array]  # largest projection of the own vertices on the normal, from the centre
-    triangle: Bool[Array, "polygon lane"]
+    centre: Vec  # [polygon, lane]
+    vertex: Vec
+    normal: Vec  # outward unit normal of the face that starts at the vertex
+    support: Float[Array, "vertex polygon lane"]  # largest projection on the normal, from the centre; FAR: no such face
 
 
 def find_contacts(model: Model, state: State) -> Manifold:
@@ -89,34 +91,38 @@ def may_touch(model: Model, pair: PairKind) -> Bool[Array, "pair lane"]:
     return modes & rows(model.active, pair.a) & rows(model.active, pair.b)
 
 
+def _edges(model: Model) -> tuple[Vec, Vec, Bool[Array, "vertex polygon lane"]]:
+    """Each face's first and last vertex in the polygon's frame, and which faces do not exist."""
+    triangle = model.n_vertices == 3
+    local = vec(jnp.moveaxis(model.vertices, 1, 0))
+    closed = local.map(lambda x: jnp.concatenate([x[:3], jnp.where(triangle, x[0], x[3])[None]]))
+    missing = triangle & (jnp.arange(MAX_VERTICES) == MAX_VERTICES - 1)[:, None, None]
+    return closed, closed.map(lambda x: jnp.roll(x, -1, axis=0)), missing
+
+
 def _polygons(model: Model, state: State) -> Polygons:
     n = model.size.polygons
     cos, sin = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n])
+    start, end, missing = _edges(model)
+    edge = end - start
+    outward = Vec(-edge.y, edge.x).scale(1 / nonzero(edge.norm()))
+    support = outward.map(lambda x: x[:, None]).dot(start.map(lambda x: x[None])).max(1)
     centre = vec(state.position[:n])
-    local = [vec(model.vertices[:, k]) for k in range(MAX_VERTICES)]
-    triangle = jnp.broadcast_to(model.n_vertices == 3, cos.shape)
-    after = [local[1], local[2], where(model.n_vertices == 3, local[0], local[3]), local[0]]
-    normal, support = [], []
-    for k in range(MAX_VERTICES):
-        edge = after[k] - local[k]
-        outward = Vec(-edge.y, edge.x).scale(1 / nonzero(edge.norm()))
-        reach = [outward.dot(v) for v in local]
-        reach[3] = jnp.where(model.n_vertices == 3, reach[0], reach[3])
-        support.append(jnp.maximum(jnp.maximum(reach[0], reach[1]), jnp.maximum(reach[2], reach[3])))
-        normal.append(outward.rotate(cos, sin))
-    vertex = [v.rotate(cos, sin) + centre for v in local]
-    return Polygons(centre, vertex, normal, support, triangle)
+    vertex, normal = start.rotate(cos, sin) + centre, outward.rotate(cos, sin)
+    return Polygons(centre, vertex, normal, jnp.where(missing, FAR, support))
 
 
-def _at(p: Polygons, index) -> Polygons:
-    pick = lambda x: rows(x, index)
-    return Polygons(
-        p.centre.map(pick),
-        [v.map(pick) for v in p.vertex],
-        [v.map(pick) for v in p.normal],
-        [pick(s) for s in p.support],
-        pick(p.triangle),
-    )
+def _choose(world: Polygons, index: tuple[int, ...]) -> Polygons:
+    """The polygons `index`. A product with a 0-1 matrix, because XLA stores its operands: whatever reads the result
+    would otherwise rotate all vertices anew."""
+    leaves = [*world.centre, *world.vertex, *world.normal, world.support]
+    sheets = [x.reshape(-1, *x.shape[-2:]) for x in leaves]
+    packed = jnp.moveaxis(jnp.concatenate(sheets), 1, 0)
+    chosen = incidence(len(packed), index).T @ packed.reshape(len(packed), -1)
+    x = jnp.moveaxis(chosen.reshape(len(index), *packed.shape[1:]), 1, 0)
+    k = MAX_VERTICES
+    sheet = lambda i: x[2 + i * k : 2 + (i + 1) * k]
+    return Polygons(Vec(x[0], x[1]), Vec(sheet(0), sheet(1)), Vec(sheet(2), sheet(3)), sheet(4))
 
 
 class Face(NamedTuple):
@@ -128,100 +134,80 @@ class Face(NamedTuple):
     end: Vec
 
 
+def _first(found: Bool[Array, "vertex ..."]) -> Int[Array, "..."]:
+    """Number of the first vertex for which it holds."""
+    number = jnp.arange(len(found), dtype=jnp.int32).reshape(-1, *[1] * (found.ndim - 1))
+    return jnp.where(found, number, len(found)).min(0)
+
+
+def _pick(x: Float[Array, "vertex ..."], number: Int[Array, "..."]) -> Float[Array, "..."]:
+    """x[number] for a vertex number that differs by pair and lane."""
+    vertices = jnp.arange(len(x), dtype=jnp.int32).reshape(-1, *[1] * (x.ndim - 1))
+    return jnp.where(vertices == number, x, 0.0).sum(0)
+
+
 def _best_face(a: Polygons, b: Polygons) -> Face:
     """The face of a along whose normal b is farthest out; the first of equals, as the reference."""
-    best = None
-    for k in range(MAX_VERTICES):
-        reach = [a.normal[k].dot(v - a.centre) for v in b.vertex]
-        reach[3] = jnp.where(b.triangle, reach[0], reach[3])
-        nearest = jnp.minimum(jnp.minimum(reach[0], reach[1]), jnp.minimum(reach[2], reach[3]))
-        end = a.vertex[(k + 1) % MAX_VERTICES]
-        if k == 2:
-            end = where(a.triangle, a.vertex[0], end)
-        face = Face(nearest - a.support[k], a.normal[k], a.vertex[k], end)
-        if best is None:
-            best = face
-        else:
-            better = face.separation > best.separation
-            if k == 3:
-                better &= ~a.triangle
-            best = Face(
-                jnp.where(better, face.separation, best.separation),
-                where(better, face.normal, best.normal),
-                where(better, face.start, best.start),
-                where(better, face.end, best.end),
-            )
-    assert best is not None
-    return best
+    normal, offset = a.normal.map(lambda x: x[:, None]), (b.vertex - a.centre).map(lambda x: x[None])
+    separation = normal.dot(offset).min(1) - a.support
+    most = separation.max(0)
+    best = _first(separation == most)
+    end = a.vertex.map(lambda x: jnp.roll(x, -1, axis=0))
+    return Face(most, *(v.map(lambda x: _pick(x, best)) for v in (a.normal, a.vertex, end)))
 
 
 def _polygon_polygon(model: Model, state: State, pair: PairKind) -> tuple[Contacts, Contacts]:
     """Two contact points: the incident polygon's two deepest vertices, clipped to the reference face."""
-    world = _polygons(model, state)
-    a, b = _at(world, pair.a), _at(world, pair.b)
-    face_a, face_b = _best_face(a, b), _best_face(b, a)
+    world, n = _polygons(model, state), len(pair)
+    either = _choose(world, pair.a + pair.b)  # both orders at once: a against b, then b against a
+    a, b = (jax.tree.map(lambda x, at=at: x[..., at, :], either) for at in (slice(n), slice(n, None)))
+    swapped = jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=-2), b, a)
+    face = _best_face(either, swapped)
+    face_a, face_b = (jax.tree.map(lambda x, at=at: x[at], face) for at in (slice(n), slice(n, None)))
     by_b = face_a.separation + FLIP_BIAS < face_b.separation
     separation = jnp.maximum(face_a.separation, face_b.separation)
     normal = where(by_b, face_b.normal, face_a.normal)
     start, end = where(by_b, face_b.start, face_a.start), where(by_b, face_b.end, face_a.end)
-    incident = [where(by_b, va, vb) for va, vb in zip(a.vertex, b.vertex, strict=True)]
+    incident = where(by_b, a.vertex, b.vertex)
+    missing = jnp.where(by_b, a.support, b.support) == FAR
 
     along = end - start
     length = along.norm()
     along = along.scale(1 / nonzero(length))
-    reach = [normal.dot(v - start) for v in incident]  # negative: inside the reference polygon
-    reach[3] = jnp.where(jnp.where(by_b, a.triangle, b.triangle), FAR, reach[3])
-    offset = [along.dot(v - start) for v in incident]
-    (depth1, offset1), (depth2, offset2) = _two_smallest(reach, offset)
+    reach = jnp.where(missing, FAR, normal.dot(incident - start))  # negative: inside the reference polygon
+    offset = along.dot(incident - start)
+    first = _first(reach == reach.min(0))
+    rest = jnp.where(jnp.arange(MAX_VERTICES)[:, None, None] == first, 2 * FAR, reach)
+    second = _first(rest == rest.min(0))
 
-    def contact(depth, offset, active):
-        point = start + normal.scale(depth) + along.scale(jnp.clip(offset, 0.0, length))
+    def contact(number, depth, active):
+        point = start + normal.scale(depth) + along.scale(jnp.clip(_pick(offset, number), 0.0, length))
         return Contacts(active, where(by_b, -normal, normal), -separation, point)
 
+    depth1, depth2 = _pick(reach, first), _pick(reach, second)
     touching = separation < 0
-    return contact(depth1, offset1, touching), contact(depth2, offset2, touching & (depth2 < 0))
-
-
-def _two_smallest(keys: list[Array], values: list[Array]):
-    """(key, value) of the smallest and of the second smallest key; ties go to the earlier one."""
-    k1, v1, k2, v2 = keys[0], values[0], jnp.full_like(keys[0], 2 * FAR), values[0]
-    for k, v in zip(keys[1:], values[1:], strict=True):
-        first, second = k < k1, k < k2
-        k2 = jnp.where(first, k1, jnp.where(second, k, k2))
-        v2 = jnp.where(first, v1, jnp.where(second, v, v2))
-        k1, v1 = jnp.where(first, k, k1), jnp.where(first, v, v1)
-    return (k1, v1), (k2, v2)
+    return contact(first, depth1, touching), contact(second, depth2, touching & (depth2 < 0))
 
 
 def _circle_polygon(model: Model, state: State) -> Contacts:
     """The circle's centre clipped to the polygon's nearest edge. Works on [circle, polygon, lane] blocks."""
     n = model.size.polygons
-    cos, sin = jnp.cos(state.rotation[:n])[None], jnp.sin(state.rotation[:n])[None]
+    cos, sin = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n])
     position = vec(state.position)
-    polygon = position.map(lambda x: x[None, :n])
+    polygon = position.map(lambda x: x[:n])
     centre = (position.map(lambda x: x[n:, None]) - polygon).unrotate(cos, sin)  # in the polygon's frame
     radius = model.radius[:, None]
-    triangle = (model.n_vertices == 3)[None]
-    local = [vec(model.vertices[:, k]).map(lambda x: x[None]) for k in range(MAX_VERTICES)]
-    after = [local[1], local[2], where(triangle, local[0], local[3]), local[0]]
+    start, end, missing = (jax.tree.map(lambda x: x[:, None], edge) for edge in _edges(model))
 
-    inside, closest, distance = None, None, None
-    for k in range(MAX_VERTICES):
-        edge, to_centre = after[k] - local[k], centre - local[k]
-        length = edge.norm()
-        along = edge.scale(1 / nonzero(length))
-        clipped = local[k] + along.scale(jnp.clip(along.dot(to_centre), 0.0, length))
-        gap = (clipped - centre).norm()
-        within = edge.cross(to_centre) < 0  # clockwise: the inside lies to the right
-        if inside is None or closest is None or distance is None:
-            inside, closest, distance = within, clipped, gap
-            continue
-        nearer = gap < distance
-        if k == 3:
-            nearer, within = nearer & ~triangle, within | triangle
-        inside &= within
-        closest, distance = where(nearer, clipped, closest), jnp.where(nearer, gap, distance)
-    assert inside is not None and closest is not None and distance is not None
+    edge, to_centre = end - start, centre - start
+    length = edge.norm()
+    along = edge.scale(1 / nonzero(length))
+    clipped = start + along.scale(jnp.clip(along.dot(to_centre), 0.0, length))
+    gap = jnp.where(missing, FAR, (clipped - centre).norm())
+    inside = (missing | (edge.cross(to_centre) < 0)).all(0)  # clockwise: the inside lies to the right
+    distance = gap.min(0)
+    nearest = _first(gap == distance)
+    closest = clipped.map(lambda x: _pick(x, nearest))
 
     outward = (centre - closest).scale(jnp.where(inside, 1.0, -1.0))  # from the circle to the polygon
     normal = outward.scale(1 / nonzero(outward.norm())).rotate(cos, sin)

@@ -1,20 +1,27 @@
-"""What the solver moves: positions and velocities of all bodies, and the choice of a body that differs by lane."""
+"""What the solver moves: positions and velocities of all bodies; and the choice of a body that differs by lane.
+
+Everything that one kernel should touch together lies in one array: XLA's CPU backend makes a kernel for every array
+it writes, and computes anew in each what they share.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from physics.vector import Vec
+from physics.types import Model
 
 
 class Motion(NamedTuple):
-    """Components [body, lane]."""
+    position: Float[Array, "body 2 lane"]
+    velocity: Float[Array, "body 3 lane"]  # x, y, angular
 
-    position: Vec
-    velocity: Vec
-    angular_velocity: Float[Array, "body lane"]
+
+def inverse_masses(model: Model) -> Float[Array, "body 3 lane"]:
+    """What turns an impulse (x, y, angular) into a change of velocity."""
+    return jnp.stack([model.inverse_mass, model.inverse_mass, model.inverse_inertia], axis=1)
 
 
 def select(x: Float[Array, "body lane"], body: Int[Array, " lane"]) -> Float[Array, " lane"]:
@@ -25,16 +32,15 @@ def select(x: Float[Array, "body lane"], body: Int[Array, " lane"]) -> Float[Arr
     return chosen
 
 
-def spread(bodies: int, terms: Sequence[tuple[Int[Array, " lane"], Array]]) -> Float[Array, "body lane"]:
-    """The sum over (body, value) of the value placed at the body's row."""
-    return jnp.stack([sum(jnp.where(body == b, value, 0.0) for body, value in terms) for b in range(bodies)])
+def one_hot(body: Int[Array, "*thing lane"], bodies: int) -> Bool[Array, "*thing body lane"]:
+    return body[..., None, :] == jnp.arange(bodies, dtype=body.dtype)[:, None]
 
 
-def add_rows(bodies: int, terms: Sequence[tuple[Sequence[int], Array]]) -> Float[Array, "body lane"]:
-    """The sum over (index, x) of x[i] placed at row index[i], for static indices."""
-    totals: list = [None] * bodies
-    for index, x in terms:
-        for i, body in enumerate(index):
-            totals[body] = x[i] if totals[body] is None else totals[body] + x[i]
-    zero = jnp.zeros_like(terms[0][1][0])
-    return jnp.stack([zero if t is None else t for t in totals])
+def pick(held: Bool[Array, "body lane"], x: Float[Array, "body row lane"]) -> Float[Array, "row lane"]:
+    """The rows of the one body that is held."""
+    return jnp.where(held[:, None], x, 0.0).sum(0)
+
+
+def incidence(bodies: int, index: Sequence[int]) -> Float[np.ndarray, "body row"]:
+    """Matrix that adds row i to body index[i]. A product with it is a fast kernel, and adds in a fixed order."""
+    return (np.arange(bodies)[:, None] == np.asarray(index)).astype(np.float32)

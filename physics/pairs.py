@@ -51,5 +51,7 @@ def pairs_of(size: Size) -> Pairs:
     polygon = [(i, j) for i in polygons for j in polygons if i < j and j >= FIXED_POLYGONS]
     circle_polygon = [(i, j) for i in bodies for j in polygons]
     circle = [(i, j) for i in bodies for j in bodies if i < j]
-    kinds = (PairKind(*map(tuple, np.array(k, int).reshape(-1, 2).T.tolist())) for k in (polygon, circle_polygon, circle))
+    kinds = (
+        PairKind(*map(tuple, np.array(k, int).reshape(-1, 2).T.tolist())) for k in (polygon, circle_polygon, circle)
+    )
     return Pairs(*kinds)

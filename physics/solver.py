@@ -7,40 +7,41 @@ import jax.numpy as jnp
 
 from physics import contact as contacts
 from physics import joint as joints
-from physics.motion import Motion
+from physics.motion import Motion, inverse_masses
 from physics.pairs import pairs_of
 from physics.types import SOLVER_ITERATIONS, Manifold, Model, Params, State
-from physics.vector import unvec
 
 
 def solve(model: Model, state: State, manifold: Manifold, motion: Motion, params: Params) -> tuple[Motion, State]:
     """Bodies' motion after the solver, and `state` with the impulses that the next step starts from."""
     groups, impulses = _contact_groups(model, state, manifold, params)
     joint, joint_impulse = joints.prepare(model, state, params)
+    masses, bodies = inverse_masses(model), len(motion.velocity)
 
-    for group, impulse in zip(groups, impulses, strict=True):
-        motion = contacts.warm_start(model, motion, group, impulse)
-    motion = joints.warm_start(motion, joint, joint_impulse)
+    arms = [contacts.arms(model, motion.position, group) for group in groups]
+    pushes = [contacts.push(g, a, i, bodies) for g, a, i in zip(groups, arms, impulses, strict=True)]
+    velocity = motion.velocity + masses * sum(pushes) + joints.warm_start(joint, joint_impulse)
 
     def iteration(carry, _):
         motion, joint_impulse, impulses = carry
         motion, joint_impulse = joints.solve(motion, joint, joint_impulse, params)
-        arms = [contacts.arms(model, motion, group) for group in groups]
-        solved = []
-        for group, arm, impulse in zip(groups, arms, impulses, strict=True):
-            motion, impulse = contacts.sweep(model, motion, group, arm, impulse, params)
+        velocity, solved = motion.velocity, []
+        for group, impulse in zip(groups, impulses, strict=True):
+            arm = contacts.arms(model, motion.position, group)
+            velocity, impulse = contacts.sweep(masses, velocity, group, arm, impulse, params)
             solved.append(impulse)
-        return (motion, joint_impulse, solved), None
+        return (Motion(motion.position, velocity), joint_impulse, solved), None
 
-    carry = (motion, joint_impulse, impulses)
+    carry = (Motion(motion.position, velocity), joint_impulse, impulses)
     (motion, joint_impulse, impulses), _ = jax.lax.scan(iteration, carry, None, length=SOLVER_ITERATIONS)
+    normal, tangent = jnp.concatenate(impulses, axis=1)
     return motion, replace(
         state,
         contact_active=manifold.active,
-        contact_normal_impulse=jnp.concatenate([i.normal for i in impulses]),
-        contact_tangent_impulse=jnp.concatenate([i.tangent for i in impulses]),
-        joint_impulse=unvec(joint_impulse.linear),
-        joint_angular_impulse=joint_impulse.angular,
+        contact_normal_impulse=normal,
+        contact_tangent_impulse=tangent,
+        joint_impulse=joint_impulse[:, :2],
+        joint_angular_impulse=joint_impulse[:, 2],
     )
 
 

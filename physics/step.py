@@ -13,7 +13,6 @@ from physics.manifold import find_contacts
 from physics.motion import Motion
 from physics.solver import solve
 from physics.types import Manifold, Model, Params, State
-from physics.vector import unvec, vec
 
 
 def step(
@@ -36,10 +35,10 @@ def step(
     """
     state = replace(state, velocity=_fall(model, state, params))
     manifold = find_contacts(model, state)
-    motion = Motion(vec(state.position), vec(state.velocity), state.angular_velocity)
-    motion = drive_motors(model, state, motion, motor, params)
-    motion = fire_thrusters(model, state, motion, thrust, params)
-    motion, state = solve(model, state, manifold, motion, params)
+    velocity = jnp.concatenate([state.velocity, state.angular_velocity[:, None]], axis=1)
+    velocity = drive_motors(model, state, velocity, motor, params)
+    velocity = fire_thrusters(model, state, velocity, thrust, params)
+    motion, state = solve(model, state, manifold, Motion(state.position, velocity), params)
     return _integrate(state, motion, params), manifold
 
 
@@ -49,14 +48,12 @@ def _fall(model: Model, state: State, params: Params) -> Float[Array, "body 2 la
 
 def _integrate(state: State, motion: Motion, params: Params) -> State:
     """Euler step, then bounds on places and speeds."""
-    clip = lambda v, most: v.map(lambda x: jnp.clip(x, -most, most))
-    v, w = motion.velocity, motion.angular_velocity
+    clip = lambda x, most: jnp.clip(x, -most, most)
+    v, w = motion.velocity[:, :2], motion.velocity[:, 2]
     return replace(
         state,
-        position=unvec(clip(motion.position + v.scale(params.dt), params.max_position)),
+        position=clip(motion.position + v * params.dt, params.max_position),
         rotation=state.rotation + w * params.dt,
-        velocity=unvec(clip(v, params.max_velocity)),
-        angular_velocity=jnp.clip(w, -params.max_angular_velocity, params.max_angular_velocity),
+        velocity=clip(v, params.max_velocity),
+        angular_velocity=clip(w, params.max_angular_velocity),
     )
-
-

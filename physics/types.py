@@ -99,7 +99,9 @@ class Model:
 
     @property
     def size(self) -> Size:
-        return Size(self.vertices.shape[0], self.radius.shape[0], self.joint_active.shape[0], self.thruster_active.shape[0])
+        return Size(
+            self.vertices.shape[0], self.radius.shape[0], self.joint_active.shape[0], self.thruster_active.shape[0]
+        )
 
 
 @jax.tree_util.register_dataclass
@@ -158,4 +160,16 @@ def initial_state(
     )
 
 
-__all__ = ["FIXED_POLYGONS", "MAX_VERTICES", "SOLVER_BATCH", "SOLVER_ITERATIONS", "Manifold", "Model", "Params", "Size", "State", "initial_state", "replace"]
+__all__ = [
+    "FIXED_POLYGONS",
+    "MAX_VERTICES",
+    "SOLVER_BATCH",
+    "SOLVER_ITERATIONS",
+    "Manifold",
+    "Model",
+    "Params",
+    "Size",
+    "State",
+    "initial_state",
+    "replace",
+]
