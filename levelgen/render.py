@@ -26,7 +26,7 @@ Host = np.ndarray | jax.Array  # levels and states that were read or computed
 Place = Point | Sequence[float] | Host  # one point, m
 Points = Sequence[Place] | Host
 
-SUPERSAMPLING = 3  # drawn this much larger, then averaged
+SUPERSAMPLING = 4  # drawn this much larger, then averaged
 BORDER = 0.08  # m of the walls and the ceiling that shows
 HEADER, FOOTER = 0.36, 0.30  # m of picture above and below the world
 PIXELS = 480  # width of a picture

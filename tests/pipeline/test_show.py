@@ -1,0 +1,137 @@
+"""Pictures of a real split: levels that solve themselves, replayed and committed as a work unit does."""
+
+import re
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from experts.labels import Label
+from experts.train import UnitResult
+from experts.witness import replay, succeeds
+from levelgen.level import SIZES
+from levelgen.sampler import sample_levels
+from pipeline.errors import Failure, UserError
+from pipeline.layout import split_path
+from pipeline.manifest import require_manifest
+from pipeline.schedule import WorkUnit
+from pipeline.show import first_success, show
+from pipeline.unit import commit
+from tests.pipeline.made import made_job, made_verdict
+
+pytestmark = pytest.mark.slow
+LEVELS = 64
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory) -> Path:
+    """Sixty-four levels of size s under sticky random actions; those that reach the goal so are `solved`."""
+    job = made_job(str(tmp_path_factory.mktemp("data")), "size=s", "levels=64")
+    ids = np.arange(LEVELS, dtype=np.int32)
+    levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
+    rng = np.random.default_rng(0)
+    action = np.repeat(rng.integers(0, 2, (16, 6, LEVELS)), 16, axis=0).astype(np.int32)
+    record = replay(levels, action, job.task)
+    solved = succeeds(np.asarray(record.done), np.asarray(record.goal))
+    assert 1 < solved.sum() < LEVELS
+    verdicts = [made_verdict(Label.SOLVED if good else Label.UNSOLVED) for good in solved]
+    path = split_path(job.out, job.budget, job.size)
+    path.mkdir(parents=True)
+    commit(job, path, WorkUnit(tuple(int(i) for i in ids)), UnitResult(ids.astype(np.int64), levels, record, verdicts))
+    return path
+
+
+def level_with(split: Path, label: str) -> int:
+    """The level with that label whose shown episode is longest."""
+    rows = [row for row in require_manifest(split).table.to_pylist() if row["label"] == label]
+    return int(rows[-1]["level_id"])
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".GIF", ".png"])
+def test_a_witness_is_drawn(split, tmp_path, capsys, suffix) -> None:
+    level_id, out = level_with(split, "solved"), tmp_path / "new" / f"level{suffix}"
+    show(split, level_id, out)
+    told = capsys.readouterr().out
+    assert told.startswith(str(out))
+    assert f"level {level_id} of size s, solved in " in told
+    assert told.count("\n") == 1
+    steps = int(re.search(r"solved in (\d+) step", told)[1])  # type: ignore[index]
+    with Image.open(out) as picture:
+        if suffix == ".png":
+            assert picture.size[0] == 480 * min(3, steps // 2 + 2)
+        else:
+            assert picture.n_frames == (steps + 1) // 2 + 1  # type: ignore[attr-defined]
+            seconds = 0.0
+            for number in range(picture.n_frames):  # type: ignore[attr-defined]
+                picture.seek(number)
+                seconds += picture.info["duration"] / 1000
+            assert seconds == pytest.approx(steps / 30 + 1.5, rel=0.15)
+
+
+def test_an_unsolved_level_shows_its_beginning_and_says_so(split, tmp_path, capsys) -> None:
+    level_id = level_with(split, "unsolved")
+    show(split, level_id, tmp_path / "level.png")
+    assert f"level {level_id} of size s is unsolved" in (told := capsys.readouterr().out)
+    assert "no witness" in told
+    with Image.open(tmp_path / "level.png") as picture:
+        assert picture.size[0] == 480
+
+
+def test_the_drawing_of_a_level_made_again_is_that_of_its_shard(split, tmp_path) -> None:
+    """The first picture of a witness is the level that its id rebuilds."""
+    from levelgen.render import draw
+    from pipeline.show import find_row, witness_film
+
+    manifest = require_manifest(split)
+    row = find_row(manifest, level_with(split, "solved"))
+    film = witness_film(manifest, row)
+    again = sample_levels(jnp.array([row["level_id"]], jnp.int32), SIZES["s"], made_job().distribution)
+    world = (0, 40, 480, 480)
+    bare = draw(again, again.state, action=np.zeros(6, np.int32)).crop(world)
+    ours = film.pictures[0].crop(world)
+    assert (np.asarray(bare) != np.asarray(ours)).any(-1).mean() < 0.02  # but for actuators at work
+
+
+@pytest.mark.parametrize("level_id", [LEVELS, -1, 10**9])
+def test_a_level_that_is_not_there(split, tmp_path, level_id) -> None:
+    with pytest.raises(UserError, match=rf"^There is no level {level_id} in .*64 levels, from 0 to 63\.$"):
+        show(split, level_id, tmp_path / "level.gif")
+
+
+@pytest.mark.parametrize("name", ["level.jpg", "level", "level.gif.txt"])
+def test_a_suffix_that_nobody_draws(split, tmp_path, name) -> None:
+    with pytest.raises(UserError, match=r"has to end in \.gif, \.png, \.mp4\.$"):
+        show(split, 0, tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+def test_a_split_that_is_not_there(tmp_path) -> None:
+    with pytest.raises(UserError, match="There is no split at"):
+        show(tmp_path / "nothing", 0, tmp_path / "level.gif")
+
+
+def test_a_file_that_cannot_be_written(split, tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"^Cannot write .*: choose another file with -o"):
+        show(split, 0, tmp_path / "file" / "level.gif")
+
+
+def test_mp4_needs_ffmpeg(split, tmp_path, monkeypatch) -> None:
+    if shutil.which("ffmpeg"):
+        show(split, level_with(split, "solved"), tmp_path / "level.mp4")
+        assert (tmp_path / "level.mp4").read_bytes()[4:8] == b"ftyp"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match="ffmpeg"):
+        show(split, level_with(split, "solved"), tmp_path / "other.mp4")
+
+
+def test_the_first_episode_that_reaches_the_goal_is_shown() -> None:
+    done, goal = np.zeros(256, bool), np.zeros(256, bool)
+    done[[10, 30, 60]], goal[[30, 60]] = True, True
+    assert first_success(done, goal) == (11, 30)
+    with pytest.raises(Failure, match="never reaches the goal"):
+        first_success(done, np.zeros(256, bool))
