@@ -11,6 +11,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.typing import VariableDict as Params
 from jaxtyping import Array, Float, Int
 
 from levelgen.actions import CHOICES
@@ -83,6 +84,13 @@ class ActorCritic(nn.Module):
         logits = Trunk(self.width, self.depth, LOGITS, POLICY_GAIN, moving_rows, name="policy")(constant, moving)
         value = Trunk(self.width, self.depth, 1, VALUE_GAIN, moving_rows, name="value")(constant, moving)
         return logits, value[0]
+
+
+def forward(
+    network: ActorCritic, params: Params, constant: Float[Array, " feature"], moving: Float[Array, "dynamic lane"]
+) -> tuple[Float[Array, "logit lane"], Float[Array, " lane"]]:
+    """Logits and value of one expert."""
+    return network.apply(params, constant, moving)  # type: ignore[return-value]
 
 
 def _entries(logits: Float[Array, "logit lane"]) -> list[Float[Array, "choice lane"]]:

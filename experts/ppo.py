@@ -3,7 +3,7 @@
 Schulman et al. 2017 (arXiv:1707.06347) with clipped values and per-minibatch normalised advantages.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import optax
 from jaxtyping import Array, Float, Key
 
 from experts.config import ExpertConfig
-from experts.policy import ActorCritic, entropy, log_probability
+from experts.policy import ActorCritic, Params, entropy, forward, log_probability
 from levelgen.actions import CHOICES
 
 ADVANTAGE_EPSILON = 1e-8
@@ -20,7 +20,7 @@ ADVANTAGE_EPSILON = 1e-8
 class Expert(NamedTuple):
     """What learns."""
 
-    params: optax.Params
+    params: Params
     optimiser: optax.OptState
 
 
@@ -69,10 +69,10 @@ def advantages(
 
 
 def loss(
-    params: optax.Params, network: ActorCritic, constant: Float[Array, " feature"], batch: Batch, config: ExpertConfig
+    params: Params, network: ActorCritic, constant: Float[Array, " feature"], batch: Batch, config: ExpertConfig
 ) -> Float[Array, ""]:
     """Clipped policy surrogate, clipped value error, entropy bonus; means over the minibatch."""
-    logits, value = network.apply(params, constant, batch.moving)  # type: ignore[misc]
+    logits, value = forward(network, params, constant, batch.moving)
     ratio = jnp.exp(log_probability(logits, batch.action) - batch.log_probability)  # type: ignore[arg-type]
     gain = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + ADVANTAGE_EPSILON)
     clipped_ratio = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
@@ -98,10 +98,11 @@ def update(
     def learn(expert, minibatch):
         gradient = jax.grad(loss)(expert.params, network, constant, from_samples(minibatch.T), config)
         change, state = transform.update(gradient, expert.optimiser, expert.params)
-        return Expert(optax.apply_updates(expert.params, change), state), None
+        params: Any = optax.apply_updates(expert.params, change)
+        return Expert(params, state), None
 
     def epoch(expert, key):
-        order = jnp.argsort(jax.random.bits(key, len(samples)))
+        order = jnp.argsort(jax.random.bits(key, (len(samples),)))
         minibatches = samples[order].reshape(config.minibatches, -1, samples.shape[1])
         return jax.lax.scan(learn, expert, minibatches)
 

@@ -3,13 +3,14 @@
 Lane `i * environments + j` is environment j of level i.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from experts.policy import ActorCritic, log_probability, most_probable, sample
+from experts.policy import ActorCritic, forward, log_probability, most_probable, sample
 from levelgen import task
 from levelgen.actions import CHOICES
 from levelgen.level import Level
@@ -64,11 +65,11 @@ def rollout(
     lanes = repeat(levels, environments)
     constant = level_features(levels)
     per_level = lambda x: x.reshape(*x.shape[:-1], level_count, environments)
-    forward = jax.vmap(network.apply, in_axes=(0, 1, 1), out_axes=(-2, 0))
+    each = jax.vmap(partial(forward, network), in_axes=(0, 1, 1), out_axes=(-2, 0))
 
     def look(world):
         moving = per_level(state_features(lanes, world.state))
-        logits, value = forward(params, constant, moving)
+        logits, value = each(params, constant, moving)
         return moving, logits, value
 
     def act(world, t):
@@ -79,7 +80,8 @@ def rollout(
         action = jnp.where(jnp.tile(greedy, level_count), most_probable(logits), sample(logits, uniform))
         chance = log_probability(logits, action)
         world, outcome = task.step(lanes, world, action, rules)
-        seen = Experience(moving, *map(per_level, (action, chance)), value, *map(per_level, outcome))
+        action, chance, reward, done, goal = map(per_level, (action, chance, *outcome))
+        seen = Experience(moving, action, chance, value, reward, done, goal)
         return world, seen
 
     world, experience = jax.lax.scan(act, world, jnp.arange(steps))

@@ -26,7 +26,7 @@ from levelgen import task
 from levelgen.identity import Stream, key_for
 from levelgen.level import Level
 from levelgen.observe import dynamic_features, feature_count, level_features
-from levelgen.task import TaskParams, TaskState
+from levelgen.task import DEFAULT_RULES, TaskParams, TaskState
 
 LANES_IN_CACHE = 128  # a core's best batch of the physics, see docs/benchmarks.md
 LANES_ON_ACCELERATOR = 32_768
@@ -57,7 +57,7 @@ def train_levels(
     level_ids: np.ndarray,
     budget: int,
     config: ExpertConfig,
-    rules: TaskParams = TaskParams(),
+    rules: TaskParams = DEFAULT_RULES,
     report: Report = lambda env_steps, solved: None,
 ) -> UnitResult:
     """Train one expert per level and label the levels.
@@ -81,9 +81,10 @@ def train_levels(
     for first, index in _batches(len(level_ids), slot_count(config)):
         kept = len(np.unique(index))
 
-        def count(update: int, first=first, kept=kept) -> None:
-            steps = (first * updates + kept * update) * config.steps_per_update
-            report(steps, sum(v.label is Label.SOLVED for v in verdicts))
+        solved = sum(v.label is Label.SOLVED for v in verdicts)
+
+        def count(update: int, first=first, kept=kept, solved=solved) -> None:
+            report((first * updates + kept * update) * config.steps_per_update, solved)
 
         mine, ids = jax.tree.map(lambda x, i=index: x[..., i], levels), jnp.asarray(level_ids[index], jnp.int32)
         slots, curve = train(mine, ids, updates, config, rules, count)

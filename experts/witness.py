@@ -13,11 +13,12 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from levelgen import task
 from levelgen.level import Level
-from levelgen.task import TaskParams, TaskState
+from levelgen.task import DEFAULT_RULES, TaskParams, TaskState
 from physics.motion import select
 from physics.pairs import pairs_of
 from physics.types import Manifold, State
@@ -46,25 +47,29 @@ class Record:
     goal: Bool[Array, "256 level"]
 
 
-def replay(level: Level, action: Int[Array, "256 6 level"], rules: TaskParams = TaskParams()) -> Record:
-    """The record of these actions, on the host. The same bits on the same machine and versions, at any count of levels."""
+def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -> Record:
+    """The record of these actions [256, 6, level], on the host.
+
+    The same bits on the same machine and versions, at any count of levels.
+    """
     level = jax.tree.map(np.asarray, level)
-    action = np.asarray(action, np.int32)
-    count = action.shape[-1]
+    actions = np.asarray(action, np.int32)
+    count = actions.shape[-1]
     blocks = [
-        jax.device_get(_replay_block(_lanes(level, lanes), action[..., lanes], rules)) for lanes in _blocks(count)
+        jax.device_get(_replay_block(_lanes(level, lanes), actions[..., lanes], rules)) for lanes in _blocks(count)
     ]
     return jax.tree.map(lambda *xs: np.ascontiguousarray(np.concatenate(xs, -1)[..., :count]), *blocks)
 
 
-def succeeds(done: Bool[np.ndarray, "time ..."], goal: Bool[np.ndarray, "time ..."]) -> Bool[np.ndarray, "..."]:
-    """Whether episodes ended, and every one that did ended in the goal."""
-    return done.any(0) & (goal | ~done).all(0)
+def succeeds(done: ArrayLike, goal: ArrayLike) -> Bool[np.ndarray, "..."]:
+    """Whether episodes ended, and every one that did ended in the goal, of flags [time, ...]."""
+    done, goal = np.asarray(done), np.asarray(goal)
+    return np.asarray(done.any(0) & (goal | ~done).all(0))
 
 
-def steps_to_goal(done: Bool[np.ndarray, "time level"]) -> Int[np.ndarray, " level"]:
-    """Length of the first episode, env steps."""
-    return np.argmax(done, axis=0) + 1
+def steps_to_goal(done: ArrayLike) -> Int[np.ndarray, " level"]:
+    """Length of the first episode, env steps, of flags [time, level]."""
+    return np.argmax(np.asarray(done), axis=0) + 1
 
 
 def _blocks(count: int) -> Iterator[np.ndarray]:

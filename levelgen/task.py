@@ -31,6 +31,9 @@ class TaskParams:
     physics: Params = field(default_factory=Params)
 
 
+DEFAULT_RULES = TaskParams()
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TaskState:
@@ -142,7 +145,7 @@ def restart(level: Level, state: TaskState, done: Bool[Array, " lane"]) -> TaskS
 
 
 def step(
-    level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams = TaskParams()
+    level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams = DEFAULT_RULES
 ) -> tuple[TaskState, Outcome]:
     """One env step with automatic reset to the same level.
 

@@ -1,4 +1,7 @@
-"""Motors turn the bodies of a revolute joint, thrusters push one body. Facts: `jax2d.joint.apply_motor`, `jax2d.engine`."""
+"""Motors turn the bodies of a revolute joint, thrusters push one body.
+
+Facts: `jax2d.joint.apply_motor`, `jax2d.engine`.
+"""
 
 import jax
 import jax.numpy as jnp

@@ -144,5 +144,5 @@ def push(contact: Contact, arm: Arms, impulse: Float[Array, "2 pair lane"], bodi
     on_a = jnp.stack([-force.x, -force.y, tangent * arm.dot_a - normal * arm.cross_a], axis=1)
     on_b = jnp.stack([force.x, force.y, normal * arm.cross_b - tangent * arm.dot_b], axis=1)
     each = jnp.concatenate([on_a, on_b])
-    total = incidence(bodies, (*pair.a, *pair.b)) @ each.reshape(len(each), -1)
+    total = jnp.matmul(incidence(bodies, (*pair.a, *pair.b)), each.reshape(len(each), -1))
     return total.reshape(bodies, 3, -1)

@@ -106,7 +106,8 @@ def solve(
     """One pass over the joints, one after another."""
 
     def solve_next(motion, one):
-        return _solve_one(motion, *one, params)
+        joint, impulse = one
+        return _solve_one(motion, joint, impulse, params)
 
     return jax.lax.scan(solve_next, motion, (joints, impulses))
 

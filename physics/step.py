@@ -12,7 +12,7 @@ from physics.actuator import drive_motors, fire_thrusters
 from physics.manifold import find_contacts
 from physics.motion import Motion
 from physics.solver import solve
-from physics.types import Manifold, Model, Params, State
+from physics.types import DEFAULT_PARAMS, Manifold, Model, Params, State
 
 
 def step(
@@ -20,7 +20,7 @@ def step(
     state: State,
     motor: Float[Array, "joint lane"],
     thrust: Float[Array, "thruster lane"],
-    params: Params = Params(),
+    params: Params = DEFAULT_PARAMS,
 ) -> tuple[State, Manifold]:
     """Advance every lane by `params.dt`.
 

@@ -10,7 +10,7 @@ Units: metres, radians, seconds, kilograms. Facts about the reference are those 
 (`jax2d.sim_state`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -57,6 +57,9 @@ class Params:
     thruster_power: float = 10.0  # N at power 1
     base_friction: float = 0.4
     faithful_padding: bool = True  # reproduce the reference's padding defect, see docs/physics.md
+
+
+DEFAULT_PARAMS = Params()
 
 
 @jax.tree_util.register_dataclass
@@ -158,18 +161,3 @@ def initial_state(
         joint_impulse=zeros((joints, 2, *lanes)),
         joint_angular_impulse=zeros((joints, *lanes)),
     )
-
-
-__all__ = [
-    "FIXED_POLYGONS",
-    "MAX_VERTICES",
-    "SOLVER_BATCH",
-    "SOLVER_ITERATIONS",
-    "Manifold",
-    "Model",
-    "Params",
-    "Size",
-    "State",
-    "initial_state",
-    "replace",
-]

@@ -1,0 +1,68 @@
+"""Advantages against a loop, and a bandit that PPO must learn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experts import ppo
+from experts.config import ExpertConfig
+from experts.policy import ActorCritic, forward, log_probability, sample
+from experts.ppo import Batch
+from levelgen.actions import CHOICES
+from levelgen.level import SIZES
+from levelgen.observe import dynamic_features, feature_count
+
+SIZE = SIZES["s"]
+FEATURES, DYNAMIC = feature_count(SIZE), len(dynamic_features(SIZE))
+
+
+def test_advantages() -> None:
+    config, rng = ExpertConfig(discount=0.9, gae_lambda=0.8), np.random.default_rng(0)
+    value, reward = rng.normal(size=(2, 20, 3)).astype(np.float32)
+    done, last = rng.random((20, 3)) < 0.2, rng.normal(size=3).astype(np.float32)
+    expected, running, following = np.zeros_like(value), np.zeros(3), last
+    for t in reversed(range(20)):
+        alive = 1 - done[t]
+        running = reward[t] + 0.9 * following * alive - value[t] + 0.9 * 0.8 * alive * running
+        expected[t], following = running, value[t]
+    np.testing.assert_allclose(ppo.advantages(value, reward, done, last, config), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_samples_keep_every_number_at_its_place() -> None:
+    rng, time, lanes = np.random.default_rng(1), 4, 3
+    moving = rng.normal(size=(time, DYNAMIC, lanes)).astype(np.float32)
+    action = rng.integers(0, 2, (time, len(CHOICES), lanes))
+    chance, value, advantage = rng.normal(size=(3, time, lanes)).astype(np.float32)
+    samples = ppo.as_samples(Batch(moving, action, chance, value, advantage))
+    back = ppo.from_samples(samples.T)
+    np.testing.assert_array_equal(back.moving, np.moveaxis(moving, 1, 0).reshape(DYNAMIC, -1))
+    np.testing.assert_array_equal(back.action, np.moveaxis(action, 1, 0).reshape(len(CHOICES), -1))
+    for mine, theirs in zip(back[2:], (chance, value, advantage), strict=True):
+        np.testing.assert_array_equal(mine, theirs.reshape(-1))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_learns_a_bandit(seed: int) -> None:
+    """One action entry pays when it is 2: after a few updates it is chosen nearly always."""
+    config = ExpertConfig(environments=16, horizon=16, learning_rate=3e-3)
+    network, samples = ActorCritic(SIZE, 16, 2), config.steps_per_update
+    expert = ppo.init(jax.random.key(seed), network, FEATURES, DYNAMIC, config)
+    constant, moving = jnp.zeros(FEATURES), jnp.ones((DYNAMIC, samples))
+
+    @jax.jit
+    def learn(expert, key):
+        logits, value = forward(network, expert.params, constant, moving)
+        action = sample(logits, jax.random.uniform(key, (len(CHOICES), samples)))
+        reward = (action[1] == 2).astype(jnp.float32)
+        chance = log_probability(logits, action)
+        batch = Batch(moving[None], action[None], chance[None], value[None], (reward - value)[None])
+        rows = ppo.as_samples(batch)
+        return ppo.update(expert, jax.random.fold_in(key, 1), network, constant, rows, config), reward.mean()
+
+    rewards = []
+    for key in jax.random.split(jax.random.key(seed), 40):
+        expert, reward = learn(expert, key)
+        rewards.append(float(reward))
+    assert rewards[0] < 0.5
+    assert rewards[-1] > 0.95

@@ -1,0 +1,124 @@
+"""Experts on real levels: verdicts, witnesses, and independence of neighbours."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experts.config import ExpertConfig
+from experts.labels import Label
+from experts.train import UnitResult, train_levels, updates_in
+from experts.witness import LANES, RECORD_STEPS, replay, steps_to_goal, succeeds
+from levelgen.distribution import Distribution
+from levelgen.level import SIZES, Level
+from levelgen.sampler import sample_levels
+
+IDS = np.arange(6)
+CONFIG = ExpertConfig(environments=16, horizon=64, width=32, attempts=4, slots=4)
+BUDGET = 20_000  # 19 updates
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return jax.tree.map(np.asarray, sample_levels(jnp.asarray(IDS), SIZES["s"], Distribution()))
+
+
+@pytest.fixture(scope="module")
+def reports() -> list[tuple[int, int]]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def result(levels: Level, reports) -> UnitResult:
+    return train_levels(levels, IDS, BUDGET, CONFIG, report=lambda *now: reports.append(now))
+
+
+def same(a, b) -> None:
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_verdicts(result: UnitResult) -> None:
+    assert [int(i) for i in result.level_ids] == IDS.tolist()
+    labels = {v.label for v in result.verdicts}
+    assert labels == {Label.SOLVED, Label.UNSOLVED}, "these levels should show both"
+    for verdict in result.verdicts:
+        assert verdict.env_steps == 19 * 1024 <= BUDGET
+        assert len(verdict.learning_curve) == 19
+        assert np.isnan(verdict.success_rate) or 0 <= verdict.success_rate <= 1
+        assert (verdict.steps_to_goal is not None) == (verdict.label is Label.SOLVED)
+        if verdict.steps_to_first_success is not None:
+            assert 0 < verdict.steps_to_first_success <= verdict.env_steps
+        assert verdict.label_reason
+
+
+def test_a_solved_level_has_a_witness_and_no_other_has(levels: Level, result: UnitResult) -> None:
+    record = result.record
+    solved = np.array([v.label is Label.SOLVED for v in result.verdicts])
+    np.testing.assert_array_equal(succeeds(record.done, record.goal), solved)
+    first = [v.steps_to_goal for v in result.verdicts if v.steps_to_goal is not None]
+    np.testing.assert_array_equal(steps_to_goal(record.done)[solved], first)
+    again = replay(jax.tree.map(lambda x: x[..., solved], levels), np.asarray(record.action)[..., solved])
+    same(again, jax.tree.map(lambda x: x[..., solved], record))
+    assert not any(np.any(x[..., ~solved]) for x in jax.tree.leaves(record))
+
+
+def test_a_result_depends_on_the_level_alone(levels: Level, result: UnitResult) -> None:
+    at = [4, 1, 2]
+    some = train_levels(jax.tree.map(lambda x: x[..., at], levels), IDS[at], BUDGET, CONFIG)
+    for i, verdict in zip(at, some.verdicts, strict=True):
+        np.testing.assert_equal(vars(verdict), vars(result.verdicts[i]))
+    same(some.record, jax.tree.map(lambda x: x[..., at], result.record))
+
+
+def test_progress_is_reported(reports: list[tuple[int, int]], result: UnitResult) -> None:
+    steps = [step for step, _ in reports]
+    assert steps == sorted(steps)
+    assert steps[-1] == len(IDS) * 19 * 1024
+
+
+def test_replay_is_the_same_at_every_count(levels: Level) -> None:
+    rng = np.random.default_rng(0)
+    count = LANES + 6  # two blocks
+    many = jax.tree.map(lambda x: np.resize(np.moveaxis(x, -1, 0), (count, *x.shape[:-1])), levels)
+    many = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), many)
+    action = rng.integers(0, 2, (RECORD_STEPS, 6, count))
+    whole = replay(many, action)
+    for at in ([0], [3, count - 1], list(range(5, 25))):
+        same(
+            replay(jax.tree.map(lambda x, at=at: x[..., at], many), action[..., at]),
+            jax.tree.map(lambda x, at=at: x[..., at], whole),
+        )
+
+
+def test_a_record_starts_anew_after_each_end(levels: Level) -> None:
+    action = np.random.default_rng(1).integers(0, 2, (RECORD_STEPS, 6, len(IDS)))
+    record = replay(levels, action)
+    for lane in range(len(IDS)):
+        starts = np.concatenate([[0], np.flatnonzero(record.done[:-1, lane]) + 1])
+        np.testing.assert_array_equal(np.flatnonzero(record.timestep[:, lane] == 0), starts)
+        for t in starts:
+            same(
+                jax.tree.map(lambda x, t=t, lane=lane: x[t, ..., lane], record.state),
+                jax.tree.map(lambda x, lane=lane: x[..., lane], levels.state),
+            )
+            assert not record.manifold.active[t, :, lane].any()
+            assert record.last_distance[t, lane] == -1
+
+
+def test_a_budget_below_one_update_is_refused() -> None:
+    with pytest.raises(ValueError, match="too small: one update of an expert takes 1024"):
+        updates_in(1023, CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"width": 0}, "width is 0"),
+        ({"minibatches": 3}, "must divide"),
+        ({"attempts": 64}, "attempts is 64"),
+        ({"clip": 2.0}, "clip is 2.0"),
+    ],
+)
+def test_wrong_hyperparameters_are_refused(change: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        ExpertConfig(**change)
