@@ -27,7 +27,8 @@ def tree_of(cls: type[T], arrays: Mapping[str, np.ndarray], path: str = "") -> T
     values = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         hint, name = hints[field.name], f"{path}{field.name}"
-        values[field.name] = tree_of(hint, arrays, f"{name}/") if dataclasses.is_dataclass(hint) else arrays[name]
+        nested = isinstance(hint, type) and dataclasses.is_dataclass(hint)
+        values[field.name] = tree_of(hint, arrays, f"{name}/") if nested else arrays[name]
     return cls(**values)  # type: ignore[return-value]
 
 
@@ -46,4 +47,4 @@ def same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     if a.shape != b.shape or a.dtype != b.dtype:
         return np.zeros(a.shape[-1], bool)
     raw_a, raw_b = (np.ascontiguousarray(x).view(np.dtype(f"u{x.dtype.itemsize}")) for x in (a, b))
-    return (raw_a == raw_b).reshape(-1, a.shape[-1]).all(0)
+    return (raw_a == raw_b).all(tuple(range(a.ndim - 1)))

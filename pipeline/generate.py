@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pyarrow.compute as pc
 from rich.console import Console
 
 from configs.schema import JobConfig
@@ -97,9 +96,8 @@ def _interruptible() -> Iterator[None]:
 
 def _labels(manifest: Manifest, job: JobConfig) -> Counter[str]:
     """How many of the job's levels have which label."""
-    wanted, ids = job.level_ids, manifest.table.column("level_id")
-    inside = pc.and_(pc.greater_equal(ids, wanted.start), pc.less(ids, wanted.stop))
-    return Counter(manifest.table.filter(inside).column("label").to_pylist())
+    wanted, ids = job.level_ids, manifest.level_ids
+    return Counter(manifest.labels[(wanted.start <= ids) & (ids < wanted.stop)].tolist())
 
 
 def _opening(job: JobConfig, split: Path, done: int) -> str:
@@ -117,6 +115,6 @@ def _closing(job: JobConfig, split: Path, manifest: Manifest, queue: Queue) -> N
         print(f"Given up: levels {unit.text}, for the reason in {quarantine_path(split, unit.name)}")
     if total:
         print(f"Next:  levelproof inspect {folder}")
-    solved = manifest.table.filter(pc.equal(manifest.table.column("label"), "solved")).column("level_id")
+    solved = manifest.level_ids[manifest.labels == "solved"]
     if len(solved):
         print(f"       levelproof show {folder} {solved[0]} -o level.gif")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
+import numpy as np
 import pyarrow as pa
 from rich.console import Console
 from rich.table import Table
@@ -38,7 +39,7 @@ def survey(split: Path, where: str | None = None, rows: int = 10) -> dict[str, A
     """The facts that `inspect` prints, as JSON's types."""
     manifest = require_manifest(split)
     chosen = select(manifest.table, where)
-    solved = chosen.filter(pa.compute.equal(chosen.column("label"), "solved"))
+    solved = select(chosen, "label = 'solved'")
     labels = {entry["values"]: entry["counts"] for entry in chosen.column("label").value_counts().to_pylist()}
     stored = sum(stored_bytes(split / shard) for shard in manifest.shards)
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
@@ -79,10 +80,10 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
 
 
 def _quantiles(table: pa.Table, column: str) -> dict[str, float] | None:
-    values = table.column(column).drop_null()
+    values = table.column(column).drop_null().to_numpy()
     if not len(values):
         return None
-    found = pa.compute.quantile(values, q=list(QUANTILES), interpolation="nearest").to_pylist()
+    found = np.quantile(values, QUANTILES, method="nearest").tolist()
     return {f"{quantile:.0%}": value for quantile, value in zip(QUANTILES, found, strict=True)}
 
 

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from configs.convert import flat
+from configs.schema import hash_of
 from pipeline.errors import Failure, UserError
 from pipeline.layout import MANIFEST
 from pipeline.schema import COLUMNS, CONFIG_KEY, HASH_KEY, MANIFEST_VERSION, VERSION_KEY
@@ -80,8 +81,10 @@ def read_fragment(path: Path, columns: Sequence[str] | None = None) -> tuple[Fra
                     f"The fragment {path} has manifest version {version}, this program reads {MANIFEST_VERSION}: "
                     "use the levelproof that wrote it."
                 )
-            table = file.read(columns=None if columns is None else list(columns))
             fragment = Fragment(path, metadata[HASH_KEY].decode(), json.loads(metadata[CONFIG_KEY]))
+            if not file.schema_arrow.equals(COLUMNS) or hash_of(fragment.config) != fragment.config_hash:
+                raise ValueError("its footer has other columns or another configuration than were written")
+            table = file.read(columns=None if columns is None else list(columns))
     except PermissionError:
         raise Failure(f"The fragment {path} cannot be read: check its permissions.") from None
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:
@@ -104,6 +107,10 @@ class Manifest:
     @property
     def level_ids(self) -> np.ndarray:
         return self.table.column("level_id").to_numpy()
+
+    @property
+    def labels(self) -> np.ndarray:
+        return np.asarray(self.table.column("label").to_pylist(), dtype=str)
 
     @property
     def config(self) -> dict[str, Any] | None:
@@ -136,7 +143,9 @@ def read_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest
                 "move the fragments of one of them elsewhere."
             )
     schema = COLUMNS if names is None else pa.schema([COLUMNS.field(name) for name in names])
-    table = pa.concat_tables([part.cast(schema) for _, part in read]) if read else schema.empty_table()
+    table = (
+        pa.concat_tables([part for _, part in read]).select(schema.names).cast(schema) if read else schema.empty_table()
+    )
     _, first = np.unique(table.column("level_id").to_numpy(), return_index=True)  # sorts; a level counts once
     shards = frozenset(name for name in table.column("shard").unique().to_pylist() if name)
     return Manifest(split, fragments, table.take(first).replace_schema_metadata(None), shards)

@@ -29,6 +29,7 @@ class Tally:
 
     def __post_init__(self) -> None:
         self.at_start = self.share
+        self.first = time.monotonic()
 
     def progress(self, unit: WorkUnit, env_steps: int, solved: int) -> None:
         self.running[unit] = env_steps, solved
@@ -44,7 +45,7 @@ class Tally:
     def tick(self, now: float) -> None:
         """Note where the job is at time `now`, s. The clock starts with the first env step: compiling is no pace."""
         steps = self.env_steps + sum(steps for steps, _ in self.running.values())
-        if not steps:
+        if not steps:  # nothing yet: the clock has not started
             self.first = now
             self.history.clear()
         self.history.append((now, steps))

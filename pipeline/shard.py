@@ -44,18 +44,19 @@ def write_shard(path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.nd
         "level_ids": [int(level_id) for level_id in level_ids],
         "fields": [place.as_json() for place in table],
     }
-    group = zarr.create_group(path, attributes=attributes)
-    for name, values in pack(arrays, table).items():
-        blosc = BloscCodec(cname="zstd", clevel=LEVEL, shuffle=BloscShuffle.shuffle, typesize=values.dtype.itemsize)
-        group.create_array(
-            name,
-            data=values,
-            chunks=(1, *values.shape[1:]),
-            shards=values.shape,
-            compressors=[blosc, Crc32cCodec()],
-            dimension_names=("level", "component", "time")[: values.ndim],
-            config={"write_empty_chunks": True},
-        )
+    with zarr.config.set({"json_indent": None}):  # of a small shard, half would be blanks
+        group = zarr.create_group(path, attributes=attributes)
+        for name, values in pack(arrays, table).items():
+            blosc = BloscCodec(cname="zstd", clevel=LEVEL, shuffle=BloscShuffle.shuffle, typesize=values.dtype.itemsize)
+            group.create_array(
+                name,
+                data=values,
+                chunks=(1, *values.shape[1:]),
+                shards=values.shape,
+                compressors=[blosc, Crc32cCodec()],
+                dimension_names=("level", "component", "time")[: values.ndim],
+                config={"write_empty_chunks": True},
+            )
     _flush(path)
 
 
@@ -108,7 +109,8 @@ class Shard:
             # zarr reads a missing file as zeros
             if array.size and not (self.path / name / "c" / "/".join("0" * array.ndim)).is_file():
                 raise FileNotFoundError(f"no file for {name}")
-            return np.asarray(array[:] if rows == list(range(array.shape[0])) else array.oindex[rows])
+            index = slice(None) if rows == list(range(array.shape[0])) else np.asarray(rows, np.intp)
+            return np.asarray(array.oindex[index])
         except (OSError, RuntimeError, ValueError, KeyError, AssertionError, zlib.error) as error:
             raise self._damaged(error) from error
 

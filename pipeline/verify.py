@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from configs.convert import ConfigError, typed
 from experts.witness import Record, replay, steps_to_goal, succeeds
 from levelgen.level import Level
@@ -82,7 +84,8 @@ def _examine_shard(path: Path, rows: list[dict[str, Any]], task: TaskParams, fin
     arrays = shard.read()
     level, record = tree_of(Level, arrays, "level/"), tree_of(Record, arrays, "record/")
     again = replay(level, record.action, task)
-    differs, reached, steps = unlike_fields(record, again), succeeds(again.done, again.goal), steps_to_goal(again.done)
+    done, goal = np.asarray(again.done), np.asarray(again.goal)
+    differs, reached, steps = unlike_fields(record, again), succeeds(done, goal), steps_to_goal(done)
     findings.shards += 1
     for row in rows:
         i, level_id = row["row"], row["level_id"]

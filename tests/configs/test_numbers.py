@@ -1,0 +1,35 @@
+"""Numbers as people type them."""
+
+from contextlib import suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from configs.convert import ConfigError
+from configs.numbers import LARGEST, parse_count
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [("1", 1), ("500", 500), ("007", 7), ("64k", 64_000), ("1M", 10**6), ("11.5M", 11_500_000), ("0.001k", 1), (3, 3)],
+)
+def test_counts(text: str | int, number: int) -> None:
+    assert parse_count(text, "levels") == number
+
+
+@pytest.mark.parametrize("text", ["0", "0k", "-1", "abc", "", "1.5", "1e6", "64K", "1 000", "k", "1.0001k", "inf", "²"])
+def test_what_is_no_count_is_refused_by_name(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"^budget is "):
+        parse_count(text, "budget")
+
+
+@given(st.integers(1, LARGEST))
+def test_every_whole_number_in_range_means_itself(number: int) -> None:
+    assert parse_count(str(number), "levels") == number
+
+
+@given(st.text(max_size=12))
+def test_any_text_is_a_count_or_refused(text: str) -> None:
+    with suppress(ConfigError):
+        assert 1 <= parse_count(text, "levels") <= LARGEST

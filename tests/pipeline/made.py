@@ -1,0 +1,79 @@
+"""Levels, records and unit results filled with random bits: what the files must bring back, whatever it means."""
+
+import dataclasses
+from typing import Any, get_type_hints
+
+import numpy as np
+
+from configs.compose import compose_job
+from configs.schema import JobConfig
+from experts.labels import Label, Verdict
+from experts.train import UnitResult
+from experts.witness import Record
+from levelgen.level import ACTIONS, SIZES, Level
+from physics.pairs import pairs_of
+from physics.types import MAX_VERTICES, Size
+from pipeline.schema import RECORD_STEPS
+
+
+def made(kind: type, size: Size, count: int, rng: np.random.Generator, *, time: bool = False) -> Any:
+    """An instance of a dataclass of arrays for `count` levels, by the shapes in its annotations.
+
+    Floats have any bits: NaN, infinities, -0.0 and denormals included. Integers are 0 to 255.
+    """
+    counts = {"body": size.bodies, "polygon": size.polygons, "circle": size.circles, "joint": size.joints}
+    counts |= {"thruster": size.thrusters, "vertex": MAX_VERTICES, "contact": pairs_of(size).contacts}
+    counts |= {"lane": count, "level": count, "2": 2, "6": ACTIONS, "256": RECORD_STEPS}
+    values = {}
+    for name, hint in get_type_hints(kind).items():
+        if dataclasses.is_dataclass(hint):
+            assert isinstance(hint, type)
+            values[name] = made(hint, size, count, rng, time=kind is Record)
+            continue
+        shape = tuple(counts[word] for word in hint.dim_str.split())
+        shape = (RECORD_STEPS, *shape) if time else shape
+        values[name] = _random(str(hint.dtypes), shape, rng)
+    return kind(**values)
+
+
+def _random(dtypes: str, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    if "bool" in dtypes:
+        return rng.random(shape) < 0.5
+    if "float" in dtypes:
+        return rng.integers(0, 2**32, shape, np.uint32).view(np.float32)
+    return rng.integers(0, 256, shape, np.int32)
+
+
+def made_level(size: str = "s", count: int = 3, seed: int = 0) -> Level:
+    return made(Level, SIZES[size], count, np.random.default_rng(seed))
+
+
+def made_record(size: str = "s", count: int = 3, seed: int = 0) -> Record:
+    return made(Record, SIZES[size], count, np.random.default_rng(seed))
+
+
+def made_verdict(label: Label = Label.SOLVED, **changes: Any) -> Verdict:
+    solved = label is Label.SOLVED
+    verdict = Verdict(
+        label=label,
+        label_reason="made for a test",
+        success_rate=1.0 if solved else float("nan"),
+        steps_to_goal=17 if solved else None,
+        steps_to_first_success=640 if solved else None,
+        env_steps=4096,
+        learning_curve=[float("nan"), 0.5],
+        best_return=1.5 if solved else float("-inf"),
+        episodes=40,
+    )
+    return dataclasses.replace(verdict, **changes)
+
+
+def made_result(level_ids: list[int], labels: list[Label], size: str = "s") -> UnitResult:
+    """Random bits, not a solution: for what writes and reads, not for what replays."""
+    count = len(level_ids)
+    verdicts = [made_verdict(label) for label in labels]
+    return UnitResult(np.array(level_ids), made_level(size, count), made_record(size, count), verdicts)
+
+
+def made_job(out: str = "data", *overrides: str) -> JobConfig:
+    return compose_job([f"out={out}", "executor=inline", *overrides])

@@ -1,0 +1,80 @@
+"""What people see while they wait."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from pipeline.progress import Board, Tally, duration
+from pipeline.schedule import Summary, WorkUnit
+
+UNIT = WorkUnit(tuple(range(16)))
+
+
+def tally(done: int = 0) -> Tally:
+    return Tally(levels=64, done=done, solved=done // 2, budget=1000)
+
+
+def test_the_share_grows_with_env_steps_and_never_beyond_the_unit() -> None:
+    now = tally()
+    assert now.share == 0
+    now.progress(UNIT, 8_000, 3)
+    assert now.share == pytest.approx(8 / 64)
+    assert now.solved_so_far == 3
+    now.progress(UNIT, 999_999, 3)
+    assert now.share == pytest.approx(16 / 64)
+    now.ended(UNIT, Summary(levels=16, solved=5, env_steps=16_000))
+    assert (now.share, now.done, now.solved_so_far) == (pytest.approx(16 / 64), 16, 5)
+
+
+def test_a_failed_attempt_takes_its_progress_back() -> None:
+    now = tally()
+    now.progress(UNIT, 8_000, 3)
+    now.ended(UNIT, None)
+    assert (now.share, now.solved_so_far) == (0, 0)
+
+
+def test_rate_and_time_left_do_not_count_the_compiling() -> None:
+    now = tally()
+    for second in range(100):
+        now.tick(float(second))
+        assert "compiling" in now.text(second)
+    for second in range(100, 110):
+        now.progress(UNIT, (second - 99) * 800, 0)  # 0.8 levels of 1000 env steps a second
+        now.tick(float(second))
+    assert now.rate == pytest.approx(800)
+    left = now.left(109.0)
+    assert left is not None
+    assert left == pytest.approx((64 - 8) / 0.8, rel=0.02)
+
+
+def test_levels_of_earlier_runs_are_no_pace() -> None:
+    now = tally(done=32)
+    assert now.share == 0.5
+    now.tick(0.0)
+    assert now.left(10.0) is None
+
+
+def test_lines_where_there_is_no_terminal() -> None:
+    text = io.StringIO()
+    board = Board(tally(), Console(file=text))
+    with board.shown():
+        board.refresh()
+        board.refresh()
+        board.ended(UNIT, Summary(16, 5, 16_000))
+    lines = text.getvalue().splitlines()
+    assert len(lines) == 2  # not one for every refresh
+    assert "16/64 levels · 5 solved" in lines[1]
+
+
+def test_a_bar_on_a_terminal() -> None:
+    text = io.StringIO()
+    board = Board(tally(), Console(file=text, force_terminal=True, width=160))
+    with board.shown():
+        board.ended(UNIT, Summary(16, 5, 16_000))
+    assert "16/64 levels · 5 solved" in text.getvalue()
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (89, "89 s"), (90, "2 min"), (5400, "1.5 h")])
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

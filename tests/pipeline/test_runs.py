@@ -1,0 +1,159 @@
+"""Runs on real Ray workers, undisturbed and killed in every way: afterwards the split is the same."""
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pipeline.fields import same_bits
+from pipeline.manifest import fragment_paths, read_manifest
+from pipeline.shard import Shard
+from tests.pipeline.command import TINY, run, start
+
+COMMAND = ["generate", *TINY]
+SPLIT = Path("data/5k/s")
+PATIENCE = 240  # s
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    done = run(COMMAND, folder)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return folder / SPLIT
+
+
+def content(split: Path) -> tuple[str, dict[int, dict]]:
+    """The rows without their places, and the stored fields of every solved level."""
+    manifest = read_manifest(split)
+    rows = manifest.table.to_pylist()
+    fields = {row["level_id"]: Shard(split / row["shard"]).read([row["row"]]) for row in rows if row["shard"]}
+    return repr([row | {"shard": bool(row["shard"]), "row": None} for row in rows]), fields
+
+
+def assert_same_content(split: Path, other: Path) -> None:
+    (rows, fields), (other_rows, other_fields) = content(split), content(other)
+    assert rows == other_rows
+    assert fields.keys() == other_fields.keys()
+    for level_id, arrays in fields.items():
+        assert all(same_bits(values, other_fields[level_id][name]).all() for name, values in arrays.items())
+    assert {f"shards/{path.name}" for path in (split / "shards").iterdir()} == read_manifest(split).shards
+
+
+def until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    """Wait for the condition while the process runs."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert process.poll() is None, f"it ended early: {process.communicate()}"
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.05)
+
+
+def descendants(process: subprocess.Popen[str]) -> set[int]:
+    """All processes below this one; Ray's are in sessions of their own, but its children all the same."""
+    parents = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and (status := _status(int(entry.name))):
+            parents[int(entry.name)] = int(status[1])
+    found, below = set(), {process.pid}
+    while below:
+        below = {pid for pid, parent in parents.items() if parent in below}
+        found |= below
+    return found
+
+
+def _status(pid: int) -> list[str] | None:
+    """State, parent, ... of a process; None when it is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+
+
+def workers(process: subprocess.Popen[str]) -> list[int]:
+    """Ray's workers that are attempting a unit now."""
+    busy = []
+    for pid in descendants(process):
+        try:
+            title = Path(f"/proc/{pid}/cmdline").read_bytes()
+        except OSError:
+            continue
+        if title.startswith(b"ray::Worker.attempt"):
+            busy.append(pid)
+    return sorted(busy)
+
+
+def assert_all_gone(pids: set[int]) -> None:
+    end = time.monotonic() + 30
+    while left := {pid for pid in pids if (status := _status(pid)) and status[0] != "Z"}:
+        assert time.monotonic() < end, f"orphans: {[Path(f'/proc/{pid}/cmdline').read_bytes() for pid in left]}"
+        time.sleep(0.1)
+
+
+def test_an_undisturbed_run_is_whole_and_leaves_no_process(undisturbed: Path) -> None:
+    manifest = read_manifest(undisturbed)
+    assert manifest.level_ids.tolist() == [0, 1, 2, 3]
+    assert "solved" in manifest.labels
+    assert not (undisturbed / "quarantine").exists()
+
+
+def test_without_ray_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
+    done = run([*COMMAND, "executor=inline"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert_same_content(tmp_path / SPLIT, undisturbed)
+
+
+def test_in_other_units_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
+    assert run(["generate", "levels=1", "first_level=2", "budget=5k", "executor=inline"], tmp_path).returncode == 0
+    assert run(["generate", "levels=4", "unit=16", "budget=5k", "executor=inline"], tmp_path).returncode == 0
+    assert_same_content(tmp_path / SPLIT, undisturbed)
+
+
+def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path) -> None:
+    process = start(COMMAND, tmp_path)
+    until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    family = descendants(process)
+    process.kill()
+    process.communicate()
+    assert len(family) > 2
+    assert_all_gone(family)
+    assert 1 <= len(fragment_paths(tmp_path / SPLIT)) < 4
+    done = run(COMMAND, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "are there already" in done.stderr
+    assert_same_content(tmp_path / SPLIT, undisturbed)
+
+
+def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
+    process = start(COMMAND, tmp_path)
+    until(lambda: workers(process), process)
+    os.kill(workers(process)[0], signal.SIGKILL)
+    _, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, err
+    assert "trying again" in err
+    assert "Traceback" not in err
+    assert_same_content(tmp_path / SPLIT, undisturbed)
+    assert not (tmp_path / SPLIT / "quarantine").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
+    process = start(COMMAND, tmp_path)
+    until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    family = descendants(process)
+    os.killpg(process.pid, number)  # as a terminal does
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Stopped: " in err
+    assert "Traceback" not in err
+    assert_all_gone(family)
+    done = run(COMMAND, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert_same_content(tmp_path / SPLIT, undisturbed)
