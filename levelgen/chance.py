@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 
 def deal(keys: Key[Array, " lane"], hands: Sequence[tuple[Any, tuple[int, ...]]]) -> list[Any]:
@@ -23,11 +23,15 @@ def deal(keys: Key[Array, " lane"], hands: Sequence[tuple[Any, tuple[int, ...]]]
     return dealt
 
 
-def choose(weights: Float[Array, "choice lane"], u: Float[Array, " lane"]) -> Bool[Array, "choice lane"]:
-    """One-hot choice with chances in proportion to the weights; the first where all are zero."""
+def pick(weights: Float[Array, "choice #lane"], u: Float[Array, " lane"]) -> Int[Array, " lane"]:
+    """A choice with chances in proportion to the weights; the first where all are zero."""
     upper = jnp.cumsum(weights, 0)
-    index = (upper < upper[-1] * (1 - u)).sum(0)
-    return jnp.arange(len(weights))[:, None] == index
+    return (upper < upper[-1] * (1 - u)).sum(0)
+
+
+def choose(weights: Float[Array, "choice lane"], u: Float[Array, " lane"]) -> Bool[Array, "choice lane"]:
+    """`pick` as one-hot."""
+    return jnp.arange(len(weights))[:, None] == pick(weights, u)
 
 
 def first_of_two(a: Array, b: Array, u: Float[Array, " lane"]) -> Bool[Array, " lane"]:

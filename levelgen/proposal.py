@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.chance import at, between, choose, first_free, put
+from levelgen.chance import at, between, first_free, pick, put
 from levelgen.distribution import Distribution
 from levelgen.level import Level, Role
 from physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
@@ -132,8 +132,7 @@ def draw_role(level: Level, u: Lane, red_allowed: Flag | bool, dist: Distributio
     there = [(level.model.active & (level.role == role)).any(0) for role in (Role.GREEN, Role.BLUE, Role.RED)]
     complete = there[0] & there[1]
     red = jnp.where(complete & ~there[2] & red_allowed, dist.red_weight, 0.0)
-    chosen = choose(jnp.stack([1.0 * complete, 1.0 * ~there[0], 1.0 * ~there[1], red]), u)
-    return at(jnp.arange(len(Role))[:, None], chosen)
+    return pick(jnp.stack([1.0 * complete, 1.0 * ~there[0], 1.0 * ~there[1], red]), u)
 
 
 def insert(level: Level, p: Proposal) -> Level:

@@ -7,6 +7,7 @@ Facts: `kinetix.environment.ued.distributions.sample_kinetix_level` 3.0.2.
 """
 
 from dataclasses import replace
+from enum import IntEnum
 from functools import partial
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from levelgen.chance import at, choose, deal
+from levelgen.chance import at, deal, pick
 from levelgen.distribution import Distribution
 from levelgen.identity import MAX_LEVEL_ID, Stream, key_for
 from levelgen.level import Level, Role
@@ -31,6 +32,14 @@ __all__ = ["Distribution", "sample_levels"]
 BLOCK = 256  # levels sampled by one call of the compiled program, however many are asked for
 GOAL_BODIES = 2  # green and blue come first
 DEFAULT = Distribution()
+
+
+class Filling(IntEnum):
+    """What comes to a place that green, blue and the third body have left."""
+
+    CONNECTED = 0
+    FREE = 1
+    NOTHING = 2
 
 
 class LevelDraws(NamedTuple):
@@ -115,8 +124,7 @@ def turns(size: Size) -> int:
 def set_floor(level: Level, u: Lane, dist: Distribution) -> Level:
     chances = [0.0, dist.floor_green_chance, dist.floor_blue_chance, dist.floor_red_chance]
     chances[Role.PLAIN] = 1 - sum(chances)
-    floor = choose(jnp.broadcast_to(jnp.array(chances)[:, None], (len(chances), len(u))), u)
-    return replace(level, role=level.role.at[0].set(jnp.argmax(floor, 0).astype(jnp.int32)))
+    return replace(level, role=level.role.at[0].set(pick(jnp.array(chances)[:, None], u)))
 
 
 def draw_control(u: Lane, size: Size) -> tuple[Flag, Flag]:
@@ -132,14 +140,14 @@ def plan_bodies(level: Level, first_moves: Lane, motor: Flag, places: PlaceDraws
     """Two free bodies, of which one can move; a third, joined where a motor must be; then what comes."""
     turn = jnp.arange(len(places.kind))[:, None]
     weights = jnp.array([dist.connected_weight, dist.free_weight, dist.empty_weight])[:, None]
-    kind = jax.vmap(lambda u: jnp.argmax(choose(jnp.broadcast_to(weights, (3, len(u))), u), 0))(places.kind)
+    kind = jax.vmap(lambda u: pick(weights, u))(places.kind)
     later = turn > GOAL_BODIES
     # A floor that is a goal cannot move: then the first body, which becomes the other goal, must
     first = (first_moves < 0.5) | (level.role[0] == Role.GREEN) | (level.role[0] == Role.BLUE)
     must_move = jnp.where(turn == 0, first, (turn == 1) & ~first) | (level.size.bodies <= dist.small_world)
     return Plan(
-        add=~later | (kind != 2),
-        connect=jnp.where(later, kind == 0, (turn == GOAL_BODIES) & motor),
+        add=~later | (kind != Filling.NOTHING),
+        connect=jnp.where(later, kind == Filling.CONNECTED, (turn == GOAL_BODIES) & motor),
         revolute=jnp.broadcast_to(turn == GOAL_BODIES, kind.shape),
         may_be_fixed=~must_move,
     )

@@ -1,0 +1,72 @@
+"""Masses: as the reference has them on its own states, and from first principles."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from physics.mass import (
+    circle_area,
+    circle_inertia,
+    inverse,
+    polygon_area,
+    polygon_centroid,
+    polygon_inertia,
+)
+from physics.types import FIXED_POLYGONS
+from tests.golden.load import HERE, load
+
+sides = st.floats(0.0625, 1.0, width=32)
+corner = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)], np.float32)
+
+
+def one(vertices: list | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One polygon in one lane, filled up to four vertices."""
+    given = np.asarray(vertices, np.float32)
+    padded = np.zeros((4, 2), np.float32)
+    padded[: len(given)] = given
+    return padded[None, :, :, None], np.full((1, 1), len(given), np.int32)
+
+
+@pytest.mark.parametrize("size", ["s", "m", "l"])
+def test_masses_of_the_reference(size: str) -> None:
+    """Rectangles, triangles and circles of sampled levels."""
+    level = load(HERE / f"{size}.npz").level
+    model, polygons = level.model, level.size.polygons
+    density = np.asarray(level.density)
+    area = [polygon_area(model.vertices, model.n_vertices), circle_area(model.radius)]
+    inertia = [polygon_inertia(model.vertices, model.n_vertices), circle_inertia(model.radius)]
+    for ours, theirs in ((area, model.inverse_mass), (inertia, model.inverse_inertia)):
+        expected = np.asarray(theirs)
+        finite = (expected != 0) & np.asarray(model.active)
+        made = np.asarray(inverse(np.concatenate([np.asarray(part) for part in ours]) * density))
+        assert finite[FIXED_POLYGONS:polygons].sum() > 300
+        assert finite[polygons:].sum() > 300
+        np.testing.assert_allclose(made[finite], expected[finite], rtol=3e-5)
+    assert (np.asarray(model.n_vertices) == 3).any()
+
+
+@settings(deadline=None)
+@given(sides, sides)
+def test_rectangle(half_width: float, half_height: float) -> None:
+    vertices, four = one(corner * [half_width, half_height])
+    mass = 4 * half_width * half_height
+    np.testing.assert_allclose(polygon_area(vertices, four), mass, rtol=1e-5)
+    np.testing.assert_allclose(polygon_inertia(vertices, four), mass * (half_width**2 + half_height**2) / 3, rtol=1e-5)
+    np.testing.assert_allclose(polygon_centroid(vertices, four), 0, atol=1e-6)
+
+
+def test_triangle() -> None:
+    vertices, three = one([(0, 2), (3, 0), (0, 0)])
+    np.testing.assert_allclose(polygon_area(vertices, three), 3)
+    np.testing.assert_allclose(polygon_centroid(vertices, three)[0, :, 0], [1, 2 / 3], rtol=1e-6)
+
+
+def test_a_circle_has_half_the_inertia_of_a_disc() -> None:
+    """The reference's formula; a disc has m r^2 / 2."""
+    radius = np.float32(0.3)
+    np.testing.assert_allclose(circle_inertia(radius), circle_area(radius) * radius**2 / 4, rtol=1e-6)
+
+
+def test_what_has_no_extent_has_an_inverse() -> None:
+    assert inverse(np.zeros(2, np.float32)).tolist() == [1, 1]
