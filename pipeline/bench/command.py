@@ -1,0 +1,164 @@
+"""The words of `levelproof bench`, and what each bench starts."""
+
+import argparse
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import pipeline
+from levelgen.actions import CHOICES
+from pipeline.bench import oracle
+from pipeline.bench.contest import Entry, compete
+from pipeline.bench.report import Result, summary, write_json, write_table
+from pipeline.errors import Exit, UserError
+from pipeline.runtime import own_cores
+
+STICKINESS = 0.9  # chance that an action entry stays as it was
+OURS, PINNED, FREE = "ours", "reference, process per core", "reference, one process"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run one bench; its exit code."""
+    given = _parser().parse_args(argv)
+    for name, value in vars(given).items():
+        if isinstance(value, int) and value < 1 and name != "json":
+            raise UserError(f"--{name.replace('_', '-')} is {value}: it has to be at least 1.")
+    if given.level_file is not None and not given.level_file.is_file():
+        raise UserError(f"There is no file {given.level_file}: give levels as .npz, or leave --level-file out.")
+    result = given.run(given)
+    if given.json:
+        write_json(result, sys.stdout)
+    else:
+        write_table(result)
+    return Exit.DONE
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="levelproof bench",
+        description="Measure this program beside the reference (Kinetix 3.0.2) in the same run: same machine, levels "
+        "and actions, in turns. The reference runs in an environment of its own, made on first use in the cache folder "
+        f"(LEVELPROOF_CACHE_DIR); {oracle.PYTHON_VARIABLE} names a Python that has it already.",
+        epilog="example: levelproof bench physics --size s --json",
+    )
+    benches = parser.add_subparsers(metavar="BENCH", required=True)
+
+    def bench(name: str, run: Callable[[argparse.Namespace], Result], does: str) -> argparse.ArgumentParser:
+        sub = benches.add_parser(
+            name,
+            help=does,
+            description=f"{does[0].upper()}{does[1:]}.",
+            epilog=f"example: levelproof bench {name} --size s",
+        )
+        sub.add_argument("--size", choices=["s", "m", "l"], default="s", help="of the levels (default: s)")
+        sub.add_argument("--repeats", type=int, default=5, help="timed runs of each side; medians count (default: 5)")
+        sub.add_argument("--level-file", type=Path, help="levels as the reference's arrays (default: it samples some)")
+        sub.add_argument("--json", action="store_true", help="print JSON")
+        sub.set_defaults(run=run)
+        return sub
+
+    sub = bench("physics", physics, "env steps a second under random actions, without observations")
+    sub.add_argument("--lanes", type=int, default=1024, help="worlds stepped side by side (default: 1024)")
+    sub.add_argument("--steps", type=int, default=64, help="env steps of a run in each lane (default: 64)")
+    sub.add_argument("--block", type=int, default=128, help="lanes our engine steps together (default: 128)")
+    sub.add_argument("--reference-block", type=int, help="the same for the reference (default: all of a process)")
+
+    sub = bench("experts", experts, "env steps a second of training one expert per level")
+    sub.add_argument("--levels", type=int, default=32, help="levels, one expert each (default: 32)")
+    sub.add_argument("--environments", type=int, default=32, help="lanes of an expert (default: 32)")
+    sub.add_argument("--horizon", type=int, default=64, help="env steps in each lane between updates (default: 64)")
+    sub.add_argument("--updates", type=int, default=2, help="updates of a run (default: 2)")
+    return parser
+
+
+def physics(given: argparse.Namespace) -> Result:
+    """The engine and the task's rules."""
+    python = oracle.oracle_python()
+    with tempfile.TemporaryDirectory() as folder:
+        actions = Path(folder) / "actions.npy"
+        np.save(actions, sticky_actions(given.steps, given.lanes))
+        levels = given.level_file or oracle.sampled_levels(python, given.size)
+        files = ["--levels", levels, "--actions", actions]
+        steps = given.lanes * given.steps
+        cores = own_cores()
+
+        def entry(name: str, script: list[object], places: list[tuple[int | None, int, int]]) -> Entry:
+            commands = [
+                [*script, *files, "--first", first, "--lanes", count, *_on(core)] for core, first, count in places
+            ]
+            return Entry(name, _words(commands), _environment(name), steps)
+
+        ours = [sys.executable, "-m", "pipeline.bench.ours_physics", "--block", given.block]
+        theirs = [python, oracle.HERE / "reference_physics.py", "--size", given.size]
+        theirs += ["--block", given.reference_block or given.lanes]
+        shared = share(given.lanes, cores)
+        entries = [entry(OURS, ours, shared), entry(PINNED, theirs, shared)]
+        if len(cores) > 1:
+            entries.append(entry(FREE, theirs, [(None, 0, given.lanes)]))
+        scores = compete(entries, given.repeats)
+    settings = {"lanes": given.lanes, "steps": given.steps, "block": given.block}
+    settings |= {"reference_block": given.reference_block or given.lanes, "stickiness": STICKINESS}
+    return summary("physics", given.size, settings, scores, oracle.versions(python))
+
+
+def experts(given: argparse.Namespace) -> Result:
+    """Training."""
+    python = oracle.oracle_python()
+    levels = given.level_file or oracle.sampled_levels(python, given.size)
+    settings = {name: getattr(given, name) for name in ("levels", "environments", "horizon", "updates")}
+    shape: list[object] = ["--levels", levels]
+    for name in ("environments", "horizon", "updates"):
+        shape += [f"--{name}", settings[name]]
+    steps = given.levels * given.environments * given.horizon * given.updates
+    cores = own_cores()
+
+    def entry(name: str, script: list[object], places: list[tuple[int | None, int, int]]) -> Entry:
+        commands = [[*script, *shape, "--first", first, "--count", count, *_on(core)] for core, first, count in places]
+        return Entry(name, _words(commands), _environment(name), steps)
+
+    theirs = [python, oracle.HERE / "reference_experts.py", "--size", given.size]
+    shared = share(given.levels, cores)
+    entries = [
+        entry(OURS, [sys.executable, "-m", "pipeline.bench.ours_experts"], shared),
+        entry(PINNED, theirs, shared),
+    ]
+    if len(cores) > 1:
+        entries.append(entry(FREE, theirs, [(None, 0, given.levels)]))
+    return summary("experts", given.size, settings, compete(entries, given.repeats), oracle.versions(python))
+
+
+def share(count: int, cores: Sequence[int]) -> list[tuple[int | None, int, int]]:
+    """(core, first, how many) of each process, as even as can be; cores without work are left out."""
+    cuts = np.linspace(0, count, min(len(cores), count) + 1).round().astype(int).tolist()
+    return [(core, a, b - a) for core, a, b in zip(cores, cuts, cuts[1:], strict=False)]
+
+
+def sticky_actions(steps: int, lanes: int, seed: int = 0) -> np.ndarray:
+    """Random multi-discrete actions that change now and then, (step, 6, lane) int32."""
+    rng = np.random.default_rng(seed)
+    fresh = rng.integers(0, np.array(CHOICES)[None, :, None], (steps, len(CHOICES), lanes), np.int32)
+    changes = rng.random(fresh.shape) >= STICKINESS
+    changes[0] = True
+    last = np.maximum.accumulate(np.where(changes, np.arange(steps)[:, None, None], 0), 0)
+    return np.take_along_axis(fresh, last, 0)
+
+
+def _on(core: int | None) -> list[object]:
+    return [] if core is None else ["--core", core]
+
+
+def _words(commands: Sequence[Sequence[object]]) -> list[list[str]]:
+    return [[str(word) for word in command] for command in commands]
+
+
+def _environment(name: str) -> dict[str, str]:
+    """Of a contestant's processes. Ours finds the packages wherever they were imported from."""
+    if name != OURS:
+        return dict(oracle.environment())
+    root = str(Path(pipeline.__file__).parent.parent)
+    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
+    return dict(os.environ) | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}

@@ -1,0 +1,88 @@
+# pyright: reportMissingImports=false
+"""Worlds of the reference, inside its own environment: built from plain arrays, sampled, and written to plain arrays.
+
+Files are .npz with one array per path of the reference's state (`polygon/position`), level axis first, as
+`levelgen.kinetix` reads them. Imports the reference and nothing of ours.
+"""
+
+import argparse
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+
+SINGLE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+
+
+def stay_on(core: int | None) -> None:
+    """One thread on one core; None: all cores, XLA's own threads. Before JAX is imported."""
+    if core is not None:
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SINGLE_THREAD}".strip()
+        os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, {core})
+
+
+def flatten(state, prefix: str = "") -> dict[str, np.ndarray]:
+    """A state as {path: array}."""
+    fields = {}
+    for field in dataclasses.fields(state):
+        value = getattr(state, field.name)
+        if dataclasses.is_dataclass(value):
+            fields |= flatten(value, f"{prefix}{field.name}/")
+        else:
+            fields[prefix + field.name] = np.asarray(value)
+    return fields
+
+
+def load_levels(path: str, size: str, first: int, count: int):
+    """Levels `first` to `first + count - 1` of a file, going round where it has fewer."""
+    import jax
+    import jax.numpy as jnp
+    from kinetix.environment import static_env_params_from_size
+    from kinetix.environment.utils import create_empty_env
+
+    empty = create_empty_env(static_env_params_from_size(size))
+    with np.load(path) as file:
+        fields = {name: file[name] for name in file.files if "/" in name or name in flatten(empty)}
+    index = (first + np.arange(count)) % len(fields["gravity"])
+
+    def fill(state, prefix=""):
+        values = {}
+        for field in dataclasses.fields(state):
+            value, name = getattr(state, field.name), prefix + field.name
+            if dataclasses.is_dataclass(value):
+                values[field.name] = fill(value, f"{name}/")
+            elif name in fields:
+                values[field.name] = jnp.asarray(fields[name][index], jnp.asarray(value).dtype)
+            else:
+                values[field.name] = jnp.broadcast_to(jnp.asarray(value), (count, *jnp.shape(value)))
+        return state.replace(**values)
+
+    return jax.tree.map(jnp.asarray, fill(empty))
+
+
+def sample_levels(path: Path, size: str, count: int, seed: int) -> None:
+    """Write `count` levels of the reference's random distribution."""
+    import jax
+    from kinetix.environment import EnvParams, static_env_params_from_size
+    from kinetix.environment.ued.ued import make_reset_fn_sample_kinetix_level
+
+    sample = jax.jit(jax.vmap(make_reset_fn_sample_kinetix_level(EnvParams(), static_env_params_from_size(size))))
+    fields = flatten(sample(jax.random.split(jax.random.PRNGKey(seed), count)))
+    np.savez_compressed(path, **fields)  # pyright: ignore[reportArgumentType]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--size", required=True)
+    parser.add_argument("--count", type=int, required=True)
+    parser.add_argument("--seed", type=int, required=True)
+    given = parser.parse_args()
+    sample_levels(given.out, given.size, given.count, given.seed)
+
+
+if __name__ == "__main__":
+    main()
