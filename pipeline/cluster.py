@@ -22,7 +22,7 @@ from ray.exceptions import RayError
 
 from configs.schema import JobConfig
 from pipeline.progress import Board
-from pipeline.runtime import own_cores, prepare_jax
+from pipeline.runtime import interruptible, own_cores, prepare_jax
 from pipeline.schedule import Outcome, Queue, WorkUnit
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
@@ -120,7 +120,8 @@ def connected() -> Iterator[None]:
         settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE, "num_cpus": len(own_cores())}
     ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
     try:
-        yield
+        with interruptible():  # only now: Ray sets a handler of its own when it starts
+            yield
     finally:
         ray.shutdown()
 

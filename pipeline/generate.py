@@ -1,10 +1,7 @@
 """The job of `levelproof generate`: what is left to do, done by workers or in this process, and said to the user."""
 
 import shlex
-import signal
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
@@ -14,10 +11,8 @@ from pipeline.errors import Exit, Failure
 from pipeline.layout import quarantine_path
 from pipeline.manifest import Manifest, read_manifest
 from pipeline.progress import Board, Tally
-from pipeline.schedule import ATTEMPTS, Outcome, Queue, WorkUnit, plan_units
+from pipeline.schedule import ATTEMPTS, Outcome, Queue, plan_units
 from pipeline.split import note_job, writing
-
-Watch = Callable[[WorkUnit, int, int], None]  # unit, env steps so far, levels solved so far
 
 
 def generate(job: JobConfig, overrides: list[str], console: Console) -> Exit:
@@ -42,7 +37,7 @@ def generate(job: JobConfig, overrides: list[str], console: Console) -> Exit:
             board = Board(Tally(len(wanted), len(done), solved, job.env_steps), console)
             board.say(_opening(job, split, len(done)))
             try:
-                with board.shown(), _interruptible():
+                with board.shown():
                     _work(job, split, queue, board)
             except KeyboardInterrupt:
                 board.say(
@@ -78,20 +73,6 @@ def _work(job: JobConfig, split: Path, queue: Queue, board: Board) -> None:
     else:
         from pipeline.cluster import run
     run(job, split, queue, settle, board)
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """SIGTERM (a batch system's time limit) stops a job as Ctrl-C does."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _labels(manifest: Manifest, job: JobConfig) -> Counter[str]:

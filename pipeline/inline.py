@@ -5,7 +5,7 @@ from pathlib import Path
 
 from configs.schema import JobConfig
 from pipeline.progress import Board
-from pipeline.runtime import prepare_jax
+from pipeline.runtime import interruptible, prepare_jax
 from pipeline.schedule import Outcome, Queue
 
 
@@ -14,11 +14,12 @@ def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Outcome], N
     prepare_jax()
     from pipeline.unit import attempt  # imports what reads the settings just made
 
-    while unit := queue.take():
+    with interruptible():
+        while unit := queue.take():
 
-        def report(env_steps: int, solved: int, unit=unit) -> None:
-            board.tally.progress(unit, env_steps, solved)
+            def report(env_steps: int, solved: int, unit=unit) -> None:
+                board.tally.progress(unit, env_steps, solved)
+                board.refresh()
+
             board.refresh()
-
-        board.refresh()
-        settle(attempt(job, split, unit, report))
+            settle(attempt(job, split, unit, report))

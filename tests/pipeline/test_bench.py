@@ -1,0 +1,227 @@
+"""The bench: its arithmetic, its processes, and both benches run for real at tiny sizes."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from levelgen.actions import CHOICES
+from levelgen.kinetix import state_to_kinetix
+from pipeline.bench import main, oracle
+from pipeline.bench.command import OURS, share, sticky_actions
+from pipeline.bench.contest import Entry, Score, compete
+from pipeline.bench.report import summary, write_json, write_table
+from pipeline.bench.worlds import load_levels
+from pipeline.errors import Exit, Failure, UserError
+from tests.golden.load import HERE, load
+
+ROOT = Path(__file__).parent.parent.parent
+ASKED = "LEVELPROOF_TEST_ORACLE"
+
+
+@pytest.fixture(scope="session")
+def level_file(tmp_path_factory) -> Path:
+    """Golden states as the reference's arrays: levels that need not be sampled first."""
+    of = load(HERE / "s.npz")
+    path = tmp_path_factory.mktemp("levels") / "levels.npz"
+    fields = state_to_kinetix(of.level, of.state, np.zeros_like(of.timestep), np.full_like(of.last_distance, -1))
+    np.savez(path, **{name: values[:16] for name, values in fields.items()})  # pyright: ignore[reportArgumentType]
+    return path
+
+
+class TestArithmetic:
+    @pytest.mark.parametrize(("count", "cores"), [(1024, 2), (5, 4), (1, 8), (7, 1), (64, 16)])
+    def test_shares_are_even_and_complete(self, count, cores) -> None:
+        places = share(count, range(cores))
+        assert [first for _, first, _ in places] == list(np.cumsum([0, *(n for _, _, n in places)])[:-1])
+        sizes = [n for _, _, n in places]
+        assert sum(sizes) == count
+        assert max(sizes) - min(sizes) <= 1
+        assert len(places) == min(count, cores)
+        assert len({core for core, _, _ in places}) == len(places)
+
+    def test_actions_are_sticky_and_cover_their_choices(self) -> None:
+        action = sticky_actions(200, 50)
+        assert action.shape == (200, 6, 50)
+        for entry, choices in enumerate(CHOICES):
+            assert set(np.unique(action[:, entry])) == set(range(choices))
+        changes = (action[1:] != action[:-1]).mean((0, 2))
+        expected = 0.1 * (1 - 1 / np.array(CHOICES))
+        np.testing.assert_allclose(changes, expected, rtol=0.1)
+        np.testing.assert_array_equal(action, sticky_actions(200, 50))
+
+    def test_levels_go_round(self, level_file) -> None:
+        levels = load_levels(str(level_file), 14, 4)
+        whole = load_levels(str(level_file), 0, 16)
+        for part in ("role", "density", "motor_binding"):
+            np.testing.assert_array_equal(getattr(levels, part), getattr(whole, part)[..., [14, 15, 0, 1]])
+
+    @staticmethod
+    def scores() -> list[Score]:
+        def score(name: str, rates: list[float], compile_seconds: float) -> Score:
+            return Score(Entry(name, [], {}, 100), compile_seconds, rates, goals=3, episodes=4)
+
+        return [score(OURS, [90, 110, 100], 5), score("slow", [3, 4, 9], 20), score("fast", [10, 11, 9], 30)]
+
+    def test_the_reference_counts_at_its_best(self) -> None:
+        result = summary("physics", "s", {"lanes": 8}, self.scores(), {"jax": "0"})
+        assert (result.ours, result.reference, result.ratio) == (100, 10, 10)
+        assert result.reference_way == "fast"
+        assert result.spread[OURS] == [90, 110]
+        assert result.compile_ratio == 0.25
+        assert result.goal_share == {OURS: 0.75, "slow": 0.75, "fast": 0.75}
+
+    def test_json_and_table(self, capsys) -> None:
+        result = summary("physics", "s", {"lanes": 8}, self.scores(), {"jax": "0"})
+        file = io.StringIO()
+        write_json(result, file)
+        told = json.loads(file.getvalue())
+        for name in ("ours", "reference", "ratio", "spread", "machine", "versions", "date", "compile_seconds"):
+            assert name in told
+        write_table(result)
+        shown = capsys.readouterr().out
+        assert "ratio 10.0" in shown
+        assert "not finite" not in shown
+        scores = self.scores()
+        scores[0].finite = False
+        write_table(summary("physics", "s", {}, scores, {}))
+        assert "not finite" in capsys.readouterr().out
+
+
+class TestProcesses:
+    """Real processes that speak the protocol of `serve`."""
+
+    HEAD = "from pipeline.bench.serve import serve\n"
+
+    @staticmethod
+    def entry(name: str, *programs: str) -> Entry:
+        environment = dict(os.environ) | {"PYTHONPATH": str(ROOT)}
+        return Entry(name, [[sys.executable, "-c", program] for program in programs], environment, steps=100)
+
+    def test_they_run_in_turns_and_together(self, tmp_path, capsys) -> None:
+        def program(name: str, seconds: float) -> str:
+            log = f"open({str(tmp_path / 'log')!r}, 'a').write({name!r})"
+            answer = {"seconds": seconds, "goal": 1, "done": 2, "finite": True}
+            return f"{self.HEAD}print('noise')\nserve({{'compile_seconds': 7}}, lambda: ({log}, {answer!r})[1])"
+
+        a = self.entry("a", program("a", 2.0), program("a", 4.0))
+        b = self.entry("b", program("b", 10.0))
+        first, second = compete([a, b], repeats=2)
+        assert first.rates == [25, 25]  # the slower process ends the run
+        assert second.rates == [10, 10]
+        assert (first.goals, first.episodes, first.compile_seconds) == (4, 8, 7)
+        assert (tmp_path / "log").read_text() == "aabaab"
+        assert "a: compiling" in capsys.readouterr().err
+
+    @pytest.mark.parametrize("program", ["raise SystemExit('no such thing')", "import sys; sys.exit('no such thing')"])
+    def test_one_that_dies_is_told(self, program) -> None:
+        with pytest.raises(Failure, match=r"ended early \(no such thing\)"):
+            compete([self.entry("a", program)], repeats=1)
+
+    def test_one_that_dies_while_it_runs_is_told(self) -> None:
+        program = f"{self.HEAD}serve({{'compile_seconds': 0}}, lambda: 1 / 0)"
+        with pytest.raises(Failure, match="ZeroDivisionError"):
+            compete([self.entry("a", program)], repeats=1)
+
+
+class TestInput:
+    @pytest.mark.parametrize(
+        "words", [["physics", "--lanes", "0"], ["experts", "--levels", "-1"], ["physics", "--repeats", "0"]]
+    )
+    def test_counts_start_at_one(self, words) -> None:
+        with pytest.raises(UserError, match=r"^--\w+ is -?\d: it has to be at least 1\.$"):
+            main(words)
+
+    @pytest.mark.parametrize("words", [[], ["storage"], ["physics", "--size", "xl"], ["physics", "--lanes", "many"]])
+    def test_unknown_words(self, words) -> None:
+        with pytest.raises(SystemExit) as error:
+            main(words)
+        assert error.value.code == Exit.INPUT
+
+    def test_a_level_file_that_is_not_there(self) -> None:
+        with pytest.raises(UserError, match=r"^There is no file nowhere\.npz"):
+            main(["physics", "--level-file", "nowhere.npz"])
+
+    def test_a_python_that_is_not_there(self, monkeypatch) -> None:
+        monkeypatch.setenv(oracle.PYTHON_VARIABLE, "/nowhere/python")
+        with pytest.raises(UserError, match="is no program"):
+            oracle.oracle_python()
+
+    def test_a_python_without_the_reference(self, monkeypatch, level_file, capsys) -> None:
+        """The reference's process says what it lacks; ours is not blamed."""
+        monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
+        with pytest.raises(Failure, match=r"kinetix"):
+            oracle.versions(oracle.oracle_python())
+
+    def test_no_network_is_told(self, monkeypatch, tmp_path, capsys) -> None:
+        """A real environment is made; its pip finds nothing."""
+        monkeypatch.delenv(oracle.PYTHON_VARIABLE, raising=False)
+        monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path))
+        for name, value in {
+            "INDEX_URL": "http://127.0.0.1:9/simple",
+            "RETRIES": "0",
+            "CONFIG_FILE": os.devnull,
+        }.items():
+            monkeypatch.setenv(f"PIP_{name}", value)
+        for name in ("PIP_EXTRA_INDEX_URL", "PIP_FIND_LINKS"):
+            monkeypatch.delenv(name, raising=False)
+        with pytest.raises(Failure, match=r"Cannot install kinetix-env==3\.0\.2 .*check the network"):
+            oracle.oracle_python()
+        assert "about two minutes" in capsys.readouterr().err
+        assert not (tmp_path / "reference" / "ready").exists()
+
+
+@pytest.fixture(scope="session")
+def reference() -> Path:
+    """The Python of the reference's environment.
+
+    Making it downloads a gigabyte and takes minutes, so the tests do it only when asked to.
+    """
+    there = (oracle.cache_folder() / "reference" / "ready").is_file()
+    if not (there or os.environ.get(oracle.PYTHON_VARIABLE) or os.environ.get(ASKED)):
+        pytest.skip(f"the reference's environment is not there: {ASKED}=1 makes it, {oracle.PYTHON_VARIABLE} names one")
+    try:
+        return oracle.oracle_python()
+    except Failure as failure:
+        pytest.skip(f"the reference's environment cannot be made: {failure}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["physics", "--lanes", "6", "--steps", "4", "--block", "4"],
+        ["experts", "--levels", "2", "--environments", "4", "--horizon", "8", "--updates", "1"],
+    ],
+    ids=["physics", "experts"],
+)
+def test_a_tiny_bench_for_real(reference, level_file, words) -> None:
+    """As a user types it, on one core, so that the reference has one way to run."""
+    core = min(os.sched_getaffinity(0))
+    command = [sys.executable, "-m", "pipeline.cli", "bench", *words, "--repeats", "2", "--level-file", str(level_file)]
+    done = subprocess.run(
+        [*command, "--json"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)},
+        preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+        check=False,
+    )
+    assert done.returncode == Exit.DONE, done.stderr
+    told = json.loads(done.stdout)
+    assert told["bench"] == words[0]
+    assert told["ours"] > 0
+    assert told["reference"] > 0
+    assert told["ratio"] == pytest.approx(told["ours"] / told["reference"], rel=0.01)
+    assert told["finite"] is True
+    assert told["reference_way"] == "reference, process per core"
+    assert len(told["runs"][OURS]) == 2
+    assert told["versions"]["reference"]["kinetix-env"] == "3.0.2"
+    assert all(seconds > 0 for seconds in told["compile_seconds"].values())
+    assert told["machine"]["cores"] == 1
