@@ -28,7 +28,8 @@ def main() -> None:
     from pipeline.bench.worlds import load_levels
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
-    config = ExpertConfig(environments=given.environments, horizon=given.horizon)
+    attempts = min(ExpertConfig.attempts, given.environments)  # of the evaluation, which is not measured
+    config = ExpertConfig(environments=given.environments, horizon=given.horizon, attempts=attempts)
     levels = load_levels(given.levels, given.first, given.count)
     ids = np.arange(given.first, given.first + given.count, dtype=np.int32)
     slots = min(slot_count(config), given.count)
