@@ -213,9 +213,9 @@ class TestLanes:
     STEPS = 16
 
     @classmethod
-    def after(cls, lanes, steps: int = STEPS):
-        """Golden states of size s, those of `lanes` in a batch of their own, some physics steps later."""
-        of = load(HERE / "s.npz")
+    def after(cls, lanes, steps: int = STEPS, size: str = "s"):
+        """Golden states, those of `lanes` in a batch of their own, some physics steps later."""
+        of = load(HERE / f"{size}.npz")
         take = lambda tree: jax.tree.map(lambda x: np.ascontiguousarray(x[..., lanes]), tree)
         return play(take(of.level.model), take(of.state), of.motor[:, lanes], of.thrust[:, lanes], steps)[0]
 
@@ -231,11 +231,11 @@ class TestLanes:
         self.same_bits(self.after(order), jax.tree.map(lambda x: x[..., order], straight))
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("count", [1, 3, 40])
-    def test_neighbours_change_no_bits(self, count: int) -> None:
+    @pytest.mark.parametrize(("size", "count"), [("s", 1), ("s", 40), ("m", 3), ("l", 3)])
+    def test_neighbours_change_no_bits(self, size: str, count: int) -> None:
         """A block filled up with repetitions of its last lane, as the last block of a job is."""
-        filled = self.after(np.minimum(np.arange(self.BLOCK), count - 1))
-        whole = self.after(np.arange(self.BLOCK))
+        filled = self.after(np.minimum(np.arange(self.BLOCK), count - 1), size=size)
+        whole = self.after(np.arange(self.BLOCK), size=size)
         mine = lambda tree: jax.tree.map(lambda x: x[..., :count], tree)
         self.same_bits(mine(filled), mine(whole))
 
