@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _refuse(sentence: str, code: int) -> int:
     end = "" if sentence.endswith((".", ")")) else "."
-    print(f"Error: {sentence[:1].upper()}{sentence[1:]}{end}", file=sys.stderr)
+    print(f"Error: {sentence}{end}", file=sys.stderr)
     return code
 
 

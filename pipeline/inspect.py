@@ -75,7 +75,7 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
             reason = str(error).strip().splitlines()[0]
             columns = ", ".join(table.column_names)
             raise UserError(
-                f"cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
+                f"Cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
             ) from None
 
 

@@ -46,7 +46,7 @@ def require_same(manifest: Manifest, job: JobConfig) -> None:
         return
     changes = told(differences(manifest.config or {}, job.results))
     raise UserError(
-        f"{manifest.split} was made with another configuration ({changes}): "
+        f"The split {manifest.split} was made with another configuration ({changes}): "
         "use the same settings, or another folder with out=NAME."
     )
 

@@ -40,7 +40,7 @@ def look(split: Path) -> dict[str, Any]:
             f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
         ) from None
     except (ValueError, KeyError, TypeError):
-        raise UserError(f"{split / JOB} is damaged: run `levelproof generate` for this split again.") from None
+        raise UserError(f"The file {split / JOB} is damaged: run `levelproof generate` for this split again.") from None
     manifest = read_manifest(split, ["label"])
     labels = dict(zip(manifest.level_ids.tolist(), manifest.table.column("label").to_pylist(), strict=True))
     inside = [labels[level_id] for level_id in labels if level_id in wanted]

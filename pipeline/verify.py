@@ -61,7 +61,9 @@ def examine(split: Path) -> Findings:
     try:
         task = typed(TaskParams, (manifest.config or {})["task"], "task")
     except (ConfigError, KeyError) as error:
-        raise Failure(f"{split} was made by a levelproof with other settings ({error}): use that one.") from None
+        raise Failure(
+            f"The split {split} was made by a levelproof with other settings ({error}): use that one."
+        ) from None
     by_shard: dict[str, list[dict[str, Any]]] = {}
     for row in manifest.table.to_pylist():
         if (row["label"] == "solved") != (row["shard"] is not None):

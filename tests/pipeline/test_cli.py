@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.manifest import fragment_paths, read_manifest
-from tests.pipeline.command import TINY, assert_refused, run
+from tests.pipeline.command import ROOT, TINY, assert_refused, run
 
 COMMANDS = ("generate", "inspect", "show", "status", "verify", "bench")
 
@@ -71,10 +72,10 @@ def test_version(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["size=xl"], ["There is no size xl", "choose one of l, m, s"]),
-        (["budget=0"], ["Budget is '0'", "at least 1"]),
+        (["size=xl"], ["there is no size xl", "choose one of l, m, s"]),
+        (["budget=0"], ["budget is '0'", "at least 1"]),
         (["budget=2000"], ["2048"]),
-        (["levels=abc"], ["Levels is 'abc'", "64k"]),
+        (["levels=abc"], ["levels is 'abc'", "64k"]),
         (["levls=5"], ["no setting levls", "did you mean levels?"]),
         (["64"], ["NAME=VALUE"]),
     ],
@@ -185,7 +186,7 @@ def test_inspect_takes_a_condition_and_refuses_what_is_none(made: Path) -> None:
     done = run(["inspect", "data/5k/s", "--where", "no_such_column = 1"], made)
     assert_refused(done, 2, "no_such_column", "columns level_id, size")
     done = run(["inspect", "data/5k/s", "--where", "label IN (SELECT content FROM read_text('/etc/passwd'))"], made)
-    assert_refused(done, 2, "cannot use the condition".capitalize())
+    assert_refused(done, 2, "Cannot use the condition")
 
 
 @pytest.mark.slow
@@ -236,9 +237,20 @@ def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_closed_pipe_is_no_error(made: Path) -> None:
     command = f"{sys.executable} -m pipeline.cli inspect data/5k/s --json | head -c 1"
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         ["bash", "-c", command], cwd=made, env=environment, capture_output=True, text=True, check=False
     )
     assert done.stdout == "{"
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_the_readme_s_reader_reads(made: Path) -> None:
+    text = (ROOT / "README.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert "data/128k/s" in program
+    command = [sys.executable, "-c", program.replace("data/128k/s", "data/5k/s")]
+    done = subprocess.run(command, cwd=made, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[ True]"

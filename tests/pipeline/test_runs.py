@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from pipeline.fields import same_bits
 from pipeline.manifest import fragment_paths, read_manifest
 from pipeline.shard import Shard
-from tests.pipeline.command import TINY, run, start
+from tests.pipeline.command import ROOT, TINY, run, start
 
 COMMAND = ["generate", *TINY]
 SPLIT = Path("data/5k/s")
@@ -155,3 +156,10 @@ def test_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Sig
     done = run([*COMMAND, "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert_same_content(tmp_path / SPLIT, undisturbed)
+
+
+def test_the_command_itself_does_not_start_jax(tmp_path: Path) -> None:
+    """On a GPU it would take the memory that the worker needs; and threads and cache are set before JAX starts."""
+    program = "from configs.compose import compose_job; compose_job([]); import pipeline.generate, pipeline.cluster"
+    environment = os.environ | {"JAX_PLATFORMS": "no_such_platform", "PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)

@@ -1,0 +1,68 @@
+"""How JAX computes in a worker: one thread, no deadlock, compiled code kept."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.runtime import CACHE_VARIABLE, cache_folder
+from tests.pipeline.command import ROOT
+
+# Orthogonal weights of several layers for several experts: batched QR factorisations side by side in one program
+FACTORISE = """
+from pipeline.runtime import prepare_jax
+prepare_jax()
+import jax
+layer = jax.nn.initializers.orthogonal()
+layers = jax.jit(jax.vmap(lambda key: [layer(k, (n, 64)) for k, n in zip(jax.random.split(key, 6), (140, 64, 64) * 2)]))
+for i in range(300):
+    jax.block_until_ready(layers(jax.random.split(jax.random.key(i), 4)))
+"""
+
+COUNT = """
+from pipeline.runtime import prepare_jax
+prepare_jax()
+import jax, os
+jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((512, 512))))
+print(sum(open(f"/proc/self/task/{t}/comm").read().startswith("tf_XLAEigen") for t in os.listdir("/proc/self/task")))
+"""
+
+
+def python(program: str, folder: Path, **environment: str) -> str:
+    ours = {CACHE_VARIABLE: str(folder), "PYTHONPATH": str(ROOT)} | environment
+    inherited = {k: v for k, v in os.environ.items() if k not in ("NPROC", "PJRT_NPROC", "XLA_FLAGS")}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, env=inherited | ours, capture_output=True, text=True, timeout=120, check=True)
+    return done.stdout
+
+
+def test_factorisations_side_by_side_do_not_deadlock(tmp_path: Path) -> None:
+    python(FACTORISE, tmp_path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
+def test_xla_has_one_thread_to_compute(tmp_path: Path) -> None:
+    assert int(python(COUNT, tmp_path)) <= 1
+
+
+def test_flags_of_the_user_stay(tmp_path: Path) -> None:
+    program = "from pipeline.runtime import prepare_jax as p; p(); p(); import os; print(os.environ['XLA_FLAGS'])"
+    flags = python(program, tmp_path, XLA_FLAGS="--xla_dump_to=/nowhere").split()
+    assert flags == ["--xla_dump_to=/nowhere", "--xla_cpu_multi_thread_eigen=false", "intra_op_parallelism_threads=1"]
+
+
+def test_compiled_code_is_kept_where_it_was_asked_for(tmp_path: Path) -> None:
+    program = "from pipeline import runtime; runtime.MIN_COMPILE_SECONDS = 0; runtime.prepare_jax(); import jax; "
+    python(program + "jax.jit(lambda x: x + 1)(1.0)", tmp_path)
+    assert list((tmp_path / "jax").iterdir())
+
+
+def test_the_cache_is_in_the_user_s_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(CACHE_VARIABLE)
+    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    if sys.platform == "linux":
+        assert cache_folder() == Path("/somewhere/levelproof")
+    monkeypatch.setenv(CACHE_VARIABLE, "~/here")
+    assert cache_folder() == Path.home() / "here"
