@@ -3,12 +3,13 @@
 Facts: `jax2d.joint.apply_motor`, `jax2d.engine`.
 """
 
-import jax
+import functools
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from physics.joint import can_act, joint_angle
-from physics.motion import inverse_masses, one_hot, select
+from physics.motion import inverse_masses, placed, select
 from physics.types import Model, Params, State
 from physics.vector import Vec, vec
 
@@ -39,8 +40,9 @@ def drive_motors(
 
     runs = can_act(model) & model.motor_on & (control != 0) & ~model.joint_fixed
     turn = jnp.where(runs, power * jnp.tanh(excess * params.motor_decay), 0.0)
-    gained = _total(model.joint_a, turn * inertia_a, len(w)) - _total(model.joint_b, turn * inertia_b, len(w))
-    return jnp.concatenate([velocity[:, :2], (w + gained)[:, None]], axis=1)
+    on_a, on_b = (turn * inertia_a)[:, None], (turn * inertia_b)[:, None]
+    gained = _total(model.joint_a, on_a, len(w)) - _total(model.joint_b, on_b, len(w))
+    return jnp.concatenate([velocity[:, :2], velocity[:, 2:] + gained], axis=1)
 
 
 def fire_thrusters(
@@ -61,7 +63,6 @@ def fire_thrusters(
     return velocity + inverse_masses(model) * _total(model.thruster_body, impulse, len(velocity))
 
 
-def _total(body, change: Float[Array, "actuator *row lane"], bodies: int) -> Float[Array, "body *row lane"]:
-    """The sum of changes at each body, for bodies that differ by lane."""
-    placed = lambda held, x: jnp.where(held.reshape(bodies, *[1] * (x.ndim - 1), -1), x, 0.0)
-    return jax.vmap(placed)(one_hot(body, bodies), change).sum(0)
+def _total(body: Int[Array, "actuator lane"], change: Float[Array, "actuator row lane"], bodies: int) -> Array:
+    """The sum of changes at each body, [body, row, lane]."""
+    return functools.reduce(jnp.add, (placed(bodies, b, x) for b, x in zip(body, change, strict=True)))

@@ -1,56 +1,39 @@
 """The contact constraint: non-penetration with friction, by accumulated impulses (Catto's sequential impulses).
 
-One *sweep* lets every contact of a solver batch read the same velocities and adds up their changes.
+All contacts of a solver batch read the same velocities; what they do to a body adds up.
 Facts: `jax2d.collision.resolve_collision`.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from physics.motion import incidence
+from physics.motion import Bodies, Motion, add, take
 from physics.pairs import PairKind
 from physics.types import Manifold, Model, Params, State
 from physics.vector import Vec, nonzero, rows, vec
 
 
 class Contact(NamedTuple):
-    """One contact of every pair of a kind; constant over a step. Zero where it may not act."""
+    """One contact of each of some pairs; constant over a step. Zero where it may not act. Leaves [pair, lane]."""
 
-    pair: PairKind
-    batch: Int[Array, "pair lane"] | None  # solver batch; None where there is only one
+    a: Bodies
+    b: Bodies
     normal: Vec
     point: Vec
-    target: Float[Array, "pair lane"]  # m/s along the normal that the constraint asks for
-    friction: Float[Array, "pair lane"]
-
-
-class Arms(NamedTuple):
-    """Geometry of a contact for the present positions; r goes from a body's centre to the contact point."""
-
-    cross_a: Array  # r x n
-    cross_b: Array
-    dot_a: Array  # r . n; the tangent is (n.y, -n.x), so r x t = -(r . n)
-    dot_b: Array
-    mass_normal: Array  # effective masses
-    mass_tangent: Array
-    coupling: Array  # how a normal impulse changes the tangential velocity
+    target: Array  # m/s along the normal that the constraint asks for
+    friction: Array
+    mass: Array  # both bodies' inverse masses
+    inertia_a: Array  # inverse
+    inertia_b: Array
+    kept: Array  # 0 where the padding defect forgets the accumulated impulses, else 1
 
 
 def prepare(
-    model: Model,
-    state: State,
-    manifold: Manifold,
-    pair: PairKind,
-    at: slice,
-    touching: Bool[Array, "pair lane"],
-    params: Params,
+    model: Model, state: State, manifold: Manifold, pair: PairKind, at: slice, params: Params
 ) -> tuple[Contact, Float[Array, "2 pair lane"]]:
-    """The contacts `at` of a manifold as constraints, with their warm-start impulses (normal, tangent; N s).
-
-    `touching` says which pairs have any active contact: they decide the solver batches.
-    """
+    """The contacts `at` of a manifold as constraints, with their warm-start impulses (normal, tangent; N s)."""
     active = manifold.active[at]
     mass_a, mass_b = rows(model.inverse_mass, pair.a), rows(model.inverse_mass, pair.b)
     collides = jnp.stack([model.collides[a, b] for a, b in zip(pair.a, pair.b, strict=True)])
@@ -59,90 +42,71 @@ def prepare(
     excess = jnp.maximum(manifold.penetration[at] - params.slop, 0.0)
     target = params.contact_bias / params.dt * excess - manifold.restitution_velocity[at]
     rough = lambda body: jnp.square(rows(model.friction, body) * params.base_friction)
+    forgotten = params.faithful_padding and pair.padded
+    last = jnp.arange(len(pair))[:, None] == len(pair) - 1
     contact = Contact(
-        pair=pair,
-        batch=_batch(touching, pair) if pair.batches > 1 else None,
+        a=pair.a,
+        b=pair.b,
         normal=vec(manifold.normal[at]).map(keep),
         point=vec(manifold.point[at]).map(keep),
         target=keep(target),
         friction=keep(jnp.sqrt(rough(pair.a) + rough(pair.b))),
+        mass=keep(mass_a + mass_b),
+        inertia_a=keep(rows(model.inverse_inertia, pair.a)),
+        inertia_b=keep(rows(model.inverse_inertia, pair.b)),
+        kept=jnp.where(last & forgotten, 0.0, jnp.ones_like(target)),
     )
     remembered = acts & state.contact_active[at]
     impulses = jnp.stack([state.contact_normal_impulse[at], state.contact_tangent_impulse[at]])
     return contact, jnp.where(remembered, impulses, 0.0)
 
 
-def _batch(touching: Bool[Array, "pair lane"], pair: PairKind) -> Int[Array, "pair lane"]:
-    """Solver batch of each touching pair.
+class Arms(NamedTuple):
+    """Geometry of a contact; r goes from a body's centre to the contact point."""
 
-    The reference sorts pairs stably, inactive first, and the pair at sorted place p belongs to batch
-    p mod n_batches. Among touching pairs, the k-th therefore stands at place (pairs - touching + k).
-    """
-    rank = jnp.cumsum(touching, axis=0, dtype=jnp.int32)
-    place = len(pair) - 1 - rank[-1:] + rank
-    return place % pair.batches
+    cross_a: Array  # r x n
+    cross_b: Array
+    dot_a: Array  # r . n; the tangent is (n.y, -n.x), so r x t = -(r . n)
+    dot_b: Array
 
 
-def arms(model: Model, position: Float[Array, "body 2 lane"], contact: Contact) -> Arms:
+def arms(position: Float[Array, "body 2 lane"], contact: Contact) -> Arms:
     """Geometry for the present positions (joints move bodies inside an iteration)."""
-    n, pair = contact.normal, contact.pair
-    r_a, r_b = (contact.point - vec(rows(position, body)) for body in (pair.a, pair.b))
-    cross_a, cross_b, dot_a, dot_b = r_a.cross(n), r_b.cross(n), r_a.dot(n), r_b.dot(n)
-    mass = rows(model.inverse_mass, pair.a) + rows(model.inverse_mass, pair.b)
-    turn_a, turn_b = rows(model.inverse_inertia, pair.a), rows(model.inverse_inertia, pair.b)
-    return Arms(
-        cross_a,
-        cross_b,
-        dot_a,
-        dot_b,
-        1 / nonzero(mass + turn_a * cross_a * cross_a + turn_b * cross_b * cross_b),
-        1 / nonzero(mass + turn_a * dot_a * dot_a + turn_b * dot_b * dot_b),
-        turn_a * cross_a * dot_a + turn_b * cross_b * dot_b,
-    )
+    n = contact.normal
+    r_a, r_b = (contact.point - vec(take(position, body)) for body in (contact.a, contact.b))
+    return Arms(r_a.cross(n), r_b.cross(n), r_a.dot(n), r_b.dot(n))
 
 
-def sweep(
-    inverse_masses: Float[Array, "body 3 lane"],
-    velocity: Float[Array, "body 3 lane"],
-    contact: Contact,
-    arm: Arms,
-    impulse: Float[Array, "2 pair lane"],
-    params: Params,
-) -> tuple[Float[Array, "body 3 lane"], Float[Array, "2 pair lane"]]:
-    """One pass over all solver batches of a kind."""
-    for batch in range(contact.pair.batches):
-        now = _solve(velocity, contact, arm, impulse)
-        if contact.batch is not None:
-            now = jnp.where(contact.batch == batch, now, impulse)
-        velocity = velocity + inverse_masses * push(contact, arm, now - impulse, len(velocity))
-        impulse = now
-    if params.faithful_padding and contact.pair.padded:
-        impulse = jnp.where(jnp.arange(len(contact.pair))[:, None] == len(contact.pair) - 1, 0.0, impulse)
-    return velocity, impulse
+def solve(
+    motion: Motion, contact: Contact, impulse: Float[Array, "2 pair lane"]
+) -> tuple[Float[Array, "2 pair lane"], Float[Array, "body 3 lane"]]:
+    """The accumulated impulses that bring each contact to its target, clamped to push and to the friction cone.
 
+    Returns:
+        The new accumulated impulses, and what their changes do to each body.
+    """
+    arm, n = arms(motion.position, contact), contact.normal
+    inertia_a, inertia_b = contact.inertia_a, contact.inertia_b
+    mass_normal = 1 / nonzero(contact.mass + inertia_a * jnp.square(arm.cross_a) + inertia_b * jnp.square(arm.cross_b))
+    mass_tangent = 1 / nonzero(contact.mass + inertia_a * jnp.square(arm.dot_a) + inertia_b * jnp.square(arm.dot_b))
+    # how a normal impulse changes the tangential velocity
+    coupling = inertia_a * arm.cross_a * arm.dot_a + inertia_b * arm.cross_b * arm.dot_b
 
-def _solve(
-    velocity: Float[Array, "body 3 lane"], contact: Contact, arm: Arms, impulse: Float[Array, "2 pair lane"]
-) -> Float[Array, "2 pair lane"]:
-    """The accumulated impulses that bring each contact to its target, clamped to push and to the friction cone."""
-    n, pair = contact.normal, contact.pair
-    a, b = rows(velocity, pair.a), rows(velocity, pair.b)
+    a, b = take(motion.velocity, contact.a), take(motion.velocity, contact.b)
     v, w_a, w_b = Vec(b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]), a[:, 2], b[:, 2]
     approach = v.dot(n) + w_b * arm.cross_b - w_a * arm.cross_a
-    normal = jnp.maximum(impulse[0] + arm.mass_normal * (contact.target - approach), 0.0)
-    slide = v.x * n.y - v.y * n.x - w_b * arm.dot_b + w_a * arm.dot_a - (normal - impulse[0]) * arm.coupling
+    normal = jnp.maximum(impulse[0] + mass_normal * (contact.target - approach), 0.0)
+    slide = v.x * n.y - v.y * n.x - w_b * arm.dot_b + w_a * arm.dot_a - (normal - impulse[0]) * coupling
     limit = contact.friction * normal
-    tangent = jnp.clip(impulse[1] - arm.mass_tangent * slide, -limit, limit)
-    return jnp.stack([normal, tangent])
+    tangent = jnp.clip(impulse[1] - mass_tangent * slide, -limit, limit)
+    now = jnp.stack([normal, tangent])
+    return now * contact.kept, push(contact, arm, now - impulse, len(motion.velocity))
 
 
 def push(contact: Contact, arm: Arms, impulse: Float[Array, "2 pair lane"], bodies: int) -> Float[Array, "body 3 lane"]:
-    """What each body gets when both bodies of every contact are pushed apart; contributions add up."""
-    n, pair = contact.normal, contact.pair
-    normal, tangent = impulse
+    """What each body gets when both bodies of every contact are pushed apart."""
+    n, (normal, tangent) = contact.normal, impulse
     force = Vec(normal * n.x + tangent * n.y, normal * n.y - tangent * n.x)
     on_a = jnp.stack([-force.x, -force.y, tangent * arm.dot_a - normal * arm.cross_a], axis=1)
     on_b = jnp.stack([force.x, force.y, normal * arm.cross_b - tangent * arm.dot_b], axis=1)
-    each = jnp.concatenate([on_a, on_b])
-    total = jnp.matmul(incidence(bodies, (*pair.a, *pair.b)), each.reshape(len(each), -1))
-    return total.reshape(bodies, 3, -1)
+    return add(bodies, contact.a, on_a, contact.b, on_b)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from physics.motion import Motion, one_hot, pick, select
+from physics.motion import Motion, add, placed, select, stored
 from physics.types import Model, Params, State
 from physics.vector import Vec, nonzero, spin, vec
 
@@ -18,8 +18,8 @@ class Joint(NamedTuple):
     """Every joint, constant over a step; leaves [joint, ..., lane]. Masses are 0 where it may not act."""
 
     acts: Bool[Array, "joint lane"]
-    a: Bool[Array, "joint body lane"]  # one-hot
-    b: Bool[Array, "joint body lane"]
+    a: Int[Array, "joint lane"]
+    b: Int[Array, "joint lane"]
     arm_a: Vec  # from the body's centre to its anchor, in the world
     arm_b: Vec
     mass_a: Array  # inverse
@@ -48,7 +48,7 @@ def can_act(model: Model) -> Bool[Array, "joint lane"]:
 
 def prepare(model: Model, state: State, params: Params) -> tuple[Joint, Float[Array, "joint 3 lane"]]:
     """The joints as constraints, with their warm-start impulses (x, y, angular)."""
-    acts, (bodies, lanes) = can_act(model), state.rotation.shape
+    acts, lanes = can_act(model), state.rotation.shape[-1]
     cos, sin = jnp.cos(state.rotation), jnp.sin(state.rotation)
     each = lambda x, body: jnp.stack([select(x, b) for b in body])
 
@@ -65,8 +65,8 @@ def prepare(model: Model, state: State, params: Params) -> tuple[Joint, Float[Ar
     beyond = angle - jnp.clip(angle, model.joint_min, model.joint_max)
     joint = Joint(
         acts=acts,
-        a=one_hot(model.joint_a, bodies),
-        b=one_hot(model.joint_b, bodies),
+        a=model.joint_a,
+        b=model.joint_b,
         arm_a=arm_a,
         arm_b=arm_b,
         mass_a=mass_a,
@@ -82,22 +82,12 @@ def prepare(model: Model, state: State, params: Params) -> tuple[Joint, Float[Ar
     return joint, jnp.concatenate([state.joint_impulse, state.joint_angular_impulse[:, None]], axis=1)
 
 
-def warm_start(joint: Joint, impulse: Float[Array, "joint 3 lane"]) -> Float[Array, "body 3 lane"]:
+def warm_start(bodies: int, joint: Joint, impulse: Float[Array, "joint 3 lane"]) -> Float[Array, "body 3 lane"]:
     """The change of velocity by the impulses that the last step ended with, all joints at once."""
     p, turn = vec(impulse), impulse[:, 2]
     on_a = (joint.mass_a * p.x, joint.mass_a * p.y, joint.inertia_a * (joint.arm_a.cross(p) + turn))
     on_b = (-joint.mass_b * p.x, -joint.mass_b * p.y, -joint.inertia_b * (joint.arm_b.cross(p) + turn))
-    return sum(_placed(held, change) for held, change in _sides(joint, on_a, on_b))  # type: ignore[return-value]
-
-
-def _sides(joint: Joint, on_a, on_b):
-    """(one-hot body, rows of change) for both bodies of every joint."""
-    for held, on in ((joint.a, on_a), (joint.b, on_b)):
-        yield from zip(held, jnp.stack(on, axis=1), strict=True)
-
-
-def _placed(held: Bool[Array, "body lane"], change: Float[Array, "row lane"]) -> Float[Array, "body row lane"]:
-    return jnp.where(held[:, None], change, 0.0)
+    return add(bodies, joint.a, jnp.stack(on_a, axis=1), joint.b, jnp.stack(on_b, axis=1))
 
 
 def solve(
@@ -115,8 +105,8 @@ def solve(
 def _solve_one(
     motion: Motion, joint: Joint, impulse: Float[Array, "3 lane"], params: Params
 ) -> tuple[Motion, Float[Array, "3 lane"]]:
-    x_a, x_b = (Vec(*pick(held, motion.position)) for held in (joint.a, joint.b))
-    (*v_a, w_a), (*v_b, w_b) = (pick(held, motion.velocity) for held in (joint.a, joint.b))
+    x_a, x_b = (Vec(*select(motion.position, body)) for body in (joint.a, joint.b))
+    (*v_a, w_a), (*v_b, w_b) = (select(motion.velocity, body) for body in (joint.a, joint.b))
 
     # anchors first, then their difference: a gap of exactly zero must come out as zero, because the
     # angle correction below looks at signs
@@ -144,7 +134,8 @@ def _solve_one(
     closer = gap.scale(params.joint_bias_position / nonzero(joint.mass_a + joint.mass_b))
 
     def moved(x, row_a, row_b):
-        return x + _placed(joint.a, jnp.stack(row_a)) + _placed(joint.b, jnp.stack(row_b))
+        on_a, on_b = stored(jnp.stack([jnp.stack(row_a), jnp.stack(row_b)]))
+        return x + placed(len(x), joint.a, on_a) + placed(len(x), joint.b, on_b)
 
     motion = Motion(
         moved(motion.position, closer.scale(joint.mass_a), closer.scale(-joint.mass_b)),

@@ -109,7 +109,7 @@ def _polygons(model: Model, state: State) -> Polygons:
     support = outward.map(lambda x: x[:, None]).dot(start.map(lambda x: x[None])).max(1)
     centre = vec(state.position[:n])
     vertex, normal = start.rotate(cos, sin) + centre, outward.rotate(cos, sin)
-    return Polygons(centre, vertex, normal, jnp.where(missing, FAR, support))
+    return Polygons(centre, vertex, normal, jnp.broadcast_to(jnp.where(missing, FAR, support), vertex.x.shape))
 
 
 def _choose(world: Polygons, index: tuple[int, ...]) -> Polygons:

@@ -4,37 +4,48 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from physics import contact as contacts
 from physics import joint as joints
+from physics import slots as slotted
+from physics.contact import Contact
 from physics.motion import Motion, inverse_masses
 from physics.pairs import pairs_of
+from physics.slots import SlottedContacts
 from physics.types import SOLVER_ITERATIONS, Manifold, Model, Params, State
+
+# Contacts that are solved together: of all pairs of a kind where one solver batch holds them, else in slots
+Group = Contact | SlottedContacts
 
 
 def solve(model: Model, state: State, manifold: Manifold, motion: Motion, params: Params) -> tuple[Motion, State]:
     """Bodies' motion after the solver, and `state` with the impulses that the next step starts from."""
-    groups, impulses = _contact_groups(model, state, manifold, params)
+    groups, impulses, warmth = _contact_groups(model, state, manifold, motion, params)
     joint, joint_impulse = joints.prepare(model, state, params)
-    masses, bodies = inverse_masses(model), len(motion.velocity)
-
-    arms = [contacts.arms(model, motion.position, group) for group in groups]
-    pushes = [contacts.push(g, a, i, bodies) for g, a, i in zip(groups, arms, impulses, strict=True)]
-    velocity = motion.velocity + masses * sum(pushes) + joints.warm_start(joint, joint_impulse)
+    masses = inverse_masses(model)
+    velocity = motion.velocity + masses * warmth + joints.warm_start(len(masses), joint, joint_impulse)
 
     def iteration(carry, _):
         motion, joint_impulse, impulses = carry
         motion, joint_impulse = joints.solve(motion, joint, joint_impulse, params)
-        velocity, solved = motion.velocity, []
+        solved = []
         for group, impulse in zip(groups, impulses, strict=True):
-            arm = contacts.arms(model, motion.position, group)
-            velocity, impulse = contacts.sweep(masses, velocity, group, arm, impulse, params)
+            if isinstance(group, SlottedContacts):
+                motion, impulse = slotted.sweep(masses, motion, group, impulse)
+            else:
+                impulse, change = contacts.solve(motion, group, impulse)
+                motion = motion._replace(velocity=motion.velocity + masses * change)
             solved.append(impulse)
-        return (Motion(motion.position, velocity), joint_impulse, solved), None
+        return (motion, joint_impulse, solved), None
 
     carry = (Motion(motion.position, velocity), joint_impulse, impulses)
     (motion, joint_impulse, impulses), _ = jax.lax.scan(iteration, carry, None, length=SOLVER_ITERATIONS)
-    normal, tangent = jnp.concatenate(impulses, axis=1)
+    by_pair = [
+        slotted.scatter(group.slots, impulse) if isinstance(group, SlottedContacts) else impulse
+        for group, impulse in zip(groups, impulses, strict=True)
+    ]
+    normal, tangent = jnp.concatenate(by_pair, axis=1)
     return motion, replace(
         state,
         contact_active=manifold.active,
@@ -45,18 +56,28 @@ def solve(model: Model, state: State, manifold: Manifold, motion: Motion, params
     )
 
 
-def _contact_groups(model: Model, state: State, manifold: Manifold, params: Params):
-    """Constraints by kind, in solver order; the two points of polygon pairs are two groups."""
-    pairs = pairs_of(model.size)
+def _contact_groups(
+    model: Model, state: State, manifold: Manifold, motion: Motion, params: Params
+) -> tuple[list[Group], list[Array], Float[Array, "body 3 lane"]]:
+    """Constraints by kind, in solver order; their impulses from the last step; what these do to each body.
+
+    The two points of polygon pairs are two groups, of the same batches.
+    """
+    pairs, bodies = pairs_of(model.size), len(motion.velocity)
     n = len(pairs.polygon)
     either = manifold.active[:n] | manifold.active[n : 2 * n]
-    groups, impulses, start = [], [], 0
+    groups, impulses, warmth, start = [], [], jnp.zeros_like(motion.velocity), 0
     for pair in (pairs.polygon, pairs.polygon, pairs.circle_polygon, pairs.circle):
         at = slice(start, start + len(pair))
         start = at.stop
-        if len(pair):
-            touching = either if pair is pairs.polygon else manifold.active[at]
-            group, impulse = contacts.prepare(model, state, manifold, pair, at, touching, params)
-            groups.append(group)
-            impulses.append(impulse)
-    return groups, impulses
+        if not len(pair):
+            continue
+        contact, impulse = contacts.prepare(model, state, manifold, pair, at, params)
+        warmth += contacts.push(contact, contacts.arms(motion.position, contact), impulse, bodies)
+        group: Group = contact
+        if pair.batches > 1:
+            slots = slotted.assign(either if pair is pairs.polygon else manifold.active[at], pair)
+            group, impulse = slotted.move(slots, contact), slotted.gather(slots, jnp.moveaxis(impulse, 0, 1))
+        groups.append(group)
+        impulses.append(impulse)
+    return groups, impulses, warmth

@@ -73,6 +73,8 @@ def nonzero(x: Array) -> Array:
 
 def rows(x: Array, index: Sequence[int]) -> Array:
     """x[index] along the first axis for a static index, as slices and broadcasts: XLA's CPU gather is slow."""
+    if not index:
+        return x[:0]
     pieces, start = [], 0
     while start < len(index):
         stop = start + 1
