@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.motion import Motion, add, placed, select, stored
+from physics.motion import Motion, add, placed, select
 from physics.types import Model, Params, State
-from physics.vector import Vec, nonzero, spin, vec
+from physics.vector import Vec, nonzero, spin, stored, vec
 
 
 class Joint(NamedTuple):

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from physics.motion import incidence
 from physics.pairs import PairKind, pairs_of
 from physics.types import MAX_VERTICES, Manifold, Model, State
-from physics.vector import Vec, nonzero, rows, spin, unvec, vec, where
+from physics.vector import Vec, nonzero, rows, spin, stored, unvec, vec, where
 
 FLIP_BIAS = 0.01  # m; b must separate this much more than a to become the reference polygon (Jax2D `epsilon`)
 FAR = 1e30  # m; stands for a vertex or edge that does not exist
@@ -75,13 +75,9 @@ def _manifold(model: Model, state: State, pair: PairKind, c: Contacts) -> Manifo
     approach = (point_velocity(pair.b) - point_velocity(pair.a)).dot(c.normal)
     restitution = jnp.minimum(at(model.restitution, pair.a), at(model.restitution, pair.b))
     keep = lambda x: jnp.where(active, x, 0.0)
-    return Manifold(
-        active=active,
-        normal=unvec(c.normal.map(keep)),
-        penetration=keep(c.penetration),
-        point=unvec(c.point.map(keep)),
-        restitution_velocity=keep(approach * restitution),
-    )
+    sheets = (*c.normal, c.penetration, *c.point, approach * restitution)
+    n_x, n_y, penetration, p_x, p_y, bounce = stored(jnp.stack([keep(x) for x in sheets]))
+    return Manifold(active, unvec(Vec(n_x, n_y)), penetration, unvec(Vec(p_x, p_y)), bounce)
 
 
 def may_touch(model: Model, pair: PairKind) -> Bool[Array, "pair lane"]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
 from physics.types import Model
-from physics.vector import rows
+from physics.vector import gather, rows, stored
 
 Bodies = tuple[int, ...] | Int[Array, "thing lane"]  # body numbers: the same in every lane, or not
 
@@ -36,15 +36,7 @@ def select(x: Float[Array, "body *row lane"], body: Int[Array, " lane"]) -> Floa
 def _along(x: Float[Array, "body *row lane"], body: Int[Array, "thing lane"]) -> Float[Array, "thing *row lane"]:
     lanes = max(x.shape[-1], body.shape[-1])  # either may be the same in all lanes
     x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
-    index = jnp.broadcast_to(body, (len(body), lanes)).reshape(len(body), *[1] * (x.ndim - 2), lanes)
-    return jnp.take_along_axis(x, index, axis=0, mode="promise_in_bounds")
-
-
-def stored(x: Float[Array, "thing row lane"]) -> Float[Array, "thing row lane"]:
-    """x itself. A product with the identity matrix, because XLA stores the operands of a product, and would compute
-    x anew for each of its readers otherwise."""
-    flat = x.reshape(len(x), -1)
-    return jnp.matmul(np.eye(len(x), dtype=np.float32), flat).reshape(x.shape)
+    return gather(x, jnp.broadcast_to(body, (len(body), lanes)))
 
 
 def incidence(bodies: int, index: Sequence[int]) -> Float[np.ndarray, "body row"]:

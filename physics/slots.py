@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from physics import vector
 from physics.contact import Contact, solve
-from physics.motion import Motion, stored
+from physics.motion import Motion
 from physics.pairs import PairKind
 from physics.types import SOLVER_BATCH
-from physics.vector import Vec
+from physics.vector import Vec, stored
 
 CHUNK = 4  # slots solved by one kernel; more: wasted where few bodies touch, less: more kernels
 CHUNKS = SOLVER_BATCH // CHUNK  # of a full batch
@@ -52,7 +53,7 @@ def assign(touching: Bool[Array, "pair lane"], pair: PairKind) -> Slots:
     number = functools.reduce(jnp.add, ((row <= k).astype(jnp.int32) for row in rank))
     in_batch = (place - first) // batches
     return Slots(
-        pair=number.reshape(batches, CHUNKS, CHUNK, -1),
+        pair=stored(number.astype(jnp.float32)).astype(jnp.int32).reshape(batches, CHUNKS, CHUNK, -1),
         used=(-(-rank[-1].max() // batches) + CHUNK - 1) // CHUNK,
         slot=place % batches * (CHUNKS * CHUNK) + in_batch,
         touching=touching,
@@ -63,16 +64,16 @@ def move(slots: Slots, contact: Contact) -> SlottedContacts:
     """The contacts of all pairs to their slots."""
     body = lambda index: jnp.asarray(index, jnp.float32)[:, None]
     leaves = jax.tree.leaves(contact._replace(a=body(contact.a), b=body(contact.b)))
-    return SlottedContacts(slots, gather(slots, jnp.stack(jnp.broadcast_arrays(*leaves), axis=1)))
+    rows = stored(jnp.stack(jnp.broadcast_arrays(*leaves)))
+    return SlottedContacts(slots, gather(slots, jnp.moveaxis(rows, 0, 1)))
 
 
 def gather(slots: Slots, x: Float[Array, "pair row lane"]) -> Float[Array, "batch chunk slot row lane"]:
     """Rows of the pairs in the slots, zero in empty slots."""
     pairs, (*places, lanes) = len(x), slots.pair.shape
-    number = slots.pair.reshape(-1, 1, lanes)
-    index = jnp.minimum(number, pairs - 1)
-    rows = jnp.take_along_axis(x, index, axis=0, mode="promise_in_bounds")
-    return jnp.where(number < pairs, rows, 0.0).reshape(*places, -1, lanes)
+    number = slots.pair.reshape(-1, lanes)
+    rows = vector.gather(x, jnp.minimum(number, pairs - 1))
+    return jnp.where(number[:, None] < pairs, rows, 0.0).reshape(*places, -1, lanes)
 
 
 def _contact(rows: Float[Array, "slot row lane"]) -> Contact:
@@ -107,6 +108,5 @@ def sweep(
 def scatter(slots: Slots, impulse: Float[Array, "batch chunk slot 2 lane"]) -> Float[Array, "2 pair lane"]:
     """Impulses back from the slots to their pairs; zero for pairs that do not touch."""
     flat = impulse.reshape(-1, *impulse.shape[-2:])
-    index = jnp.where(slots.touching, slots.slot, 0)[:, None]
-    found = jnp.take_along_axis(flat, index, axis=0, mode="promise_in_bounds")
+    found = vector.gather(flat, jnp.where(slots.touching, slots.slot, 0))
     return jnp.moveaxis(jnp.where(slots.touching[:, None], found, 0.0), 1, 0)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 
 class Vec(NamedTuple):
@@ -90,3 +91,17 @@ def rows(x: Array, index: Sequence[int]) -> Array:
             pieces.append(jnp.broadcast_to(x[first : first + 1], (count, *x.shape[1:])))
         start = stop
     return pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
+
+
+def gather(x: Float[Array, "source *row lane"], index: Int[Array, "thing lane"]) -> Float[Array, "thing *row lane"]:
+    """x[index[thing, lane], ..., lane], for an index in bounds. Flat, because XLA would transpose x otherwise."""
+    lanes, size = x.shape[-1], x[0].size
+    within = jnp.arange(size, dtype=jnp.int32).reshape(x.shape[1:])
+    flat = index.reshape(len(index), *[1] * (x.ndim - 2), lanes) * size + within
+    return x.reshape(-1).at[flat].get(mode="promise_in_bounds")
+
+
+def stored(x: Float[Array, "sheet ..."]) -> Float[Array, "sheet ..."]:
+    """x itself. A product with the identity matrix, because XLA stores the operands of a product, and would compute
+    x anew for each of its readers otherwise. Cheap where there are few sheets."""
+    return jnp.matmul(np.eye(len(x), dtype=np.float32), x.reshape(len(x), -1)).reshape(x.shape)
