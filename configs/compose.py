@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, Quote, QuotedString
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -72,10 +72,10 @@ def _parsed(text: str) -> Override:
     quoted = f"{key}={QuotedString(value, Quote.single).with_quotes()}"
     try:
         override = OverridesParser.create().parse_override(quoted if key in WORDS and value[:1] not in "'\"" else text)
-    except OverrideParseException:
+    except HydraException:
         try:
             override = OverridesParser.create().parse_override(quoted)
-        except OverrideParseException:
+        except HydraException:
             raise ConfigError(f"cannot read {text!r}: write settings as NAME=VALUE, as in levels=64.") from None
     if override.is_add() or override.is_force_add() or override.is_delete():
         raise ConfigError(f"cannot use {text!r}: settings can be changed, not added or removed.")

@@ -17,7 +17,7 @@ from pipeline.schema import RECORD_STEPS
 from pipeline.shard import stored_bytes
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
-SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps", "shard", "row")
+SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps")
 
 
 def inspect(split: Path, where: str | None, rows: int, as_json: bool) -> None:
@@ -111,7 +111,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     for name, text in lines.items():
         if text is not None:
             console.print(f"{name + ':':33}{text}", markup=False, soft_wrap=True)
-    table = Table(*SHOWN, box=None, pad_edge=False)
+    table = Table(*SHOWN, box=None, pad_edge=False, padding=(0, 1, 0, 0))  # fits 80 columns
     for row in facts["rows"]:
         table.add_row(*(_cell(row[name]) for name in SHOWN))
     if facts["rows"]:

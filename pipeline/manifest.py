@@ -139,8 +139,8 @@ def read_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest
         if fragment.config_hash != fragments[0].config_hash:
             changes = told(differences(fragments[0].config, fragment.config))
             raise Failure(
-                f"The split {split} mixes two configurations, {fragments[0].path.name} and {fragment.path.name} ({changes}): "
-                "move the fragments of one of them elsewhere."
+                f"The split {split} mixes two configurations, {fragments[0].path.name} and {fragment.path.name} "
+                f"({changes}): move the fragments of one of them elsewhere."
             )
     schema = COLUMNS if names is None else pa.schema([COLUMNS.field(name) for name in names])
     table = (

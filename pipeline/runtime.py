@@ -14,8 +14,8 @@ CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
 # One process per core, each with one thread, is twice as fast as one process with XLA's own threads; and a sum
 # that is split over threads would make a level's bits depend on the machine's number of cores.
 XLA_FLAGS = ("--xla_cpu_multi_thread_eigen=false", "intra_op_parallelism_threads=1")
-# NPROC and PJRT_NPROC size XLA's pool. With two or more threads, two QR factorisations at once (the experts'
-# orthogonal weights) can hold every thread while each waits for parts of its work to get one: a deadlock in jaxlib 0.10.
+# NPROC and PJRT_NPROC size XLA's pool. With two or more threads, QR factorisations side by side (the experts'
+# orthogonal weights) can hold every thread while each waits for parts of its work to get one: a deadlock of jaxlib.
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MIN_COMPILE_SECONDS = 0.2  # what compiles faster is not worth a file
 

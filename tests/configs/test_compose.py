@@ -64,6 +64,7 @@ def test_out_may_be_any_path(text: str) -> None:
         ("~levels", "NAME=VALUE"),
         ("levels", "NAME=VALUE"),
         ("=3", "NAME=VALUE"),
+        ("0=", "NAME=VALUE"),
         ("task=3", "group of settings"),
     ],
 )
