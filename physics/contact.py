@@ -7,7 +7,7 @@ Facts: `jax2d.collision.resolve_collision`.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from physics.motion import Bodies, Motion, add, take
 from physics.pairs import PairKind
@@ -28,10 +28,17 @@ class Contact(NamedTuple):
     inertia_a: Array  # inverse
     inertia_b: Array
     kept: Array  # 0 where the padding defect forgets the accumulated impulses, else 1
+    batch: Array | None  # solver batch; None: all are in one
 
 
 def prepare(
-    model: Model, state: State, manifold: Manifold, pair: PairKind, at: slice, params: Params
+    model: Model,
+    state: State,
+    manifold: Manifold,
+    pair: PairKind,
+    at: slice,
+    batch: Int[Array, "pair lane"] | None,
+    params: Params,
 ) -> tuple[Contact, Float[Array, "2 pair lane"]]:
     """The contacts `at` of a manifold as constraints, with their warm-start impulses (normal, tangent; N s)."""
     active = manifold.active[at]
@@ -55,6 +62,7 @@ def prepare(
         inertia_a=keep(rows(model.inverse_inertia, pair.a)),
         inertia_b=keep(rows(model.inverse_inertia, pair.b)),
         kept=jnp.where(last & forgotten, 0.0, jnp.ones_like(target)),
+        batch=batch,
     )
     remembered = acts & state.contact_active[at]
     impulses = jnp.stack([state.contact_normal_impulse[at], state.contact_tangent_impulse[at]])
@@ -78,9 +86,11 @@ def arms(position: Float[Array, "body 2 lane"], contact: Contact) -> Arms:
 
 
 def solve(
-    motion: Motion, contact: Contact, impulse: Float[Array, "2 pair lane"]
+    motion: Motion, contact: Contact, impulse: Float[Array, "2 pair lane"], batch: int = 0
 ) -> tuple[Float[Array, "2 pair lane"], Float[Array, "body 3 lane"]]:
     """The accumulated impulses that bring each contact to its target, clamped to push and to the friction cone.
+
+    Only contacts of solver batch `batch` change, where there are several.
 
     Returns:
         The new accumulated impulses, and what their changes do to each body.
@@ -100,7 +110,11 @@ def solve(
     limit = contact.friction * normal
     tangent = jnp.clip(impulse[1] - mass_tangent * slide, -limit, limit)
     now = jnp.stack([normal, tangent])
-    return now * contact.kept, push(contact, arm, now - impulse, len(motion.velocity))
+    kept = now * contact.kept
+    if contact.batch is not None:
+        mine = contact.batch == batch
+        now, kept = jnp.where(mine, now, impulse), jnp.where(mine, kept, impulse)
+    return kept, push(contact, arm, now - impulse, len(motion.velocity))
 
 
 def push(contact: Contact, arm: Arms, impulse: Float[Array, "2 pair lane"], bodies: int) -> Float[Array, "body 3 lane"]:

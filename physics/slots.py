@@ -1,4 +1,4 @@
-"""Kinds of pairs too many for one solver batch: only those that touch are solved, moved together into slots.
+"""Kinds of pairs too many for two solver batches: only those that touch are solved, moved together into slots.
 
 The reference sorts pairs stably, inactive first, and the pair at sorted place p belongs to batch p mod batches. So
 the k-th of A touching pairs among N stands at place N - A + k, and batch t holds every `batches`-th touching pair.
@@ -21,6 +21,7 @@ from physics.types import SOLVER_BATCH
 from physics.vector import Vec, stored
 
 CHUNK = 4  # slots solved by one kernel; more: wasted where few bodies touch, less: more kernels
+SLOTS_FROM = 3  # solver batches; with fewer, solving all pairs in every batch costs less than moving them
 CHUNKS = SOLVER_BATCH // CHUNK  # of a full batch
 
 
@@ -38,6 +39,12 @@ class SlottedContacts(NamedTuple):
 
     slots: Slots
     rows: Float[Array, "batch chunk slot row lane"]  # of each contact: all its numbers, so that a chunk loads at once
+
+
+def batches_of(touching: Bool[Array, "pair lane"], pair: PairKind) -> Int[Array, "pair lane"]:
+    """Solver batch of each touching pair."""
+    rank = jnp.cumsum(touching, axis=0, dtype=jnp.int32)
+    return (len(pair) - rank[-1] + rank - 1) % pair.batches
 
 
 def assign(touching: Bool[Array, "pair lane"], pair: PairKind) -> Slots:
@@ -78,7 +85,7 @@ def gather(slots: Slots, x: Float[Array, "pair row lane"]) -> Float[Array, "batc
 
 def _contact(rows: Float[Array, "slot row lane"]) -> Contact:
     a, b, n_x, n_y, p_x, p_y, *rest = jnp.moveaxis(rows, 1, 0)
-    return Contact(a.astype(jnp.int32), b.astype(jnp.int32), Vec(n_x, n_y), Vec(p_x, p_y), *rest)
+    return Contact(a.astype(jnp.int32), b.astype(jnp.int32), Vec(n_x, n_y), Vec(p_x, p_y), *rest, batch=None)
 
 
 def sweep(

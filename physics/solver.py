@@ -12,10 +12,10 @@ from physics import slots as slotted
 from physics.contact import Contact
 from physics.motion import Motion, inverse_masses
 from physics.pairs import pairs_of
-from physics.slots import SlottedContacts
+from physics.slots import SLOTS_FROM, SlottedContacts, batches_of
 from physics.types import SOLVER_ITERATIONS, Manifold, Model, Params, State
 
-# Contacts that are solved together: of all pairs of a kind where one solver batch holds them, else in slots
+# Contacts that are solved together: of all pairs of a kind where a solver batch or two hold them, else in slots
 Group = Contact | SlottedContacts
 
 
@@ -34,8 +34,9 @@ def solve(model: Model, state: State, manifold: Manifold, motion: Motion, params
             if isinstance(group, SlottedContacts):
                 motion, impulse = slotted.sweep(masses, motion, group, impulse)
             else:
-                impulse, change = contacts.solve(motion, group, impulse)
-                motion = motion._replace(velocity=motion.velocity + masses * change)
+                for batch in range(SLOTS_FROM - 1 if group.batch is not None else 1):
+                    impulse, change = contacts.solve(motion, group, impulse, batch)
+                    motion = motion._replace(velocity=motion.velocity + masses * change)
             solved.append(impulse)
         return (motion, joint_impulse, solved), None
 
@@ -72,11 +73,13 @@ def _contact_groups(
         start = at.stop
         if not len(pair):
             continue
-        contact, impulse = contacts.prepare(model, state, manifold, pair, at, params)
+        touching = either if pair is pairs.polygon else manifold.active[at]
+        batch = batches_of(touching, pair) if 1 < pair.batches < SLOTS_FROM else None
+        contact, impulse = contacts.prepare(model, state, manifold, pair, at, batch, params)
         warmth += contacts.push(contact, contacts.arms(motion.position, contact), impulse, bodies)
         group: Group = contact
-        if pair.batches > 1:
-            slots = slotted.assign(either if pair is pairs.polygon else manifold.active[at], pair)
+        if pair.batches >= SLOTS_FROM:
+            slots = slotted.assign(touching, pair)
             group, impulse = slotted.move(slots, contact), slotted.gather(slots, jnp.moveaxis(impulse, 0, 1))
         groups.append(group)
         impulses.append(impulse)
