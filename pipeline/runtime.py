@@ -13,7 +13,11 @@ from pathlib import Path
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
 # One process per core, each with one thread, is twice as fast as one process with XLA's own threads; and a sum
 # that is split over threads would make a level's bits depend on the machine's number of cores.
-XLA_FLAGS = ("--xla_cpu_multi_thread_eigen=false", "intra_op_parallelism_threads=1")
+XLA_FLAGS = (
+    "--xla_cpu_multi_thread_eigen=false",
+    "intra_op_parallelism_threads=1",
+    "--xla_cpu_prefer_vector_width=512",  # where the processor has it; worth 10 to 20% of the physics
+)
 # NPROC and PJRT_NPROC size XLA's pool. With two or more threads, QR factorisations side by side (the experts'
 # orthogonal weights) can hold every thread while each waits for parts of its work to get one: a deadlock of jaxlib.
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
