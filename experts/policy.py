@@ -24,6 +24,30 @@ FIRSTS = np.cumsum([0, *CHOICES[:-1]]).tolist()  # of each entry's logits
 HIDDEN_GAIN, POLICY_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0  # of orthogonal initial kernels
 
 
+def orthogonal(gain: float) -> nn.initializers.Initializer:
+    """Kernels with orthogonal rows (or columns, if these are fewer) of length `gain`, evenly distributed.
+
+    Gram-Schmidt, twice for accuracy, on a Gaussian matrix. Flax's own does a QR factorisation, and several of these
+    side by side can deadlock the thread pool of jaxlib 0.10's CPU backend.
+    """
+
+    def initialise(key, shape, dtype=jnp.float32):
+        units, inputs = shape
+        if units > inputs:
+            return initialise(key, (inputs, units), dtype).T
+
+        def add_row(k, kernel):
+            earlier = jnp.where(jnp.arange(units)[:, None] < k, kernel, 0.0)
+            row = kernel[k]
+            for _ in range(2):
+                row = row - earlier.T @ (earlier @ row)
+            return kernel.at[k].set(row / jnp.linalg.norm(row))
+
+        return gain * jax.lax.fori_loop(0, units, add_row, jax.random.normal(key, shape, dtype))
+
+    return initialise
+
+
 class Dense(nn.Module):
     """A layer on columns."""
 
@@ -32,7 +56,7 @@ class Dense(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "input lane"]) -> Float[Array, "unit lane"]:
-        kernel = self.param("kernel", nn.initializers.orthogonal(self.gain), (self.units, x.shape[0]))
+        kernel = self.param("kernel", orthogonal(self.gain), (self.units, x.shape[0]))
         bias = self.param("bias", nn.initializers.zeros, (self.units,))
         return kernel @ x + bias[:, None]
 
@@ -48,7 +72,7 @@ class FirstDense(nn.Module):
     def __call__(
         self, constant: Float[Array, " feature"], moving: Float[Array, "dynamic lane"]
     ) -> Float[Array, "unit lane"]:
-        kernel = self.param("kernel", nn.initializers.orthogonal(self.gain), (self.units, constant.shape[0]))
+        kernel = self.param("kernel", orthogonal(self.gain), (self.units, constant.shape[0]))
         bias = self.param("bias", nn.initializers.zeros, (self.units,))
         columns = rows(kernel.T, self.moving_rows)
         return columns.T @ moving + (bias + kernel @ constant)[:, None]

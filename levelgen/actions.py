@@ -27,7 +27,9 @@ def controls(
     return jnp.where(level.motor_auto, 1.0, motor), thrust
 
 
-def _bound(binding: Int[Array, "actuator lane"], entries: Float[Array, "binding lane"]) -> Float[Array, "actuator lane"]:
+def _bound(
+    binding: Int[Array, "actuator lane"], entries: Float[Array, "binding lane"]
+) -> Float[Array, "actuator lane"]:
     """The entry each actuator is bound to, picked by comparison: a gather per lane is slower."""
     return sum((jnp.where(binding == k, entry, 0.0) for k, entry in enumerate(entries)), jnp.float32(0.0))
 

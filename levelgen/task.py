@@ -30,6 +30,13 @@ class TaskParams:
     dense_reward_scale: float = 0.1  # 1/m; reward for each metre that green and blue come closer; 0: none
     physics: Params = field(default_factory=Params)
 
+    def __post_init__(self) -> None:
+        for name in ("frame_skip", "max_timesteps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
+        if self.dense_reward_scale < 0:
+            raise ValueError(f"dense_reward_scale is {self.dense_reward_scale}: it must not be negative")
+
 
 DEFAULT_RULES = TaskParams()
 

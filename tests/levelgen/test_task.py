@@ -236,3 +236,16 @@ def test_red_wins_over_blue() -> None:
     _, outcome = episode_step()(level, reset(level), np.zeros((6, len(both)), np.int32))
     assert np.asarray(outcome.goal).all()
     np.testing.assert_array_equal(outcome.reward, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"frame_skip": 0}, "frame_skip is 0"),
+        ({"max_timesteps": 0}, "max_timesteps"),
+        ({"dense_reward_scale": -1.0}, "negative"),
+    ],
+)
+def test_impossible_rules_are_refused(change: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        TaskParams(**change)

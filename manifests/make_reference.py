@@ -1,0 +1,30 @@
+"""Writes a split's manifest as one file, and its levels' initial worlds, into this folder. See README.md here.
+
+python manifests/make_reference.py data/128k/s
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from levelgen.level import SIZES
+from levelgen.sampler import sample_levels
+from pipeline.fields import arrays_of
+from pipeline.manifest import read_manifest
+from pipeline.runtime import prepare_jax
+
+
+def main(split: Path) -> None:
+    prepare_jax()
+    name = f"{split.parent.name}-{split.name}"
+    here = Path(__file__).parent
+    table = read_manifest(split).table.sort_by("level_id")
+    pq.write_table(table, here / f"{name}.parquet", compression="zstd")
+    levels = arrays_of(sample_levels(table["level_id"].to_numpy(), SIZES[split.name]))
+    np.savez_compressed(here / f"{name}-levels.npz", **levels)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,44 @@
+"""The committed reference manifest can be made again."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from configs.compose import compose_job
+from experts.train import train_levels
+from levelgen.level import SIZES
+from levelgen.sampler import sample_levels
+from pipeline.fields import arrays_of
+
+FOLDER = Path(__file__).parent.parent / "manifests"
+ROWS = pq.read_table(FOLDER / "128k-s.parquet").to_pylist()
+WORLDS = dict(np.load(FOLDER / "128k-s-levels.npz"))
+IDS = np.array([row["level_id"] for row in ROWS])
+
+
+def test_it_describes_the_default_dataset() -> None:
+    assert IDS.tolist() == list(range(64))
+    assert {row["config_hash"] for row in ROWS} == {compose_job([]).hash}, "make it again: manifests/README.md"
+    assert {row["label"] for row in ROWS} == {"solved", "unsolved"}
+
+
+def test_every_level_starts_as_it_did() -> None:
+    for name, values in arrays_of(sample_levels(IDS, SIZES["s"])).items():
+        np.testing.assert_allclose(values, WORLDS[name], rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.slow
+def test_three_levels_come_out_as_they_did() -> None:
+    """Two that were solved early and one where the goal was never reached: no change of last bits decides these."""
+    early = sorted((r for r in ROWS if r["label"] == "solved"), key=lambda r: r["steps_to_first_success"])[1:3]
+    never = next(r for r in ROWS if r["label"] == "unsolved" and r["steps_to_first_success"] is None)
+    chosen = np.array([row["level_id"] for row in (*early, never)])
+    job = compose_job([])
+    levels = jax.tree.map(np.asarray, sample_levels(chosen, SIZES["s"], job.distribution))
+    for name, values in arrays_of(levels).items():
+        np.testing.assert_allclose(values, WORLDS[name][..., chosen], rtol=1e-5, atol=1e-6, err_msg=name)
+    result = train_levels(levels, chosen, job.env_steps, job.expert, job.task)
+    assert [v.label for v in result.verdicts] == ["solved", "solved", "unsolved"]
