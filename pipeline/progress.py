@@ -22,7 +22,7 @@ class Tally:
     levels: int  # wanted
     done: int  # committed, those of earlier runs included
     solved: int
-    budget: int  # env steps per level at most
+    budget: int  # env steps per level
     running: dict[WorkUnit, tuple[int, int]] = field(default_factory=dict)  # env steps, solved
     env_steps: int = 0  # of this run's committed units
     history: deque[tuple[float, int]] = field(default_factory=deque)  # time, env steps of this run
@@ -59,6 +59,13 @@ class Tally:
         return min(1.0, (self.done + under_way) / self.levels)
 
     @property
+    def trained(self) -> int:
+        """Levels whose experts have had their budget, committed or not."""
+        return self.done + sum(
+            min(steps // self.budget, len(unit.level_ids)) for unit, (steps, _) in self.running.items()
+        )
+
+    @property
     def solved_so_far(self) -> int:
         return self.solved + sum(solved for _, solved in self.running.values())
 
@@ -78,7 +85,9 @@ class Tally:
     def text(self, now: float) -> str:
         left = self.left(now)
         tail = f"about {duration(left)} left" if left is not None else "compiling" if not self.rate else "..."
-        return f"{self.done}/{self.levels} levels · {self.solved_so_far} solved · {self.rate:,.0f} env steps/s · {tail}"
+        return (
+            f"{self.trained}/{self.levels} levels · {self.solved_so_far} solved · {self.rate:,.0f} env steps/s · {tail}"
+        )
 
 
 class Board:

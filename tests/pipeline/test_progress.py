@@ -78,3 +78,13 @@ def test_a_bar_on_a_terminal() -> None:
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (89, "89 s"), (90, "2 min"), (5400, "1.5 h")])
 def test_durations(seconds: float, text: str) -> None:
     assert duration(seconds) == text
+
+
+def test_levels_count_when_their_experts_are_trained() -> None:
+    now = tally(done=16)
+    now.progress(UNIT, 3_999, 1)
+    assert now.trained == 16 + 3
+    now.tick(0.0)
+    assert now.text(0.0).startswith("19/64 levels")
+    now.progress(UNIT, 999_999, 1)
+    assert now.trained == 32
