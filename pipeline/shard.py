@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import zarr
-from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
+from zarr.codecs import BloscCodec, Crc32cCodec
 
 from pipeline.errors import Failure
 from pipeline.layout import fragment_of
@@ -47,7 +47,7 @@ def write_shard(path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.nd
     with zarr.config.set({"json_indent": None}):  # of a small shard, half would be blanks
         group = zarr.create_group(path, attributes=attributes)
         for name, values in pack(arrays, table).items():
-            blosc = BloscCodec(cname="zstd", clevel=LEVEL, shuffle=BloscShuffle.shuffle, typesize=values.dtype.itemsize)
+            blosc = BloscCodec(cname="zstd", clevel=LEVEL, shuffle="shuffle", typesize=values.dtype.itemsize)
             group.create_array(
                 name,
                 data=values,

@@ -224,8 +224,8 @@ def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(made:
 
 @pytest.mark.slow
 def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path) -> None:
-    """An expert that cannot be built: every attempt fails, the command says so and ends with 3."""
-    done = run(["generate", "levels=1", "budget=5k", "task.frame_skip=0", "executor=inline"], tmp_path)
+    """Steps that a 32-bit counter cannot count: every attempt fails, the command says so and ends with 3."""
+    done = run(["generate", "levels=1", "budget=5k", "task.max_timesteps=3000000000", "executor=inline"], tmp_path)
     assert done.returncode == 3, done.stderr
     assert done.stderr.count("trying again") == 2
     assert "given up" in done.stderr

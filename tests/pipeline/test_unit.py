@@ -121,7 +121,7 @@ def test_a_unit_without_solved_levels_has_no_shard(tmp_path: Path, job: JobConfi
 
 
 def test_a_failed_attempt_is_a_value(tmp_path: Path) -> None:
-    broken = made_job("data", "budget=5k", "expert.minibatches=1", "task.frame_skip=0")  # a step without physics
+    broken = made_job("data", "budget=5k", "task.max_timesteps=3000000000")  # no 32-bit counter reaches it
     outcome = attempt(broken, tmp_path, UNIT, lambda steps, solved: None)
     assert outcome.summary is None
     assert "Traceback" in outcome.reason
