@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-SINGLE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+# As ours runs (pipeline/runtime.py), so that neither side has an advantage
+SINGLE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1 --xla_cpu_prefer_vector_width=512"
 
 
 def stay_on(core: int | None) -> None:

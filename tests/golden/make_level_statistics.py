@@ -11,7 +11,6 @@ as FILE with {size} in its name replaced.
 """
 
 import argparse
-import dataclasses
 import json
 from importlib.metadata import version
 from pathlib import Path
@@ -21,23 +20,12 @@ import numpy as np
 from kinetix.environment import EnvParams, static_env_params_from_size
 from kinetix.environment.ued.ued import make_reset_fn_sample_kinetix_level
 from level_statistics import statistics
+from make_golden import flatten
 
 QUANTILES = 256
 COUNTED = 40  # statistics with at most so many different values are kept as counts
 COUNTS = {"s": 20000, "m": 20000, "l": 8000}  # levels
 BATCH = 1000
-
-
-def flatten(state, prefix=""):
-    """A state as {path: array}."""
-    fields = {}
-    for field in dataclasses.fields(state):
-        value = getattr(state, field.name)
-        if dataclasses.is_dataclass(value):
-            fields |= flatten(value, f"{prefix}{field.name}/")
-        else:
-            fields[prefix + field.name] = np.asarray(value)
-    return fields
 
 
 def sample(size, count, seed):
