@@ -28,7 +28,7 @@ from levelgen.level import Level
 from levelgen.observe import dynamic_features, feature_count, level_features
 from levelgen.task import DEFAULT_RULES, TaskParams, TaskState
 
-LANES_IN_CACHE = 128  # a core's best batch of the physics, see docs/benchmarks.md
+LANES_IN_CACHE = 128  # their physics and one minibatch fit the cache of a core
 LANES_ON_ACCELERATOR = 32_768
 
 Report = Callable[[int, int], None]  # (env steps so far, levels solved so far)

@@ -143,9 +143,14 @@ def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
     assert not (tmp_path / SPLIT / "quarantine").exists()
 
 
+def heed_ctrl_c() -> None:
+    """As a command in a terminal's foreground: a shell's background jobs, and what they start, ignore SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
-    process = start(COMMAND, tmp_path)
+    process = start(COMMAND, tmp_path, preexec_fn=heed_ctrl_c)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
     family = descendants(process)
     os.killpg(process.pid, number)  # as a terminal does
