@@ -19,10 +19,9 @@ from jaxtyping import Array, Bool, Float, Int
 from levelgen import task
 from levelgen.level import Level
 from levelgen.task import DEFAULT_RULES, TaskParams, TaskState
-from physics.motion import select
 from physics.pairs import pairs_of
 from physics.types import Manifold, State
-from physics.vector import unvec, vec
+from physics.vector import select, unvec, vec
 
 RECORD_STEPS = 256
 LANES = 64
@@ -86,7 +85,7 @@ def _lanes(tree: T, lanes: np.ndarray) -> T:
 def _replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskParams) -> Record:
     def act(carry: tuple[TaskState, Manifold], action):
         now, manifold = carry
-        after, outcome, contacts = task.advance(level, now, action, rules)
+        after, outcome, contacts = task.advance_seen(level, now, action, rules)
         record = Record(
             now.state,
             manifold,

@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from levelgen.actions import controls
 from levelgen.level import Level, Role
-from physics.motion import select
 from physics.pairs import pairs_of
 from physics.step import step as physics_step
+from physics.step import step_unseen
 from physics.types import Manifold, Params, State
-from physics.vector import rows, vec
+from physics.vector import rows, select, vec
 
 NO_DISTANCE = -1.0  # last_distance before the first step of an episode
 
@@ -72,7 +72,7 @@ def has_roles(level: Level, a, b, first: Role, second: Role) -> Bool[Array, "pai
     return ((role_a == first) & (role_b == second)) | ((role_a == second) & (role_b == first))
 
 
-def touches(level: Level, manifold: Manifold, first: Role, second: Role) -> Bool[Array, " lane"]:
+def touches(level: Level, active: Bool[Array, "contact lane"], first: Role, second: Role) -> Bool[Array, " lane"]:
     """Whether bodies of these roles are in contact.
 
     The first contact point of a polygon pair, or the contact of a circle pair, counts.
@@ -81,7 +81,7 @@ def touches(level: Level, manifold: Manifold, first: Role, second: Role) -> Bool
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
     at = {0: pairs.polygon, 2 * n: pairs.circle_polygon, 2 * n + m: pairs.circle}
     hits = [
-        (has_roles(level, pair.a, pair.b, first, second) & manifold.active[start : start + len(pair)]).any(0)
+        (has_roles(level, pair.a, pair.b, first, second) & active[start : start + len(pair)]).any(0)
         for start, pair in at.items()
         if len(pair)
     ]
@@ -105,24 +105,31 @@ class Frame(NamedTuple):
     goal: Bool[Array, " lane"]
     fail: Bool[Array, " lane"]
     distance: Float[Array, " lane"]
-    manifold: Manifold
+    seen: Manifold | None
 
 
 def advance(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
-) -> tuple[TaskState, Outcome, Manifold]:
-    """One env step without reset.
+) -> tuple[TaskState, Outcome]:
+    """One env step without reset: the next state, and what the step gave."""
+    return _advance(level, now, action, params, lambda *given: (step_unseen(*given), None))[:2]
 
-    Returns:
-        The next state, what the step gave, and the contacts of its last physics step.
-    """
+
+def advance_seen(
+    level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
+) -> tuple[TaskState, Outcome, Manifold]:
+    """The same, and the contacts of the last physics step."""
+    return _advance(level, now, action, params, physics_step)
+
+
+def _advance(level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams, physics) -> tuple:
     motor, thrust = controls(level, action)
 
     def frame(state, _):
-        state, manifold = physics_step(level.model, state, motor, thrust, params.physics)
-        fail = touches(level, manifold, Role.GREEN, Role.RED)
-        goal = touches(level, manifold, Role.GREEN, Role.BLUE) & ~fail
-        return state, Frame(goal, fail, goal_distance(level, state), manifold)
+        state, seen = physics(level.model, state, motor, thrust, params.physics)
+        fail = touches(level, state.contact_active, Role.GREEN, Role.RED)
+        goal = touches(level, state.contact_active, Role.GREEN, Role.BLUE) & ~fail
+        return state, Frame(goal, fail, goal_distance(level, state), seen)
 
     state, frames = jax.lax.scan(frame, now.state, None, length=params.frame_skip)
     ended = frames.goal | frames.fail
@@ -137,7 +144,7 @@ def advance(
     shaping = jnp.where(now.last_distance == NO_DISTANCE, 0.0, params.dense_reward_scale * closer)
     reward = goal.astype(jnp.float32) - select(frames.fail, first).astype(jnp.float32) + shaping
     after = TaskState(state, timestep, jnp.where(done, NO_DISTANCE, distance))
-    return after, Outcome(reward, done, goal), jax.tree.map(lambda x: x[-1], frames.manifold)
+    return after, Outcome(reward, done, goal), jax.tree.map(lambda x: x[-1], frames.seen)
 
 
 def has_nan(state: State) -> Bool[Array, " lane"]:
@@ -162,5 +169,5 @@ def step(
         action: multi-discrete, one entry per binding (`levelgen.actions`).
         params: rules.
     """
-    after, outcome, _ = advance(level, now, action, params)
+    after, outcome = advance(level, now, action, params)
     return restart(level, after, outcome.done), outcome

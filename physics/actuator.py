@@ -3,66 +3,58 @@
 Facts: `jax2d.joint.apply_motor`, `jax2d.engine`.
 """
 
-import functools
-
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
 
-from physics.joint import can_act, joint_angle
-from physics.motion import inverse_masses, placed, select
+from physics.body import Bodies
+from physics.joint import Joints
+from physics.lanes import Ref, anywhere, each, pick, spread, when
+from physics.trigonometry import cos_sin, tanh
 from physics.types import Model, Params, State
-from physics.vector import Vec, vec
+from physics.vector import Vec
 
 
-def drive_motors(
-    model: Model,
-    state: State,
-    velocity: Float[Array, "body 3 lane"],
-    control: Float[Array, "joint lane"],
-    params: Params,
-) -> Float[Array, "body 3 lane"]:
+def drive_motors(model: Model, bodies: Bodies, joints: Joints, control: Ref, params: Params) -> None:
     """Angular impulses that bring each motor's joint to its speed, weakened near the joint limits.
 
-    `control` is in [-1, 1], one per joint.
+    `control` [joint, lane] is in [-1, 1].
     """
-    w = velocity[:, 2]
-    each = lambda x, body: jnp.stack([select(x, b) for b in body])
-    inertia_a, inertia_b = each(model.inverse_inertia, model.joint_a), each(model.inverse_inertia, model.joint_b)
-    both = inertia_a + inertia_b
-    power = params.motor_power * params.dt * model.motor_power / jnp.where(both == 0, 1.0, both)
-    excess = each(w, model.joint_b) - each(w, model.joint_a) - model.motor_speed * control * params.motor_speed
 
-    angle = joint_angle(model, state)
-    zone = params.motor_limit_zone
-    beyond = angle - jnp.clip(angle, model.joint_min + zone, model.joint_max - zone)
-    towards_limit = model.joint_limited & (beyond != 0) & (jnp.sign(beyond) == jnp.sign(control))
-    power = power * jnp.where(towards_limit, jnp.maximum(0.0, 1 - jnp.abs(beyond) / zone), 1.0)
+    def one(j):
+        runs = joints.acts[j] & model.motor_on[j] & (control[j] != 0) & ~model.joint_fixed[j]
+        when(anywhere(runs), lambda: drive(j, runs))
 
-    runs = can_act(model) & model.motor_on & (control != 0) & ~model.joint_fixed
-    turn = jnp.where(runs, power * jnp.tanh(excess * params.motor_decay), 0.0)
-    on_a, on_b = (turn * inertia_a)[:, None], (turn * inertia_b)[:, None]
-    gained = _total(model.joint_a, on_a, len(w)) - _total(model.joint_b, on_b, len(w))
-    return jnp.concatenate([velocity[:, :2], velocity[:, 2:] + gained], axis=1)
+    def drive(j, runs):
+        a, b = model.joint_a[j], model.joint_b[j]
+        motion_a, motion_b = pick(bodies.motion.shape[0], lambda i: bodies.motion[i], a, b)
+        _, _, inertia_a, inertia_b = joints.masses[j]
+        both = inertia_a + inertia_b
+        power = params.motor_power * params.dt * model.motor_power[j] / jnp.where(both == 0, 1.0, both)
+        excess = motion_b[4] - motion_a[4] - model.motor_speed[j] * control[j] * params.motor_speed
 
+        zone, angle = params.motor_limit_zone, joints.angle[j]
+        beyond = angle - jnp.clip(angle, model.joint_min[j] + zone, model.joint_max[j] - zone)
+        towards_limit = model.joint_limited[j] & (beyond != 0) & (jnp.sign(beyond) == jnp.sign(control[j]))
+        power = power * jnp.where(towards_limit, jnp.maximum(0.0, 1 - jnp.abs(beyond) / zone), 1.0)
+        turn = jnp.where(runs, power * tanh(excess * params.motor_decay), 0.0)
+        none = jnp.zeros_like(turn)
+        spread(bodies.push, (a, jnp.stack([none, none, turn])), (b, jnp.stack([none, none, -turn])))
 
-def fire_thrusters(
-    model: Model,
-    state: State,
-    velocity: Float[Array, "body 3 lane"],
-    control: Float[Array, "thruster lane"],
-    params: Params,
-) -> Float[Array, "body 3 lane"]:
-    """A force on one body, along the thruster, at its place. `control` is in [0, 1], one per thruster."""
-    rotation = jnp.stack([select(state.rotation, body) for body in model.thruster_body])
-    arm = vec(model.thruster_position).rotate(jnp.cos(rotation), jnp.sin(rotation))
-    heading = model.thruster_rotation + rotation
-    direction = Vec(jnp.cos(heading), jnp.sin(heading))
-    force = model.thruster_power * model.thruster_active * params.thruster_power * control * params.dt
-    push = direction.scale(force)
-    impulse = jnp.stack([push.x, push.y, arm.cross(push)], axis=1)
-    return velocity + inverse_masses(model) * _total(model.thruster_body, impulse, len(velocity))
+    each(joints.acts.shape[0], one)
 
 
-def _total(body: Int[Array, "actuator lane"], change: Float[Array, "actuator row lane"], bodies: int) -> Array:
-    """The sum of changes at each body, [body, row, lane]."""
-    return functools.reduce(jnp.add, (placed(bodies, b, x) for b, x in zip(body, change, strict=True)))
+def fire_thrusters(model: Model, before: State, bodies: Bodies, control: Ref, params: Params) -> None:
+    """A force on one body, along the thruster, at its place. `control` [thruster, lane] is in [0, 1]."""
+
+    def one(t):
+        force = model.thruster_power[t] * model.thruster_active[t] * params.thruster_power * control[t] * params.dt
+        when(anywhere(force != 0), lambda: fire(t, force))
+
+    def fire(t, force):
+        body = model.thruster_body[t]
+        turn, _ = pick(bodies.motion.shape[0], lambda i: jnp.stack([*bodies.turn[i], before.rotation[i]]), body, body)
+        cos, sin, rotation = turn
+        arm = Vec(*model.thruster_position[t]).rotate(cos, sin)
+        push = Vec(*cos_sin(model.thruster_rotation[t] + rotation)).scale(force)
+        spread(bodies.push, (body, jnp.stack([push.x, push.y, arm.cross(push)])))
+
+    each(model.thruster_active.shape[0], one)

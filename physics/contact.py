@@ -4,69 +4,40 @@ All contacts of a solver batch read the same velocities; what they do to a body 
 Facts: `jax2d.collision.resolve_collision`.
 """
 
+import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from physics.motion import Bodies, Motion, add, take
-from physics.pairs import PairKind
+from physics.body import Bodies, place, velocity, yield_to
+from physics.lanes import Ref, anywhere, each, when
+from physics.pairs import Table
 from physics.types import Manifold, Model, Params, State
-from physics.vector import Vec, nonzero, rows, vec
+from physics.vector import Vec, nonzero, spin
 
 
 class Contact(NamedTuple):
-    """One contact of each of some pairs; constant over a step. Zero where it may not act. Leaves [pair, lane]."""
+    """One contact of a pair of bodies, as geometry finds it; leaves [lane]."""
 
-    a: Bodies
-    b: Bodies
-    normal: Vec
-    point: Vec
-    target: Array  # m/s along the normal that the constraint asks for
-    friction: Array
-    mass: Array  # both bodies' inverse masses
-    inertia_a: Array  # inverse
-    inertia_b: Array
-    kept: Array  # 0 where the padding defect forgets the accumulated impulses, else 1
-    batch: Array | None  # solver batch; None: all are in one
+    active: Array
+    normal: Vec  # from the pair's first body to its second
+    penetration: Array  # m
+    point: Vec  # m, in the world
 
 
-def prepare(
-    model: Model,
-    state: State,
-    manifold: Manifold,
-    pair: PairKind,
-    at: slice,
-    batch: Int[Array, "pair lane"] | None,
-    params: Params,
-) -> tuple[Contact, Float[Array, "2 pair lane"]]:
-    """The contacts `at` of a manifold as constraints, with their warm-start impulses (normal, tangent; N s)."""
-    active = manifold.active[at]
-    mass_a, mass_b = rows(model.inverse_mass, pair.a), rows(model.inverse_mass, pair.b)
-    collides = jnp.stack([model.collides[a, b] for a, b in zip(pair.a, pair.b, strict=True)])
-    acts = active & collides & ~((mass_a == 0) & (mass_b == 0))
-    keep = lambda x: jnp.where(acts, x, 0.0)
-    excess = jnp.maximum(manifold.penetration[at] - params.slop, 0.0)
-    target = params.contact_bias / params.dt * excess - manifold.restitution_velocity[at]
-    rough = lambda body: jnp.square(rows(model.friction, body) * params.base_friction)
-    forgotten = params.faithful_padding and pair.padded
-    last = jnp.arange(len(pair))[:, None] == len(pair) - 1
-    contact = Contact(
-        a=pair.a,
-        b=pair.b,
-        normal=vec(manifold.normal[at]).map(keep),
-        point=vec(manifold.point[at]).map(keep),
-        target=keep(target),
-        friction=keep(jnp.sqrt(rough(pair.a) + rough(pair.b))),
-        mass=keep(mass_a + mass_b),
-        inertia_a=keep(rows(model.inverse_inertia, pair.a)),
-        inertia_b=keep(rows(model.inverse_inertia, pair.b)),
-        kept=jnp.where(last & forgotten, 0.0, jnp.ones_like(target)),
-        batch=batch,
-    )
-    remembered = acts & state.contact_active[at]
-    impulses = jnp.stack([state.contact_normal_impulse[at], state.contact_tangent_impulse[at]])
-    return contact, jnp.where(remembered, impulses, 0.0)
+class Constraints(NamedTuple):
+    """References, one row a contact. Only rows of contacts that act are ever read."""
+
+    geometry: Ref  # [contact, 4, lane]: normal x, y, point x, y
+    effort: Ref  # [contact, 5, lane]: target (m/s along the normal), friction, both inverse masses, inverse inertias
+    impulse: Ref  # [contact, 2, lane]: accumulated, normal and tangent, N s
+    acts: Ref  # [contact, lane]: whether it pushes
+    rank: Ref  # [contact, lane]: the how-manieth of the touching pairs of its kind, from 1; later its solver batch
+    touching: Ref  # [kind, lane]: how many pairs of a kind touch
+    listed: Ref  # numbers of the contacts that act in any lane, by solver batch
+    ends: Ref  # [batch + 1]: where each batch ends in `listed`
 
 
 class Arms(NamedTuple):
@@ -78,49 +49,186 @@ class Arms(NamedTuple):
     dot_b: Array
 
 
-def arms(position: Float[Array, "body 2 lane"], contact: Contact) -> Arms:
-    """Geometry for the present positions (joints move bodies inside an iteration)."""
-    n = contact.normal
-    r_a, r_b = (contact.point - vec(take(position, body)) for body in (contact.a, contact.b))
-    return Arms(r_a.cross(n), r_b.cross(n), r_a.dot(n), r_b.dot(n))
+def clear(constraints: Constraints, after: State) -> None:
+    """No contact acts, none is remembered."""
+
+    def none(c):
+        constraints.acts[c] = jnp.zeros_like(constraints.acts[c])
+        after.contact_active[c] = jnp.zeros_like(after.contact_active[c])
+        after.contact_normal_impulse[c] = jnp.zeros_like(after.contact_normal_impulse[c])
+        after.contact_tangent_impulse[c] = jnp.zeros_like(after.contact_tangent_impulse[c])
+
+    def untouched(kind):
+        constraints.touching[kind] = jnp.zeros_like(constraints.touching[kind])
+
+    each(constraints.acts.shape[0], none)
+    each(constraints.touching.shape[0], untouched)
 
 
-def solve(
-    motion: Motion, contact: Contact, impulse: Float[Array, "2 pair lane"], batch: int = 0
-) -> tuple[Float[Array, "2 pair lane"], Float[Array, "body 3 lane"]]:
-    """The accumulated impulses that bring each contact to its target, clamped to push and to the friction cone.
+def count(constraints: Constraints, kind: int, numbers: list, contacts: list[Contact]) -> None:
+    """Rank a pair, touching where any of its contacts is active, among the touching pairs of its kind."""
+    touching = functools.reduce(jnp.logical_or, (contact.active for contact in contacts))
+    so_far = constraints.touching[kind] + touching
+    constraints.touching[kind] = so_far
+    for c in numbers:
+        constraints.rank[c] = so_far
 
-    Only contacts of solver batch `batch` change, where there are several.
 
-    Returns:
-        The new accumulated impulses, and what their changes do to each body.
+def bounce(model: Model, bodies: Bodies, a, b, contact: Contact) -> Float[Array, " lane"]:
+    """Velocity along the normal that restitution asks for, m/s."""
+
+    def point_velocity(body):
+        motion = bodies.motion[body]
+        return velocity(motion) + spin(motion[4], contact.point - place(motion))
+
+    approach = (point_velocity(b) - point_velocity(a)).dot(contact.normal)
+    return approach * jnp.minimum(model.restitution[a], model.restitution[b])
+
+
+def see_nothing(seen: Manifold) -> None:
+    """No contact is active."""
+
+    def blank(c):
+        for ref in (seen.active, seen.normal, seen.penetration, seen.point, seen.restitution_velocity):
+            ref[c] = jnp.zeros_like(ref[c])
+
+    each(seen.active.shape[0], blank)
+
+
+def see(seen: Manifold, model: Model, bodies: Bodies, c, table: Table, contact: Contact) -> None:
+    """Write a contact down, zero where it is not active."""
+    keep = lambda x: jnp.where(contact.active, x, 0.0)
+    seen.active[c] = contact.active
+    seen.normal[c] = keep(jnp.stack([*contact.normal]))
+    seen.penetration[c] = keep(contact.penetration)
+    seen.point[c] = keep(jnp.stack([*contact.point]))
+    seen.restitution_velocity[c] = keep(bounce(model, bodies, table.a[c], table.b[c], contact))
+
+
+def prepare(
+    model: Model, before: State, after: State, bodies: Bodies, to: Constraints, c, table: Table, contact: Contact,
+    params: Params,
+) -> None:  # fmt: skip
+    """Contact c as a constraint, pushing with what it remembers of the last step's impulses."""
+    a, b = table.a[c], table.b[c]
+    mass_a, mass_b = model.inverse_mass[a], model.inverse_mass[b]
+    acts = contact.active & model.collides[a, b] & ((mass_a != 0) | (mass_b != 0))
+    after.contact_active[c] = contact.active
+    to.acts[c] = acts
+
+    def constrain():
+        keep = lambda x: jnp.where(acts, x, 0.0)
+        excess = jnp.maximum(contact.penetration - params.slop, 0.0)
+        target = params.contact_bias / params.dt * excess - bounce(model, bodies, a, b, contact)
+        rough = lambda body: jnp.square(model.friction[body] * params.base_friction)
+        friction = jnp.sqrt(rough(a) + rough(b))
+        inertia = [keep(model.inverse_inertia[body]) for body in (a, b)]
+        to.geometry[c] = keep(jnp.stack([*contact.normal, *contact.point]))
+        to.effort[c] = jnp.stack([keep(target), keep(friction), keep(mass_a + mass_b), *inertia])
+        remembered = acts & before.contact_active[c]
+        last = jnp.stack([before.contact_normal_impulse[c], before.contact_tangent_impulse[c]])
+        impulse = jnp.where(remembered, last, 0.0)
+        to.impulse[c] = impulse
+        normal, point = _geometry(to, c)
+        arm = _arms(bodies.motion[a], bodies.motion[b], normal, point)
+        _push(bodies, a, b, normal, arm, impulse[0], impulse[1])
+
+    when(anywhere(acts), constrain)
+
+
+def share_out(to: Constraints, table: Table) -> None:
+    """List the contacts that act, by solver batch.
+
+    The reference sorts the pairs of a kind stably, those that do not touch first, and the pair at sorted place p
+    belongs to batch p mod batches: the k-th of A touching pairs among N stands at place N - A + k.
     """
-    arm, n = arms(motion.position, contact), contact.normal
-    inertia_a, inertia_b = contact.inertia_a, contact.inertia_b
-    mass_normal = 1 / nonzero(contact.mass + inertia_a * jnp.square(arm.cross_a) + inertia_b * jnp.square(arm.cross_b))
-    mass_tangent = 1 / nonzero(contact.mass + inertia_a * jnp.square(arm.dot_a) + inertia_b * jnp.square(arm.dot_b))
+
+    def batch(s, filled):
+        kind, batches = table.kind[s], table.batches[s]
+        first_place = table.pairs[s] - to.touching[kind] - 1
+
+        def list_if_in(c, filled):
+            in_batch = jax.lax.rem(first_place + to.rank[c], batches) == table.turn[s]
+            mine = anywhere(to.acts[c] & in_batch)
+            to.listed[filled] = c  # the next one overwrites it if it is not mine
+            return filled + mine
+
+        filled = jax.lax.fori_loop(table.first[s], table.last[s], list_if_in, filled)
+        to.ends[s + 1] = filled
+        return filled
+
+    to.ends[0] = jnp.int32(0)
+    jax.lax.fori_loop(0, table.segments, batch, jnp.int32(0))
+
+
+def solve(model: Model, bodies: Bodies, to: Constraints, table: Table) -> None:
+    """One pass over the contacts, batch by batch."""
+
+    def batch(s):
+        kind, batches = table.kind[s], table.batches[s]
+        first_place = table.pairs[s] - to.touching[kind] - 1
+
+        def one(k):
+            c = to.listed[k]
+            in_batch = jax.lax.rem(first_place + to.rank[c], batches) == table.turn[s]
+            _solve_one(bodies, to, c, table.a[c], table.b[c], to.acts[c] & in_batch, table.kept[c])
+
+        each(to.ends[s + 1], one, first=to.ends[s])
+        when(to.ends[s + 1] > to.ends[s], lambda: yield_to(model, bodies))
+
+    each(table.segments, batch)
+
+
+def remember(after: State, to: Constraints) -> None:
+    """Hand the accumulated impulses to the next step."""
+
+    def write(k):
+        c = to.listed[k]
+        acts = to.acts[c]
+        after.contact_normal_impulse[c] = jnp.where(acts, to.impulse[c, 0], 0.0)
+        after.contact_tangent_impulse[c] = jnp.where(acts, to.impulse[c, 1], 0.0)
+
+    each(to.ends[to.ends.shape[0] - 1], write)
+
+
+def _geometry(to: Constraints, c) -> tuple[Vec, Vec]:
+    n_x, n_y, p_x, p_y = to.geometry[c]
+    return Vec(n_x, n_y), Vec(p_x, p_y)
+
+
+def _arms(motion_a: Array, motion_b: Array, normal: Vec, point: Vec) -> Arms:
+    r_a, r_b = point - place(motion_a), point - place(motion_b)
+    return Arms(r_a.cross(normal), r_b.cross(normal), r_a.dot(normal), r_b.dot(normal))
+
+
+def _solve_one(bodies: Bodies, to: Constraints, c, a, b, mine: Bool[Array, " lane"], kept: Float[Array, ""]) -> None:
+    """The accumulated impulses that bring a contact to its target, clamped to push and to the friction cone."""
+    n, point = _geometry(to, c)
+    target, friction, mass, inertia_a, inertia_b = to.effort[c]
+    before_normal, before_tangent = to.impulse[c]
+    motion_a, motion_b = bodies.motion[a], bodies.motion[b]
+    arm = _arms(motion_a, motion_b, n, point)
+    mass_normal = 1 / nonzero(mass + inertia_a * jnp.square(arm.cross_a) + inertia_b * jnp.square(arm.cross_b))
+    mass_tangent = 1 / nonzero(mass + inertia_a * jnp.square(arm.dot_a) + inertia_b * jnp.square(arm.dot_b))
     # how a normal impulse changes the tangential velocity
     coupling = inertia_a * arm.cross_a * arm.dot_a + inertia_b * arm.cross_b * arm.dot_b
 
-    a, b = take(motion.velocity, contact.a), take(motion.velocity, contact.b)
-    v, w_a, w_b = Vec(b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]), a[:, 2], b[:, 2]
+    v, w_a, w_b = velocity(motion_b) - velocity(motion_a), motion_a[4], motion_b[4]
     approach = v.dot(n) + w_b * arm.cross_b - w_a * arm.cross_a
-    normal = jnp.maximum(impulse[0] + mass_normal * (contact.target - approach), 0.0)
-    slide = v.x * n.y - v.y * n.x - w_b * arm.dot_b + w_a * arm.dot_a - (normal - impulse[0]) * coupling
-    limit = contact.friction * normal
-    tangent = jnp.clip(impulse[1] - mass_tangent * slide, -limit, limit)
-    now = jnp.stack([normal, tangent])
-    kept = now * contact.kept
-    if contact.batch is not None:
-        mine = contact.batch == batch
-        now, kept = jnp.where(mine, now, impulse), jnp.where(mine, kept, impulse)
-    return kept, push(contact, arm, now - impulse, len(motion.velocity))
+    normal = jnp.maximum(before_normal + mass_normal * (target - approach), 0.0)
+    slide = v.x * n.y - v.y * n.x - w_b * arm.dot_b + w_a * arm.dot_a - (normal - before_normal) * coupling
+    limit = friction * normal
+    tangent = jnp.clip(before_tangent - mass_tangent * slide, -limit, limit)
+    # the padding defect forgets the accumulated impulses of some pairs: kept is 0
+    to.impulse[c] = jnp.stack(
+        [jnp.where(mine, normal * kept, before_normal), jnp.where(mine, tangent * kept, before_tangent)]
+    )
+    change = lambda now, before: jnp.where(mine, now - before, 0.0)
+    _push(bodies, a, b, n, arm, change(normal, before_normal), change(tangent, before_tangent))
 
 
-def push(contact: Contact, arm: Arms, impulse: Float[Array, "2 pair lane"], bodies: int) -> Float[Array, "body 3 lane"]:
-    """What each body gets when both bodies of every contact are pushed apart."""
-    n, (normal, tangent) = contact.normal, impulse
+def _push(bodies: Bodies, a, b, n: Vec, arm: Arms, normal: Array, tangent: Array) -> None:
+    """Push both bodies of a contact apart."""
     force = Vec(normal * n.x + tangent * n.y, normal * n.y - tangent * n.x)
-    on_a = jnp.stack([-force.x, -force.y, tangent * arm.dot_a - normal * arm.cross_a], axis=1)
-    on_b = jnp.stack([force.x, force.y, normal * arm.cross_b - tangent * arm.dot_b], axis=1)
-    return add(bodies, contact.a, on_a, contact.b, on_b)
+    bodies.push[a] += jnp.stack([-force.x, -force.y, tangent * arm.dot_a - normal * arm.cross_a])
+    bodies.push[b] += jnp.stack([force.x, force.y, normal * arm.cross_b - tangent * arm.dot_b])

@@ -5,141 +5,134 @@ Facts: `jax2d.joint`. Joints are solved one after another; each also moves its b
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
 
-from physics.motion import Motion, add, placed, select
+from physics.body import Bodies, place, velocity
+from physics.lanes import Ref, anywhere, each, pick, spread, when
 from physics.types import Model, Params, State
-from physics.vector import Vec, nonzero, spin, stored, vec
+from physics.vector import Vec, nonzero, spin
 
 
-class Joint(NamedTuple):
-    """Every joint, constant over a step; leaves [joint, ..., lane]. Masses are 0 where it may not act."""
+class Joints(NamedTuple):
+    """References, one row a joint, constant over a step but for the impulses. Masses are 0 where it may not act."""
 
-    acts: Bool[Array, "joint lane"]
-    a: Int[Array, "joint lane"]
-    b: Int[Array, "joint lane"]
-    arm_a: Vec  # from the body's centre to its anchor, in the world
-    arm_b: Vec
-    mass_a: Array  # inverse
-    mass_b: Array
-    inertia_a: Array  # inverse
-    inertia_b: Array
-    weight_a: Array  # share of a's anchor in the joint's point: the heavier body decides
-    fixed: Bool[Array, "joint lane"]
-    turns: Bool[Array, "joint lane"]  # whether an angular impulse applies
-    angle_bias: Array  # rad/s that the angle asks for
+    acts: Ref  # [joint, lane]: active, with active bodies, not both immovable
+    turns: Ref  # [joint, lane]: whether an angular impulse applies
+    arms: Ref  # [joint, 4, lane]: from the centre of a to its anchor, of b to its, in the world
+    masses: Ref  # [joint, 4, lane]: inverse masses of a and b, inverse inertias of a and b
+    weight: Ref  # [joint, lane]: share of a's anchor in the joint's point: the heavier body decides
+    angle: Ref  # [joint, lane]: angle of b relative to a, from the joint's resting angle, rad
+    angle_bias: Ref  # [joint, lane]: rad/s that the angle asks for
+    impulse: Ref  # [joint, 3, lane]: accumulated, x, y (N s) and angular (N m s)
 
 
-def joint_angle(model: Model, state: State) -> Float[Array, "joint lane"]:
-    """Angle of body b relative to body a, from the joint's resting angle, rad."""
-    angle = lambda body: jnp.stack([select(state.rotation, b) for b in body])
-    return angle(model.joint_b) - angle(model.joint_a) - model.joint_rotation
+def prepare(model: Model, before: State, bodies: Bodies, to: Joints, params: Params) -> None:
+    """All joints as constraints."""
+
+    def one(j):
+        to.acts[j] = jnp.zeros_like(to.acts[j])
+        to.impulse[j] = jnp.stack(
+            [before.joint_impulse[j, 0], before.joint_impulse[j, 1], before.joint_angular_impulse[j]]
+        )
+        when(anywhere(model.joint_active[j]), lambda: _prepare_one(model, before, bodies, to, j, params))
+
+    each(to.acts.shape[0], one)
 
 
-def can_act(model: Model) -> Bool[Array, "joint lane"]:
-    """Active, with active bodies, not both immovable."""
-    each = lambda x, body: jnp.stack([select(x, b) for b in body])
-    movable = lambda body: each(model.inverse_mass, body) != 0
-    alive = each(model.active, model.joint_a) & each(model.active, model.joint_b)
-    return model.joint_active & alive & (movable(model.joint_a) | movable(model.joint_b))
+def _prepare_one(model: Model, before: State, bodies: Bodies, to: Joints, j, params: Params) -> None:
+    def read(i):
+        alive = model.active[i].astype(bodies.turn.dtype)
+        mass = [model.inverse_mass[i], model.inverse_inertia[i]]
+        return jnp.stack([alive, *mass, before.rotation[i], *bodies.turn[i]])
 
-
-def prepare(model: Model, state: State, params: Params) -> tuple[Joint, Float[Array, "joint 3 lane"]]:
-    """The joints as constraints, with their warm-start impulses (x, y, angular)."""
-    acts, lanes = can_act(model), state.rotation.shape[-1]
-    cos, sin = jnp.cos(state.rotation), jnp.sin(state.rotation)
-    each = lambda x, body: jnp.stack([select(x, b) for b in body])
-
-    def side(body, anchor):
-        masses = (jnp.where(acts, each(x, body), 0.0) for x in (model.inverse_mass, model.inverse_inertia))
-        return vec(anchor).rotate(each(cos, body), each(sin, body)), *masses
-
-    arm_a, mass_a, inertia_a = side(model.joint_a, model.joint_anchor_a)
-    arm_b, mass_b, inertia_b = side(model.joint_b, model.joint_anchor_b)
+    of_a, of_b = pick(bodies.motion.shape[0], read, model.joint_a[j], model.joint_b[j])
+    (alive_a, mass_a, inertia_a, rotation_a, *turn_a), (alive_b, mass_b, inertia_b, rotation_b, *turn_b) = of_a, of_b
+    acts = model.joint_active[j] & (alive_a * alive_b != 0) & ((mass_a != 0) | (mass_b != 0))
+    mass_a, mass_b, inertia_a, inertia_b = (jnp.where(acts, x, 0.0) for x in (mass_a, mass_b, inertia_a, inertia_b))
+    arm_a = Vec(*model.joint_anchor_a[j]).rotate(*turn_a)
+    arm_b = Vec(*model.joint_anchor_b[j]).rotate(*turn_b)
     heavy_a, heavy_b = 1 / nonzero(mass_a), 1 / nonzero(mass_b)
-    weight_a = jnp.where(mass_a == 0, 1.0, jnp.where(mass_b == 0, 0.0, heavy_a / (heavy_a + heavy_b)))
+    weight = jnp.where(mass_a == 0, 1.0, jnp.where(mass_b == 0, 0.0, heavy_a / (heavy_a + heavy_b)))
 
-    angle = joint_angle(model, state)
-    beyond = angle - jnp.clip(angle, model.joint_min, model.joint_max)
-    joint = Joint(
-        acts=acts,
-        a=model.joint_a,
-        b=model.joint_b,
-        arm_a=arm_a,
-        arm_b=arm_b,
-        mass_a=mass_a,
-        mass_b=mass_b,
-        inertia_a=inertia_a,
-        inertia_b=inertia_b,
-        weight_a=weight_a,
-        fixed=model.joint_fixed,
-        turns=model.joint_fixed | (model.joint_limited & (beyond != 0)),
-        angle_bias=jnp.where(model.joint_fixed, angle * params.fixed_joint_bias, beyond * params.joint_limit_bias),
-    )
-    joint = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], lanes)), joint)
-    return joint, jnp.concatenate([state.joint_impulse, state.joint_angular_impulse[:, None]], axis=1)
+    angle = rotation_b - rotation_a - model.joint_rotation[j]
+    beyond = angle - jnp.clip(angle, model.joint_min[j], model.joint_max[j])
+    fixed = model.joint_fixed[j]
+    to.acts[j] = acts
+    to.turns[j] = fixed | (model.joint_limited[j] & (beyond != 0))
+    to.arms[j] = jnp.stack([*arm_a, *arm_b])
+    to.masses[j] = jnp.stack([mass_a, mass_b, inertia_a, inertia_b])
+    to.weight[j] = weight
+    to.angle[j] = angle
+    to.angle_bias[j] = jnp.where(fixed, angle * params.fixed_joint_bias, beyond * params.joint_limit_bias)
 
 
-def warm_start(bodies: int, joint: Joint, impulse: Float[Array, "joint 3 lane"]) -> Float[Array, "body 3 lane"]:
-    """The change of velocity by the impulses that the last step ended with, all joints at once."""
-    p, turn = vec(impulse), impulse[:, 2]
-    on_a = (joint.mass_a * p.x, joint.mass_a * p.y, joint.inertia_a * (joint.arm_a.cross(p) + turn))
-    on_b = (-joint.mass_b * p.x, -joint.mass_b * p.y, -joint.inertia_b * (joint.arm_b.cross(p) + turn))
-    return add(bodies, joint.a, jnp.stack(on_a, axis=1), joint.b, jnp.stack(on_b, axis=1))
+def warm_start(model: Model, bodies: Bodies, to: Joints) -> None:
+    """Push with the impulses that the last step ended with."""
+
+    def one(j):
+        x, y, turn = jnp.where(to.acts[j], to.impulse[j], 0.0)
+        a_x, a_y, b_x, b_y = to.arms[j]
+        on_a = jnp.stack([x, y, Vec(a_x, a_y).cross(Vec(x, y)) + turn])
+        on_b = jnp.stack([-x, -y, -(Vec(b_x, b_y).cross(Vec(x, y)) + turn)])
+        spread(bodies.push, (model.joint_a[j], on_a), (model.joint_b[j], on_b))
+
+    each(to.acts.shape[0], lambda j: when(anywhere(to.acts[j]), lambda: one(j)))
 
 
-def solve(
-    motion: Motion, joints: Joint, impulses: Float[Array, "joint 3 lane"], params: Params
-) -> tuple[Motion, Float[Array, "joint 3 lane"]]:
+def solve(model: Model, bodies: Bodies, to: Joints, params: Params) -> None:
     """One pass over the joints, one after another."""
 
-    def solve_next(motion, one):
-        joint, impulse = one
-        return _solve_one(motion, joint, impulse, params)
+    def one(j):
+        when(anywhere(to.acts[j]), lambda: _solve_one(model, bodies, to, j, params))
 
-    return jax.lax.scan(solve_next, motion, (joints, impulses))
+    each(to.acts.shape[0], one)
 
 
-def _solve_one(
-    motion: Motion, joint: Joint, impulse: Float[Array, "3 lane"], params: Params
-) -> tuple[Motion, Float[Array, "3 lane"]]:
-    x_a, x_b = (Vec(*select(motion.position, body)) for body in (joint.a, joint.b))
-    (*v_a, w_a), (*v_b, w_b) = (select(motion.velocity, body) for body in (joint.a, joint.b))
+def _solve_one(model: Model, bodies: Bodies, to: Joints, j, params: Params) -> None:
+    a, b = model.joint_a[j], model.joint_b[j]
+    motion_a, motion_b = pick(bodies.motion.shape[0], lambda i: bodies.motion[i], a, b)
+    mass_a, mass_b, inertia_a, inertia_b = to.masses[j]
+    a_x, a_y, b_x, b_y = to.arms[j]
+    arm_a, arm_b, fixed = Vec(a_x, a_y), Vec(b_x, b_y), model.joint_fixed[j]
+    x_a, x_b, w_a, w_b = place(motion_a), place(motion_b), motion_a[4], motion_b[4]
 
     # anchors first, then their difference: a gap of exactly zero must come out as zero, because the
     # angle correction below looks at signs
-    anchor_a, anchor_b = x_a + joint.arm_a, x_b + joint.arm_b
+    anchor_a, anchor_b = x_a + arm_a, x_b + arm_b
     gap = anchor_b - anchor_a
-    point = anchor_a.scale(joint.weight_a) + anchor_b.scale(1 - joint.weight_a)
-    drift = Vec(*v_b) + spin(w_b, point - x_b) - Vec(*v_a) - spin(w_a, point - x_a)
+    point = anchor_a.scale(to.weight[j]) + anchor_b.scale(1 - to.weight[j])
+    drift = velocity(motion_b) + spin(w_b, point - x_b) - velocity(motion_a) - spin(w_a, point - x_a)
     direction = drift.scale(1 / nonzero(drift.norm()))
     mass = (
-        joint.mass_a
-        + joint.mass_b
-        + jnp.square(joint.arm_a.cross(direction)) * joint.inertia_a
-        + jnp.square(joint.arm_b.cross(direction)) * joint.inertia_b
+        mass_a
+        + mass_b
+        + jnp.square(arm_a.cross(direction)) * inertia_a
+        + jnp.square(arm_b.cross(direction)) * inertia_b
     )
     pull = (drift + gap.scale(params.joint_bias_velocity)).scale(params.joint_stiffness / nonzero(mass))
-    turn_a, turn_b = joint.inertia_a * joint.arm_a.cross(pull), -joint.inertia_b * joint.arm_b.cross(pull)
+    turn_a, turn_b = inertia_a * arm_a.cross(pull), -inertia_b * arm_b.cross(pull)
 
     spin_difference = w_b + turn_b - w_a - turn_a
     # a limit that is already being left (by a motor, say) gets no correction
-    corrects = joint.fixed | (jnp.sign(spin_difference) == jnp.sign(joint.angle_bias))
-    twist = (spin_difference + joint.angle_bias) / nonzero(joint.inertia_a + joint.inertia_b)
-    twist = jnp.where(joint.turns & corrects, twist, 0.0)
-    turn_a, turn_b = turn_a + joint.inertia_a * twist, turn_b - joint.inertia_b * twist
+    corrects = fixed | (jnp.sign(spin_difference) == jnp.sign(to.angle_bias[j]))
+    twist = (spin_difference + to.angle_bias[j]) / nonzero(inertia_a + inertia_b)
+    twist = jnp.where(to.turns[j] & corrects, twist, 0.0)
+    turn_a, turn_b = turn_a + inertia_a * twist, turn_b - inertia_b * twist
 
-    closer = gap.scale(params.joint_bias_position / nonzero(joint.mass_a + joint.mass_b))
+    closer = gap.scale(params.joint_bias_position / nonzero(mass_a + mass_b))
+    on_a = jnp.stack([*closer.scale(mass_a), *pull.scale(mass_a), turn_a])
+    on_b = jnp.stack([*closer.scale(-mass_b), *pull.scale(-mass_b), turn_b])
+    spread(bodies.motion, (a, on_a), (b, on_b))
+    x, y, angular = to.impulse[j]
+    to.impulse[j] = jnp.stack([x + pull.x, y + pull.y, jnp.where(fixed, angular + twist, 0.0)])
 
-    def moved(x, row_a, row_b):
-        on_a, on_b = stored(jnp.stack([jnp.stack(row_a), jnp.stack(row_b)]))
-        return x + placed(len(x), joint.a, on_a) + placed(len(x), joint.b, on_b)
 
-    motion = Motion(
-        moved(motion.position, closer.scale(joint.mass_a), closer.scale(-joint.mass_b)),
-        moved(motion.velocity, (*pull.scale(joint.mass_a), turn_a), (*pull.scale(-joint.mass_b), turn_b)),
-    )
-    angular = jnp.where(joint.fixed, impulse[2] + twist, 0.0)
-    return motion, jnp.where(joint.acts, jnp.stack([impulse[0] + pull.x, impulse[1] + pull.y, angular]), 0.0)
+def remember(after: State, to: Joints) -> None:
+    """Hand the accumulated impulses to the next step."""
+
+    def write(j):
+        x, y, turn = jnp.where(to.acts[j], to.impulse[j], 0.0)
+        after.joint_impulse[j] = jnp.stack([x, y])
+        after.joint_angular_impulse[j] = turn
+
+    each(to.acts.shape[0], write)

@@ -6,119 +6,142 @@ Polygons are clockwise; face k goes from vertex k to vertex k + 1. A triangle's 
 that its third face closes it; its fourth face does not exist.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.motion import incidence
-from physics.pairs import PairKind, pairs_of
-from physics.types import MAX_VERTICES, Manifold, Model, State
-from physics.vector import Vec, nonzero, rows, spin, stored, unvec, vec, where
+from physics.body import Bodies, place
+from physics.contact import Contact
+from physics.lanes import Ref, anywhere, each, when
+from physics.pairs import Table, pairs_of
+from physics.types import MAX_VERTICES, Model
+from physics.vector import Vec, nonzero, where
 
 FLIP_BIAS = 0.01  # m; b must separate this much more than a to become the reference polygon (Jax2D `epsilon`)
 FAR = 1e30  # m; stands for a vertex or edge that does not exist
+MARGIN = 0.01  # m; bodies whose boxes are farther apart cannot touch, whatever the rounding
 
-
-class Contacts(NamedTuple):
-    """Contacts of one kind of pair, components [pair, lane]."""
-
-    active: Bool[Array, "pair lane"]
-    normal: Vec
-    penetration: Float[Array, "pair lane"]
-    point: Vec
+# found(kind, contact numbers, contacts): what to do with the contacts of a pair
+Found = Callable[[int, list, list[Contact]], None]
 
 
 class Polygons(NamedTuple):
-    """Polygons in the world; components [vertex, polygon, lane]."""
+    """References to each polygon's geometry, [x or y, polygon, vertex, lane] where it has vertices."""
 
-    centre: Vec  # [polygon, lane]
+    start: Ref  # first vertex of each face, in the polygon's frame
+    edge: Ref  # from there to the next
+    along: Ref  # the same, of length 1
+    length: Ref  # [polygon, vertex, lane]
+    support: Ref  # [polygon, vertex, lane]: largest projection on the face's normal, from the centre; FAR: no such face
+    vertex: Ref  # in the world
+    normal: Ref  # outward unit normal of each face, in the world
+    box: Ref  # [polygon, 4, lane]: lowest x, y and highest x, y
+
+
+class Outline(NamedTuple):
+    """One polygon in the world; components [vertex, lane]."""
+
+    centre: Vec  # [lane]
     vertex: Vec
-    normal: Vec  # outward unit normal of the face that starts at the vertex
-    support: Float[Array, "vertex polygon lane"]  # largest projection on the normal, from the centre; FAR: no such face
+    normal: Vec
+    support: Array
 
 
-def find_contacts(model: Model, state: State) -> Manifold:
-    """All contacts of a state, in the order of `pairs.py`, zero where not active.
-
-    `state.velocity` is used for the restitution target only.
-    """
-    pairs = pairs_of(model.size)
-    first, second = _polygon_polygon(model, state, pairs.polygon)
-    kinds = [
-        (pairs.polygon, first),
-        (pairs.polygon, second),
-        (pairs.circle_polygon, _circle_polygon(model, state)),
-        (pairs.circle, _circle_circle(model, state, pairs.circle)),
-    ]
-    manifolds = [_manifold(model, state, pair, contacts) for pair, contacts in kinds if len(pair)]
-    return Manifold(*(jnp.concatenate(leaves) for leaves in zip(*map(_leaves, manifolds), strict=True)))
+def read_vec(ref: Ref, i) -> Vec:
+    return Vec(ref[0, i], ref[1, i])
 
 
-def _leaves(m: Manifold) -> tuple:
-    return m.active, m.normal, m.penetration, m.point, m.restitution_velocity
+def write_vec(ref: Ref, i, v: Vec) -> None:
+    ref[0, i], ref[1, i] = v.x, v.y
 
 
-def _manifold(model: Model, state: State, pair: PairKind, c: Contacts) -> Manifold:
-    """Add the restitution target and blank what is not active or may never collide."""
-    active = c.active & may_touch(model, pair)
-    position, velocity = vec(state.position), vec(state.velocity)
+def outline_polygons(model: Model, bodies: Bodies, to: Polygons) -> None:
+    """All polygons' geometry, in their own frames and in the world."""
 
-    def at(x, body):
-        return rows(x, body)
+    def one(i):
+        triangle = model.n_vertices[i] == 3
+        corners = model.vertices[i]
 
-    def point_velocity(body):
-        r = c.point - position.map(lambda x: at(x, body))
-        return velocity.map(lambda x: at(x, body)) + spin(at(state.angular_velocity, body), r)
+        def close(x):
+            return jnp.stack([x[0], x[1], x[2], jnp.where(triangle, x[0], x[3])])
 
-    approach = (point_velocity(pair.b) - point_velocity(pair.a)).dot(c.normal)
-    restitution = jnp.minimum(at(model.restitution, pair.a), at(model.restitution, pair.b))
-    keep = lambda x: jnp.where(active, x, 0.0)
-    sheets = (*c.normal, c.penetration, *c.point, approach * restitution)
-    n_x, n_y, penetration, p_x, p_y, bounce = stored(jnp.stack([keep(x) for x in sheets]))
-    return Manifold(active, unvec(Vec(n_x, n_y)), penetration, unvec(Vec(p_x, p_y)), bounce)
+        start = Vec(close(corners[:, 0]), close(corners[:, 1]))
+        missing = triangle & (jnp.arange(MAX_VERTICES) == MAX_VERTICES - 1)[:, None]
+        edge = start.map(lambda x: jnp.roll(x, -1, axis=0)) - start
+        length = edge.norm()
+        outward = Vec(-edge.y, edge.x).scale(1 / nonzero(length))
+        support = outward.map(lambda x: x[:, None]).dot(start.map(lambda x: x[None])).max(1)
+        cos, sin = bodies.turn[i]
+        vertex = start.rotate(cos, sin) + place(bodies.motion[i])
+        write_vec(to.start, i, start)
+        write_vec(to.edge, i, edge)
+        write_vec(to.along, i, edge.scale(1 / nonzero(length)))
+        to.length[i] = length
+        to.support[i] = jnp.where(missing, FAR, support)
+        write_vec(to.vertex, i, vertex)
+        write_vec(to.normal, i, outward.rotate(cos, sin))
+        to.box[i] = jnp.stack([vertex.x.min(0), vertex.y.min(0), vertex.x.max(0), vertex.y.max(0)])
+
+    each(to.support.shape[0], one)
 
 
-def may_touch(model: Model, pair: PairKind) -> Bool[Array, "pair lane"]:
+def find_contacts(model: Model, bodies: Bodies, polygons: Polygons, table: Table, found: Found) -> None:
+    """All pairs that may touch, in the order of `pairs.py`; `found` for those that come near each other."""
+    size = model.size
+    pairs = pairs_of(size)
+    n, m = len(pairs.polygon), len(pairs.circle_polygon)
+    disc = lambda i: (place(bodies.motion[i]), model.radius[i - size.polygons])
+
+    def polygon_pair(p):
+        a, b = table.a[p], table.b[p]
+        mine, other = polygons.box[a], polygons.box[b]
+        apart = (mine[:2] > other[2:] + MARGIN) | (other[:2] > mine[2:] + MARGIN)
+        may = may_touch(model, a, b)
+
+        def narrow():
+            contacts = _polygon_polygon(_outline(bodies, polygons, a), _outline(bodies, polygons, b))
+            found(0, [p, n + p], [c._replace(active=c.active & may) for c in contacts])
+
+        when(anywhere(may & ~apart.any(0)), narrow)
+
+    def circle_polygon(c):
+        a, b = table.a[c], table.b[c]
+        (centre, radius), box = disc(a), polygons.box[b]
+        reach = radius + MARGIN
+        apart = (centre.x < box[0] - reach) | (centre.x > box[2] + reach)
+        apart |= (centre.y < box[1] - reach) | (centre.y > box[3] + reach)
+        may = may_touch(model, a, b)
+
+        def narrow():
+            contact = _circle_polygon(bodies, polygons, centre, radius, b)
+            found(1, [c], [contact._replace(active=contact.active & may)])
+
+        when(anywhere(may & ~apart), narrow)
+
+    def circle_circle(c):
+        a, b = table.a[c], table.b[c]
+        contact = _circle_circle(*disc(a), *disc(b))
+        contact = contact._replace(active=contact.active & may_touch(model, a, b))
+        when(anywhere(contact.active), lambda: found(2, [c], [contact]))
+
+    each(n, polygon_pair)
+    each(2 * n + m, circle_polygon, first=2 * n)
+    each(pairs.contacts, circle_circle, first=2 * n + m)
+
+
+def may_touch(model: Model, a, b) -> Bool[Array, " lane"]:
     """Both bodies are active and their collision modes allow it (joined bodies still have manifolds)."""
-    mode_a, mode_b = rows(model.collision_mode, pair.a), rows(model.collision_mode, pair.b)
+    mode_a, mode_b = model.collision_mode[a], model.collision_mode[b]
     modes = (mode_a == 2) | (mode_b == 2) | (mode_a * mode_b > 0)
-    return modes & rows(model.active, pair.a) & rows(model.active, pair.b)
+    return modes & model.active[a] & model.active[b]
 
 
-def _edges(model: Model) -> tuple[Vec, Vec, Bool[Array, "vertex polygon lane"]]:
-    """Each face's first and last vertex in the polygon's frame, and which faces do not exist."""
-    triangle = model.n_vertices == 3
-    local = vec(jnp.moveaxis(model.vertices, 1, 0))
-    closed = local.map(lambda x: jnp.concatenate([x[:3], jnp.where(triangle, x[0], x[3])[None]]))
-    missing = triangle & (jnp.arange(MAX_VERTICES) == MAX_VERTICES - 1)[:, None, None]
-    return closed, closed.map(lambda x: jnp.roll(x, -1, axis=0)), missing
-
-
-def _polygons(model: Model, state: State) -> Polygons:
-    n = model.size.polygons
-    cos, sin = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n])
-    start, end, missing = _edges(model)
-    edge = end - start
-    outward = Vec(-edge.y, edge.x).scale(1 / nonzero(edge.norm()))
-    support = outward.map(lambda x: x[:, None]).dot(start.map(lambda x: x[None])).max(1)
-    centre = vec(state.position[:n])
-    vertex, normal = start.rotate(cos, sin) + centre, outward.rotate(cos, sin)
-    return Polygons(centre, vertex, normal, jnp.broadcast_to(jnp.where(missing, FAR, support), vertex.x.shape))
-
-
-def _choose(world: Polygons, index: tuple[int, ...]) -> Polygons:
-    """The polygons `index`. A product with a 0-1 matrix, because XLA stores its operands: whatever reads the result
-    would otherwise rotate all vertices anew."""
-    leaves = [*world.centre, *world.vertex, *world.normal, world.support]
-    sheets = [x.reshape(-1, *x.shape[-2:]) for x in leaves]
-    packed = jnp.moveaxis(jnp.concatenate(sheets), 1, 0)
-    chosen = incidence(len(packed), index).T @ packed.reshape(len(packed), -1)
-    x = jnp.moveaxis(chosen.reshape(len(index), *packed.shape[1:]), 1, 0)
-    k = MAX_VERTICES
-    sheet = lambda i: x[2 + i * k : 2 + (i + 1) * k]
-    return Polygons(Vec(x[0], x[1]), Vec(sheet(0), sheet(1)), Vec(sheet(2), sheet(3)), sheet(4))
+def _outline(bodies: Bodies, polygons: Polygons, i) -> Outline:
+    return Outline(
+        place(bodies.motion[i]), read_vec(polygons.vertex, i), read_vec(polygons.normal, i), polygons.support[i]
+    )
 
 
 class Face(NamedTuple):
@@ -130,19 +153,21 @@ class Face(NamedTuple):
     end: Vec
 
 
-def _first(found: Bool[Array, "vertex ..."]) -> Int[Array, "..."]:
+def _first(found: Bool[Array, "vertex lane"]) -> Int[Array, " lane"]:
     """Number of the first vertex for which it holds."""
-    number = jnp.arange(len(found), dtype=jnp.int32).reshape(-1, *[1] * (found.ndim - 1))
+    number = jnp.arange(len(found), dtype=jnp.int32)[:, None]
     return jnp.where(found, number, len(found)).min(0)
 
 
-def _pick(x: Float[Array, "vertex ..."], number: Int[Array, "..."]) -> Float[Array, "..."]:
-    """x[number] for a vertex number that differs by pair and lane."""
-    vertices = jnp.arange(len(x), dtype=jnp.int32).reshape(-1, *[1] * (x.ndim - 1))
-    return jnp.where(vertices == number, x, 0.0).sum(0)
+def _pick(x: Float[Array, "vertex lane"], number: Int[Array, " lane"]) -> Float[Array, " lane"]:
+    """x[number] for a vertex number that differs by lane."""
+    chosen = x[0]
+    for k in range(1, len(x)):
+        chosen = jnp.where(number == k, x[k], chosen)
+    return chosen
 
 
-def _best_face(a: Polygons, b: Polygons) -> Face:
+def _best_face(a: Outline, b: Outline) -> Face:
     """The face of a along whose normal b is farthest out; the first of equals, as the reference."""
     normal, offset = a.normal.map(lambda x: x[:, None]), (b.vertex - a.centre).map(lambda x: x[None])
     separation = normal.dot(offset).min(1) - a.support
@@ -152,14 +177,9 @@ def _best_face(a: Polygons, b: Polygons) -> Face:
     return Face(most, *(v.map(lambda x: _pick(x, best)) for v in (a.normal, a.vertex, end)))
 
 
-def _polygon_polygon(model: Model, state: State, pair: PairKind) -> tuple[Contacts, Contacts]:
+def _polygon_polygon(a: Outline, b: Outline) -> list[Contact]:
     """Two contact points: the incident polygon's two deepest vertices, clipped to the reference face."""
-    world, n = _polygons(model, state), len(pair)
-    either = _choose(world, pair.a + pair.b)  # both orders at once: a against b, then b against a
-    a, b = (jax.tree.map(lambda x, at=at: x[..., at, :], either) for at in (slice(n), slice(n, None)))
-    swapped = jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=-2), b, a)
-    face = _best_face(either, swapped)
-    face_a, face_b = (jax.tree.map(lambda x, at=at: x[at], face) for at in (slice(n), slice(n, None)))
+    face_a, face_b = _best_face(a, b), _best_face(b, a)
     by_b = face_a.separation + FLIP_BIAS < face_b.separation
     separation = jnp.maximum(face_a.separation, face_b.separation)
     normal = where(by_b, face_b.normal, face_a.normal)
@@ -173,53 +193,44 @@ def _polygon_polygon(model: Model, state: State, pair: PairKind) -> tuple[Contac
     reach = jnp.where(missing, FAR, normal.dot(incident - start))  # negative: inside the reference polygon
     offset = along.dot(incident - start)
     first = _first(reach == reach.min(0))
-    rest = jnp.where(jnp.arange(MAX_VERTICES)[:, None, None] == first, 2 * FAR, reach)
+    rest = jnp.where(jnp.arange(MAX_VERTICES)[:, None] == first, 2 * FAR, reach)
     second = _first(rest == rest.min(0))
 
     def contact(number, depth, active):
         point = start + normal.scale(depth) + along.scale(jnp.clip(_pick(offset, number), 0.0, length))
-        return Contacts(active, where(by_b, -normal, normal), -separation, point)
+        return Contact(active, where(by_b, -normal, normal), -separation, point)
 
     depth1, depth2 = _pick(reach, first), _pick(reach, second)
     touching = separation < 0
-    return contact(first, depth1, touching), contact(second, depth2, touching & (depth2 < 0))
+    return [contact(first, depth1, touching), contact(second, depth2, touching & (depth2 < 0))]
 
 
-def _circle_polygon(model: Model, state: State) -> Contacts:
-    """The circle's centre clipped to the polygon's nearest edge. Works on [circle, polygon, lane] blocks."""
-    n = model.size.polygons
-    cos, sin = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n])
-    position = vec(state.position)
-    polygon = position.map(lambda x: x[:n])
-    centre = (position.map(lambda x: x[n:, None]) - polygon).unrotate(cos, sin)  # in the polygon's frame
-    radius = model.radius[:, None]
-    start, end, missing = (jax.tree.map(lambda x: x[:, None], edge) for edge in _edges(model))
+def _circle_polygon(bodies: Bodies, polygons: Polygons, centre: Vec, radius: Array, i) -> Contact:
+    """The circle's centre clipped to the polygon's nearest edge."""
+    cos, sin = bodies.turn[i]
+    polygon = place(bodies.motion[i])
+    local = (centre - polygon).unrotate(cos, sin)  # in the polygon's frame
+    start, length = read_vec(polygons.start, i), polygons.length[i]
+    edge, along = read_vec(polygons.edge, i), read_vec(polygons.along, i)
+    missing = polygons.support[i] == FAR
 
-    edge, to_centre = end - start, centre - start
-    length = edge.norm()
-    along = edge.scale(1 / nonzero(length))
+    to_centre = local - start
     clipped = start + along.scale(jnp.clip(along.dot(to_centre), 0.0, length))
-    gap = jnp.where(missing, FAR, (clipped - centre).norm())
+    gap = jnp.where(missing, FAR, (clipped - local).norm())
     inside = (missing | (edge.cross(to_centre) < 0)).all(0)  # clockwise: the inside lies to the right
     distance = gap.min(0)
     nearest = _first(gap == distance)
     closest = clipped.map(lambda x: _pick(x, nearest))
 
-    outward = (centre - closest).scale(jnp.where(inside, 1.0, -1.0))  # from the circle to the polygon
+    outward = (local - closest).scale(jnp.where(inside, 1.0, -1.0))  # from the circle to the polygon
     normal = outward.scale(1 / nonzero(outward.norm())).rotate(cos, sin)
-    point = closest.rotate(cos, sin) + polygon
-    flat = lambda x: jnp.broadcast_to(x, distance.shape).reshape(-1, distance.shape[-1])
     penetration = jnp.where(inside, radius, radius - distance)
-    return Contacts(flat((distance <= radius) | inside), normal.map(flat), flat(penetration), point.map(flat))
+    return Contact((distance <= radius) | inside, normal, penetration, closest.rotate(cos, sin) + polygon)
 
 
-def _circle_circle(model: Model, state: State, pair: PairKind) -> Contacts:
-    n = model.size.polygons
-    position = vec(state.position)
-    at = lambda index: position.map(lambda x: rows(x, index))
-    radius = lambda index: rows(model.radius, [i - n for i in index])
-    between = at(pair.b) - at(pair.a)
+def _circle_circle(centre_a: Vec, radius_a: Array, centre_b: Vec, radius_b: Array) -> Contact:
+    between = centre_b - centre_a
     distance = between.norm()
-    reach = radius(pair.a) + radius(pair.b)
+    reach = radius_a + radius_b
     normal = between.scale(1 / nonzero(distance))
-    return Contacts(distance < reach, normal, reach - distance, at(pair.a) + normal.scale(radius(pair.a)))
+    return Contact(distance < reach, normal, reach - distance, centre_a + normal.scale(radius_a))

@@ -1,18 +1,23 @@
-"""One physics step: gravity, contacts, actuators, solver, integration.
+"""One physics step of every lane: as machine code on a CPU, else as operations of XLA.
 
-The order is part of the reference's result (`jax2d.engine.PhysicsEngine.step`).
+All ways come from the one source, `physics.engine.step_block`, a function of references to the arrays of a block of
+lanes; the tests hold them to each other.
 """
 
-from dataclasses import replace
+from functools import cache
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from physics.actuator import drive_motors, fire_thrusters
-from physics.manifold import find_contacts
-from physics.motion import Motion
-from physics.solver import solve
-from physics.types import DEFAULT_PARAMS, Manifold, Model, Params, State
+from physics.codegen.compile import bytes_of, compile_kernel
+from physics.engine import Given, step_block
+from physics.lanes import LANES
+from physics.pairs import table_of
+from physics.rooms import Room, is_room, manifold_rooms, rooms_of, scratch_rooms
+from physics.types import DEFAULT_PARAMS, Manifold, Model, Params, Size, State
 
 
 def step(
@@ -29,31 +34,101 @@ def step(
         state: the worlds before the step.
         motor: control of each joint's motor, in [-1, 1].
         thrust: control of each thruster, in [0, 1].
+        params: constants of the engine.
 
     Returns:
         The worlds after the step, and the contacts found at its start.
     """
-    state = replace(state, velocity=_fall(model, state, params))
-    manifold = find_contacts(model, state)
-    velocity = jnp.concatenate([state.velocity, state.angular_velocity[:, None]], axis=1)
-    velocity = drive_motors(model, state, velocity, motor, params)
-    velocity = fire_thrusters(model, state, velocity, thrust, params)
-    motion, state = solve(model, state, manifold, Motion(state.position, velocity), params)
-    return _integrate(state, motion, params), manifold
+    return _step(model, state, motor, thrust, params, seen=True)
 
 
-def _fall(model: Model, state: State, params: Params) -> Float[Array, "body 2 lane"]:
-    return state.velocity + model.gravity * params.dt * (model.inverse_mass != 0)[:, None]
+def step_unseen(
+    model: Model,
+    state: State,
+    motor: Float[Array, "joint lane"],
+    thrust: Float[Array, "thruster lane"],
+    params: Params = DEFAULT_PARAMS,
+) -> State:
+    """The same without writing the contacts down; which of them were active, `State.contact_active` tells."""
+    return _step(model, state, motor, thrust, params, seen=False)[0]
 
 
-def _integrate(state: State, motion: Motion, params: Params) -> State:
-    """Euler step, then bounds on places and speeds."""
-    clip = lambda x, most: jnp.clip(x, -most, most)
-    v, w = motion.velocity[:, :2], motion.velocity[:, 2]
-    return replace(
-        state,
-        position=clip(motion.position + v * params.dt, params.max_position),
-        rotation=state.rotation + w * params.dt,
-        velocity=clip(v, params.max_velocity),
-        angular_velocity=clip(w, params.max_angular_velocity),
-    )
+def _step(model, state, motor, thrust, params: Params, seen: bool) -> tuple[State, Any]:
+    given = _same_lanes(Given(model, state, motor, thrust))
+    if state.position.dtype != jnp.float32:
+        return on_all_lanes(given, params, seen)
+    if jax.default_backend() == "cpu":
+        return as_machine_code(given, params, seen)
+    ways = {"cpu": as_machine_code, "default": on_all_lanes}
+    return jax.lax.platform_dependent(given, **{k: lambda given, f=f: f(given, params, seen) for k, f in ways.items()})
+
+
+def _same_lanes(given: Given) -> Given:
+    """Every array with as many lanes as the one that has most."""
+    lanes = max(x.shape[-1] for x in jax.tree.leaves(given))
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], lanes)), given)
+
+
+def on_all_lanes(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
+    """The step as XLA's own operations, all lanes as one block: slow on a CPU, but anywhere and in any precision."""
+    size, lanes, dtype = given.model.size, given.before.rotation.shape[-1], given.before.position.dtype
+
+    def empty(room: Room):
+        shape = (*room.shape, lanes) if room.lanes else room.shape
+        return jax.new_ref(jnp.zeros(shape, dtype if room.dtype == "float32" else room.dtype))
+
+    empties = lambda rooms: jax.tree.map(empty, rooms, is_leaf=is_room)
+    table = jax.tree.map(jnp.asarray, table_of(size, params.faithful_padding))
+    table = jax.tree.map(jax.new_ref, table._replace(kept=table.kept.astype(dtype)))
+    read = jax.tree.map(jax.new_ref, given)
+    after = jax.tree.map(lambda x: jax.new_ref(jnp.zeros_like(x)), given.before)
+    contacts = empties(manifold_rooms(size)) if seen else None
+    step_block(table, read, after, contacts, empties(scratch_rooms(size)), params)
+    return jax.tree.map(lambda ref: ref[...], (after, contacts))
+
+
+def as_machine_code(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
+    """The step as machine code for this CPU, block by block of LANES lanes; the last block is filled up."""
+    lanes = given.before.rotation.shape[-1]
+    kernel = _compiled(given.model.size, params, seen, rooms_of(given))
+    missing = -lanes % LANES
+    fill = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge")
+    given = jax.tree.map(fill, given) if missing else given
+    shape = lambda room: jax.ShapeDtypeStruct((*room.shape, lanes + missing), room.dtype)
+    results = [shape(room) for room in leaves(kernel.results)]
+    call = jax.ffi.ffi_call(kernel.name, [*results, jax.ShapeDtypeStruct((kernel.scratch_bytes,), np.uint8)])
+    *filled, _ = call(*jax.tree.leaves(given), *table_of(given.model.size, params.faithful_padding))
+    filled = [x[..., :lanes] for x in filled] if missing else filled
+    return jax.tree.unflatten(jax.tree.structure(kernel.results, is_leaf=is_room), filled)
+
+
+class Kernel(NamedTuple):
+    """A compiled step."""
+
+    name: str  # for `jax.ffi.ffi_call`
+    results: tuple[State, Manifold | None]  # rooms
+    scratch_bytes: int
+
+
+def leaves(rooms: Any) -> list[Room]:
+    return jax.tree.leaves(rooms, is_leaf=is_room)
+
+
+@cache
+def _compiled(size: Size, params: Params, seen: bool, given: Given) -> Kernel:
+    table = jax.tree.map(lambda x: Room(x.shape, str(x.dtype), lanes=False), table_of(size, params.faithful_padding))
+    results, scratch = (given.before, manifold_rooms(size) if seen else None), scratch_rooms(size)
+
+    def kernel(given, table, results, scratch):
+        after, contacts = results
+        step_block(table, given, after, contacts, scratch, params)
+
+    with jax.ensure_compile_time_eval():
+        refs = jax.tree.map(_reference, (given, table, results, scratch), is_leaf=is_room)
+    jaxpr = jax.make_jaxpr(kernel)(*refs)
+    name = compile_kernel(jaxpr, leaves((given, table)), leaves(results), leaves(scratch))
+    return Kernel(name, results, sum(map(bytes_of, leaves(scratch))))
+
+
+def _reference(room: Room) -> Any:
+    return jax.new_ref(jnp.zeros((*room.shape, LANES) if room.lanes else room.shape, room.dtype))

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 
@@ -101,7 +100,8 @@ def gather(x: Float[Array, "source *row lane"], index: Int[Array, "thing lane"])
     return x.reshape(-1).at[flat].get(mode="promise_in_bounds")
 
 
-def stored(x: Float[Array, "sheet ..."]) -> Float[Array, "sheet ..."]:
-    """x itself. A product with the identity matrix, because XLA stores the operands of a product, and would compute
-    x anew for each of its readers otherwise. Cheap where there are few sheets."""
-    return jnp.matmul(np.eye(len(x), dtype=np.float32), x.reshape(len(x), -1)).reshape(x.shape)
+def select(x: Float[Array, "thing *row lane"], number: Int[Array, " lane"]) -> Float[Array, "*row lane"]:
+    """x[number[lane], ..., lane]."""
+    lanes = max(x.shape[-1], number.shape[-1])  # either may be the same in all lanes
+    x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
+    return gather(x, jnp.broadcast_to(number, (1, lanes)))[0]

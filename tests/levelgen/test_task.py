@@ -168,14 +168,13 @@ def with_roles(level: Level, roles: dict[int, Role], active: bool = True) -> Lev
     return dataclasses.replace(level, role=role, model=dataclasses.replace(level.model, active=flags))
 
 
-def manifold_with(level: Level, contact: int | None) -> Manifold:
+def contacts_with(level: Level, contact: int | None) -> Manifold:
     """No contact but one."""
     contacts, lanes = pairs_of(level.size).contacts, level.role.shape[-1]
     active = np.zeros((contacts, lanes), bool)
     if contact is not None:
         active[contact] = True
-    scalar, vector = np.zeros((contacts, lanes), np.float32), np.zeros((contacts, 2, lanes), np.float32)
-    return Manifold(jnp.asarray(active), vector, scalar, vector, scalar)
+    return jnp.asarray(active)
 
 
 def pair_contacts(level: Level) -> list[tuple[int, int, int, bool]]:
@@ -193,9 +192,9 @@ def test_touching_follows_the_roles(first: Role, second: Role) -> None:
     """Green with blue is the goal, green with red the end; no other two roles mean anything."""
     one = as_level(golden("s"), slice(0, 1))
     for contact, a, b, counts in pair_contacts(one):
-        level, manifold = with_roles(one, {a: first, b: second}), manifold_with(one, contact)
-        goal = bool(touches(level, manifold, Role.GREEN, Role.BLUE)[0])
-        fail = bool(touches(level, manifold, Role.GREEN, Role.RED)[0])
+        level, active = with_roles(one, {a: first, b: second}), contacts_with(one, contact)
+        goal = bool(touches(level, active, Role.GREEN, Role.BLUE)[0])
+        fail = bool(touches(level, active, Role.GREEN, Role.RED)[0])
         assert goal == (counts and {first, second} == {Role.GREEN, Role.BLUE}), (contact, a, b)
         assert fail == (counts and {first, second} == {Role.GREEN, Role.RED}), (contact, a, b)
 
@@ -204,7 +203,7 @@ def test_inactive_bodies_have_no_role() -> None:
     one = as_level(golden("s"), slice(0, 1))
     contact, a, b, _ = pair_contacts(one)[-1]
     asleep = with_roles(one, {a: Role.GREEN, b: Role.BLUE}, active=False)
-    assert not touches(asleep, manifold_with(one, contact), Role.GREEN, Role.BLUE)[0]
+    assert not touches(asleep, contacts_with(one, contact), Role.GREEN, Role.BLUE)[0]
     assert not has_roles(asleep, [a], [b], Role.GREEN, Role.BLUE).any()
     assert goal_distance(asleep, asleep.state)[0] == 0
 

@@ -1,0 +1,60 @@
+"""Arrays of a kernel as LLVM values: one vector for each row of lanes, one scalar for each number without lanes."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+
+from physics.lanes import LANES
+
+Operand = Any  # an LLVM value; llvmlite does not say of its own that they have types
+INDEX = ir.IntType(64)
+ELEMENT = {"float32": ir.FloatType(), "int32": ir.IntType(32), "bool": ir.IntType(1)}
+STORED = {**ELEMENT, "bool": ir.IntType(8)}  # in memory
+
+
+def has_lanes(shape: tuple[int, ...]) -> bool:
+    return bool(shape) and shape[-1] == LANES
+
+
+@dataclass(frozen=True)
+class Value:
+    """An array: `rows` is an object array of LLVM values, each a vector of lanes if `lanes`, else a scalar."""
+
+    rows: np.ndarray
+    dtype: str
+    lanes: bool
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (*self.rows.shape, LANES) if self.lanes else self.rows.shape
+
+
+def llvm_type(dtype: str, lanes: bool) -> ir.Type:
+    element = ELEMENT[dtype]
+    return ir.VectorType(element, LANES) if lanes else element
+
+
+def constant(x, dtype: str, lanes: bool = False) -> ir.Constant:
+    """A number, in every lane."""
+    number = float(x) if dtype == "float32" else int(x)
+    if lanes:
+        return ir.Constant(llvm_type(dtype, True), [number] * LANES)
+    return ir.Constant(ELEMENT[dtype], number)
+
+
+def splat(builder: ir.IRBuilder, x: Operand) -> Operand:
+    """A scalar in every lane."""
+    kind = ir.VectorType(x.type, LANES)
+    undefined = ir.Constant(kind, ir.Undefined)
+    first = builder.insert_element(undefined, x, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES))
+
+
+def array(shape: tuple[int, ...], fill) -> np.ndarray:
+    """An object array, each element `fill(index)`."""
+    out = np.empty(shape, object)
+    for index in np.ndindex(*shape):
+        out[index] = fill(index)
+    return out

@@ -1,0 +1,59 @@
+"""How a kernel is written: for a block of lanes, over references to arrays whose last axis are the lanes.
+
+A reference reads and writes rows: `ref[i]` is a row of lanes, i a number that may be known only at run time. What
+differs between lanes is computed in all of them and selected; what no lane needs is skipped. The same source becomes
+machine code (`physics.codegen`), a Pallas kernel, or plain XLA operations on all lanes at once.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+LANES = 16  # of a block: as many float32 as the widest vector register holds
+
+Ref = Any  # a reference to an array, `jax.Ref`
+Scalar = Int[Array, ""] | int
+
+
+def each(count: Scalar, do: Callable[[Any], None], first: Scalar = 0) -> None:
+    """do(i) for i = first, ..., count - 1."""
+
+    def body(i, _):
+        do(i)
+
+    jax.lax.fori_loop(first, count, body, None)
+
+
+def when(condition: Bool[Array, ""], do: Callable[[], None]) -> None:
+    """do() if the condition holds."""
+    jax.lax.cond(condition, do, lambda: None)
+
+
+def anywhere(condition: Bool[Array, " lane"]) -> Bool[Array, ""]:
+    """Whether it holds in any lane."""
+    return jnp.any(condition)
+
+
+def pick(
+    count: int, read: Callable[[Any], Array], a: Int[Array, " lane"], b: Int[Array, " lane"]
+) -> tuple[Array, Array]:
+    """read(a[lane])[..., lane] and read(b[lane])[..., lane], of `count` rows, where the number differs by lane."""
+
+    def look(i, found):
+        row = read(i)
+        return tuple(jnp.where(number == i, row, x) for number, x in zip((a, b), found, strict=True))
+
+    first = read(0)
+    return jax.lax.fori_loop(1, count, look, (first, first))
+
+
+def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]]) -> None:
+    """ref[number[lane], ..., lane] += change, for each (number, change)."""
+
+    def add(i):
+        ref[i] += sum(jnp.where(number == i, change, 0.0) for number, change in changes)
+
+    each(ref.shape[0], add)
