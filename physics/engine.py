@@ -1,8 +1,9 @@
-"""One physics step: gravity, contacts, actuators, solver, integration.
+"""One physics step of a block of lanes: gravity, contacts, actuators, solver, integration.
 
 The order is part of the reference's result (`jax2d.engine.PhysicsEngine.step`).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from physics import actuator, body, contact, joint, manifold
@@ -16,7 +17,7 @@ from physics.types import SOLVER_ITERATIONS, Manifold, Model, Params, State
 
 
 class Given(NamedTuple):
-    """References that a step reads."""
+    """What a step reads."""
 
     model: Model
     before: State
@@ -25,7 +26,7 @@ class Given(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """References that a step works in."""
+    """What a step works in."""
 
     bodies: Bodies
     polygons: Polygons
@@ -33,47 +34,82 @@ class Scratch(NamedTuple):
     constraints: Constraints
 
 
-def step_block(
-    table: Table, given: Given, after: State, seen: Manifold | None, scratch: Scratch, params: Params
-) -> None:
-    """Advance the lanes of a block by `params.dt`.
+class Block(NamedTuple):
+    """References to everything of a block of lanes."""
 
-    Args:
-        table: lookup tables of the size.
-        given: the worlds before.
-        after: is given the worlds after.
-        seen: is given the contacts, where somebody wants to see them.
-        scratch: room to work in.
-        params: constants of the engine.
-    """
-    model, before = given.model, given.before
-    bodies, polygons, joints, constraints = scratch
-    body.start(model, before, bodies, params)
-    contact.clear(constraints, after)
-    manifold.outline_polygons(model, bodies, polygons)
-    if seen is not None:
-        contact.see_nothing(seen)
+    table: Table  # lookup tables of the size
+    given: Given  # the worlds before
+    after: State  # is given the worlds after
+    seen: Manifold | None  # is given the contacts, where somebody wants to see them
+    scratch: Scratch
+
+    @property
+    def model(self) -> Model:
+        return self.given.model
+
+
+Stage = Callable[[Block, Params], None]
+
+
+def fall(block: Block, params: Params) -> None:
+    """Gravity into the velocities; where every polygon is."""
+    body.start(block.model, block.given.before, block.scratch.bodies, params)
+    manifold.outline_polygons(block.model, block.scratch.bodies, block.scratch.polygons)
+
+
+def find_contacts(block: Block, params: Params) -> None:
+    """Contacts of the pairs that come near each other, as constraints; they push with what they remember."""
+    bodies, polygons, _, constraints = block.scratch
+    contact.clear(constraints, block.after)
+    if block.seen is not None:
+        contact.see_nothing(block.seen)
 
     def found(kind: int, numbers: list, contacts: list) -> None:
         contact.count(constraints, kind, numbers, contacts)
         for c, one in zip(numbers, contacts, strict=True):
-            contact.prepare(model, before, after, bodies, constraints, c, table, one, params)
-            if seen is not None:
-                contact.see(seen, model, bodies, c, table, one)
+            contact.prepare(
+                block.model, block.given.before, block.after, bodies, constraints, c, block.table, one, params
+            )
+            if block.seen is not None:
+                contact.see(block.seen, block.model, bodies, c, block.table, one)
 
-    manifold.find_contacts(model, bodies, polygons, table, found)
-    contact.share_out(constraints, table)
-    joint.prepare(model, before, bodies, joints, params)
-    actuator.drive_motors(model, bodies, joints, given.motor, params)
-    actuator.fire_thrusters(model, before, bodies, given.thrust, params)
+    manifold.find_contacts(block.model, bodies, polygons, block.table, found)
+    contact.share_out(constraints, block.table)
+
+
+def act(block: Block, params: Params) -> None:
+    """Joints as constraints, motors, thrusters; then everything that pushes changes the velocities."""
+    model, bodies, joints = block.model, block.scratch.bodies, block.scratch.joints
+    joint.prepare(model, block.given.before, bodies, joints, params)
+    actuator.drive_motors(model, bodies, joints, block.given.motor, params)
+    actuator.fire_thrusters(model, block.given.before, bodies, block.given.thrust, params)
     joint.warm_start(model, bodies, joints)
     body.yield_to(model, bodies)
 
+
+def solve(block: Block, params: Params) -> None:
+    """Ten iterations of joints, then contacts."""
+    bodies, _, joints, constraints = block.scratch
+
     def iteration(_):
-        joint.solve(model, bodies, joints, params)
-        contact.solve(model, bodies, constraints, table)
+        joint.solve(block.model, bodies, joints, params)
+        contact.solve(block.model, bodies, constraints, block.table)
 
     each(SOLVER_ITERATIONS, iteration)
-    contact.remember(after, constraints)
-    joint.remember(after, joints)
-    body.integrate(before, after, bodies, params)
+
+
+def integrate(block: Block, params: Params) -> None:
+    """What the next step remembers, and where the bodies go."""
+    bodies, _, joints, constraints = block.scratch
+    contact.remember(block.after, constraints)
+    joint.remember(block.after, joints)
+    body.integrate(block.given.before, block.after, bodies, params)
+
+
+STAGES: tuple[Stage, ...] = (fall, find_contacts, act, solve, integrate)
+
+
+def step_block(block: Block, params: Params, stages: tuple[Stage, ...] = STAGES) -> None:
+    """Advance the lanes of a block by `params.dt`."""
+    for stage in stages:
+        stage(block, params)

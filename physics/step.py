@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from physics.codegen.compile import bytes_of, compile_kernel
-from physics.engine import Given, step_block
+from physics.engine import STAGES, Block, Given, Stage, step_block
 from physics.lanes import LANES
 from physics.pairs import table_of
 from physics.rooms import Room, is_room, manifold_rooms, rooms_of, scratch_rooms
@@ -83,14 +83,17 @@ def on_all_lanes(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
     read = jax.tree.map(jax.new_ref, given)
     after = jax.tree.map(lambda x: jax.new_ref(jnp.zeros_like(x)), given.before)
     contacts = empties(manifold_rooms(size)) if seen else None
-    step_block(table, read, after, contacts, empties(scratch_rooms(size)), params)
+    step_block(Block(table, read, after, contacts, empties(scratch_rooms(size))), params)
     return jax.tree.map(lambda ref: ref[...], (after, contacts))
 
 
-def as_machine_code(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
-    """The step as machine code for this CPU, block by block of LANES lanes; the last block is filled up."""
+def as_machine_code(given: Given, params: Params, seen: bool, stages: tuple[Stage, ...] = STAGES) -> tuple[State, Any]:
+    """The step as machine code for this CPU, block by block of LANES lanes; the last block is filled up.
+
+    With fewer `stages`, it takes less time and fills in less: to measure what each costs.
+    """
     lanes = given.before.rotation.shape[-1]
-    kernel = _compiled(given.model.size, params, seen, rooms_of(given))
+    kernel = _compiled(given.model.size, params, seen, rooms_of(given), stages)
     missing = -lanes % LANES
     fill = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge")
     given = jax.tree.map(fill, given) if missing else given
@@ -115,20 +118,19 @@ def leaves(rooms: Any) -> list[Room]:
 
 
 @cache
-def _compiled(size: Size, params: Params, seen: bool, given: Given) -> Kernel:
+def _compiled(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...]) -> Kernel:
     table = jax.tree.map(lambda x: Room(x.shape, str(x.dtype), lanes=False), table_of(size, params.faithful_padding))
     results, scratch = (given.before, manifold_rooms(size) if seen else None), scratch_rooms(size)
 
-    def kernel(given, table, results, scratch):
-        after, contacts = results
-        step_block(table, given, after, contacts, scratch, params)
+    def kernel(*arrays):
+        given, table, (after, contacts), scratch = jax.tree.map(jax.new_ref, arrays)
+        step_block(Block(table, given, after, contacts, scratch), params, stages)
 
-    with jax.ensure_compile_time_eval():
-        refs = jax.tree.map(_reference, (given, table, results, scratch), is_leaf=is_room)
-    jaxpr = jax.make_jaxpr(kernel)(*refs)
+    arrays = jax.tree.map(_block_of, (given, table, results, scratch), is_leaf=is_room)
+    jaxpr = jax.make_jaxpr(kernel)(*arrays)
     name = compile_kernel(jaxpr, leaves((given, table)), leaves(results), leaves(scratch))
     return Kernel(name, results, sum(map(bytes_of, leaves(scratch))))
 
 
-def _reference(room: Room) -> Any:
-    return jax.new_ref(jnp.zeros((*room.shape, LANES) if room.lanes else room.shape, room.dtype))
+def _block_of(room: Room) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((*room.shape, LANES) if room.lanes else room.shape, room.dtype)

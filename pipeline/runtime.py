@@ -15,8 +15,7 @@ CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
 # that is split over threads would make a level's bits depend on the machine's number of cores.
 XLA_FLAGS = (
     "--xla_cpu_multi_thread_eigen=false",
-    "intra_op_parallelism_threads=1",
-    "--xla_cpu_prefer_vector_width=512",  # where the processor has it; worth 10 to 20% of the physics
+    "--xla_cpu_prefer_vector_width=512",  # where the processor has it
 )
 # NPROC and PJRT_NPROC size XLA's pool. With two or more threads, QR factorisations side by side (the experts'
 # orthogonal weights) can hold every thread while each waits for parts of its work to get one: a deadlock of jaxlib.

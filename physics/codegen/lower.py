@@ -92,7 +92,7 @@ def _equation(b: ir.IRBuilder, equation, operands: list) -> list:
             return [primitives.reduction(b, name, operands[0], params["axes"], str(out.dtype))]
         case "iota":
             return [primitives.iota(params["shape"], params["dimension"], str(params["dtype"]))]
-        case "copy" | "stop_gradient" | "copy_p":
+        case "ref" | "new_ref" | "copy":  # a reference to an argument: the argument itself
             return operands
         case "while":
             return _while(b, params, operands)

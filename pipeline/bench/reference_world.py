@@ -13,14 +13,15 @@ from pathlib import Path
 import numpy as np
 
 # As ours runs (pipeline/runtime.py), so that neither side has an advantage
-SINGLE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1 --xla_cpu_prefer_vector_width=512"
+SINGLE_THREAD = "--xla_cpu_multi_thread_eigen=false --xla_cpu_prefer_vector_width=512"
+THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def stay_on(core: int | None) -> None:
     """One thread on one core; None: all cores, XLA's own threads. Before JAX is imported."""
     if core is not None:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SINGLE_THREAD}".strip()
-        os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+        os.environ.update(dict.fromkeys(THREADS, "1"))
         if hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, {core})
 
