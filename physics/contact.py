@@ -13,9 +13,11 @@ from jaxtyping import Array, Bool, Float
 
 from physics.body import Bodies, place, velocity, yield_to
 from physics.lanes import Ref, anywhere, each, when
-from physics.pairs import Table
+from physics.pairs import GROUPS, Table
 from physics.types import Manifold, Model, Params, State
 from physics.vector import Vec, nonzero, spin
+
+NONE = -1.0  # instead of a batch
 
 
 class Contact(NamedTuple):
@@ -28,16 +30,20 @@ class Contact(NamedTuple):
 
 
 class Constraints(NamedTuple):
-    """References, one row a contact. Only rows of contacts that act are ever read."""
+    """References, one row a contact. Only rows of contacts that act in any lane are ever read.
+
+    A group are the first points of polygon pairs, their second points, circle-polygon pairs, or pairs of circles.
+    """
 
     geometry: Ref  # [contact, 4, lane]: normal x, y, point x, y
     effort: Ref  # [contact, 5, lane]: target (m/s along the normal), friction, both inverse masses, inverse inertias
     impulse: Ref  # [contact, 2, lane]: accumulated, normal and tangent, N s
-    acts: Ref  # [contact, lane]: whether it pushes
-    rank: Ref  # [contact, lane]: the how-manieth of the touching pairs of its kind, from 1; later its solver batch
+    batch: Ref  # [contact, lane]: number of the solver batch; NONE where it does not push
     touching: Ref  # [kind, lane]: how many pairs of a kind touch
-    listed: Ref  # numbers of the contacts that act in any lane, by solver batch
-    ends: Ref  # [batch + 1]: where each batch ends in `listed`
+    acting: Ref  # numbers of the contacts that push in any lane, each group from the place of its first contact
+    counts: Ref  # [group]: how many these are
+    listed: Ref  # the same, by solver batch
+    ends: Ref  # [segment + 1]: where each batch begins and ends in `listed`
 
 
 class Arms(NamedTuple):
@@ -52,26 +58,24 @@ class Arms(NamedTuple):
 def clear(constraints: Constraints, after: State) -> None:
     """No contact acts, none is remembered."""
 
-    def none(c):
-        constraints.acts[c] = jnp.zeros_like(constraints.acts[c])
-        after.contact_active[c] = jnp.zeros_like(after.contact_active[c])
-        after.contact_normal_impulse[c] = jnp.zeros_like(after.contact_normal_impulse[c])
-        after.contact_tangent_impulse[c] = jnp.zeros_like(after.contact_tangent_impulse[c])
+    def blank(ref):
+        def one(i):
+            ref[i] = jnp.zeros_like(ref[i])
 
-    def untouched(kind):
-        constraints.touching[kind] = jnp.zeros_like(constraints.touching[kind])
+        return one
 
-    each(constraints.acts.shape[0], none)
-    each(constraints.touching.shape[0], untouched)
+    for ref in (after.contact_active, after.contact_normal_impulse, after.contact_tangent_impulse):
+        each(ref.shape[0], blank(ref))
+    for ref in (constraints.touching, constraints.counts):
+        each(ref.shape[0], blank(ref))
 
 
-def count(constraints: Constraints, kind: int, numbers: list, contacts: list[Contact]) -> None:
-    """Rank a pair, touching where any of its contacts is active, among the touching pairs of its kind."""
+def rank(constraints: Constraints, kind: int, contacts: list[Contact]) -> Float[Array, " lane"]:
+    """The how-manieth touching pair of its kind a pair is, from 1: it touches where any of its contacts is active."""
     touching = functools.reduce(jnp.logical_or, (contact.active for contact in contacts))
     so_far = constraints.touching[kind] + touching
     constraints.touching[kind] = so_far
-    for c in numbers:
-        constraints.rank[c] = so_far
+    return so_far
 
 
 def bounce(model: Model, bodies: Bodies, a, b, contact: Contact) -> Float[Array, " lane"]:
@@ -106,15 +110,14 @@ def see(seen: Manifold, model: Model, bodies: Bodies, c, table: Table, contact: 
 
 
 def prepare(
-    model: Model, before: State, after: State, bodies: Bodies, to: Constraints, c, table: Table, contact: Contact,
-    params: Params,
+    model: Model, before: State, after: State, bodies: Bodies, to: Constraints, c, group: int,
+    rank: Float[Array, " lane"], table: Table, contact: Contact, params: Params,
 ) -> None:  # fmt: skip
     """Contact c as a constraint, pushing with what it remembers of the last step's impulses."""
     a, b = table.a[c], table.b[c]
     mass_a, mass_b = model.inverse_mass[a], model.inverse_mass[b]
     acts = contact.active & model.collides[a, b] & ((mass_a != 0) | (mass_b != 0))
     after.contact_active[c] = contact.active
-    to.acts[c] = acts
 
     def constrain():
         keep = lambda x: jnp.where(acts, x, 0.0)
@@ -129,6 +132,9 @@ def prepare(
         last = jnp.stack([before.contact_normal_impulse[c], before.contact_tangent_impulse[c]])
         impulse = jnp.where(remembered, last, 0.0)
         to.impulse[c] = impulse
+        to.batch[c] = jnp.where(acts, rank, NONE)  # until `share_out` knows the batch
+        to.acting[table.start[group] + to.counts[group]] = c
+        to.counts[group] += 1
         normal, point = _geometry(to, c)
         arm = _arms(bodies.motion[a], bodies.motion[b], normal, point)
         _push(bodies, a, b, normal, arm, impulse[0], impulse[1])
@@ -137,58 +143,66 @@ def prepare(
 
 
 def share_out(to: Constraints, table: Table) -> None:
-    """List the contacts that act, by solver batch.
+    """Share the contacts that act out into solver batches.
 
     The reference sorts the pairs of a kind stably, those that do not touch first, and the pair at sorted place p
     belongs to batch p mod batches: the k-th of A touching pairs among N stands at place N - A + k.
     """
 
-    def batch(s, filled):
-        kind, batches = table.kind[s], table.batches[s]
-        first_place = table.pairs[s] - to.touching[kind] - 1
+    def place(group):
+        kind, batches = table.kind[group], table.batches[group]
+        first = table.pairs[group] - to.touching[kind] - 1
 
-        def list_if_in(c, filled):
-            in_batch = jax.lax.rem(first_place + to.rank[c], batches) == table.turn[s]
-            mine = anywhere(to.acts[c] & in_batch)
-            to.listed[filled] = c  # the next one overwrites it if it is not mine
-            return filled + mine
+        def one(k):
+            c = to.acting[k]
+            place = first + to.batch[c]
+            turn = place - batches * jnp.floor((place + 0.5) / batches)  # exact: whole numbers
+            to.batch[c] = jnp.where(to.batch[c] == NONE, NONE, turn)
 
-        filled = jax.lax.fori_loop(table.first[s], table.last[s], list_if_in, filled)
+        each(table.start[group] + to.counts[group], one, first=table.start[group])
+
+    def fill(s, filled):
+        group, turn = table.group[s], table.turn[s]
+
+        def list_if_in(k, filled):
+            c = to.acting[k]
+            to.listed[filled] = c  # the next one takes its place if it is in another batch
+            return filled + anywhere(to.batch[c] == turn)
+
+        first = table.start[group]
+        filled = jax.lax.fori_loop(first, first + to.counts[group], list_if_in, filled)
         to.ends[s + 1] = filled
         return filled
 
+    each(GROUPS, place)
     to.ends[0] = jnp.int32(0)
-    jax.lax.fori_loop(0, table.segments, batch, jnp.int32(0))
+    jax.lax.fori_loop(0, table.segments, fill, jnp.int32(0))
 
 
 def solve(model: Model, bodies: Bodies, to: Constraints, table: Table) -> None:
     """One pass over the contacts, batch by batch."""
 
     def batch(s):
-        kind, batches = table.kind[s], table.batches[s]
-        first_place = table.pairs[s] - to.touching[kind] - 1
-
         def one(k):
             c = to.listed[k]
-            in_batch = jax.lax.rem(first_place + to.rank[c], batches) == table.turn[s]
-            _solve_one(bodies, to, c, table.a[c], table.b[c], to.acts[c] & in_batch, table.kept[c])
+            _solve_one(bodies, to, c, table.a[c], table.b[c], to.batch[c] == table.turn[s], table.kept[c])
 
-        each(to.ends[s + 1], one, first=to.ends[s])
-        when(to.ends[s + 1] > to.ends[s], lambda: yield_to(model, bodies))
+        first, end = to.ends[s], to.ends[s + 1]
+        each(end, one, first=first)
+        when(end > first, lambda: yield_to(model, bodies))
 
     each(table.segments, batch)
 
 
-def remember(after: State, to: Constraints) -> None:
+def remember(after: State, to: Constraints, table: Table) -> None:
     """Hand the accumulated impulses to the next step."""
 
     def write(k):
-        c = to.listed[k]
-        acts = to.acts[c]
-        after.contact_normal_impulse[c] = jnp.where(acts, to.impulse[c, 0], 0.0)
-        after.contact_tangent_impulse[c] = jnp.where(acts, to.impulse[c, 1], 0.0)
+        c = to.acting[k]
+        after.contact_normal_impulse[c] = to.impulse[c, 0]
+        after.contact_tangent_impulse[c] = to.impulse[c, 1]
 
-    each(to.ends[to.ends.shape[0] - 1], write)
+    each(GROUPS, lambda group: each(table.start[group] + to.counts[group], write, first=table.start[group]))
 
 
 def _geometry(to: Constraints, c) -> tuple[Vec, Vec]:

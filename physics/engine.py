@@ -65,10 +65,20 @@ def find_contacts(block: Block, params: Params) -> None:
         contact.see_nothing(block.seen)
 
     def found(kind: int, numbers: list, contacts: list) -> None:
-        contact.count(constraints, kind, numbers, contacts)
-        for c, one in zip(numbers, contacts, strict=True):
+        rank = contact.rank(constraints, kind, contacts)
+        for group, (c, one) in enumerate(zip(numbers, contacts, strict=True), kind + (kind > 0)):
             contact.prepare(
-                block.model, block.given.before, block.after, bodies, constraints, c, block.table, one, params
+                block.model,
+                block.given.before,
+                block.after,
+                bodies,
+                constraints,
+                c,
+                group,
+                rank,
+                block.table,
+                one,
+                params,
             )
             if block.seen is not None:
                 contact.see(block.seen, block.model, bodies, c, block.table, one)
@@ -101,7 +111,7 @@ def solve(block: Block, params: Params) -> None:
 def integrate(block: Block, params: Params) -> None:
     """What the next step remembers, and where the bodies go."""
     bodies, _, joints, constraints = block.scratch
-    contact.remember(block.after, constraints)
+    contact.remember(block.after, constraints, block.table)
     joint.remember(block.after, joints)
     body.integrate(block.given.before, block.after, bodies, params)
 

@@ -13,6 +13,8 @@ import numpy as np
 from physics.types import FIXED_POLYGONS, SOLVER_BATCH, Size
 
 KINDS = 3  # of pairs: polygons, circle-polygon, circles
+GROUPS = 4  # of contacts: first and second points of polygon pairs, circle-polygon, circles
+KIND_OF_GROUP = (0, 0, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -61,38 +63,39 @@ def pairs_of(size: Size) -> Pairs:
 
 
 class Table(NamedTuple):
-    """What kernels look up by number: references, or the arrays behind them.
-
-    A segment is one solver batch of one group of contacts: first points, second points, circle-polygon, circle-circle.
-    """
+    """What kernels look up by number: references, or the arrays behind them. A segment is a solver batch of a group."""
 
     a: Any  # [contact] first body
     b: Any  # [contact] second body
     kept: Any  # [contact] 0 where the padding defect forgets the accumulated impulses, else 1
-    first: Any  # [segment] first contact of the group
-    last: Any  # [segment] the one after its last
-    kind: Any  # [segment] of its pairs: 0 polygons, 1 circle-polygon, 2 circles
-    pairs: Any  # [segment] of the kind
-    batches: Any  # [segment] of the kind
+    start: Any  # [group] first contact
+    kind: Any  # [group] of its pairs
+    pairs: Any  # [group] of the kind
+    batches: Any  # [group] of the kind
+    group: Any  # [segment]
     turn: Any  # [segment] number of the batch
 
     @property
     def segments(self) -> int:
-        return self.first.shape[0]
+        return self.group.shape[0]
 
 
 def table_of(size: Size, faithful_padding: bool) -> Table:
-    """The lookup tables of a size."""
+    """The lookup tables of a size. Whole numbers that lanes calculate with are floats, exact ones."""
     pairs = pairs_of(size)
-    kinds = (pairs.polygon, pairs.circle_polygon, pairs.circle)
-    a, b, kept, segments, start = [], [], [], [], 0
-    for kind in (0, 0, 1, 2):
-        pair = kinds[kind]
-        a += pair.a
-        b += pair.b
-        forgotten = faithful_padding and pair.padded
-        kept += [1.0] * (len(pair) - 1) + [0.0 if forgotten else 1.0] * min(len(pair), 1)
-        segments += [(start, start + len(pair), kind, len(pair), pair.batches, turn) for turn in range(pair.batches)]
-        start += len(pair)
-    columns = (np.array(column, np.int32) for column in zip(*segments, strict=True))
-    return Table(np.array(a, np.int32), np.array(b, np.int32), np.array(kept, np.float32), *columns)
+    kinds = [(pairs.polygon, pairs.circle_polygon, pairs.circle)[kind] for kind in KIND_OF_GROUP]
+    kept = [np.ones(len(pair), np.float32) for pair in kinds]
+    for pair, row in zip(kinds, kept, strict=True):
+        row[len(pair) - 1 :] = not (faithful_padding and pair.padded)
+    whole, number = (lambda x: np.array(x, np.int32)), (lambda x: np.array(x, np.float32))
+    return Table(
+        a=whole([body for pair in kinds for body in pair.a]),
+        b=whole([body for pair in kinds for body in pair.b]),
+        kept=np.concatenate(kept),
+        start=whole(np.cumsum([0, *map(len, kinds)])[:-1]),
+        kind=whole(KIND_OF_GROUP),
+        pairs=number([len(pair) for pair in kinds]),
+        batches=number([pair.batches for pair in kinds]),
+        group=whole([group for group, pair in enumerate(kinds) for _ in range(pair.batches)]),
+        turn=number([turn for pair in kinds for turn in range(pair.batches)]),
+    )

@@ -9,7 +9,7 @@ from physics.contact import Constraints
 from physics.engine import Scratch
 from physics.joint import Joints
 from physics.manifold import Polygons
-from physics.pairs import KINDS, pairs_of, table_of
+from physics.pairs import GROUPS, KINDS, pairs_of, table_of
 from physics.types import MAX_VERTICES, Manifold, Size
 
 
@@ -39,7 +39,7 @@ def scratch_rooms(size: Size) -> Scratch:
     """What a step works in."""
     table, contacts = table_of(size, True), pairs_of(size).contacts
     polygons, corners, joints = size.polygons, MAX_VERTICES, size.joints
-    listed = int((table.last - table.first).sum()) + 1  # one more: see `contact.share_out`
+    listed = int((table.pairs * table.batches).sum()) + 1  # one more: see `contact.share_out`
     return Scratch(
         Bodies(motion=room(size.bodies, 5), push=room(size.bodies, 3), turn=room(size.bodies, 2)),
         Polygons(
@@ -66,9 +66,10 @@ def scratch_rooms(size: Size) -> Scratch:
             geometry=room(contacts, 4),
             effort=room(contacts, 5),
             impulse=room(contacts, 2),
-            acts=room(contacts, dtype="bool"),
-            rank=room(contacts, dtype="int32"),
-            touching=room(KINDS, dtype="int32"),
+            batch=room(contacts),
+            touching=room(KINDS),
+            acting=room(contacts, dtype="int32", lanes=False),
+            counts=room(GROUPS, dtype="int32", lanes=False),
             listed=room(listed, dtype="int32", lanes=False),
             ends=room(table.segments + 1, dtype="int32", lanes=False),
         ),

@@ -79,7 +79,7 @@ def on_all_lanes(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
 
     empties = lambda rooms: jax.tree.map(empty, rooms, is_leaf=is_room)
     table = jax.tree.map(jnp.asarray, table_of(size, params.faithful_padding))
-    table = jax.tree.map(jax.new_ref, table._replace(kept=table.kept.astype(dtype)))
+    table = jax.tree.map(lambda x: jax.new_ref(x.astype(dtype) if x.dtype == jnp.float32 else x), table)
     read = jax.tree.map(jax.new_ref, given)
     after = jax.tree.map(lambda x: jax.new_ref(jnp.zeros_like(x)), given.before)
     contacts = empties(manifold_rooms(size)) if seen else None

@@ -1,0 +1,211 @@
+"""What a physics step costs, stage by stage, and how far it is from its arithmetic.
+
+    python -m benchmarks.floor [SIZE ...]
+
+Times: the machine code of the first 1, 2, ... stages (physics/engine.py) over sampled levels in mid-episode, one core;
+a stage costs what it adds. Work: the same blocks through an interpreter of the kernel's jaxpr that counts vector
+operations, loads and stores of rows. Floor: vector operations at VECTORS_PER_CYCLE, and at CLOCK, the core's own.
+"""
+
+import os
+import sys
+import time
+from collections import Counter
+
+os.environ.update(dict.fromkeys(("NPROC", "OMP_NUM_THREADS"), "1"))
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+from levelgen import task
+from levelgen.actions import controls
+from levelgen.level import SIZES
+from levelgen.sampler import sample_levels
+from physics.codegen.primitives import ELEMENTWISE
+from physics.engine import STAGES, Block, Given, step_block
+from physics.lanes import LANES
+from physics.pairs import table_of
+from physics.rooms import is_room, scratch_rooms
+from physics.step import as_machine_code
+from physics.types import DEFAULT_PARAMS
+
+LEVELS, COUNTED = 1024, 64  # lanes timed, lanes counted
+STEPS = 32  # env steps under random actions before the measurement
+VECTORS_PER_CYCLE = 2  # 512-bit arithmetic of this generation of cores
+REPEATS = 40
+
+
+def worlds(size: str) -> Given:
+    """Levels some way into their episodes, and controls."""
+    level = sample_levels(np.arange(LEVELS), SIZES[size])
+    choices = jnp.array([3, 3, 3, 3, 2, 2])[:, None]
+
+    def act(now, key):
+        action = jax.random.randint(key, (6, LEVELS), 0, choices)
+        return task.step(level, now, action)[0], action
+
+    now, actions = jax.jit(lambda now: jax.lax.scan(act, now, jax.random.split(jax.random.key(0), STEPS)))(
+        task.reset(level)
+    )
+    return Given(level.model, now.state, *controls(level, actions[-1]))
+
+
+def seconds(given: Given, stages: tuple) -> float:
+    """Of one block of lanes."""
+    compiled = jax.jit(lambda given: as_machine_code(given, DEFAULT_PARAMS, False, stages))
+    jax.block_until_ready(compiled(given))
+    best = np.inf
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        jax.block_until_ready(compiled(given))
+        best = min(best, time.perf_counter() - start)
+    return best / (LEVELS / LANES)
+
+
+def count(given: Given, stages: tuple) -> Counter:
+    """Vector operations, loads and stores of one block of lanes, on average."""
+    size, total = given.model.size, Counter()
+    arrays = lambda rooms: jax.tree.map(
+        lambda r: np.zeros((*r.shape, LANES) if r.lanes else r.shape, r.dtype), rooms, is_leaf=is_room
+    )
+
+    def kernel(given, table, after, scratch):
+        block = Block(*jax.tree.map(jax.new_ref, (table, given, after)), None, jax.tree.map(jax.new_ref, scratch))
+        step_block(block, DEFAULT_PARAMS, stages)
+
+    table, scratch = table_of(size, True), arrays(scratch_rooms(size))
+    for first in range(0, COUNTED, LANES):
+        mine = jax.tree.map(lambda x, at=first: np.array(x[..., at : at + LANES]), given)
+        handed = mine, table, jax.tree.map(np.zeros_like, mine.before), scratch
+        closed = jax.make_jaxpr(kernel)(*handed)
+        run(closed.jaxpr, [np.array(x) for x in (*closed.consts, *jax.tree.leaves(handed))], total)
+    return Counter({what: n * LANES // COUNTED for what, n in total.items()})
+
+
+def rows(shape: tuple[int, ...]) -> int:
+    return int(np.prod(shape[:-1])) if shape and shape[-1] == LANES else 0
+
+
+def run(jaxpr: core.Jaxpr, arguments: list, total: Counter) -> list:
+    """Interpret a kernel, references being NumPy arrays, and count."""
+    known = dict(zip(jaxpr.invars, arguments, strict=True))
+    read = lambda x: x.val if isinstance(x, core.Literal) else known[x]
+    for equation in jaxpr.eqns:
+        results = one(equation, [read(x) for x in equation.invars], total)
+        known.update(zip(equation.outvars, results, strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def one(equation, operands: list, total: Counter) -> list:
+    name, params = equation.primitive.name, equation.params
+    if name == "new_ref":
+        return operands
+    if name in ("get", "swap", "addupdate"):
+        return access(name, params, operands, total)
+    if name == "while":
+        n, m = params["cond_nconsts"], params["body_nconsts"]
+        of_test, of_body, values = operands[:n], operands[n : n + m], operands[n + m :]
+        while run(params["cond_jaxpr"].jaxpr, [*of_test, *values], total)[0]:
+            values = run(params["body_jaxpr"].jaxpr, [*of_body, *values], total)
+        return values
+    if name == "scan":
+        constants, values = operands[: params["num_consts"]], operands[params["num_consts"] :]
+        for _ in range(params["length"]):
+            values = run(params["jaxpr"].jaxpr, [*constants, *values], total)
+        return values
+    if name == "cond":
+        return run(params["branches"][int(operands[0])].jaxpr, operands[1:], total)
+    if name == "jit":
+        return run(params["jaxpr"].jaxpr, operands, total)
+    results = equation.primitive.bind(*map(jnp.asarray, operands), **params)
+    results = results if equation.primitive.multiple_results else [results]
+    if name in ELEMENTWISE or name in ("integer_pow", "convert_element_type"):
+        total["operations"] += rows(results[0].shape)
+    elif name.startswith("reduce_"):
+        total["operations"] += max(rows(operands[0].shape) - rows(results[0].shape), 1)
+    return [np.asarray(x) for x in results]
+
+
+def access(name: str, params: dict, operands: list, total: Counter) -> list:
+    """Read or write some rows of a reference."""
+    written = name != "get"
+    transforms = jax.tree.unflatten(params["tree"], operands[1 + written :])
+    index = tuple(
+        slice(int(i.start), int(i.start) + i.size) if hasattr(i, "stride") else int(i)
+        for i in (transforms[0].indices if transforms else ())
+    )
+    ref = operands[0]
+    total["stores" if written else "loads"] += rows(np.shape(ref[index]))
+    if name == "get":
+        return [np.array(ref[index])]
+    ref[index] = operands[1] + (ref[index] if name == "addupdate" else 0)
+    return [None] * (name == "swap")
+
+
+def clock() -> float:
+    """The core's cycles a second, from a chain of dependent integer additions."""
+    from llvmlite import binding, ir
+
+    module, word = ir.Module(), ir.IntType(64)
+    function = ir.Function(module, ir.FunctionType(word, [word]), "chain")
+    b = ir.IRBuilder(function.append_basic_block())
+    start, body, done = b.block, b.append_basic_block(), b.append_basic_block()
+    b.branch(body)
+    b.position_at_end(body)
+    i, x = b.phi(word), b.phi(word)
+    i.add_incoming(word(0), start)
+    x.add_incoming(word(1), start)
+    y = x
+    for _ in range(16):
+        y = b.xor(b.add(y, i), word(0x5DEECE66D))  # two cycles, one after the other
+    after = b.add(i, word(1))
+    i.add_incoming(after, body)
+    x.add_incoming(y, body)
+    b.cbranch(b.icmp_unsigned("<", after, function.args[0]), body, done)
+    b.position_at_end(done)
+    b.ret(y)
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    target = binding.Target.from_default_triple().create_target_machine(opt=1)
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(str(module)), target)
+    import ctypes
+
+    chain = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(engine.get_function_address("chain"))
+    rounds, best = 1_000_000, np.inf
+    for _ in range(5):
+        begin = time.perf_counter()
+        chain(rounds)
+        best = min(best, time.perf_counter() - begin)
+    return rounds * 32 / best
+
+
+def main() -> None:
+    cycles = clock()
+    print(f"clock {cycles / 1e9:.2f} GHz; microseconds of a block of {LANES} lanes, one physics step\n")
+    print("| size | stage | us | vector operations | loads | stores | operations at the floor, us |")
+    print("|---|---|---|---|---|---|---|")
+    for size in sys.argv[1:] or "sml":
+        given, before, counted = worlds(size), 0.0, Counter()
+        for k in range(1, len(STAGES) + 1):
+            now, work = seconds(given, STAGES[:k]), count(given, STAGES[:k])
+            row(size, STAGES[k - 1].__name__, now - before, work - counted, cycles)
+            before, counted = now, work
+        row(size, "all", before, counted, cycles)
+
+
+def row(size: str, name: str, took: float, work: Counter, cycles: float) -> None:
+    floor = work["operations"] / VECTORS_PER_CYCLE / cycles
+    cells = (
+        f"{took * 1e6:.2f}",
+        *(f"{work[what]:,}" for what in ("operations", "loads", "stores")),
+        f"{floor * 1e6:.2f}",
+    )
+    print("|", " | ".join((size, name, *cells)), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()
