@@ -5,6 +5,7 @@ differs between lanes is computed in all of them and selected; what no lane need
 machine code (`physics.codegen`), a Pallas kernel, or plain XLA operations on all lanes at once.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -43,8 +44,11 @@ def pick(
     """read(a[lane])[..., lane] and read(b[lane])[..., lane], of `count` rows, where the number differs by lane."""
 
     def look(i, found):
-        row = read(i)
-        return tuple(jnp.where(number == i, row, x) for number, x in zip((a, b), found, strict=True))
+        def choose():
+            row = read(i)
+            return tuple(jnp.where(number == i, row, x) for number, x in zip((a, b), found, strict=True))
+
+        return jax.lax.cond(anywhere((a == i) | (b == i)), choose, lambda: found)
 
     first = read(0)
     return jax.lax.fori_loop(1, count, look, (first, first))
@@ -54,6 +58,11 @@ def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane
     """ref[number[lane], ..., lane] += change, for each (number, change)."""
 
     def add(i):
-        ref[i] += sum(jnp.where(number == i, change, 0.0) for number, change in changes)
+        here = [number == i for number, _ in changes]
+
+        def change():
+            ref[i] += sum(jnp.where(mine, change, 0.0) for mine, (_, change) in zip(here, changes, strict=True))
+
+        when(anywhere(functools.reduce(jnp.logical_or, here)), change)
 
     each(ref.shape[0], add)
