@@ -1,0 +1,61 @@
+"""Machine code for another processor gives the same bits: every operation is rounded by itself."""
+
+import hashlib
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from llvmlite import binding
+
+from physics.step import step_unseen
+from tests.golden.load import HERE, load
+
+STEPS = 8
+PLAIN = {
+    "x86_64": "x86-64",
+    "AMD64": "x86-64",
+}  # the oldest processor of the kind: 128-bit vectors, no fused operations
+
+
+class NoFeatures:
+    """Stands for a processor that has nothing beyond its kind."""
+
+    def flatten(self) -> str:
+        return ""
+
+
+def digest(size: str) -> str:
+    """Of the states some steps after the golden ones."""
+    of = load(HERE / f"{size}.npz")
+    state = of.state
+    compiled = jax.jit(step_unseen)
+    for _ in range(STEPS):
+        state = compiled(of.level.model, state, of.motor, of.thrust)
+    total = hashlib.sha256()
+    for leaf in jax.tree.leaves(state):
+        x = np.array(leaf)
+        x[x != x] = np.nan  # of what sign a NaN is, no standard says; it ends the episode
+        total.update(x.tobytes())
+    return total.hexdigest()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() not in PLAIN, reason="says what to compile for on x86 only")
+@pytest.mark.parametrize("size", ["s", "l"])
+def test_an_old_processor_gives_the_same_bits(size: str) -> None:
+    command = [sys.executable, "-m", "tests.physics.test_machines", size]
+    ran = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True)
+    cpu, theirs = ran.stdout.split()
+    assert cpu != binding.get_host_cpu_name()
+    assert theirs == digest(size)
+
+
+if __name__ == "__main__":
+    processor = PLAIN[platform.machine()]
+    binding.get_host_cpu_name = lambda: processor
+    binding.get_host_cpu_features = NoFeatures
+    print(processor, digest(sys.argv[1]))
