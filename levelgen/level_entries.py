@@ -1,0 +1,194 @@
+"""What may stand where in a level file: names, types and bounds; and reading a value that nobody vouches for.
+
+Names, their order, and what must be there: `kinetix.util.saving` 3.0.2 and what it stores
+(`kinetix.environment.env_state`, `jax2d.sim_state`).
+"""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Role
+from physics.types import FIXED_POLYGONS, MAX_VERTICES, SOLVER_BATCH, SOLVER_ITERATIONS, Size
+
+MOST_THINGS = 64  # of a kind; a file with so many of each has 3 MB
+LARGEST = 1000.0  # of a quantity of a thing; the engine itself stops bodies at 15 m and 100 m/s
+LARGEST_INVERSE = 1e9  # 1/kg and 1/(kg m^2)
+LARGEST_RULE = 1_000_000
+
+
+class LevelFileError(ValueError):
+    """A level file that cannot be used, or a level that such a file cannot hold: where, and what it should be."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What may stand in one place of a file: a number, or numbers in nested objects with the keys "0", "1", ..."""
+
+    kind: type[float] | type[int] | type[bool]
+    low: float = 0.0
+    high: float = 0.0
+    shape: tuple[int, ...] = ()
+
+    def read(self, parent: object, name: str, where: str) -> Any:
+        """The value called `name` in the object at `where`; nested lists, if it is more than one number.
+
+        Raises:
+            LevelFileError: it is missing, or something else.
+        """
+        return self._read(item(parent, name, where), f"{where}.{name}", self.shape)
+
+    def _read(self, value: object, where: str, shape: tuple[int, ...]) -> Any:
+        if shape:
+            return [self._read(item(value, str(i), where), f"{where}.{i}", shape[1:]) for i in range(shape[0])]
+        if self.kind is bool:
+            good = isinstance(value, bool)
+        else:
+            numbers = int if self.kind is int else int | float
+            good = isinstance(value, numbers) and not isinstance(value, bool) and self.low <= value <= self.high
+        if not good:
+            raise LevelFileError(f"{where} is {told(value)}, it has to be {self._wanted}")
+        return self.kind(value)  # pyright: ignore[reportArgumentType]
+
+    @property
+    def _wanted(self) -> str:
+        if self.kind is bool:
+            return "true or false"
+        return f"a {'whole ' if self.kind is int else ''}number from {self.low:,g} to {self.high:,g}"
+
+
+def item(parent: object, name: str, where: str) -> object:
+    """An object's entry; `where` the object is, in words that a person finds it by.
+
+    Raises:
+        LevelFileError: there is none.
+    """
+    if not isinstance(parent, dict):
+        raise LevelFileError(f"{where or 'the whole'} is {told(parent)}, it has to be an object")
+    if name not in parent:
+        raise LevelFileError(f"{where}{'.' if where else ''}{name} is missing")
+    return parent[name]
+
+
+def told(value: object) -> str:
+    """A value in a few words, however much it is."""
+    if isinstance(value, dict | list):
+        return "an object" if isinstance(value, dict) else "a list"
+    words = json.dumps(value[:40] if isinstance(value, str) else value)
+    return words if len(words) <= 40 else f"{words[:40]} ..."
+
+
+def _real(*shape: int) -> Entry:
+    return Entry(float, -LARGEST, LARGEST, shape)
+
+
+FLAG = Entry(bool)
+AMOUNT = Entry(float, 0.0, LARGEST)
+INVERSE = Entry(float, 0.0, LARGEST_INVERSE)
+BINDING = Entry(int, 0, 255)  # of what is not active; level_file looks at the others
+GRAVITY = _real(2)
+BODY = {
+    "position": _real(2),
+    "rotation": _real(),
+    "velocity": _real(2),
+    "angular_velocity": _real(),
+    "inverse_mass": INVERSE,
+    "inverse_inertia": INVERSE,
+    "friction": AMOUNT,
+    "restitution": AMOUNT,
+    "collision_mode": Entry(int, 0, 2),
+    "active": FLAG,
+    "n_vertices": Entry(int, 0, MAX_VERTICES),
+    "vertices": _real(MAX_VERTICES, 2),
+    "radius": AMOUNT,
+    "role": Entry(int, 0, max(Role)),
+    "density": AMOUNT,
+}
+
+
+def entries_of(size: Size) -> dict[str, dict[str, Entry]]:
+    """The entries of each kind of thing."""
+    body = Entry(int, 0, size.bodies - 1)
+    joint = {
+        "a_index": body,
+        "b_index": body,
+        "a_relative_pos": _real(2),
+        "b_relative_pos": _real(2),
+        "global_position": _real(2),
+        "active": FLAG,
+        "acc_impulse": _real(2),
+        "acc_r_impulse": _real(),
+        "motor_speed": _real(),
+        "motor_power": _real(),
+        "motor_on": FLAG,
+        "motor_has_joint_limits": FLAG,
+        "min_rotation": _real(),
+        "max_rotation": _real(),
+        "is_fixed_joint": FLAG,
+        "rotation": _real(),
+        "motor_binding": BINDING,
+    }
+    thruster = {
+        "object_index": body,
+        "relative_position": _real(2),
+        "rotation": _real(),
+        "power": _real(),
+        "global_position": _real(2),
+        "active": FLAG,
+        "thruster_binding": BINDING,
+    }
+    return {"polygon": BODY, "circle": BODY, "joint": joint, "thruster": thruster}
+
+
+_COUNT = Entry(int, 0, MOST_THINGS)
+COUNTS = {
+    "num_polygons": Entry(int, FIXED_POLYGONS, MOST_THINGS),
+    "num_circles": _COUNT,
+    "num_joints": _COUNT,
+    "num_thrusters": _COUNT,
+}
+STATIC_CONSTANTS = {  # of which this engine has one value
+    "max_polygon_vertices": MAX_VERTICES,
+    "num_solver_iterations": SOLVER_ITERATIONS,
+    "solver_batch_size": SOLVER_BATCH,
+    "do_warm_starting": True,
+    "num_static_fixated_polys": FIXED_POLYGONS,
+    "num_motor_bindings": MOTOR_BINDINGS,
+    "num_thruster_bindings": THRUSTER_BINDINGS,
+}
+# what the reference wants to find, and nothing here depends on
+STATIC_EXTRA = {"screen_dim": {"0": 500, "1": 500}, "downscale": 4, "max_shape_size": 2}
+EXTRA = {"pixels_per_unit": 100, "num_shape_roles": len(Role)}
+NO_CONTACT = {
+    "normal": {"0": 0.0, "1": 0.0},
+    "penetration": 0.0,
+    "collision_point": {"0": 0.0, "1": 0.0},
+    "active": False,
+    "acc_impulse_normal": 0.0,
+    "acc_impulse_tangent": 0.0,
+    "restitution_velocity_target": 0.0,
+}
+
+STEPS = Entry(int, 1, LARGEST_RULE)
+_RULE = Entry(float, 0.0, LARGEST_RULE)
+TASK = {"max_timesteps": STEPS, "dense_reward_scale": _RULE}
+PHYSICS = {  # our name in physics.types.Params -> theirs
+    "dt": "dt",
+    "slop": "slop",
+    "joint_bias_velocity": "baumgarte_coefficient_joints_v",
+    "joint_bias_position": "baumgarte_coefficient_joints_p",
+    "fixed_joint_bias": "baumgarte_coefficient_fjoint_av",
+    "joint_limit_bias": "baumgarte_coefficient_rjoint_limit_av",
+    "contact_bias": "baumgarte_coefficient_collision",
+    "joint_stiffness": "joint_stiffness",
+    "max_position": "clip_position",
+    "max_velocity": "clip_velocity",
+    "max_angular_velocity": "clip_angular_velocity",
+    "motor_speed": "base_motor_speed",
+    "motor_power": "base_motor_power",
+    "thruster_power": "base_thruster_power",
+    "motor_decay": "motor_decay_coefficient",
+    "motor_limit_zone": "motor_joint_limit",
+    "base_friction": "base_friction",
+}
+RULES = dict.fromkeys(PHYSICS, _RULE) | {"dt": Entry(float, 1e-6, 1.0)}  # s
