@@ -104,9 +104,16 @@ def _parser() -> argparse.ArgumentParser:
     sub = command(
         "show", _show, "draw a level's witness as a moving picture", "levelproof show data/128k/s 7 -o level.gif"
     )
-    _split(sub)
-    sub.add_argument("level_id", type=int, metavar="LEVEL_ID")
+    sub.add_argument("source", type=Path, metavar="SPLIT", help=f"{SPLIT}; or a level file, such as level.json")
+    sub.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help="a level of the split")
     sub.add_argument("-o", "--out", type=Path, default=Path("level.gif"), help="file to write (default: level.gif)")
+
+    sub = command(
+        "export", _export, "write a level as a file that Kinetix opens", "levelproof export data/128k/s 7 -o level.json"
+    )
+    _split(sub)
+    sub.add_argument("level_id", type=int, metavar="LEVEL_ID", help="a level of the split")
+    sub.add_argument("-o", "--out", type=Path, default=Path("level.json"), help="file to write (default: level.json)")
 
     sub = command("status", _status, "tell how far a split is", "levelproof status data/128k/s")
     _split(sub)
@@ -163,7 +170,14 @@ def _inspect(arguments: argparse.Namespace) -> int:
 def _show(arguments: argparse.Namespace) -> int:
     from pipeline.show import show
 
-    show(arguments.split, arguments.level_id, arguments.out)
+    show(arguments.source, arguments.level_id, arguments.out)
+    return Exit.DONE
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from pipeline.export import export
+
+    export(arguments.split, arguments.level_id, arguments.out)
     return Exit.DONE
 
 

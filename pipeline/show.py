@@ -1,4 +1,4 @@
-"""One level of a split as a picture or a film: its witness, or the initial world where it has none."""
+"""One level as a picture or a film: its witness, or the initial world where it has none."""
 
 import shutil
 import subprocess
@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 from PIL import Image
@@ -16,34 +15,33 @@ from PIL import Image
 from configs.convert import typed
 from levelgen.level import SIZES, Level
 from levelgen.render import Caption, draw, sheet, write_gif, write_png
-from levelgen.sampler import Distribution, sample_levels
 from levelgen.task import TaskParams
 from physics.types import State
 from pipeline.errors import Failure, UserError
 from pipeline.fields import tree_of
+from pipeline.levels import find_row, is_level_file, level_file, level_of
 from pipeline.manifest import Manifest, require_manifest
 from pipeline.shard import Shard
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures a second
 LAST_SECONDS = 1.5  # how long a film rests on its last picture
+MOST_LETTERS = 40  # of a file's name in a picture
 SHEET = (3, 2)  # columns and rows of a still
 
 
-def show(split: Path, level_id: int, out: Path) -> None:
-    """Draw a level of `split` to `out`, and tell in one line what was drawn.
+def show(source: Path, level_id: int | None, out: Path) -> None:
+    """Draw a level of a split, or that of a level file, to `out`, and tell in one line what was drawn.
 
     `.gif` and `.mp4` are films of the witness's first episode, `.png` is a sheet of pictures of it.
 
     Raises:
-        UserError: no such level, or a file that cannot be written.
+        UserError: no such level, or a file that cannot be read or written.
         Failure: the split is damaged.
     """
     write = WRITERS.get(out.suffix.lower())
     if write is None:
         raise UserError(f"Cannot draw to {out}: its name has to end in {', '.join(WRITERS)}.")
-    manifest = require_manifest(split)
-    row = find_row(manifest, level_id)
-    film = witness_film(manifest, row) if row["shard"] else still(manifest, row)
+    film = film_of(source, level_id)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         write(film, out)
@@ -61,19 +59,22 @@ class Film:
     told: str
 
 
-def find_row(manifest: Manifest, level_id: int) -> dict[str, Any]:
-    """The manifest's row of a level.
+def film_of(source: Path, level_id: int | None) -> Film:
+    """What there is to see of a level.
 
     Raises:
-        UserError: it has none.
+        UserError: no such level, or a file that cannot be read.
+        Failure: the split is damaged.
     """
-    ids = manifest.level_ids
-    place = int(np.searchsorted(ids, level_id))
-    if place == len(ids) or ids[place] != level_id:
-        raise UserError(
-            f"There is no level {level_id} in {manifest.split}: it has {len(ids)} levels, from {ids[0]} to {ids[-1]}."
-        )
-    return manifest.table.slice(place, 1).to_pylist()[0]
+    if is_level_file(source):
+        if level_id is not None:
+            raise UserError(f"{source} is a level file, which has one level: leave out the id {level_id}.")
+        return file_still(source)
+    manifest = require_manifest(source)
+    if level_id is None:
+        raise UserError(f"Which level of {source}? Add its id, such as {manifest.level_ids[0]}.")
+    row = find_row(manifest, level_id)
+    return witness_film(manifest, row) if row["shard"] else still(manifest, row)
 
 
 def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
@@ -98,16 +99,23 @@ def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
 
 
 def still(manifest: Manifest, row: dict[str, Any]) -> Film:
-    """The initial world of a level without a witness, made again from its id."""
-    config = manifest.config or {}
-    level_id = jnp.array([row["level_id"]], jnp.int32)
-    level = sample_levels(level_id, SIZES[row["size"]], typed(Distribution, config["distribution"]))
+    """The initial world of a level without a witness."""
+    level = level_of(manifest, row)
     caption = Caption(_title(row), "0.0 s", row["label"], good=False)
     told = (
         f"level {row['level_id']} of size {row['size']} is {row['label']} ({row['label_reason']}): "
         "there is no witness, so this is its initial world"
     )
     return Film([draw(level, level.state, caption=caption)], [LAST_SECONDS], told)
+
+
+def file_still(path: Path) -> Film:
+    """The initial world of a level file."""
+    level = level_file(path).level
+    size = next((name for name, size in SIZES.items() if size == level.size), "custom")
+    title = " ".join(path.stem.split())[:MOST_LETTERS]
+    told = f"{path.name}, a level of size {size}: a level file has no witness, so this is its initial world"
+    return Film([draw(level, level.state, caption=Caption(f"{title} · size {size}", "0.0 s"))], [LAST_SECONDS], told)
 
 
 def first_success(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time"]) -> tuple[int, int]:

@@ -84,7 +84,8 @@ def test_an_unsolved_level_shows_its_beginning_and_says_so(split, tmp_path, caps
 def test_the_drawing_of_a_level_made_again_is_that_of_its_shard(split, tmp_path) -> None:
     """The first picture of a witness is the level that its id rebuilds."""
     from levelgen.render import draw
-    from pipeline.show import find_row, witness_film
+    from pipeline.levels import find_row
+    from pipeline.show import witness_film
 
     manifest = require_manifest(split)
     row = find_row(manifest, level_with(split, "solved"))
