@@ -87,6 +87,7 @@ AMOUNT = Entry(float, 0.0, LARGEST)
 INVERSE = Entry(float, 0.0, LARGEST_INVERSE)
 BINDING = Entry(int, 0, 255)  # of what is not active; level_file looks at the others
 GRAVITY = _real(2)
+IN_WORLD = Entry(float, -10 * LARGEST, 10 * LARGEST, (2,))  # worked out from a position and an anchor
 BODY = {
     "position": _real(2),
     "rotation": _real(),
@@ -114,7 +115,7 @@ def entries_of(size: Size) -> dict[str, dict[str, Entry]]:
         "b_index": body,
         "a_relative_pos": _real(2),
         "b_relative_pos": _real(2),
-        "global_position": _real(2),
+        "global_position": IN_WORLD,
         "active": FLAG,
         "acc_impulse": _real(2),
         "acc_r_impulse": _real(),
@@ -133,7 +134,7 @@ def entries_of(size: Size) -> dict[str, dict[str, Entry]]:
         "relative_position": _real(2),
         "rotation": _real(),
         "power": _real(),
-        "global_position": _real(2),
+        "global_position": IN_WORLD,
         "active": FLAG,
         "thruster_binding": BINDING,
     }

@@ -1,19 +1,31 @@
-"""Levels, records and unit results filled with random bits: what the files must bring back, whatever it means."""
+"""Levels, records and unit results filled with random bits: what the files must bring back, whatever it means.
+
+And a real split without training.
+"""
 
 import dataclasses
+from pathlib import Path
 from typing import Any, get_type_hints
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from configs.compose import compose_job
 from configs.schema import JobConfig
 from experts.labels import Label, Verdict
 from experts.train import UnitResult
-from experts.witness import Record
+from experts.witness import Record, replay, succeeds
 from levelgen.level import ACTIONS, SIZES, Level
+from levelgen.sampler import sample_levels
 from physics.pairs import pairs_of
 from physics.types import MAX_VERTICES, Size
+from pipeline.layout import split_path
+from pipeline.schedule import WorkUnit
 from pipeline.schema import RECORD_STEPS
+from pipeline.unit import commit
+
+PLAYED = 64  # levels of `played_split`
 
 
 def made(kind: type, size: Size, count: int, rng: np.random.Generator, *, time: bool = False) -> Any:
@@ -77,3 +89,20 @@ def made_result(level_ids: list[int], labels: list[Label], size: str = "s") -> U
 
 def made_job(out: str = "data", *overrides: str) -> JobConfig:
     return compose_job([f"out={out}", "executor=inline", *overrides])
+
+
+def played_split(folder: Path) -> Path:
+    """A real split in `folder`: levels of size s under random actions; what reaches the goal is `solved`."""
+    job = made_job(str(folder), "size=s", f"levels={PLAYED}")
+    ids = np.arange(PLAYED, dtype=np.int32)
+    levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
+    rng = np.random.default_rng(0)
+    action = np.repeat(rng.integers(0, 2, (16, 6, PLAYED)), 16, axis=0).astype(np.int32)
+    record = replay(levels, action, job.task)
+    solved = succeeds(np.asarray(record.done), np.asarray(record.goal))
+    assert 1 < solved.sum() < PLAYED
+    verdicts = [made_verdict(Label.SOLVED if good else Label.UNSOLVED) for good in solved]
+    path = split_path(job.out, job.budget, job.size)
+    path.mkdir(parents=True)
+    commit(job, path, WorkUnit(tuple(int(i) for i in ids)), UnitResult(ids.astype(np.int64), levels, record, verdicts))
+    return path

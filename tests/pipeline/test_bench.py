@@ -22,7 +22,6 @@ from pipeline.runtime import own_cores
 from tests.golden.load import HERE, load
 
 ROOT = Path(__file__).parent.parent.parent
-ASKED = "LEVELPROOF_TEST_ORACLE"
 
 
 @pytest.fixture(scope="session")
@@ -175,21 +174,6 @@ class TestInput:
             oracle.oracle_python()
         assert "about two minutes" in capsys.readouterr().err
         assert not (tmp_path / "reference" / "ready").exists()
-
-
-@pytest.fixture(scope="session")
-def reference() -> Path:
-    """The Python of the reference's environment.
-
-    Making it downloads a gigabyte and takes minutes, so the tests do it only when asked to.
-    """
-    there = (oracle.cache_folder() / "reference" / "ready").is_file()
-    if not (there or os.environ.get(oracle.PYTHON_VARIABLE) or os.environ.get(ASKED)):
-        pytest.skip(f"the reference's environment is not there: {ASKED}=1 makes it, {oracle.PYTHON_VARIABLE} names one")
-    try:
-        return oracle.oracle_python()
-    except Failure as failure:
-        pytest.skip(f"the reference's environment cannot be made: {failure}")
 
 
 @pytest.mark.slow

@@ -4,45 +4,24 @@ import re
 import shutil
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
-from experts.labels import Label
-from experts.train import UnitResult
-from experts.witness import replay, succeeds
 from levelgen.level import SIZES
 from levelgen.sampler import sample_levels
 from pipeline.errors import Failure, UserError
-from pipeline.layout import split_path
 from pipeline.manifest import require_manifest
-from pipeline.schedule import WorkUnit
 from pipeline.show import first_success, show
-from pipeline.unit import commit
-from tests.pipeline.made import made_job, made_verdict
+from tests.pipeline.made import PLAYED, made_job, played_split
 
 pytestmark = pytest.mark.slow
-LEVELS = 64
 
 
 @pytest.fixture(scope="module")
 def split(tmp_path_factory) -> Path:
-    """Sixty-four levels of size s under sticky random actions; those that reach the goal so are `solved`."""
-    job = made_job(str(tmp_path_factory.mktemp("data")), "size=s", "levels=64")
-    ids = np.arange(LEVELS, dtype=np.int32)
-    levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
-    rng = np.random.default_rng(0)
-    action = np.repeat(rng.integers(0, 2, (16, 6, LEVELS)), 16, axis=0).astype(np.int32)
-    record = replay(levels, action, job.task)
-    solved = succeeds(np.asarray(record.done), np.asarray(record.goal))
-    assert 1 < solved.sum() < LEVELS
-    verdicts = [made_verdict(Label.SOLVED if good else Label.UNSOLVED) for good in solved]
-    path = split_path(job.out, job.budget, job.size)
-    path.mkdir(parents=True)
-    commit(job, path, WorkUnit(tuple(int(i) for i in ids)), UnitResult(ids.astype(np.int64), levels, record, verdicts))
-    return path
+    return played_split(tmp_path_factory.mktemp("data"))
 
 
 def level_with(split: Path, label: str) -> int:
@@ -97,7 +76,7 @@ def test_the_drawing_of_a_level_made_again_is_that_of_its_shard(split, tmp_path)
     assert (np.asarray(bare) != np.asarray(ours)).any(-1).mean() < 0.02  # but for actuators at work
 
 
-@pytest.mark.parametrize("level_id", [LEVELS, -1, 10**9])
+@pytest.mark.parametrize("level_id", [PLAYED, -1, 10**9])
 def test_a_level_that_is_not_there(split, tmp_path, level_id) -> None:
     with pytest.raises(UserError, match=rf"^There is no level {level_id} in .*64 levels, from 0 to 63\.$"):
         show(split, level_id, tmp_path / "level.gif")

@@ -1,0 +1,42 @@
+"""Level files opened by the reference, in its own environment (`reference_levels.py` runs there)."""
+
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from levelgen.kinetix import Fields, level_from_kinetix
+from levelgen.level import Level
+from pipeline.bench import oracle
+
+ROOT = Path(__file__).parents[2]
+
+
+class Played(NamedTuple):
+    """What the reference made of some files."""
+
+    files: list[Path]
+    arrays: dict[str, np.ndarray]
+
+    def states(self) -> Fields:
+        """By the reference's names, (step, level, ...)."""
+        return {
+            name.removeprefix("state/"): values for name, values in self.arrays.items() if name.startswith("state/")
+        }
+
+    def levels(self) -> Level:
+        """As the reference opened them."""
+        return level_from_kinetix({name: values[0] for name, values in self.states().items()})
+
+
+def open_in_reference(python: Path, files: list[Path], out: Path, steps: int = 0) -> Played:
+    environment = dict(oracle.environment()) | {
+        "PYTHONPATH": str(ROOT / "pipeline" / "bench"),
+        "JAX_COMPILATION_CACHE_DIR": str(oracle.cache_folder() / "reference-jax"),
+    }
+    command = [python, ROOT / "tests" / "levelgen" / "reference_levels.py", out, str(steps), *files]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    with np.load(out) as arrays:
+        return Played(files, dict(arrays))
