@@ -9,7 +9,7 @@ from physics.body import Bodies
 from physics.joint import Joints
 from physics.lanes import Ref, anywhere, each, pick, spread, when
 from physics.trigonometry import cos_sin, tanh
-from physics.types import Model, Params, State
+from physics.types import FIXED_POLYGONS, Model, Params, State
 from physics.vector import Vec
 
 
@@ -37,7 +37,9 @@ def drive_motors(model: Model, bodies: Bodies, joints: Joints, control: Ref, par
         power = power * jnp.where(towards_limit, jnp.maximum(0.0, 1 - jnp.abs(beyond) / zone), 1.0)
         turn = jnp.where(runs, power * tanh(excess * params.motor_decay), 0.0)
         none = jnp.zeros_like(turn)
-        spread(bodies.push, (a, jnp.stack([none, none, turn])), (b, jnp.stack([none, none, -turn])))
+        spread(
+            bodies.push, (a, jnp.stack([none, none, turn])), (b, jnp.stack([none, none, -turn])), first=FIXED_POLYGONS
+        )
 
     each(joints.acts.shape[0], one)
 
@@ -55,6 +57,6 @@ def fire_thrusters(model: Model, before: State, bodies: Bodies, control: Ref, pa
         cos, sin, rotation = turn
         arm = Vec(*model.thruster_position[t]).rotate(cos, sin)
         push = Vec(*cos_sin(model.thruster_rotation[t] + rotation)).scale(force)
-        spread(bodies.push, (body, jnp.stack([push.x, push.y, arm.cross(push)])))
+        spread(bodies.push, (body, jnp.stack([push.x, push.y, arm.cross(push)])), first=FIXED_POLYGONS)
 
     each(model.thruster_active.shape[0], one)

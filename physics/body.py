@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from physics.lanes import Ref, each
 from physics.trigonometry import cos_sin
-from physics.types import Model, Params, State
+from physics.types import FIXED_POLYGONS, Model, Params, State
 from physics.vector import Vec
 
 
@@ -15,7 +15,7 @@ class Bodies(NamedTuple):
     """References, one row a body."""
 
     motion: Ref  # [body, 5, lane]: place x, y (m), velocity x, y (m/s), angular velocity (rad/s)
-    push: Ref  # [body, 3, lane]: sum of impulses x, y (N s), angular (N m s), since the last `yield_to`
+    push: Ref  # [body, 3, lane]: sum of impulses x, y (N s), angular (N m s), since the body last yielded to them
     turn: Ref  # [body, 2, lane]: cosine and sine of the rotation
 
 
@@ -41,17 +41,18 @@ def start(model: Model, before: State, bodies: Bodies, params: Params) -> None:
     each(bodies.motion.shape[0], read)
 
 
-def yield_to(model: Model, bodies: Bodies) -> None:
-    """Let the impulses in `push` change the velocities."""
+def yield_one(model: Model, bodies: Bodies, i) -> None:
+    """Let the impulses in `push` change the velocities of body i."""
+    mass, push = model.inverse_mass[i], bodies.push[i]
+    bodies.motion[i, 2] += mass * push[0]
+    bodies.motion[i, 3] += mass * push[1]
+    bodies.motion[i, 4] += model.inverse_inertia[i] * push[2]
+    bodies.push[i] = jnp.zeros_like(push)
 
-    def move(i):
-        mass, push = model.inverse_mass[i], bodies.push[i]
-        bodies.motion[i, 2] += mass * push[0]
-        bodies.motion[i, 3] += mass * push[1]
-        bodies.motion[i, 4] += model.inverse_inertia[i] * push[2]
-        bodies.push[i] = jnp.zeros_like(push)
 
-    each(bodies.motion.shape[0], move)
+def yield_all(model: Model, bodies: Bodies) -> None:
+    """The same for every body; the scenery never moves."""
+    each(bodies.motion.shape[0], lambda i: yield_one(model, bodies, i), first=FIXED_POLYGONS)
 
 
 def integrate(before: State, after: State, bodies: Bodies, params: Params) -> None:

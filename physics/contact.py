@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from physics.body import Bodies, place, velocity, yield_to
+from physics.body import Bodies, place, velocity, yield_all, yield_one
 from physics.lanes import Ref, anywhere, each, when
 from physics.pairs import GROUPS, Table
-from physics.types import Manifold, Model, Params, State
+from physics.types import FIXED_POLYGONS, Manifold, Model, Params, State
 from physics.vector import Vec, nonzero, spin
 
 NONE = -1.0  # instead of a batch
@@ -187,9 +187,16 @@ def solve(model: Model, bodies: Bodies, to: Constraints, table: Table) -> None:
             c = to.listed[k]
             _solve_one(bodies, to, c, table.a[c], table.b[c], to.batch[c] == table.turn[s], table.kept[c])
 
+        def yield_both(k):
+            c = to.listed[k]
+            yield_one(model, bodies, table.a[c])
+            yield_one(model, bodies, table.b[c])
+
         first, end = to.ends[s], to.ends[s + 1]
         each(end, one, first=first)
-        when(end > first, lambda: yield_to(model, bodies))
+        few = 2 * (end - first) < bodies.motion.shape[0] - FIXED_POLYGONS
+        when(few, lambda: each(end, yield_both, first=first))
+        when(~few, lambda: yield_all(model, bodies))
 
     each(table.segments, batch)
 

@@ -94,7 +94,7 @@ def act(block: Block, params: Params) -> None:
     actuator.drive_motors(model, bodies, joints, block.given.motor, params)
     actuator.fire_thrusters(model, block.given.before, bodies, block.given.thrust, params)
     joint.warm_start(model, bodies, joints)
-    body.yield_to(model, bodies)
+    body.yield_all(model, bodies)
 
 
 def solve(block: Block, params: Params) -> None:

@@ -54,8 +54,8 @@ def pick(
     return jax.lax.fori_loop(1, count, look, (first, first))
 
 
-def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]]) -> None:
-    """ref[number[lane], ..., lane] += change, for each (number, change)."""
+def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]], first: int = 0) -> None:
+    """ref[number[lane], ..., lane] += change, for each (number, change); numbers below `first` are left alone."""
 
     def add(i):
         here = [number == i for number, _ in changes]
@@ -65,4 +65,4 @@ def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane
 
         when(anywhere(functools.reduce(jnp.logical_or, here)), change)
 
-    each(ref.shape[0], add)
+    each(ref.shape[0], add, first=first)
