@@ -8,16 +8,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 
 import pipeline
-from levelgen.actions import CHOICES
+from levelgen.level import SIZES
+from physics.types import FIXED_POLYGONS
 from pipeline.bench import oracle
+from pipeline.bench.actions import STICKINESS, sticky_actions
 from pipeline.bench.contest import Entry, compete
 from pipeline.bench.report import Result, summary, write_json, write_table
 from pipeline.errors import Exit, UserError
-from pipeline.runtime import own_cores
+from pipeline.runtime import own_cores, prepare_jax
 
-STICKINESS = 0.9  # chance that an action entry stays as it was
+CUSTOM = "8,8,8,4"  # a size without a name, for parity
 OURS, PINNED, FREE = "ours", "reference, process per core", "reference, one process"
 
 
@@ -27,13 +30,7 @@ def main(argv: Sequence[str]) -> int:
     for name, value in vars(given).items():
         if isinstance(value, int) and value < 1 and name != "json":
             raise UserError(f"--{name.replace('_', '-')} is {value}: it has to be at least 1.")
-    if given.level_file is not None and not given.level_file.is_file():
-        raise UserError(f"There is no file {given.level_file}: give levels as .npz, or leave --level-file out.")
-    result = given.run(given)
-    if given.json:
-        write_json(result, sys.stdout)
-    else:
-        write_table(result)
+    given.run(given)
     return Exit.DONE
 
 
@@ -47,32 +44,89 @@ def _parser() -> argparse.ArgumentParser:
     )
     benches = parser.add_subparsers(metavar="BENCH", required=True)
 
-    def bench(name: str, run: Callable[[argparse.Namespace], Result], does: str) -> argparse.ArgumentParser:
+    def bench(name: str, run: Callable[[argparse.Namespace], None], does: str) -> argparse.ArgumentParser:
         sub = benches.add_parser(
             name,
             help=does,
             description=f"{does[0].upper()}{does[1:]}.",
             epilog=f"example: levelproof bench {name} --size s",
         )
-        sub.add_argument("--size", choices=["s", "m", "l"], default="s", help="of the levels (default: s)")
-        sub.add_argument("--repeats", type=int, default=5, help="timed runs of each side; medians count (default: 5)")
-        sub.add_argument("--level-file", type=Path, help="levels as the reference's arrays (default: it samples some)")
         sub.add_argument("--json", action="store_true", help="print JSON")
         sub.set_defaults(run=run)
         return sub
 
-    sub = bench("physics", physics, "env steps a second under random actions, without observations")
+    def race(name: str, run: Callable[[argparse.Namespace], Result], does: str) -> argparse.ArgumentParser:
+        sub = bench(name, lambda given: _race(run, given), does)
+        sub.add_argument("--size", choices=["s", "m", "l"], default="s", help="of the levels (default: s)")
+        sub.add_argument("--repeats", type=int, default=5, help="timed runs of each side; medians count (default: 5)")
+        sub.add_argument("--level-file", type=Path, help="levels as the reference's arrays (default: it samples some)")
+        return sub
+
+    sub = race("physics", physics, "env steps a second under random actions, without observations")
     sub.add_argument("--lanes", type=int, default=1024, help="worlds stepped side by side (default: 1024)")
     sub.add_argument("--steps", type=int, default=64, help="env steps of a run in each lane (default: 64)")
     sub.add_argument("--block", type=int, default=128, help="lanes our engine steps together (default: 128)")
     sub.add_argument("--reference-block", type=int, help="the same for the reference (default: all of a process)")
 
-    sub = bench("experts", experts, "env steps a second of training one expert per level")
+    sub = race("experts", experts, "env steps a second of training one expert per level")
     sub.add_argument("--levels", type=int, default=32, help="levels, one expert each (default: 32)")
     sub.add_argument("--environments", type=int, default=32, help="lanes of an expert (default: 32)")
     sub.add_argument("--horizon", type=int, default=64, help="env steps in each lane between updates (default: 64)")
     sub.add_argument("--updates", type=int, default=2, help="updates of a run (default: 2)")
+
+    sub = bench(
+        "parity", parity, "how far the physics is from the reference's: one step from many states, and episodes"
+    )
+    sub.add_argument(
+        "--size",
+        nargs="+",
+        type=_size,
+        default=["s", "m", "l", CUSTOM],
+        help=f"of the worlds: s, m, l or POLYGONS,CIRCLES,JOINTS,THRUSTERS (default: s m l {CUSTOM})",
+    )
+    sub.add_argument("--states", type=int, default=10_000, help="states a size to take one step from (default: 10,000)")
+    sub.add_argument("--episodes", type=int, default=1_000, help="levels with actions to play, a size (default: 1,000)")
     return parser
+
+
+def _size(text: str) -> str:
+    """One that both engines can have."""
+    numbers = text.split(",")
+    if text in SIZES or (len(numbers) == 4 and all(map(str.isdecimal, numbers)) and int(numbers[0]) > FIXED_POLYGONS):
+        return text
+    raise argparse.ArgumentTypeError(
+        f"{text} is no size: give s, m, l, or numbers such as {CUSTOM} (polygons, the scenery's {FIXED_POLYGONS} "
+        "included, circles, joints, thrusters)"
+    )
+
+
+def _race(run: Callable[[argparse.Namespace], Result], given: argparse.Namespace) -> None:
+    if given.level_file is not None and not given.level_file.is_file():
+        raise UserError(f"There is no file {given.level_file}: give levels as .npz, or leave --level-file out.")
+    result = run(given)
+    if given.json:
+        write_json(result, sys.stdout)
+    else:
+        write_table(result)
+
+
+def parity(given: argparse.Namespace) -> None:
+    """Both engines in turns, this one in this process."""
+    prepare_jax()
+    from pipeline.bench.parity.campaign import campaign  # compiles functions as it is imported
+    from pipeline.bench.parity.progress import Board
+    from pipeline.bench.parity.report import Report
+
+    python = oracle.oracle_python()
+    with Board(Console(stderr=True)).shown() as board:
+        sizes = [campaign(python, size, given.states, given.episodes, board) for size in given.size]
+    settings = {"states": given.states, "episodes": given.episodes, "stickiness": STICKINESS}
+    report = Report.of(sizes, settings, oracle.versions(python))
+    if given.json:
+        report.write_json(sys.stdout)
+    else:
+        report.write_tables()
+    report.check()
 
 
 def physics(given: argparse.Namespace) -> Result:
@@ -135,16 +189,6 @@ def share(count: int, cores: Sequence[int]) -> list[tuple[int | None, int, int]]
     """(core, first, how many) of each process, as even as can be; cores without work are left out."""
     cuts = np.linspace(0, count, min(len(cores), count) + 1).round().astype(int).tolist()
     return [(core, a, b - a) for core, a, b in zip(cores, cuts, cuts[1:], strict=False)]
-
-
-def sticky_actions(steps: int, lanes: int, seed: int = 0) -> np.ndarray:
-    """Random multi-discrete actions that change now and then, (step, 6, lane) int32."""
-    rng = np.random.default_rng(seed)
-    fresh = rng.integers(0, np.array(CHOICES)[None, :, None], (steps, len(CHOICES), lanes), np.int32)
-    changes = rng.random(fresh.shape) >= STICKINESS
-    changes[0] = True
-    last = np.maximum.accumulate(np.where(changes, np.arange(steps)[:, None, None], 0), 0)
-    return np.take_along_axis(fresh, last, 0)
 
 
 def _on(core: int | None) -> list[object]:

@@ -49,8 +49,8 @@ def compete(entries: Sequence[Entry], repeats: int) -> list[Score]:
     """
     with ExitStack() as stack:
 
-        def make(entry: Entry, command: Sequence[str]) -> _Process:
-            return _Process(command, entry.environment, stack, stack.enter_context(tempfile.TemporaryFile("w+")))
+        def make(entry: Entry, command: Sequence[str]) -> Process:
+            return Process(command, entry.environment, stack, stack.enter_context(tempfile.TemporaryFile("w+")))
 
         teams = [[make(entry, command) for command in entry.commands] for entry in entries]
         scores = []
@@ -68,7 +68,9 @@ def compete(entries: Sequence[Entry], repeats: int) -> list[Score]:
 
 
 @dataclass
-class _Process:
+class Process:
+    """A process that speaks the protocol of `serve`; it ends with `stack`."""
+
     command: Sequence[str]
     environment: Mapping[str, str]
     stack: ExitStack
@@ -81,10 +83,10 @@ class _Process:
         )
         self.stack.callback(_end, self.running)
 
-    def go(self) -> None:
+    def go(self, request: str = "") -> None:
         assert self.running.stdin is not None
         with suppress(BrokenPipeError):  # it died: `answer` says so
-            self.running.stdin.write("\n")
+            self.running.stdin.write(f"{request}\n")
             self.running.stdin.flush()
 
     def answer(self) -> dict:
@@ -99,7 +101,7 @@ class _Process:
         )
 
 
-def _run_once(score: Score, team: Sequence[_Process]) -> None:
+def _run_once(score: Score, team: Sequence[Process]) -> None:
     for process in team:
         process.go()
     answers = [process.answer() for process in team]

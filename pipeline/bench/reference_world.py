@@ -38,14 +38,23 @@ def flatten(state, prefix: str = "") -> dict[str, np.ndarray]:
     return fields
 
 
+def static_of(size: str):
+    """The reference's static parameters of `s`, `m`, `l` or of `POLYGONS,CIRCLES,JOINTS,THRUSTERS`."""
+    from kinetix.environment import static_env_params_from_size
+
+    if "," not in size:
+        return static_env_params_from_size(size)
+    names = ("num_polygons", "num_circles", "num_joints", "num_thrusters")
+    return static_env_params_from_size("s").replace(**dict(zip(names, map(int, size.split(",")), strict=True)))
+
+
 def load_levels(path: str, size: str, first: int, count: int):
     """Levels `first` to `first + count - 1` of a file, going round where it has fewer."""
     import jax
     import jax.numpy as jnp
-    from kinetix.environment import static_env_params_from_size
     from kinetix.environment.utils import create_empty_env
 
-    empty = create_empty_env(static_env_params_from_size(size))
+    empty = create_empty_env(static_of(size))
     with np.load(path) as file:
         fields = {name: file[name] for name in file.files if "/" in name or name in flatten(empty)}
     index = (first + np.arange(count)) % len(fields["gravity"])

@@ -19,6 +19,13 @@ def serve(ready: dict, run: Callable[[], dict]) -> None:
         _say(run())
 
 
+def answer(ready: dict, do: Callable[[dict], dict]) -> None:
+    """The same for requests: each line read is one, as JSON, and `do` makes its answer."""
+    _say(ready)
+    for line in sys.stdin:
+        _say(do(json.loads(line)))
+
+
 def timed(action: Callable):
     """(seconds, result)."""
     start = time.perf_counter()

@@ -13,7 +13,8 @@ import pytest
 from levelgen.actions import CHOICES
 from levelgen.kinetix import state_to_kinetix
 from pipeline.bench import main, oracle
-from pipeline.bench.command import OURS, share, sticky_actions
+from pipeline.bench.actions import sticky_actions
+from pipeline.bench.command import OURS, share
 from pipeline.bench.contest import Entry, Score, compete
 from pipeline.bench.report import summary, write_json, write_table
 from pipeline.bench.worlds import load_levels

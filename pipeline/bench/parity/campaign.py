@@ -1,0 +1,125 @@
+"""The parity campaign of one size: where its states and episodes come from."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from levelgen.level import SIZES, Level
+from levelgen.sampler import sample_levels
+from physics.types import Size
+from pipeline.bench import oracle
+from pipeline.bench.actions import sticky_actions
+from pipeline.bench.parity.engines import Reference
+from pipeline.bench.parity.episodes import STEPS, Block, Episodes, play_block, summed
+from pipeline.bench.parity.onestep import OneStep, Pool, one_step, picked, pool_of
+from pipeline.bench.parity.progress import Board
+from pipeline.bench.parity.scenes import SCENES
+from pipeline.bench.parity.worlds import blocks, joined, lanes_of
+from pipeline.bench.worlds import load_levels
+
+SAMPLED, HANDMADE = "sampled", "handmade"
+ADVERSARIAL_SHARE, HANDMADE_SHARE = 0.4, 0.2  # of the states; the others come from sampled levels
+HANDMADE_EPISODES = 0.2  # of the episodes
+TIMES = (0, 1, 2, 4, 8, 16, 32, 47)  # env steps at which scenes are looked at
+SHORT = TIMES[-1] + 1  # env steps that scenes are played
+Tick = Callable[..., None]  # (what a block was, blocks that nobody knew of)
+
+
+@dataclass(frozen=True)
+class SizeReport:
+    size: str
+    one_step: OneStep
+    episodes: Episodes | None
+    handmade: list[str]  # names of the handmade levels that were played
+
+
+def size_of(text: str) -> Size:
+    """`s`, `m`, `l` or `POLYGONS,CIRCLES,JOINTS,THRUSTERS`.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    return SIZES[text] if text in SIZES else Size(*map(int, text.split(",")))
+
+
+def campaign(python: Path, size: str, states: int, episodes: int, board: Board) -> SizeReport:
+    """Run it. Sizes without a name have no handmade levels and no episodes."""
+    sampled, named = _sampled(python, size), size in SIZES
+    tick = lambda what, more=0: board.tick(f"size {size}: {what}", more)
+    with Reference.started(python, size) as reference:
+        board.more(_blocks(states) + (3 * _blocks(episodes) if named else 0))
+        names, pools, parts = [], [], []
+        if named:
+            names, handmade = reference.handmade()
+            pools, parts = _episodes(reference, _pairs(sampled, names, handmade, episodes), states, tick)
+        pools.append(_scenes(reference, sampled, states, not named, tick))
+        result = one_step(pool_of(pools), reference, tick)
+    return SizeReport(size, result, summed(size, parts) if parts else None, names)
+
+
+def _sampled(python: Path, size: str) -> Level:
+    """Of the reference where it has the size, else ours: which levels is all the same to both."""
+    if size in SIZES:
+        return load_levels(str(oracle.sampled_levels(python, size)), 0, oracle.LEVELS)
+    return jax.device_get(sample_levels(np.arange(oracle.LEVELS), size_of(size)))
+
+
+def _pairs(sampled: Level, names: list[str], handmade: Level, count: int) -> Pool:
+    """Levels for episodes, every fifth a handmade one; their actions' first step."""
+    drawn = max(1, round(count * HANDMADE_EPISODES))
+    crafted, random = np.arange(drawn) % len(names), np.arange(count - drawn) % sampled.role.shape[-1]
+    origin = [f"{names[k]} (actions {lane})" for lane, k in enumerate(crafted)]
+    origin += [f"sampled level {k} (actions {drawn + lane})" for lane, k in enumerate(random)]
+    return Pool(
+        level=joined([lanes_of(handmade, crafted), lanes_of(sampled, random)]),
+        action=sticky_actions(STEPS, count),
+        scene=[HANDMADE] * drawn + [SAMPLED] * (count - drawn),
+        origin=origin,
+    )
+
+
+def _episodes(reference: Reference, pairs: Pool, states: int, tick: Tick) -> tuple[list[Pool], list[Block]]:
+    """Play the pairs, and pick states along them."""
+    rng, pools, parts = np.random.default_rng(0), [], []
+    shares = {HANDMADE: HANDMADE_SHARE, SAMPLED: 1 - ADVERSARIAL_SHARE - HANDMADE_SHARE}
+    for lanes in blocks(len(pairs)):
+        block = pairs.lanes(lanes)
+        count = int(lanes[-1] - lanes[0]) + 1  # the last block is filled up
+        parts.append(play_block(block, count, reference, tick))
+        for scene, share in shares.items():
+            chosen = np.flatnonzero([name == scene for name in block.scene[:count]])
+            if len(chosen):
+                each = min(STEPS, ceil(states * share / pairs.scene.count(scene)))
+                times = np.argsort(rng.random((STEPS, len(chosen))), 0)[:each]
+                pools.append(picked(block.lanes(chosen), lanes_of(parts[-1].record, chosen), times))
+    return pools, parts
+
+
+def _scenes(reference: Reference, sampled: Level, states: int, with_sampled: bool, tick: Tick) -> Pool:
+    """States of adversarial scenes along short rollouts, their starts included."""
+    rng = np.random.default_rng(1)
+    each = ceil(states * ADVERSARIAL_SHARE / len(SCENES) / len(TIMES))
+    lanes_in = lambda count: rng.permutation(np.resize(np.arange(oracle.LEVELS), max(oracle.LEVELS, count)))[:count]
+    levels = {name: change(lanes_of(sampled, lanes_in(each)), rng) for name, change in SCENES.items()}
+    if with_sampled:
+        count = ceil(states * (1 - ADVERSARIAL_SHARE) / len(TIMES))
+        levels[SAMPLED] = lanes_of(sampled, lanes_in(count))
+    scene = [name for name, level in levels.items() for _ in range(level.role.shape[-1])]
+    origin = [f"{name} {lane}" for lane, name in enumerate(scene)]
+    every = Pool(joined([*levels.values()]), sticky_actions(SHORT, len(scene), seed=1), scene, origin)
+    pools = []
+    for lanes in blocks(len(every)):
+        block, keep = every.lanes(lanes), np.arange(lanes[-1] - lanes[0] + 1)
+        record = reference.play(block.level, block.level.state, block.action, record=True).record
+        times = np.repeat(np.array(TIMES)[:, None], len(keep), 1)
+        pools.append(picked(block.lanes(keep), lanes_of(record, keep), times))
+        tick("scenes", 1)
+    return pool_of(pools)
+
+
+def _blocks(count: int) -> int:
+    return len([*blocks(count)])

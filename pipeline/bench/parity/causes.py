@@ -1,0 +1,240 @@
+"""Why a state is off: is it rounding, and what amplifies it.
+
+Both engines compute in single precision, in another order of additions. So a state that is off is stepped again from
+COPIES neighbours, every number of it moved by at most one unit in its last place (then by more: MOVES). Where our own
+results reach as far as the reference's, number by number, no engine in single precision can be asked for more. What
+amplifies the last bit is named by what else the neighbours do (contacts that come and go, normals that turn), by what
+happens without the joints' limits, and by what holds the body that is off.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from levelgen.level import Level
+from physics.pairs import pairs_of
+from physics.types import State
+from pipeline.bench.parity.distance import MOTION, OFF, evolving_gaps
+from pipeline.bench.parity.engines import Stepped
+from pipeline.bench.parity.worlds import BLOCK, lanes_of, nudged_tree
+
+COPIES = BLOCK  # neighbours, the state itself first
+MOVES = (1, 4, 16)  # units in the last place
+BROKEN = 1e6  # rad or m; a world with such numbers has broken down
+TURNED = 1e-3  # of a unit normal, or m of a contact point: more than rounding does to a well-defined one
+SMALL = 60.0  # 1/(kg m^2); a body with more inverse inertia is spun by small changes of impulses
+DEEP = 0.1  # m of overlap
+RESTING = 0.01  # rad/s
+SPINNING = 5.0  # rad/s
+FAST = 20.0  # m/s
+Step = Callable[[Level, np.ndarray], Stepped]
+
+BROKEN_WORLD = "broken world"
+TOUCHING = "touching or not"
+SEPARATING_AXIS = "tie in the separating axis"
+DEEPEST_VERTEX = "tie of the deepest vertices"
+NEAREST_EDGE = "tie of the nearest edges"
+CENTRES = "coincident circles"
+LIMIT_AT_REST = "limit at rest"
+LIMIT = "limit that is left or not"
+CIRCLE_DEEP = "circle deep in a polygon"
+DEEP_BODIES = "bodies deep in each other"
+SMALL_BODY = "small body held by several contacts"
+JOINTED_BODY = "body held by several joints"
+HELD_BODY = "body held by several contacts"
+IMPACT = "fast impact"
+SPIN = "fast spin"
+UNNAMED = "rounding of no named kind"
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What was found out about one state."""
+
+    explained: bool  # our neighbours reach as far as the reference
+    name: str
+    moved: int  # units in the last place that it took
+    spread: float  # of the neighbours' motion
+
+
+class Neighbours(NamedTuple):
+    """Neighbours of one state, one per lane, after a step; the state itself is the first."""
+
+    level: Level
+    after: Stepped
+
+
+def find_cause(step: Step, level: Level, action: np.ndarray, theirs: Stepped) -> Cause:
+    """Of one state that is off.
+
+    Args:
+        step: our physics step of BLOCK lanes.
+        level: one lane, stepped from its `state`.
+        action: [6, 1].
+        theirs: what the reference made of it, one lane.
+    """
+    for most in MOVES:
+        seen = neighbours(step, level, action, most)
+        if reached(seen.after.state, theirs.state):
+            return Cause(True, name_cause(step, seen, action, theirs), most, spread(seen.after.state))
+    broken = is_broken(level.state, theirs.state)
+    return Cause(broken, name_cause(step, seen, action, theirs), MOVES[-1], spread(seen.after.state))
+
+
+def neighbours(step: Step, level: Level, action: np.ndarray, most: int) -> Neighbours:
+    """Every float of the state moved by at most `most` units in its last place; those of the model too, beyond 1."""
+    level = lanes_of(level, np.zeros(COPIES, int))
+    moved = nudged_tree((level.state, level.model), np.random.default_rng(0), most)
+    state, model = jax.tree.map(_first_stays, (level.state, level.model), moved)
+    level = replace(level, state=state, model=model if most > 1 else level.model)
+    return Neighbours(level, step(level, np.repeat(action, COPIES, -1)))
+
+
+def _first_stays(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    return np.concatenate([old[..., :1], new[..., 1:]], -1)
+
+
+def reached(ours: State, theirs: State) -> bool:
+    """Whether each of the reference's numbers lies among our neighbours', or no farther out than these spread."""
+    for name, far in evolving_gaps(ours, theirs).items():
+        x, y = getattr(ours, name), getattr(theirs, name)
+        with np.errstate(invalid="ignore", over="ignore"):
+            wide = (x.max(-1) - x.min(-1)) / (1 if name in MOTION else 1 + np.abs(y[..., 0]))
+        if not ((far.min(-1) <= OFF) | (far.min(-1) <= wide)).all():
+            return False
+    return bool((ours.contact_active == theirs.contact_active).any(-1).all())
+
+
+def is_broken(*states: State) -> bool:
+    return any(not (np.abs(getattr(state, name)) < BROKEN).all() for state in states for name in MOTION)
+
+
+def spread(states: State) -> float:
+    """Of neighbours: the widest range of any place or speed."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return float(max(np.ptp(getattr(states, name), axis=-1).max() for name in MOTION))
+
+
+def name_cause(step: Step, seen: Neighbours, action: np.ndarray, theirs: Stepped) -> str:
+    """The first kind that fits, decisions by the last bit before what merely amplifies."""
+    before = lanes_of(seen.level, [0])
+    ours = lanes_of(seen.after, [0])
+    if is_broken(before.state, theirs.state, ours.state):
+        return BROKEN_WORLD
+    bodies = Bodies.off(before, ours, theirs)
+    return (
+        _flipped_contact(before, bodies, seen.after, theirs)
+        or _limit(step, seen, action, bodies)
+        or _deep(before, bodies, ours)
+        or _held(before, bodies)
+    )
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """What the difference is about, in one world."""
+
+    worst: int  # the movable body that is off most
+    group: np.ndarray  # [body]: those it touches or is joined to, over others too
+    contacts: np.ndarray  # [contact]: those that act on the group
+
+    @staticmethod
+    def off(before: Level, ours: Stepped, theirs: Stepped) -> "Bodies":
+        model, movable = before.model, (before.model.inverse_mass != 0)[:, 0]
+        gaps = evolving_gaps(ours.state, theirs.state)
+        each = [gaps[name].reshape(len(movable), -1).max(-1) for name in MOTION]
+        worst = int(np.argmax(np.where(movable, np.max(each, 0), -1)))
+        a, b = contact_bodies(before)
+        active = (ours.state.contact_active | theirs.state.contact_active)[:, 0]
+        acts = active & model.collides[a, b, 0]
+        edges = [*zip(a[acts], b[acts], strict=True)]
+        joined = model.joint_active[:, 0]
+        edges += [*zip(model.joint_a[joined, 0], model.joint_b[joined, 0], strict=True)]
+        group = np.arange(len(movable)) == worst
+        for _ in range(len(movable)):
+            for one, other in edges:
+                if movable[one] and movable[other] and (group[one] or group[other]):
+                    group[one] = group[other] = True
+        return Bodies(worst, group, active & (group[a] | group[b]))
+
+
+def contact_bodies(level: Level) -> tuple[np.ndarray, np.ndarray]:
+    """Both bodies of each contact, in the numbering of physics/pairs.py."""
+    pairs = pairs_of(level.size)
+    kinds = (pairs.polygon, pairs.polygon, pairs.circle_polygon, pairs.circle)
+    a, b = (np.array([body for kind in kinds for body in getattr(kind, end)], int) for end in "ab")
+    return a, b
+
+
+def _flipped_contact(before: Level, bodies: Bodies, after: Stepped, theirs: Stepped) -> str | None:
+    """A contact that is found otherwise by some neighbour, or by the reference."""
+    everyone = jax.tree.map(lambda x, y: np.concatenate([x, y], -1), after, theirs)
+    active = everyone.state.contact_active
+    a, b = contact_bodies(before)
+    near = bodies.group[a] | bodies.group[b]
+    if (near & (active.any(-1) != active.all(-1))).any():
+        return TOUCHING
+    with np.errstate(invalid="ignore"):
+        turned = np.ptp(everyone.normal, axis=-1).max(1) > TURNED
+        slid = np.ptp(everyone.point, axis=-1).max(1) > TURNED
+    pairs = pairs_of(before.size)
+    n, m = len(pairs.polygon), len(pairs.circle_polygon)
+    number = np.arange(len(a))
+    kinds = (
+        (SEPARATING_AXIS, turned & (number < 2 * n)),
+        (DEEPEST_VERTEX, slid & (number < 2 * n)),
+        (NEAREST_EDGE, (turned | slid) & (number >= 2 * n) & (number < 2 * n + m)),
+        (CENTRES, turned & (number >= 2 * n + m)),
+    )
+    return next((name for name, found in kinds if (found & bodies.contacts).any()), None)
+
+
+def _limit(step: Step, seen: Neighbours, action: np.ndarray, bodies: Bodies) -> str | None:
+    """Joints beyond their limits, if the neighbours come together without them."""
+    model, state = seen.level.model, seen.level.state
+    a, b = model.joint_a[:, 0], model.joint_b[:, 0]
+    angle = (state.rotation[b] - state.rotation[a] - model.joint_rotation)[:, 0]
+    beyond = (angle <= model.joint_min[:, 0]) | (angle >= model.joint_max[:, 0])
+    held = (model.joint_active & ~model.joint_fixed & model.joint_limited)[:, 0] & (bodies.group[a] | bodies.group[b])
+    if not (held & beyond).any():
+        return None
+    free = replace(seen.level, model=replace(model, joint_limited=model.joint_limited & ~(held & beyond)[:, None]))
+    if spread(step(free, np.repeat(action, COPIES, -1)).state) > spread(seen.after.state) / 10:
+        return None
+    turning = np.abs(state.angular_velocity[b] - state.angular_velocity[a])[held & beyond, 0]
+    return LIMIT_AT_REST if turning.min() < RESTING else LIMIT
+
+
+def _deep(before: Level, bodies: Bodies, ours: Stepped) -> str | None:
+    """Overlaps whose undoing takes impulses that are large beside what they leave."""
+    pairs = pairs_of(before.size)
+    n, m = len(pairs.polygon), len(pairs.circle_polygon)
+    a, b = contact_bodies(before)
+    acts = bodies.contacts & before.model.collides[a, b, 0]
+    depth = np.where(acts, ours.penetration[:, 0], 0)
+    circle = slice(2 * n, 2 * n + m)
+    radius = before.model.radius[a[circle] - before.size.polygons, 0]
+    if (acts[circle] & (depth[circle] > 0.99 * radius)).any():
+        return CIRCLE_DEEP
+    return DEEP_BODIES if (depth > DEEP).any() else None
+
+
+def _held(before: Level, bodies: Bodies) -> str:
+    """What holds the body that is off, and how it moves."""
+    model, worst = before.model, bodies.worst
+    a, b = contact_bodies(before)
+    contacts = int((bodies.contacts & model.collides[a, b, 0] & ((a == worst) | (b == worst))).sum())
+    ends = (model.joint_a[:, 0] == worst) | (model.joint_b[:, 0] == worst)
+    joints = int((model.joint_active[:, 0] & ends).sum())
+    if contacts + joints > 1 and model.inverse_inertia[worst, 0] > SMALL:
+        return SMALL_BODY
+    if joints > 1:
+        return JOINTED_BODY
+    if contacts + joints > 1:
+        return HELD_BODY
+    if np.abs(before.state.angular_velocity[bodies.group]).max() > SPINNING:
+        return SPIN
+    return IMPACT if np.abs(before.state.velocity[bodies.group]).max() > FAST else UNNAMED

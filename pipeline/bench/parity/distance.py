@@ -1,0 +1,80 @@
+"""How far one physics step of ours is from the reference's, field by field."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from physics.types import State
+from pipeline.bench.parity.engines import Stepped
+
+OFF = 1e-3  # a state with a larger difference is looked into
+MOTION = ("position", "rotation", "velocity", "angular_velocity")
+CONTACT_IMPULSES = ("contact_normal_impulse", "contact_tangent_impulse")
+JOINT_IMPULSES = ("joint_impulse", "joint_angular_impulse")
+GEOMETRY = ("normal", "penetration", "point")
+UNITS = {
+    "position": "m",
+    "rotation": "rad",
+    "velocity": "m/s",
+    "angular_velocity": "rad/s",
+    **dict.fromkeys((*CONTACT_IMPULSES, *JOINT_IMPULSES), "1 + |x|"),
+    "normal": "1",
+    "penetration": "m",
+    "point": "m",
+    "control": "1",
+}
+
+
+class Distances(NamedTuple):
+    """Largest difference of each field in each lane, and in how many contacts the two differ."""
+
+    by_field: dict[str, Float[np.ndarray, " lane"]]
+    contacts: Float[np.ndarray, " lane"]
+
+    @property
+    def motion(self) -> Float[np.ndarray, " lane"]:
+        """Of any place or speed."""
+        return np.max([self.by_field[name] for name in MOTION], 0)
+
+    @property
+    def off(self) -> Bool[np.ndarray, " lane"]:
+        """States to look into: what the next step starts from differs, be it by a contact."""
+        evolving = [self.by_field[name] for name in (*MOTION, *CONTACT_IMPULSES, *JOINT_IMPULSES)]
+        return (np.max(evolving, 0) > OFF) | (self.contacts > 0)
+
+
+def distances(ours: Stepped, theirs: Stepped) -> Distances:
+    fields = {name: largest(gap) for name, gap in evolving_gaps(ours.state, theirs.state).items()}
+    both = ours.state.contact_active & theirs.state.contact_active
+    for name in GEOMETRY:
+        apart = gap(getattr(ours, name), getattr(theirs, name))
+        fields[name] = largest(np.where(both if apart.ndim == both.ndim else both[:, None], apart, 0))
+    fields["control"] = largest(gap(ours.control, theirs.control))
+    return Distances(fields, (ours.state.contact_active != theirs.state.contact_active).sum(0))
+
+
+def evolving_gaps(ours: State, theirs: State) -> dict[str, np.ndarray]:
+    """Difference of every number that evolves, in the units of UNITS; lanes of either may broadcast.
+
+    Impulses of contacts that do not touch are nobody's: the reference leaves old numbers there.
+    """
+    gaps = {name: gap(getattr(ours, name), getattr(theirs, name)) for name in MOTION}
+    touching = ours.contact_active | theirs.contact_active
+    for name in (*CONTACT_IMPULSES, *JOINT_IMPULSES):
+        there = getattr(theirs, name)
+        apart = gap(getattr(ours, name), there) / (1 + np.abs(np.nan_to_num(there)))
+        gaps[name] = np.where(touching, apart, 0) if name in CONTACT_IMPULSES else apart
+    return gaps
+
+
+def gap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """|a - b|; equal where both are no number, infinite where one is."""
+    same = (a == b) | (np.isnan(a) & np.isnan(b))
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.where(same, 0, np.nan_to_num(np.abs(a - b), nan=np.inf, posinf=np.inf))
+
+
+def largest(values: np.ndarray) -> Float[np.ndarray, " lane"]:
+    """By lane; 0 of nothing."""
+    return values.reshape(-1, values.shape[-1]).max(0, initial=0)

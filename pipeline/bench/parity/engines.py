@@ -1,0 +1,146 @@
+"""Both engines behind the same three questions: one physics step, one env step, an episode under given actions."""
+
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from levelgen import task
+from levelgen.actions import controls
+from levelgen.kinetix import MANIFOLDS, level_from_kinetix, state_from_kinetix, state_to_kinetix
+from levelgen.level import Level
+from levelgen.task import TaskParams, TaskState
+from physics.step import step as physics_step
+from physics.types import Manifold, Params, State
+from pipeline.bench import oracle
+from pipeline.bench.contest import Process
+from pipeline.bench.parity.worlds import record_from_kinetix
+from pipeline.runtime import cache_folder
+
+RULES = TaskParams(dense_reward_scale=0.0)  # rewards are -1, 0 and 1
+GEOMETRY = {"normal": "normal", "penetration": "penetration", "point": "collision_point"}
+
+
+class Stepped(NamedTuple):
+    """After one physics step."""
+
+    state: State
+    normal: Float[np.ndarray, "contact 2 lane"]
+    penetration: Float[np.ndarray, "contact lane"]
+    point: Float[np.ndarray, "contact 2 lane"]
+    control: Float[np.ndarray, "actuator lane"]  # what the action told joints, then thrusters, to do
+
+
+class Played(NamedTuple):
+    """Env steps with automatic reset, and the state before each action where it was asked for."""
+
+    reward: Float[np.ndarray, "step lane"]
+    done: Bool[np.ndarray, "step lane"]
+    record: State | None  # [..., step, lane]
+
+
+@partial(jax.jit, static_argnames="params")
+def _one_step(level: Level, action: Int[Array, "6 lane"], params: Params) -> tuple[State, Manifold, Array, Array]:
+    motor, thrust = controls(level, action)
+    return *physics_step(level.model, level.state, motor, thrust, params), motor, thrust
+
+
+@jax.jit
+def _env_step(level: Level, action: Int[Array, "6 lane"]) -> State:
+    return task.advance(level, task.reset(level), action, RULES)[0].state
+
+
+@jax.jit
+def _act(level: Level, now: TaskState, action: Int[Array, "6 lane"]):
+    return task.step(level, now, action, RULES)
+
+
+def step_ours(level: Level, action: np.ndarray, params: Params = RULES.physics) -> Stepped:
+    """One physics step of every lane."""
+    state, manifold, motor, thrust = jax.device_get(_one_step(level, action, params))
+    control = np.concatenate([np.broadcast_to(x, (len(x), action.shape[-1])) for x in (motor, thrust)])
+    return Stepped(state, manifold.normal, manifold.penetration, manifold.point, control)
+
+
+def env_step_ours(level: Level, action: np.ndarray) -> State:
+    """One env step of every lane, without reset."""
+    return jax.device_get(_env_step(level, action))
+
+
+def play_ours(level: Level, start: State, action: np.ndarray, record: bool) -> Played:
+    """Episodes from `start`, which resets lead to the level's own state."""
+    level = jax.tree.map(jnp.asarray, level)
+    lanes = action.shape[-1]
+    now = TaskState(start, jnp.zeros(lanes, jnp.int32), jnp.full(lanes, task.NO_DISTANCE, jnp.float32))
+    told, states = [], []
+    for one in action:
+        if record:
+            states.append(jax.tree.map(np.asarray, now.state))
+        now, outcome = _act(level, now, one)
+        told.append((np.asarray(outcome.reward), np.asarray(outcome.done)))
+    reward, done = (np.stack(x) for x in zip(*told, strict=True))
+    return Played(reward, done, jax.tree.map(lambda *xs: np.stack(xs, -2), *states) if record else None)
+
+
+@dataclass
+class Reference:
+    """The reference's process for worlds of one size."""
+
+    process: Process
+    folder: Path
+
+    @staticmethod
+    @contextmanager
+    def started(python: Path, size: str) -> Iterator["Reference"]:
+        """Its process lives as long as the context."""
+        cache = cache_folder() / "reference-jax"
+        cache.mkdir(parents=True, exist_ok=True)
+        command = [python, oracle.HERE / "reference_parity.py", "--size", size, "--cache", cache]
+        with ExitStack() as stack, tempfile.TemporaryFile("w+") as errors, tempfile.TemporaryDirectory() as folder:
+            process = Process([str(word) for word in command], oracle.environment(), stack, errors)
+            process.wake()
+            process.answer()
+            yield Reference(process, Path(folder))
+
+    def handmade(self) -> tuple[list[str], Level]:
+        """Names and worlds of the handmade levels of this size; impulses they were saved with included."""
+        told, fields = self._ask("handmade")
+        return told["names"], level_from_kinetix(fields)
+
+    def step(self, level: Level, action: np.ndarray) -> Stepped:
+        fields = self._ask("step", level, level.state, action)[1]
+        normal, penetration, point = (self._contacts(fields, name) for name in GEOMETRY.values())
+        return Stepped(state_from_kinetix(fields), normal, penetration, point, np.moveaxis(fields["control"], 0, -1))
+
+    def play(self, level: Level, start: State, action: np.ndarray, record: bool) -> Played:
+        """As `play_ours`, but resets lead to `start`."""
+        fields = self._ask("play", level, start, action, record=record)[1]
+        told = fields.pop("reward"), fields.pop("done")
+        return Played(*told, record_from_kinetix(fields) if record else None)
+
+    def _ask(self, what: str, level: Level | None = None, start: State | None = None, action=None, **more):
+        request = {"do": what, "out": str(self.folder / "out.npz"), **more}
+        if level is not None and start is not None:
+            lanes = action.shape[-1]
+            worlds = state_to_kinetix(level, start, np.zeros(lanes, np.int32), np.full(lanes, -1, np.float32))
+            request["worlds"] = str(self.folder / "in.npz")
+            np.savez(request["worlds"], actions=action, **worlds)  # pyright: ignore[reportArgumentType]
+        self.process.go(json.dumps(request))
+        told = self.process.answer()
+        with np.load(request["out"]) as file:
+            return told, {name: file[name] for name in file.files}
+
+    @staticmethod
+    def _contacts(fields: dict[str, np.ndarray], name: str) -> np.ndarray:
+        """In our numbering: first points of polygon pairs, second points, circle-polygon, circle-circle."""
+        polygon, *others = (fields[f"{kind}/{name}"] for kind in MANIFOLDS)
+        return np.moveaxis(np.concatenate([polygon[:, :, 0], polygon[:, :, 1], *others], 1), 0, -1)

@@ -1,0 +1,217 @@
+"""Whole episodes: the same levels and actions in both engines, and why outcomes part.
+
+Contacts are chaotic: a difference in the last bit grows by each of them. So each engine also plays against itself, from
+starts in which every place of a movable body is moved by at most one unit in its last place. How often the reference
+parts from itself is what any other engine has to expect.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+
+from levelgen.level import Level
+from physics.types import State
+from pipeline.bench.parity.distance import MOTION, OFF, evolving_gaps, gap, largest
+from pipeline.bench.parity.engines import Played, Reference, env_step_ours, play_ours
+from pipeline.bench.parity.onestep import Pool
+from pipeline.bench.parity.scenes import movable
+from pipeline.bench.parity.worlds import BLOCK, lanes_of, nudged_tree, starting_in
+
+STEPS = 256  # env steps; by then every first episode has ended
+TARGETS = {"s": 0.97, "m": 0.95, "l": 0.9}  # share of the pairs with the same outcome
+COPIES = 32  # starts near to that of a pair that parts, itself included
+FIRST_OFF = (1e-4, 1e-2)  # m, rad
+
+NEAR_STARTS_PART = "starts one unit in the last place away part as well"
+STEPS_AGREE = "every env step agrees from the reference's own states; rounding adds up"
+STEP_AMPLIFIES = "one env step amplifies rounding as much"
+NOT_EXPLAINED = "NOT EXPLAINED"
+NAMES = {-1: "red", 0: "time", 1: "goal"}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The first episode's end, by lane."""
+
+    step: np.ndarray  # env step, from 0
+    reward: np.ndarray  # -1, 0, 1
+
+    def same(self, other: "Outcome") -> np.ndarray:
+        return (self.step == other.step) & (self.reward == other.reward)
+
+    def text(self, lane: int) -> str:
+        return f"{NAMES[int(self.reward[lane])]} at {self.step[lane] + 1}"
+
+
+@dataclass(frozen=True)
+class Parted:
+    """A pair whose outcomes differ."""
+
+    scene: str
+    origin: str
+    ours: str
+    theirs: str
+    first_off: list[int | None]  # env step from which on places differ by each of FIRST_OFF
+    at_contact: bool  # contacts came, went or differed in that step
+    near_starts: int  # of COPIES - 1 starts near to it, how many have another outcome in our engine
+    step_off: float  # largest difference of an env step of ours from the reference's states
+    reason: str
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The pairs of one size."""
+
+    pairs: int
+    touched: int  # that end by touching blue or red in the reference, not by time
+    same: float  # share with the same outcome in both engines
+    same_touched: float | None  # of those that end by touching
+    reference_itself: float  # share with the same outcome in the reference from a start one last place away
+    ours_itself: float
+    target: float | None
+    parted: list[Parted]
+    reasons: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Block:
+    """What a block of pairs gave."""
+
+    theirs: Outcome
+    same: np.ndarray
+    reference_itself: np.ndarray
+    ours_itself: np.ndarray
+    parted: list[Parted]
+    record: State  # the reference's
+
+
+def outcome(played: Played) -> Outcome:
+    step = np.argmax(played.done, 0)
+    return Outcome(step, np.sign(np.take_along_axis(played.reward, step[None], 0)[0]).astype(int))
+
+
+def near(level: Level, rng: np.random.Generator) -> State:
+    """The initial state with every number of movable bodies at most one unit in its last place away."""
+    free, moved = movable(level), nudged_tree(level.state, rng)
+    keep = lambda old, new: np.where(free if old.ndim == 2 else free[:, None], new, old)
+    return replace(level.state, **{name: keep(getattr(level.state, name), getattr(moved, name)) for name in MOTION})
+
+
+def play_block(pairs: Pool, count: int, reference: Reference, tick: Callable[[str], None]) -> Block:
+    """BLOCK pairs, of which the first `count` are to be looked at."""
+    level, action = pairs.level, pairs.action
+    other = near(level, np.random.default_rng(0))
+    theirs = reference.play(level, level.state, action, record=True)
+    tick("episodes of the reference")
+    theirs_near = reference.play(level, other, action, record=False)
+    tick("episodes of the reference from near starts")
+    ours = play_ours(level, level.state, action, record=True)
+    ours_near = play_ours(level, other, action, record=False)
+    tick("episodes of ours")
+    a, b = outcome(ours), outcome(theirs)
+    lanes = np.flatnonzero(~a.same(b)[:count])
+    near_starts = _near_starts(level, action, lanes, a)
+    parted = [
+        _part(pairs.lanes(np.array([lane])), lane, ours.record, theirs.record, a, b, others)
+        for lane, others in zip(lanes, near_starts, strict=True)
+    ]
+    return Block(
+        Outcome(b.step[:count], b.reward[:count]),
+        a.same(b)[:count],
+        b.same(outcome(theirs_near))[:count],
+        a.same(outcome(ours_near))[:count],
+        parted,
+        theirs.record,
+    )
+
+
+def summed(size: str, parts: list[Block]) -> Episodes:
+    join = lambda name: np.concatenate([getattr(part, name) for part in parts])
+    reward = np.concatenate([part.theirs.reward for part in parts])
+    same, touched = join("same"), reward != 0
+    parted = [one for part in parts for one in part.parted]
+    reasons = [one.reason for one in parted]
+    return Episodes(
+        pairs=len(same),
+        touched=int(touched.sum()),
+        same=float(same.mean()),
+        same_touched=float(same[touched].mean()) if touched.any() else None,
+        reference_itself=float(join("reference_itself").mean()),
+        ours_itself=float(join("ours_itself").mean()),
+        target=TARGETS.get(size),
+        parted=parted,
+        reasons={name: reasons.count(name) for name in dict.fromkeys(reasons)},
+    )
+
+
+def _part(pair: Pool, lane: int, ours: State, theirs: State, a: Outcome, b: Outcome, near_starts: int) -> Parted:
+    """Look into a pair, given records of its block, [..., step, lane]."""
+    until = int(min(a.step[lane], b.step[lane])) + 1  # states before each action of both first episodes
+    first, at_contact = _first_off(*(_until(states, lane, until) for states in (ours, theirs)))
+    step_off, amplified = _steps(pair.level, _until(theirs, lane, int(b.step[lane]) + 1), pair.action)
+    if near_starts:
+        reason = NEAR_STARTS_PART
+    elif step_off <= OFF:
+        reason = STEPS_AGREE
+    else:
+        reason = STEP_AMPLIFIES if amplified else NOT_EXPLAINED
+    told = (text.text(lane) for text in (a, b))
+    return Parted(pair.scene[0], pair.origin[0], *told, first, at_contact, near_starts, step_off, reason)
+
+
+def _until(states: State, lane: int, end: int) -> State:
+    """States of one lane before each of its first `end` actions, as lanes."""
+    return jax.tree.map(lambda x: np.ascontiguousarray(x[..., :end, lane]), states)
+
+
+def _first_off(ours: State, theirs: State) -> tuple[list[int | None], bool]:
+    """When places first differ by FIRST_OFF, and whether a contact came, went or differed in the first such step."""
+    apart = np.maximum(*(largest(gap(getattr(ours, name), getattr(theirs, name))) for name in MOTION[:2]))
+    first = [int(np.argmax(apart > limit)) if (apart > limit).any() else None for limit in FIRST_OFF]
+    if first[0] is None:
+        return first, False
+    x, y, at = ours.contact_active, theirs.contact_active, first[0]
+    before = max(at - 1, 0)
+    events = (x[:, at] != y[:, at]) | (x[:, at] != x[:, before]) | (y[:, at] != y[:, before])
+    return first, bool(events.any())
+
+
+def _near_starts(level: Level, action: np.ndarray, lanes: np.ndarray, ours: Outcome) -> list[int]:
+    """For each lane, how many of COPIES - 1 near starts have another outcome than `ours`."""
+    counts, rng, per_block = [], np.random.default_rng(1), BLOCK // COPIES
+    for first in range(0, len(lanes), per_block):
+        some = lanes[first : first + per_block]
+        lane = np.resize(np.repeat(some, COPIES), BLOCK)
+        copies = lanes_of(level, lane)
+        played = play_ours(copies, near(copies, rng), action[:, :, lane], record=False)
+        other = ~outcome(played).same(Outcome(ours.step[lane], ours.reward[lane]))
+        counts += other.reshape(-1, COPIES)[: len(some), 1:].sum(1).tolist()
+    return counts
+
+
+def _steps(level: Level, states: State, action: np.ndarray) -> tuple[float, bool]:
+    """Largest difference of our env steps from the reference's states, and whether neighbours spread as far.
+
+    Args:
+        level: one lane.
+        states: of the reference, one env step a lane; at most BLOCK.
+        action: [step, 6, 1].
+    """
+    count = states.rotation.shape[-1]
+    if count < 2:
+        return 0.0, True
+    lane = np.minimum(np.arange(BLOCK), count - 2)
+    worlds = starting_in(lanes_of(level, np.zeros(BLOCK, int)), lanes_of(states, lane))
+    after = env_step_ours(worlds, action[lane, :, 0].T)
+    gaps = evolving_gaps(after, lanes_of(states, lane + 1))
+    apart = np.max([largest(gaps[name]) for name in MOTION], 0)
+    worst = int(np.argmax(apart))
+    if apart[worst] <= OFF:
+        return float(apart[worst]), True
+    copies = lanes_of(worlds, np.full(BLOCK, worst))
+    moved = nudged_tree(copies.state, np.random.default_rng(2))
+    spread = env_step_ours(starting_in(copies, moved), np.repeat(action[lane[worst]], BLOCK, 1))
+    wide = max(np.ptp(getattr(spread, name), axis=-1).max() for name in MOTION)
+    return float(apart[worst]), bool(apart[worst] <= wide)

@@ -1,0 +1,287 @@
+"""Adversarial scenes: sampled levels changed into what an engine finds hardest.
+
+Each scene is a function (levels, rng) -> levels over all lanes, numpy on the host. SCENES names them.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import numpy as np
+
+from levelgen.level import WORLD_SIDE, Level
+from levelgen.shuffle import separate
+from physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
+from physics.types import FIXED_POLYGONS, State
+
+FLOOR_TOP = 0.4  # m
+Change = Callable[[Level, np.random.Generator], Level]
+
+
+def inside(level: Level, rng: np.random.Generator) -> Level:
+    """Circles with their centres inside polygons, the floor and (rarely) the other scenery included."""
+    position = level.state.position.copy()
+    for circle in range(level.size.polygons, level.size.bodies):
+        weight = np.ones(level.size.polygons)
+        weight[1:FIXED_POLYGONS] = 0.1
+        polygon = _chosen(rng, level.model.active[: level.size.polygons] * weight[:, None])
+        position[circle] = _point_in(level, polygon, rng)
+    return replace(level, state=replace(level.state, position=position))
+
+
+def overlap(level: Level, rng: np.random.Generator) -> Level:
+    """Movable bodies moved deep into other bodies; no joints in half of the lanes."""
+    position = _on_others(level, rng)
+    position += np.where(movable(level)[:, None], rng.normal(0, 0.05, position.shape), 0)
+    return _moved(_loose(level, rng.random(level.role.shape[-1]) < 0.5), position)
+
+
+def coincident(level: Level, rng: np.random.Generator) -> Level:
+    """Movable bodies whose centres are exactly those of others, with equal angles in half of the lanes."""
+    upright = movable(level) & (rng.random(level.role.shape[-1]) < 0.5)
+    state = replace(level.state, rotation=np.where(upright, np.float32(0), level.state.rotation))
+    level = _loose(replace(level, state=state), rng.random(level.role.shape[-1]) < 0.5)
+    return _moved(level, _on_others(level, rng))
+
+
+def triangles(level: Level, rng: np.random.Generator) -> Level:
+    """Movable polygons without their fourth vertices; masses follow."""
+    model, n = level.model, level.size.polygons
+    cut = movable(level)[:n] & (rng.random(model.n_vertices.shape) < 0.9)
+    centred = model.vertices - model.vertices[:, :3].mean(1, keepdims=True)
+    centred[:, 3] = 0
+    vertices = np.where(cut[:, None, None], centred, model.vertices).astype(np.float32)
+    level = replace(level, model=replace(model, vertices=vertices, n_vertices=np.where(cut, 3, model.n_vertices)))
+    return with_masses(level, np.concatenate([cut, np.zeros((level.size.circles, cut.shape[-1]), bool)]))
+
+
+def fast(level: Level, rng: np.random.Generator) -> Level:
+    """Bodies at 100 m/s, or at the bound of their spin."""
+    shape = level.role.shape
+    angle, quick = rng.uniform(-np.pi, np.pi, shape), rng.random(shape) < 0.5
+    speed = np.where(quick, 100.0, rng.exponential(10, shape))
+    velocity = np.stack([np.cos(angle), np.sin(angle)], 1) * speed[:, None]
+    spin = np.where(rng.random(shape) < 0.2, rng.choice([-50.0, 50.0], shape), rng.normal(0, 15, shape))
+    return _thrown(level, velocity, spin)
+
+
+def bounce(level: Level, rng: np.random.Generator) -> Level:
+    """High restitution, friction of none or much, every collision mode, other gravities."""
+    shape = level.role.shape
+    mode = np.where(level.model.collision_mode == 2, 2, rng.choice([0, 1, 1, 1, 2], shape)).astype(np.int32)
+    pull = rng.normal([[0], [-6]], 4, level.model.gravity.shape) * (rng.random(shape[-1]) < 0.7)
+    model = replace(
+        level.model,
+        restitution=rng.uniform(0.8, 1, shape).astype(np.float32),
+        friction=rng.choice([0.0, 0.5, 2.0], shape).astype(np.float32),
+        collision_mode=mode,
+        gravity=pull.astype(np.float32),
+    )
+    return _thrown(replace(level, model=model), rng.normal(0, 8, (shape[0], 2, shape[1])), rng.normal(0, 10, shape))
+
+
+def stacks(level: Level, rng: np.random.Generator) -> Level:
+    """Upright bodies piled on the floor, each exactly touching the one below; nothing is joined."""
+    level = _loose(level, np.ones(level.role.shape[-1], bool))
+    free, lanes = movable(level), level.role.shape[-1]
+    position, rotation = level.state.position.copy(), np.where(free, np.float32(0), level.state.rotation)
+    low, high = _upright_reach(level)
+    piles = 1 if level.size.bodies <= 8 else 3
+    offset = rng.normal(0, 0.02, lanes) * (rng.random(lanes) < 0.5)
+    top = np.full((piles, lanes), FLOOR_TOP)
+    for body in range(FIXED_POLYGONS, level.size.bodies):
+        pile = body % piles
+        x = (pile + 1) * WORLD_SIDE / (piles + 1) + offset * (body % 2)
+        place = np.stack([x, top[pile] - low[body]])
+        position[body] = np.where(free[body], place, position[body])
+        top[pile] += np.where(free[body], high[body] - low[body], 0)
+    return replace(level, state=replace(level.state, position=position.astype(np.float32), rotation=rotation))
+
+
+def chains(level: Level, rng: np.random.Generator) -> Level:
+    """All movable bodies of a lane joined one to the next while joints last; half of the chains hang from the ceiling.
+
+    Joints left over close loops. Anchors meet along the chain, not in the loops.
+    """
+    model, state, lanes = level.model, level.state, level.role.shape[-1]
+    free = movable(level)
+    order = np.argsort(np.where(free, rng.random(free.shape), 2), 0)  # movable bodies first, in any order
+    count = free.sum(0)
+    hangs = rng.random(lanes) < 0.5
+    position = state.position.copy()
+    anchor_a, anchor_b = (rng.normal(0, 0.15, model.joint_anchor_a.shape) for _ in "ab")
+    a, b, active = np.array(model.joint_a), np.array(model.joint_b), np.zeros_like(model.joint_active)
+    for joint in range(level.size.joints):
+        along = joint + 1 < count + hangs  # a next body is there
+        index = joint - hangs  # of body a in the order; -1: the ceiling
+        loop = rng.integers(0, np.maximum(count - 1, 1))
+        first = np.where(along, index, loop)
+        second = np.where(along, index + 1, (loop + 1) % np.maximum(count, 1))
+        body = lambda at: np.take_along_axis(order, np.clip(at, 0, len(order) - 1)[None], 0)[0]
+        a[joint], b[joint] = np.where(first < 0, FIXED_POLYGONS - 1, body(first)), body(second)
+        ceiling = first < 0
+        anchor_a[joint] = np.where(ceiling, [[0], [-(WORLD_SIDE + 1)]] + anchor_a[joint], anchor_a[joint])
+        active[joint] = (a[joint] != b[joint]) & (along | ((count > 1) & (rng.random(lanes) < 0.3)))
+        meets = _at(position, a[joint]) + _turned(_at(state.rotation, a[joint]), anchor_a[joint])
+        place = meets - _turned(_at(state.rotation, b[joint]), anchor_b[joint])
+        position[b[joint], :, np.arange(lanes)] = np.where(active[joint] & along, place, _at(position, b[joint])).T
+    fixed = rng.random(active.shape) < 0.3
+    turned = _angle(state, a, b)
+    joints = {
+        "joint_active": active,
+        "joint_a": a.astype(np.int32),
+        "joint_b": b.astype(np.int32),
+        "joint_anchor_a": anchor_a.astype(np.float32),
+        "joint_anchor_b": anchor_b.astype(np.float32),
+        "joint_fixed": fixed,
+        "joint_rotation": np.where(fixed, turned, model.joint_rotation).astype(np.float32),
+        "joint_limited": model.joint_limited & ~fixed,
+    }
+    model = replace(model, **joints)
+    model = replace(model, collides=np.asarray(separate(model)))
+    return replace(level, model=model, state=replace(state, position=position.astype(np.float32)))
+
+
+def limits(level: Level, rng: np.random.Generator) -> Level:
+    """Chains in half of the lanes; every joint is at a limit, or a little beyond; strong motors."""
+    chained, lanes = chains(level, rng), level.role.shape[-1]
+    half = np.arange(lanes) % 2 == 0
+    level = _where(half, chained, level)
+    model, shape = level.model, level.model.joint_active.shape
+    turned = _angle(level.state, model.joint_a, model.joint_b) - model.joint_rotation
+    turned += rng.choice([0.0, 0.0, 0.05, -0.05], shape)  # exactly at it, or beyond
+    narrow, low = rng.choice([0.0, 0.1, 0.5], shape), rng.random(shape) < 0.5
+    changes = {
+        "joint_min": np.where(low, turned, turned - narrow),
+        "joint_max": np.where(low, turned + narrow, turned),
+        "motor_speed": rng.uniform(0.5, 3, shape),
+        "motor_power": rng.uniform(0.5, 3, shape),
+    }
+    model = replace(
+        model,
+        joint_fixed=np.zeros(shape, bool),
+        joint_limited=np.ones(shape, bool),
+        motor_on=rng.random(shape) < 0.6,
+        **{name: x.astype(np.float32) for name, x in changes.items()},
+    )
+    return replace(level, model=model, motor_auto=rng.random(shape) < 0.3)
+
+
+def fixed(level: Level, rng: np.random.Generator) -> Level:
+    """Every joint is fixed, at an angle a little off the present one."""
+    model = level.model
+    rotation = _angle(level.state, model.joint_a, model.joint_b) + rng.normal(0, 0.1, model.joint_a.shape)
+    ones = np.ones(model.joint_fixed.shape, bool)
+    return replace(level, model=replace(model, joint_fixed=ones, joint_rotation=rotation.astype(np.float32)))
+
+
+def inactive(level: Level, rng: np.random.Generator) -> Level:
+    """Bodies, joints and thrusters switched off at random, whatever holds on to them."""
+    off = lambda x, share: x & (rng.random(x.shape) >= share)
+    active = np.where(movable(level), off(level.model.active, 0.4), level.model.active)
+    model = replace(
+        level.model,
+        active=active,
+        joint_active=off(level.model.joint_active, 0.2),
+        thruster_active=off(level.model.thruster_active, 0.2),
+    )
+    return replace(level, model=model)
+
+
+SCENES: dict[str, Change] = {
+    scene.__name__: scene
+    for scene in (inside, overlap, coincident, triangles, fast, bounce, stacks, chains, limits, fixed, inactive)
+}
+
+
+def movable(level: Level) -> np.ndarray:
+    """Active bodies of finite mass, [body, lane]."""
+    return np.asarray(level.model.active) & (np.asarray(level.model.inverse_mass) != 0)
+
+
+def with_masses(level: Level, where: np.ndarray) -> Level:
+    """Masses and inertias from shapes and densities where asked, [body, lane]."""
+    model = level.model
+    area = np.concatenate([polygon_area(model.vertices, model.n_vertices), circle_area(model.radius)])
+    turning = np.concatenate([polygon_inertia(model.vertices, model.n_vertices), circle_inertia(model.radius)])
+    mass, inertia = (np.asarray(inverse(x * level.density)) for x in (area, turning))
+    return replace(
+        level,
+        model=replace(
+            model,
+            inverse_mass=np.where(where, mass, model.inverse_mass),
+            inverse_inertia=np.where(where, inertia, model.inverse_inertia),
+        ),
+    )
+
+
+def _chosen(rng: np.random.Generator, weight: np.ndarray) -> np.ndarray:
+    """A row for each lane, with chances in proportion to [row, lane] weights."""
+    share = np.cumsum(weight, 0)
+    return (rng.random(weight.shape[-1]) * share[-1] >= share).sum(0).clip(max=len(weight) - 1)
+
+
+def _at(x: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """x[body[lane], ..., lane]."""
+    return np.moveaxis(np.asarray(x)[body, ..., np.arange(len(body))], 0, -1)
+
+
+def _turned(angle: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])
+
+
+def _point_in(level: Level, polygon: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A random point in a polygon of each lane, m; near the room where the polygon is scenery."""
+    corners, count = _at(level.model.vertices, polygon), _at(level.model.n_vertices, polygon)
+    weight = rng.exponential(1, (len(corners), len(polygon))) * (np.arange(len(corners))[:, None] < count)
+    local = (corners * (weight / weight.sum(0))[:, None]).sum(0)
+    point = _at(level.state.position, polygon) + _turned(_at(level.state.rotation, polygon), local)
+    return np.clip(point, -0.3 + FLOOR_TOP * (np.arange(2) == 1)[:, None], WORLD_SIDE + 0.3).astype(np.float32)
+
+
+def _on_others(level: Level, rng: np.random.Generator) -> np.ndarray:
+    """Each movable body at the place of another one that stays, or at a place shared by several."""
+    free, position = movable(level), level.state.position
+    stays = _chosen(rng, free + 1e-9)
+    target = np.where(rng.random(free.shape) < 0.6, stays, np.arange(len(free))[:, None])
+    return np.where(free[:, None], np.stack([_at(position, body) for body in target]), position)
+
+
+def _moved(level: Level, position: np.ndarray) -> Level:
+    return replace(level, state=replace(level.state, position=position.astype(np.float32)))
+
+
+def _loose(level: Level, lanes: np.ndarray) -> Level:
+    """Without joints, in these lanes."""
+    model = replace(level.model, joint_active=level.model.joint_active & ~lanes)
+    apart = ~np.eye(level.size.bodies, dtype=bool)[..., None]
+    return replace(level, model=replace(model, collides=np.where(lanes, apart, model.collides)))
+
+
+def _thrown(level: Level, velocity: np.ndarray, spin: np.ndarray) -> Level:
+    free = movable(level)
+    state = replace(
+        level.state,
+        velocity=np.where(free[:, None], velocity, 0).astype(np.float32),
+        angular_velocity=np.where(free, spin, 0).astype(np.float32),
+    )
+    return replace(level, state=state)
+
+
+def _upright_reach(level: Level) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest point of each body about its centre at angle 0, m."""
+    model = level.model
+    used = np.arange(model.vertices.shape[1])[:, None] < np.asarray(model.n_vertices)[:, None]
+    y = model.vertices[:, :, 1]
+    low, high = np.where(used, y, np.inf).min(1), np.where(used, y, -np.inf).max(1)
+    return np.concatenate([low, -model.radius]), np.concatenate([high, model.radius])
+
+
+def _angle(state: State, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of body b relative to body a, rad."""
+    return np.take_along_axis(state.rotation, b, 0) - np.take_along_axis(state.rotation, a, 0)
+
+
+def _where(lanes: np.ndarray, yes: Level, no: Level) -> Level:
+    return jax.tree.map(lambda x, y: np.where(lanes, x, y).astype(np.asarray(y).dtype), yes, no)

@@ -1,0 +1,59 @@
+"""Batches of worlds on the host: numpy trees of our types, lanes last, in blocks of one size."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeVar
+
+import jax
+import numpy as np
+
+from levelgen.kinetix import state_from_kinetix
+from levelgen.level import Level
+from physics.types import State
+
+BLOCK = 256  # lanes of every program, ours and the reference's: few compilations, however many worlds
+T = TypeVar("T")
+
+
+def lanes_of(tree: T, lanes) -> T:
+    """Some lanes of a tree."""
+    return jax.tree.map(lambda x: np.ascontiguousarray(np.asarray(x)[..., lanes]), tree)
+
+
+def joined(trees: Sequence[T]) -> T:
+    """One batch of several."""
+    return jax.tree.map(lambda *xs: np.concatenate(xs, -1), *trees)
+
+
+def blocks(count: int, size: int = BLOCK) -> Iterator[np.ndarray]:
+    """Lane numbers of each block; the last one is filled up with its last lane."""
+    for first in range(0, count, size):
+        yield np.minimum(np.arange(first, first + size), count - 1)
+
+
+def starting_in(level: Level, state: State) -> Level:
+    """The level with another initial state."""
+    return dataclasses.replace(level, state=state)
+
+
+def record_from_kinetix(fields: Mapping[str, np.ndarray]) -> State:
+    """States of the reference (step, lane, ...) as ours, [..., step, lane]."""
+    steps, lanes = fields["polygon/rotation"].shape[:2]
+    flat = state_from_kinetix({name: x.reshape(steps * lanes, *x.shape[2:]) for name, x in fields.items()})
+    return jax.tree.map(lambda x: x.reshape(*x.shape[:-1], steps, lanes), flat)
+
+
+def nudged(values: np.ndarray, rng: np.random.Generator, most: int = 1) -> np.ndarray:
+    """Each number moved by at most `most` units in its last place; zeros stay."""
+    moves = rng.integers(-most, most + 1, values.shape)
+    out = values.astype(np.float32)
+    for k in range(1, most + 1):
+        towards = np.where(moves > 0, np.inf, -np.inf).astype(np.float32)
+        out = np.where(np.abs(moves) >= k, np.nextafter(out, towards), out)
+    return np.where(values == 0, values, out).astype(np.float32)
+
+
+def nudged_tree(tree: T, rng: np.random.Generator, most: int = 1) -> T:
+    """Every float of a tree nudged."""
+    move = lambda x: nudged(x, rng, most) if np.asarray(x).dtype.kind == "f" else x
+    return jax.tree.map(move, tree)
