@@ -30,6 +30,8 @@ def main(argv: Sequence[str]) -> int:
     for name, value in vars(given).items():
         if isinstance(value, int) and value < 1 and name != "json":
             raise UserError(f"--{name.replace('_', '-')} is {value}: it has to be at least 1.")
+    if given.level_file is not None and not given.level_file.is_file():
+        raise UserError(f"There is no file {given.level_file}: give levels as .npz, or leave --level-file out.")
     given.run(given)
     return Exit.DONE
 
@@ -51,6 +53,7 @@ def _parser() -> argparse.ArgumentParser:
             description=f"{does[0].upper()}{does[1:]}.",
             epilog=f"example: levelproof bench {name} --size s",
         )
+        sub.add_argument("--level-file", type=Path, help="levels as the reference's arrays (default: it samples some)")
         sub.add_argument("--json", action="store_true", help="print JSON")
         sub.set_defaults(run=run)
         return sub
@@ -59,7 +62,6 @@ def _parser() -> argparse.ArgumentParser:
         sub = bench(name, lambda given: _race(run, given), does)
         sub.add_argument("--size", choices=["s", "m", "l"], default="s", help="of the levels (default: s)")
         sub.add_argument("--repeats", type=int, default=5, help="timed runs of each side; medians count (default: 5)")
-        sub.add_argument("--level-file", type=Path, help="levels as the reference's arrays (default: it samples some)")
         return sub
 
     sub = race("physics", physics, "env steps a second under random actions, without observations")
@@ -101,8 +103,6 @@ def _size(text: str) -> str:
 
 
 def _race(run: Callable[[argparse.Namespace], Result], given: argparse.Namespace) -> None:
-    if given.level_file is not None and not given.level_file.is_file():
-        raise UserError(f"There is no file {given.level_file}: give levels as .npz, or leave --level-file out.")
     result = run(given)
     if given.json:
         write_json(result, sys.stdout)
@@ -112,6 +112,8 @@ def _race(run: Callable[[argparse.Namespace], Result], given: argparse.Namespace
 
 def parity(given: argparse.Namespace) -> None:
     """Both engines in turns, this one in this process."""
+    if given.level_file is not None and len(given.size) > 1:
+        raise UserError("--level-file has levels of one size: give that one as --size.")
     prepare_jax()
     from pipeline.bench.parity.campaign import campaign  # compiles functions as it is imported
     from pipeline.bench.parity.progress import Board
@@ -119,7 +121,7 @@ def parity(given: argparse.Namespace) -> None:
 
     python = oracle.oracle_python()
     with Board(Console(stderr=True)).shown() as board:
-        sizes = [campaign(python, size, given.states, given.episodes, board) for size in given.size]
+        sizes = [campaign(python, size, given.states, given.episodes, board, given.level_file) for size in given.size]
     settings = {"states": given.states, "episodes": given.episodes, "stickiness": STICKINESS}
     report = Report.of(sizes, settings, oracle.versions(python))
     if given.json:

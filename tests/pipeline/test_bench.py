@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from levelgen.actions import CHOICES
-from levelgen.kinetix import state_to_kinetix
 from pipeline.bench import main, oracle
 from pipeline.bench.actions import sticky_actions
 from pipeline.bench.command import OURS, share
@@ -20,19 +19,8 @@ from pipeline.bench.report import summary, write_json, write_table
 from pipeline.bench.worlds import load_levels
 from pipeline.errors import Exit, Failure, UserError
 from pipeline.runtime import own_cores
-from tests.golden.load import HERE, load
 
 ROOT = Path(__file__).parent.parent.parent
-
-
-@pytest.fixture(scope="session")
-def level_file(tmp_path_factory) -> Path:
-    """Golden states as the reference's arrays: levels that need not be sampled first."""
-    of = load(HERE / "s.npz")
-    path = tmp_path_factory.mktemp("levels") / "levels.npz"
-    fields = state_to_kinetix(of.level, of.state, np.zeros_like(of.timestep), np.full_like(of.last_distance, -1))
-    np.savez(path, **{name: values[:16] for name, values in fields.items()})  # pyright: ignore[reportArgumentType]
-    return path
 
 
 class TestArithmetic:

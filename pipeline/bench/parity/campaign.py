@@ -1,25 +1,27 @@
 """The parity campaign of one size: where its states and episodes come from."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from levelgen.level import SIZES, Level
+from levelgen.level import SIZES, Level, Role
 from levelgen.sampler import sample_levels
 from physics.types import Size
 from pipeline.bench import oracle
 from pipeline.bench.actions import sticky_actions
 from pipeline.bench.parity.engines import Reference
 from pipeline.bench.parity.episodes import STEPS, Block, Episodes, play_block, summed
-from pipeline.bench.parity.onestep import OneStep, Pool, one_step, picked, pool_of
+from pipeline.bench.parity.onestep import OneStep, Pool, distinct, one_step, picked, pool_of
 from pipeline.bench.parity.progress import Board
 from pipeline.bench.parity.scenes import SCENES
 from pipeline.bench.parity.worlds import blocks, joined, lanes_of
 from pipeline.bench.worlds import load_levels
+from pipeline.errors import UserError
 
 SAMPLED, HANDMADE = "sampled", "handmade"
 ADVERSARIAL_SHARE, HANDMADE_SHARE = 0.4, 0.2  # of the states; the others come from sampled levels
@@ -46,9 +48,16 @@ def size_of(text: str) -> Size:
     return SIZES[text] if text in SIZES else Size(*map(int, text.split(",")))
 
 
-def campaign(python: Path, size: str, states: int, episodes: int, board: Board) -> SizeReport:
-    """Run it. Sizes without a name have no handmade levels and no episodes."""
-    sampled, named = _sampled(python, size), size in SIZES
+def campaign(
+    python: Path, size: str, states: int, episodes: int, board: Board, level_file: Path | None = None
+) -> SizeReport:
+    """Run it. Sizes without a name have no handmade levels and no episodes.
+
+    Raises:
+        UserError: the levels of `level_file` are of another size.
+        Failure: the reference's process ends early.
+    """
+    sampled, named = _sampled(python, size, level_file), size in SIZES
     tick = lambda what, more=0: board.tick(f"size {size}: {what}", more)
     with Reference.started(python, size) as reference:
         board.more(_blocks(states) + (3 * _blocks(episodes) if named else 0))
@@ -57,15 +66,21 @@ def campaign(python: Path, size: str, states: int, episodes: int, board: Board) 
             names, handmade = reference.handmade()
             pools, parts = _episodes(reference, _pairs(sampled, names, handmade, episodes), states, tick)
         pools.append(_scenes(reference, sampled, states, not named, tick))
-        result = one_step(pool_of(pools), reference, tick)
+        result = one_step(distinct(pool_of(pools)), reference, tick)
     return SizeReport(size, result, summed(size, parts) if parts else None, names)
 
 
-def _sampled(python: Path, size: str) -> Level:
+def _sampled(python: Path, size: str, level_file: Path | None) -> Level:
     """Of the reference where it has the size, else ours: which levels is all the same to both."""
-    if size in SIZES:
-        return load_levels(str(oracle.sampled_levels(python, size)), 0, oracle.LEVELS)
-    return jax.device_get(sample_levels(np.arange(oracle.LEVELS), size_of(size)))
+    if level_file is None and size not in SIZES:
+        return jax.device_get(sample_levels(jnp.arange(oracle.LEVELS), size_of(size)))
+    path = level_file or oracle.sampled_levels(python, size)
+    with np.load(path) as file:
+        count = len(file["gravity"])
+    levels = load_levels(str(path), 0, count)
+    if levels.size != size_of(size):
+        raise UserError(f"The levels of {path} are of size {','.join(map(str, levels.size))}: --size is {size}.")
+    return levels
 
 
 def _pairs(sampled: Level, names: list[str], handmade: Level, count: int) -> Pool:
@@ -100,21 +115,27 @@ def _episodes(reference: Reference, pairs: Pool, states: int, tick: Tick) -> tup
 
 
 def _scenes(reference: Reference, sampled: Level, states: int, with_sampled: bool, tick: Tick) -> Pool:
-    """States of adversarial scenes along short rollouts, their starts included."""
+    """States of adversarial scenes along short rollouts, their starts included.
+
+    Nobody is green, blue or red there: what touches at its start would end each episode at once.
+    """
     rng = np.random.default_rng(1)
     each = ceil(states * ADVERSARIAL_SHARE / len(SCENES) / len(TIMES))
-    lanes_in = lambda count: rng.permutation(np.resize(np.arange(oracle.LEVELS), max(oracle.LEVELS, count)))[:count]
-    levels = {name: change(lanes_of(sampled, lanes_in(each)), rng) for name, change in SCENES.items()}
+    there = sampled.role.shape[-1]
+    some = lambda count: lanes_of(sampled, rng.permutation(np.resize(np.arange(there), max(there, count)))[:count])
+    levels = {name: change(some(each), rng) for name, change in SCENES.items()}
     if with_sampled:
         count = ceil(states * (1 - ADVERSARIAL_SHARE) / len(TIMES))
-        levels[SAMPLED] = lanes_of(sampled, lanes_in(count))
+        levels[SAMPLED] = some(count)
     scene = [name for name, level in levels.items() for _ in range(level.role.shape[-1])]
     origin = [f"{name} {lane}" for lane, name in enumerate(scene)]
-    every = Pool(joined([*levels.values()]), sticky_actions(SHORT, len(scene), seed=1), scene, origin)
+    level = joined([*levels.values()])
+    level = replace(level, role=np.full_like(level.role, Role.PLAIN))
+    every = Pool(level, sticky_actions(SHORT, len(scene), seed=1), scene, origin)
     pools = []
     for lanes in blocks(len(every)):
         block, keep = every.lanes(lanes), np.arange(lanes[-1] - lanes[0] + 1)
-        record = reference.play(block.level, block.level.state, block.action, record=True).record
+        record = reference.play(block.level, block.level.state, block.action, record=True).states
         times = np.repeat(np.array(TIMES)[:, None], len(keep), 1)
         pools.append(picked(block.lanes(keep), lanes_of(record, keep), times))
         tick("scenes", 1)

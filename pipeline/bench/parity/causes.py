@@ -17,7 +17,7 @@ import numpy as np
 from levelgen.level import Level
 from physics.pairs import pairs_of
 from physics.types import State
-from pipeline.bench.parity.distance import MOTION, OFF, evolving_gaps
+from pipeline.bench.parity.distance import CONTACT_IMPULSES, JOINT_IMPULSES, MOTION, OFF, evolving_gaps
 from pipeline.bench.parity.engines import Stepped
 from pipeline.bench.parity.worlds import BLOCK, lanes_of, nudged_tree
 
@@ -43,8 +43,8 @@ LIMIT = "limit that is left or not"
 CIRCLE_DEEP = "circle deep in a polygon"
 DEEP_BODIES = "bodies deep in each other"
 SMALL_BODY = "small body held by several contacts"
-JOINTED_BODY = "body held by several joints"
-HELD_BODY = "body held by several contacts"
+CHAIN = "bodies joined in a chain"
+HELD_BODY = "bodies held by several contacts"
 IMPACT = "fast impact"
 SPIN = "fast spin"
 UNNAMED = "rounding of no named kind"
@@ -124,6 +124,8 @@ def name_cause(step: Step, seen: Neighbours, action: np.ndarray, theirs: Stepped
     ours = lanes_of(seen.after, [0])
     if is_broken(before.state, theirs.state, ours.state):
         return BROKEN_WORLD
+    if (ours.state.contact_active != theirs.state.contact_active).any():
+        return TOUCHING
     bodies = Bodies.off(before, ours, theirs)
     return (
         _flipped_contact(before, bodies, seen.after, theirs)
@@ -144,10 +146,16 @@ class Bodies:
     @staticmethod
     def off(before: Level, ours: Stepped, theirs: Stepped) -> "Bodies":
         model, movable = before.model, (before.model.inverse_mass != 0)[:, 0]
-        gaps = evolving_gaps(ours.state, theirs.state)
-        each = [gaps[name].reshape(len(movable), -1).max(-1) for name in MOTION]
-        worst = int(np.argmax(np.where(movable, np.max(each, 0), -1)))
         a, b = contact_bodies(before)
+        gaps = evolving_gaps(ours.state, theirs.state)
+        by_thing = lambda names: np.max([gaps[name].reshape(len(gaps[name]), -1).max(-1) for name in names], 0)
+        apart = by_thing(MOTION)
+        if apart.max() <= OFF:  # impulses only
+            for ends, gap in ((a, by_thing(CONTACT_IMPULSES)), (b, by_thing(CONTACT_IMPULSES))):
+                np.maximum.at(apart, ends, gap)
+            for ends in (model.joint_a[:, 0], model.joint_b[:, 0]):
+                np.maximum.at(apart, ends, by_thing(JOINT_IMPULSES))
+        worst = int(np.argmax(np.where(movable, apart, -1)))
         active = (ours.state.contact_active | theirs.state.contact_active)[:, 0]
         acts = active & model.collides[a, b, 0]
         edges = [*zip(a[acts], b[acts], strict=True)]
@@ -226,14 +234,15 @@ def _held(before: Level, bodies: Bodies) -> str:
     """What holds the body that is off, and how it moves."""
     model, worst = before.model, bodies.worst
     a, b = contact_bodies(before)
-    contacts = int((bodies.contacts & model.collides[a, b, 0] & ((a == worst) | (b == worst))).sum())
-    ends = (model.joint_a[:, 0] == worst) | (model.joint_b[:, 0] == worst)
-    joints = int((model.joint_active[:, 0] & ends).sum())
-    if contacts + joints > 1 and model.inverse_inertia[worst, 0] > SMALL:
+    acts = bodies.contacts & model.collides[a, b, 0]
+    ends = np.stack([model.joint_a[:, 0], model.joint_b[:, 0]])
+    joined = model.joint_active[:, 0] & bodies.group[ends].any(0)
+    holds = (acts & ((a == worst) | (b == worst))).sum() + (joined & (ends == worst).any(0)).sum()
+    if holds > 1 and model.inverse_inertia[worst, 0] > SMALL:
         return SMALL_BODY
-    if joints > 1:
-        return JOINTED_BODY
-    if contacts + joints > 1:
+    if joined.sum() > 1:
+        return CHAIN
+    if acts.sum() > 1:
         return HELD_BODY
     if np.abs(before.state.angular_velocity[bodies.group]).max() > SPINNING:
         return SPIN

@@ -4,7 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
+from levelgen.level import Level
 from physics.types import State
 from pipeline.bench.parity.engines import Stepped
 
@@ -44,14 +46,16 @@ class Distances(NamedTuple):
         return (np.max(evolving, 0) > OFF) | (self.contacts > 0)
 
 
-def distances(ours: Stepped, theirs: Stepped) -> Distances:
+def distances(level: Level, ours: Stepped, theirs: Stepped) -> Distances:
+    """After a step of these levels. What inactive actuators are told is nobody's."""
     fields = {name: largest(gap) for name, gap in evolving_gaps(ours.state, theirs.state).items()}
     both = ours.state.contact_active & theirs.state.contact_active
     for name in GEOMETRY:
         apart = gap(getattr(ours, name), getattr(theirs, name))
         fields[name] = largest(np.where(both if apart.ndim == both.ndim else both[:, None], apart, 0))
-    fields["control"] = largest(gap(ours.control, theirs.control))
-    return Distances(fields, (ours.state.contact_active != theirs.state.contact_active).sum(0))
+    acting = np.concatenate([level.model.joint_active, level.model.thruster_active])
+    fields["control"] = largest(np.where(acting, gap(ours.control, theirs.control), 0))
+    return Distances(fields, np.asarray(ours.state.contact_active != theirs.state.contact_active).sum(0))
 
 
 def evolving_gaps(ours: State, theirs: State) -> dict[str, np.ndarray]:
@@ -68,8 +72,9 @@ def evolving_gaps(ours: State, theirs: State) -> dict[str, np.ndarray]:
     return gaps
 
 
-def gap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def gap(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     """|a - b|; equal where both are no number, infinite where one is."""
+    a, b = np.asarray(a), np.asarray(b)
     same = (a == b) | (np.isnan(a) & np.isnan(b))
     with np.errstate(invalid="ignore", over="ignore"):
         return np.where(same, 0, np.nan_to_num(np.abs(a - b), nan=np.inf, posinf=np.inf))

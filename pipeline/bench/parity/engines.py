@@ -47,6 +47,12 @@ class Played(NamedTuple):
     done: Bool[np.ndarray, "step lane"]
     record: State | None  # [..., step, lane]
 
+    @property
+    def states(self) -> State:
+        """The record that was asked for."""
+        assert self.record is not None
+        return self.record
+
 
 @partial(jax.jit, static_argnames="params")
 def _one_step(level: Level, action: Int[Array, "6 lane"], params: Params) -> tuple[State, Manifold, Array, Array]:
@@ -117,23 +123,28 @@ class Reference:
         return told["names"], level_from_kinetix(fields)
 
     def step(self, level: Level, action: np.ndarray) -> Stepped:
-        fields = self._ask("step", level, level.state, action)[1]
+        """One physics step of every lane."""
+        fields = self._ask("step", (level, level.state, action))[1]
         normal, penetration, point = (self._contacts(fields, name) for name in GEOMETRY.values())
         return Stepped(state_from_kinetix(fields), normal, penetration, point, np.moveaxis(fields["control"], 0, -1))
 
     def play(self, level: Level, start: State, action: np.ndarray, record: bool) -> Played:
         """As `play_ours`, but resets lead to `start`."""
-        fields = self._ask("play", level, start, action, record=record)[1]
+        fields = self._ask("play", (level, start, action), record=record)[1]
         told = fields.pop("reward"), fields.pop("done")
         return Played(*told, record_from_kinetix(fields) if record else None)
 
-    def _ask(self, what: str, level: Level | None = None, start: State | None = None, action=None, **more):
+    def _ask(
+        self, what: str, worlds: tuple[Level, State, np.ndarray] | None = None, **more: bool
+    ) -> tuple[dict, dict[str, np.ndarray]]:
+        """What it answers, and the arrays it writes."""
         request = {"do": what, "out": str(self.folder / "out.npz"), **more}
-        if level is not None and start is not None:
-            lanes = action.shape[-1]
-            worlds = state_to_kinetix(level, start, np.zeros(lanes, np.int32), np.full(lanes, -1, np.float32))
+        if worlds is not None:
+            level, start, actions = worlds
+            lanes = actions.shape[-1]
+            fields = state_to_kinetix(level, start, np.zeros(lanes, np.int32), np.full(lanes, -1, np.float32))
             request["worlds"] = str(self.folder / "in.npz")
-            np.savez(request["worlds"], actions=action, **worlds)  # pyright: ignore[reportArgumentType]
+            np.savez(request["worlds"], actions=actions, **fields)  # pyright: ignore[reportArgumentType]
         self.process.go(json.dumps(request))
         told = self.process.answer()
         with np.load(request["out"]) as file:

@@ -114,8 +114,8 @@ def play_block(pairs: Pool, count: int, reference: Reference, tick: Callable[[st
     lanes = np.flatnonzero(~a.same(b)[:count])
     near_starts = _near_starts(level, action, lanes, a)
     parted = [
-        _part(pairs.lanes(np.array([lane])), lane, ours.record, theirs.record, a, b, others)
-        for lane, others in zip(lanes, near_starts, strict=True)
+        _part(pairs.lanes(np.array([lane])), lane, ours.states, theirs.states, a, b, others)
+        for lane, others in zip(lanes.tolist(), near_starts, strict=True)
     ]
     return Block(
         Outcome(b.step[:count], b.reward[:count]),
@@ -123,7 +123,7 @@ def play_block(pairs: Pool, count: int, reference: Reference, tick: Callable[[st
         b.same(outcome(theirs_near))[:count],
         a.same(outcome(ours_near))[:count],
         parted,
-        theirs.record,
+        theirs.states,
     )
 
 
@@ -157,8 +157,17 @@ def _part(pair: Pool, lane: int, ours: State, theirs: State, a: Outcome, b: Outc
         reason = STEPS_AGREE
     else:
         reason = STEP_AMPLIFIES if amplified else NOT_EXPLAINED
-    told = (text.text(lane) for text in (a, b))
-    return Parted(pair.scene[0], pair.origin[0], *told, first, at_contact, near_starts, step_off, reason)
+    return Parted(
+        scene=pair.scene[0],
+        origin=pair.origin[0],
+        ours=a.text(lane),
+        theirs=b.text(lane),
+        first_off=first,
+        at_contact=at_contact,
+        near_starts=near_starts,
+        step_off=step_off,
+        reason=reason,
+    )
 
 
 def _until(states: State, lane: int, end: int) -> State:

@@ -1,5 +1,6 @@
 """One physics step from each of many states, in both engines."""
 
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -102,6 +103,16 @@ def pool_of(pools: Sequence[Pool]) -> Pool:
     return Pool(level, action, [x for pool in pools for x in pool.scene], [x for pool in pools for x in pool.origin])
 
 
+def distinct(pool: Pool) -> Pool:
+    """Each world once: a level that ends at once comes back again and again."""
+    leaves = [np.asarray(x).reshape(-1, len(pool)).T for x in jax.tree.leaves((pool.level, pool.action))]
+    worlds = (b"".join(np.ascontiguousarray(x[lane]).tobytes() for x in leaves) for lane in range(len(pool)))
+    first: dict[bytes, int] = {}
+    for lane, world in enumerate(worlds):
+        first.setdefault(hashlib.sha256(world).digest(), lane)
+    return pool.lanes(np.array([*first.values()]))
+
+
 def picked(played: Pool, record: State, times: Int[np.ndarray, "pick lane"]) -> Pool:
     """The states at `times` of lanes that were played: actions [step, 6, lane], record [..., step, lane]."""
     lane, time = np.broadcast_to(np.arange(times.shape[1]), times.shape).ravel(), times.ravel()
@@ -121,12 +132,12 @@ def one_step(pool: Pool, reference: Reference, tick: Callable[[str], None]) -> O
         block, count = pool.lanes(lanes), int(lanes[-1] - lanes[0]) + 1  # the last block is filled up
         theirs, ours = reference.step(block.level, block.action), step_ours(block.level, block.action)
         fixed = step_ours(block.level, block.action, replace(RULES.physics, faithful_padding=False))
-        apart = distances(ours, theirs)
+        apart = distances(block.level, ours, theirs)
         parts.append(_first(apart, count))
-        defect.append(distances(fixed, ours).motion[:count])
+        defect.append(distances(block.level, fixed, ours).motion[:count])
         off += [
             _look_into(block.lanes(np.array([lane])), lanes_of(theirs, [lane]), _lane(apart, lane))
-            for lane in np.flatnonzero(apart.off[:count])
+            for lane in np.flatnonzero(apart.off[:count]).tolist()
         ]
         tick("states")
     apart = Distances(

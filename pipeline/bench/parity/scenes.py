@@ -7,7 +7,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from levelgen.level import WORLD_SIDE, Level
 from levelgen.shuffle import separate
@@ -204,7 +206,7 @@ def with_masses(level: Level, where: np.ndarray) -> Level:
     model = level.model
     area = np.concatenate([polygon_area(model.vertices, model.n_vertices), circle_area(model.radius)])
     turning = np.concatenate([polygon_inertia(model.vertices, model.n_vertices), circle_inertia(model.radius)])
-    mass, inertia = (np.asarray(inverse(x * level.density)) for x in (area, turning))
+    mass, inertia = (np.asarray(inverse(jnp.asarray(x * level.density))) for x in (area, turning))
     return replace(
         level,
         model=replace(
@@ -215,18 +217,19 @@ def with_masses(level: Level, where: np.ndarray) -> Level:
     )
 
 
-def _chosen(rng: np.random.Generator, weight: np.ndarray) -> np.ndarray:
+def _chosen(rng: np.random.Generator, weight: ArrayLike) -> np.ndarray:
     """A row for each lane, with chances in proportion to [row, lane] weights."""
-    share = np.cumsum(weight, 0)
-    return (rng.random(weight.shape[-1]) * share[-1] >= share).sum(0).clip(max=len(weight) - 1)
+    share = np.cumsum(np.asarray(weight), 0)
+    return (rng.random(share.shape[-1]) * share[-1] >= share).sum(0).clip(max=len(share) - 1)
 
 
-def _at(x: np.ndarray, body: np.ndarray) -> np.ndarray:
+def _at(x: ArrayLike, body: ArrayLike) -> np.ndarray:
     """x[body[lane], ..., lane]."""
+    body = np.asarray(body)
     return np.moveaxis(np.asarray(x)[body, ..., np.arange(len(body))], 0, -1)
 
 
-def _turned(angle: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def _turned(angle: ArrayLike, vector: np.ndarray) -> np.ndarray:
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])
 
@@ -278,9 +281,10 @@ def _upright_reach(level: Level) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([low, -model.radius]), np.concatenate([high, model.radius])
 
 
-def _angle(state: State, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _angle(state: State, a: ArrayLike, b: ArrayLike) -> np.ndarray:
     """Of body b relative to body a, rad."""
-    return np.take_along_axis(state.rotation, b, 0) - np.take_along_axis(state.rotation, a, 0)
+    of = lambda body: np.take_along_axis(np.asarray(state.rotation), np.asarray(body), 0)
+    return of(b) - of(a)
 
 
 def _where(lanes: np.ndarray, yes: Level, no: Level) -> Level:

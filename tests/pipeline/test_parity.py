@@ -1,0 +1,374 @@
+"""`levelproof bench parity`: scenes, distances, causes and tables on golden states; a small campaign for real."""
+
+import dataclasses
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from physics.types import FIXED_POLYGONS
+from pipeline.bench import main, oracle
+from pipeline.bench.parity import causes, episodes, scenes
+from pipeline.bench.parity.campaign import SizeReport, size_of
+from pipeline.bench.parity.distance import distances, gap
+from pipeline.bench.parity.engines import Played, Stepped, play_ours, step_ours
+from pipeline.bench.parity.onestep import Pool, distinct, one_step, picked
+from pipeline.bench.parity.report import Report, tables
+from pipeline.bench.parity.worlds import BLOCK, blocks, lanes_of, nudged
+from pipeline.errors import Exit, Failure, UserError
+from tests.golden.load import HERE, load
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture(scope="module")
+def pool() -> Pool:
+    """A block of golden states of size s."""
+    of = load(HERE / "s.npz")
+    level, action = lanes_of((of.level, of.action), np.arange(BLOCK))
+    return Pool(level, action, of.scene[:BLOCK], [f"golden {lane}" for lane in range(BLOCK)])
+
+
+@pytest.fixture(scope="module")
+def stepped(pool) -> Stepped:
+    return step_ours(pool.level, pool.action)
+
+
+@pytest.fixture(scope="module")
+def large():
+    """Levels of size l, at rest at their starts."""
+    return load(HERE / "l.npz").level
+
+
+def altered(after: Stepped, **state) -> Stepped:
+    return after._replace(state=dataclasses.replace(after.state, **state))
+
+
+class Parrot:
+    """Stands where the reference does, and gives what our engine gave: no process for tests of the arithmetic."""
+
+    def __init__(self, **state) -> None:
+        self.state = state
+
+    def step(self, level, action) -> Stepped:
+        after = step_ours(level, action)
+        return altered(after, **{name: change(getattr(after.state, name)) for name, change in self.state.items()})
+
+
+class TestWorlds:
+    def test_blocks_are_filled_up(self) -> None:
+        parts = [*blocks(5, 3)]
+        np.testing.assert_array_equal(parts, [[0, 1, 2], [3, 4, 4]])
+
+    def test_nudged_by_units_in_the_last_place(self) -> None:
+        values = np.array([1.0, -3.0, 1e-8, 1e8, 0.0], np.float32)[:, None].repeat(1000, 1)
+        for most in (1, 4):
+            units = np.abs(nudged(values, np.random.default_rng(0), most).view(np.int32) - values.view(np.int32))
+            assert units[:4].max() == most
+            assert (units[4] == 0).all()
+
+
+class TestScenes:
+    @pytest.mark.parametrize("name", scenes.SCENES)
+    def test_shapes_and_types_stay(self, large, name) -> None:
+        made = scenes.SCENES[name](large, np.random.default_rng(0))
+        for new, old in zip(jax.tree.leaves(made), jax.tree.leaves(large), strict=True):
+            assert np.shape(new) == np.shape(old)
+            assert np.asarray(new).dtype == np.asarray(old).dtype
+            assert np.isfinite(new).all()
+        still = ~scenes.movable(large)
+        np.testing.assert_array_equal(
+            made.state.velocity[still[:, None].repeat(2, 1)], large.state.velocity[still[:, None].repeat(2, 1)]
+        )
+
+    @staticmethod
+    def made(name: str, level):
+        return scenes.SCENES[name](level, np.random.default_rng(0))
+
+    def test_coincident(self, large) -> None:
+        level = self.made("coincident", large)
+        free, place = scenes.movable(level), level.state.position
+        same = (place[:, None] == place[None]).all(2) & free[:, None] & free[None]
+        assert (same.sum((0, 1)) > free.sum(0)).mean() > 0.5
+
+    def test_fast(self, large) -> None:
+        level = self.made("fast", large)
+        speed = np.linalg.norm(level.state.velocity, axis=1)[scenes.movable(level)]
+        assert np.isclose(speed, 100).mean() > 0.3
+
+    def test_triangles_have_masses(self, large) -> None:
+        level = self.made("triangles", large)
+        cut = (level.model.n_vertices == 3) & (large.model.n_vertices == 4)
+        assert cut.sum() > 100
+        n = level.size.polygons
+        assert (level.model.inverse_mass[:n][cut] > large.model.inverse_mass[:n][cut]).all()
+
+    def test_stacks_stand_on_the_floor(self, large) -> None:
+        level = self.made("stacks", large)
+        low = scenes._upright_reach(level)[0] + level.state.position[:, 1]
+        assert np.isclose(np.where(scenes.movable(level), low, np.inf).min(0), scenes.FLOOR_TOP, atol=1e-5).mean() > 0.9
+        assert not level.model.joint_active.any()
+
+    def test_chains_meet(self, large) -> None:
+        level = self.made("chains", large)
+        model, state = level.model, level.state
+        first = [scenes._at(state.position, body[0]) for body in (model.joint_a, model.joint_b)]
+        turn = [scenes._at(state.rotation, body[0]) for body in (model.joint_a, model.joint_b)]
+        anchors = (model.joint_anchor_a[0], model.joint_anchor_b[0])
+        ends = [x + scenes._turned(angle, anchor) for x, angle, anchor in zip(first, turn, anchors, strict=True)]
+        # a loop may move its bodies again, never along the chain
+        assert (np.abs(ends[0] - ends[1]).max(0) < 1e-4)[model.joint_active[0]].mean() > 0.9
+        ceiling = (model.joint_a[0] == FIXED_POLYGONS - 1) & model.joint_active[0]
+        assert 0.3 < ceiling.mean() < 0.7
+        assert (model.joint_active.sum(0) >= 2).mean() > 0.5
+
+    def test_limits_are_reached(self, large) -> None:
+        model = self.made("limits", large).model
+        assert model.joint_limited.all()
+        assert not model.joint_fixed.any()
+        assert (model.joint_min <= model.joint_max).all()
+        assert (model.joint_active.sum(0) >= 2).mean() > 0.4
+
+    def test_inactive_bodies_hold_joints(self, large) -> None:
+        model = self.made("inactive", large).model
+        asleep = ~np.take_along_axis(model.active, model.joint_b, 0) & model.joint_active
+        assert asleep.any()
+
+
+class TestDistances:
+    def test_none_to_itself(self, pool, stepped) -> None:
+        apart = distances(pool.level, stepped, stepped)
+        assert all((x == 0).all() for x in apart.by_field.values())
+        assert not apart.off.any()
+
+    def test_no_number_counts(self) -> None:
+        nan = np.nan
+        np.testing.assert_array_equal(gap([nan, nan, np.inf, 1], [nan, 1, np.inf, 3]), [0, np.inf, 0, 2])
+
+    def test_only_impulses_of_contacts_that_touch_count(self, pool, stepped) -> None:
+        active, impulse = stepped.state.contact_active, stepped.state.contact_normal_impulse
+        old = altered(stepped, contact_normal_impulse=np.where(active, impulse, 7))
+        assert not distances(pool.level, stepped, old).off.any()
+        other = altered(stepped, contact_normal_impulse=np.where(active, impulse + 7, 7))
+        np.testing.assert_array_equal(distances(pool.level, stepped, other).off, active.any(0))
+
+    def test_another_contact_is_off(self, pool, stepped) -> None:
+        other = altered(stepped, contact_active=~stepped.state.contact_active)
+        assert distances(pool.level, stepped, other).off.all()
+
+
+class TestCauses:
+    @staticmethod
+    def find(pool: Pool, lane: int, theirs: Stepped) -> causes.Cause:
+        one = pool.lanes(np.array([lane]))
+        return causes.find_cause(step_ours, one.level, one.action, lanes_of(theirs, [lane]))
+
+    def test_a_wrong_engine_is_not_explained(self, pool, stepped) -> None:
+        """Half of gravity more, in lanes of every scene."""
+        free = scenes.movable(pool.level)[:, None] * np.array([0, 0.08])[:, None]
+        wrong = altered(stepped, velocity=(stepped.state.velocity + free).astype(np.float32))
+        off = np.flatnonzero(distances(pool.level, stepped, wrong).off)
+        told = [self.find(pool, lane, wrong).explained for lane in off[:24]]
+        assert np.mean(told) < 0.1
+
+    def test_the_last_bits_are_explained(self, pool, stepped) -> None:
+        """What a neighbour becomes is no surprise."""
+        seen = causes.neighbours(step_ours, pool.lanes(np.array([3])).level, pool.action[:, [3]], 1)
+        theirs = lanes_of(seen.after, [BLOCK - 1])
+        assert causes.reached(seen.after.state, theirs.state)
+
+    def test_a_box_that_lies_flat(self, pool) -> None:
+        """Two corners equally deep: which is the first contact point is decided by the last bit."""
+        alone = np.arange(pool.level.size.bodies)[:, None] < pool.level.size.polygons
+        model = dataclasses.replace(pool.level.model, active=pool.level.model.active & alone)
+        level = scenes.stacks(dataclasses.replace(pool.level, model=model), np.random.default_rng(0))
+        lower = np.array([0, 0.005], np.float32)[:, None] * scenes.movable(level)[:, None]
+        position = level.state.position - lower
+        level = dataclasses.replace(level, state=dataclasses.replace(level.state, position=position.astype(np.float32)))
+        after = step_ours(level, pool.action)
+        lane = int(np.flatnonzero(after.state.contact_active[0] & after.state.contact_active[4])[0])
+        swap = np.arange(len(after.state.contact_active))
+        swap[[0, 4]] = [4, 0]  # both points of floor and box
+        impulse = after.state.contact_tangent_impulse[swap] + np.float32(0.01)
+        theirs = altered(after, contact_tangent_impulse=impulse)._replace(point=after.point[swap])
+        found = self.find(Pool(level, pool.action, pool.scene, pool.origin), lane, theirs)
+        assert found.name == causes.DEEPEST_VERTEX
+
+    def test_a_contact_more(self, pool, stepped) -> None:
+        active = stepped.state.contact_active
+        lane = int(np.argmax(active.any(0)))
+        one = int(np.argmax(active[:, lane]))
+        other = active.copy()
+        other[one, lane] = False
+        found = self.find(pool, lane, altered(stepped, contact_active=other))
+        assert found.name == causes.TOUCHING
+        assert not found.explained  # no neighbour loses a contact that is deep
+
+    def test_a_broken_world(self, pool, stepped) -> None:
+        broken = altered(stepped, rotation=stepped.state.rotation + np.float32(1e8))
+        found = self.find(pool, 0, broken)
+        assert (found.name, found.explained) == (causes.BROKEN_WORLD, True)
+
+    def test_impulses_alone_lead_to_the_body(self, pool, stepped) -> None:
+        active = stepped.state.contact_active
+        a, b = causes.contact_bodies(pool.level)
+        lane = int(np.argmax(active[9:].any(0)))
+        contact = 9 + int(np.argmax(active[9:, lane]))
+        impulse = stepped.state.contact_normal_impulse.copy()
+        impulse[contact, lane] += 5
+        one = lanes_of((pool.level, stepped, altered(stepped, contact_normal_impulse=impulse)), [lane])
+        assert causes.Bodies.off(*one).worst in (a[contact], b[contact])
+
+
+class TestPool:
+    def test_each_world_once(self, pool) -> None:
+        twice = pool.lanes(np.array([1, 2, 1, 3, 2]))
+        assert distinct(twice).origin == ["golden 1", "golden 2", "golden 3"]
+
+
+class TestEpisodes:
+    def test_outcomes(self) -> None:
+        done = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [1, 1, 1]], bool)
+        reward = np.array([[0, 0, 0], [1.0, 0, 0], [0, 0, -1], [-1, 0, 1]])
+        found = episodes.outcome(Played(reward, done, None))
+        assert [found.text(lane) for lane in range(3)] == ["goal at 2", "time at 4", "red at 3"]
+        other = episodes.Outcome(np.array([1, 3, 3]), np.array([1, 0, -1]))
+        np.testing.assert_array_equal(found.same(other), [True, True, False])
+
+    def test_near_starts_keep_the_scenery(self, pool) -> None:
+        level = pool.level
+        near = episodes.near(level, np.random.default_rng(0))
+        free = scenes.movable(level)
+        np.testing.assert_array_equal(near.rotation[~free], level.state.rotation[~free])
+        assert (near.rotation[free] != level.state.rotation[free]).mean() > 0.3
+        np.testing.assert_allclose(near.position, level.state.position, rtol=3e-7)
+
+    def test_first_difference(self, pool) -> None:
+        states = jax.tree.map(lambda x: np.repeat(np.asarray(x)[..., :1], 6, -1), pool.level.state)
+        moved = states.position.copy()
+        moved[5, 0, 3:] += 1e-3
+        first, at_contact = episodes._first_off(states, dataclasses.replace(states, position=moved))
+        assert (first, at_contact) == ([3, None], False)
+        active = states.contact_active.copy()
+        active[0, 3:] ^= True
+        _, at_contact = episodes._first_off(states, dataclasses.replace(states, position=moved, contact_active=active))
+        assert at_contact
+
+    def test_our_episodes_record_what_they_play(self, pool) -> None:
+        action = np.repeat(pool.action[None], 3, 0)
+        played = play_ours(pool.level, pool.level.state, action, record=True)
+        np.testing.assert_array_equal(played.states.rotation[:, 0], pool.level.state.rotation)
+        assert played.reward.shape == (3, BLOCK)
+        times = np.array([[0, 2], [1, 1]])
+        some = pool.lanes(np.array([4, 5]))
+        some = dataclasses.replace(some, action=action[..., 4:6])
+        states = picked(some, lanes_of(played.states, [4, 5]), times)
+        np.testing.assert_array_equal(states.level.state.position[..., 1], played.states.position[..., 2, 5])
+        assert states.origin == [
+            "golden 4, env step 0",
+            "golden 5, env step 2",
+            "golden 4, env step 1",
+            "golden 5, env step 1",
+        ]
+
+
+@pytest.fixture(scope="module")
+def report(pool) -> Report:
+    few = pool.lanes(np.arange(40))
+    ticks: list[str] = []
+    found = one_step(few, Parrot(), ticks.append)  # pyright: ignore[reportArgumentType]
+    assert ticks == ["states"]
+    pairs = episodes.Episodes(
+        pairs=4,
+        touched=2,
+        same=0.75,
+        same_touched=0.5,
+        reference_itself=1.0,
+        ours_itself=1.0,
+        target=0.97,
+        parted=[episodes.Parted("sampled", "level 3", "goal at 3", "goal at 4", [2, None], True, 5, 1e-5, "chance")],
+        reasons={"chance": 1},
+    )
+    return Report.of([SizeReport("s", found, pairs, ["one"])], {"states": 40}, {"jax2d": "1.0.1"})
+
+
+class TestReport:
+    def test_the_same_engine_is_not_off(self, report) -> None:
+        found = report.sizes[0].one_step
+        assert found.states == 40
+        assert found.off == []
+        assert all(row.largest == 0 for row in found.fields)
+        assert found.scenes[-1].scene == "all"
+        assert sum(row.states for row in found.scenes[:-1]) == 40
+        assert found.defect.differ[0] >= found.defect.differ[1]
+        report.check()
+
+    def test_an_engine_that_is_wrong_is_told(self, pool, report) -> None:
+        wrong = Parrot(velocity=lambda x: x + np.float32(0.1))
+        found = one_step(pool.lanes(np.arange(3)), wrong, lambda _: None)  # pyright: ignore[reportArgumentType]
+        assert len(found.off) == 3
+        told = dataclasses.replace(report, sizes=[SizeReport("s", found, None, [])])
+        with pytest.raises(Failure, match=r"does not explain 3 differences.*size s, golden 0.*--json"):
+            told.check()
+
+    def test_tables_and_json(self, report, capsys) -> None:
+        for _, head, rows in tables(report):
+            assert all(len(row) == len(head) for row in rows)
+        report.write_tables()
+        shown = capsys.readouterr().out
+        assert "75.0%" in shown
+        assert "NOT EXPLAINED" not in shown
+        file = io.StringIO()
+        report.write_json(file)
+        told = json.loads(file.getvalue())
+        assert told["bench"] == "parity"
+        assert told["sizes"][0]["episodes"]["same"] == 0.75
+        assert told["sizes"][0]["one_step"]["fields"][0]["largest"] == 0
+
+
+@pytest.mark.slow
+def test_a_small_campaign_for_real(reference, level_file) -> None:
+    """As a user types it. Handmade levels, scenes, episodes: all that differs is rounding."""
+    words = ["--size", "s", "--states", "120", "--episodes", "12", "--level-file", str(level_file), "--json"]
+    code = "import sys; from pipeline.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "bench", "parity", *words]
+    environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
+    assert done.returncode == Exit.DONE, done.stderr
+    told = json.loads(done.stdout)
+    (one,) = told["sizes"]
+    scene = {row["scene"]: row for row in one["one_step"]["scenes"]}
+    assert {"sampled", "handmade", *scenes.SCENES} <= set(scene)
+    assert scene["all"]["states"] >= 100
+    assert scene["all"]["within"][-1] > 0.9
+    assert len(one["handmade"]) == 10
+    assert one["episodes"]["pairs"] == 12
+    assert one["episodes"]["same"] >= 0.75
+    assert told["versions"]["reference"]["jax2d"] == "1.0.1"
+    assert "blocks" in done.stderr
+
+
+class TestInput:
+    def test_levels_of_another_size(self, level_file, monkeypatch) -> None:
+        monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
+        with pytest.raises(UserError, match=r"are of size 5,2,1,1: --size is m\.$"):
+            main(["parity", "--size", "m", "--level-file", str(level_file)])
+        with pytest.raises(UserError, match="levels of one size"):
+            main(["parity", "--level-file", str(level_file)])
+
+    def test_sizes(self) -> None:
+        assert size_of("8,7,6,5") == (8, 7, 6, 5)
+        assert size_of("s").polygons == 5
+
+    @pytest.mark.parametrize("size", ["xl", "8,8,8", "4,1,1,1", "8,8,-1,4"])
+    def test_no_size(self, size, capsys) -> None:
+        with pytest.raises(SystemExit) as error:
+            main(["parity", "--size", size])
+        assert error.value.code == 2
+        assert f"{size} is no size: give s, m, l" in " ".join(capsys.readouterr().err.split())
