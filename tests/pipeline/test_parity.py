@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from physics.types import FIXED_POLYGONS
+from physics.types import FIXED_POLYGONS, Params
 from pipeline.bench import main, oracle
 from pipeline.bench.parity import causes, episodes, scenes
 from pipeline.bench.parity.campaign import SizeReport, size_of
@@ -41,6 +41,12 @@ def stepped(pool) -> Stepped:
 
 
 @pytest.fixture(scope="module")
+def reference_after(pool, stepped) -> Stepped:
+    """What the reference made of them; its geometry is not kept, so ours stands there."""
+    return stepped._replace(state=lanes_of(load(HERE / "s.npz").after, np.arange(BLOCK)))
+
+
+@pytest.fixture(scope="module")
 def large():
     """Levels of size l, at rest at their starts."""
     return load(HERE / "l.npz").level
@@ -48,17 +54,6 @@ def large():
 
 def altered(after: Stepped, **state) -> Stepped:
     return after._replace(state=dataclasses.replace(after.state, **state))
-
-
-class Parrot:
-    """Stands where the reference does, and gives what our engine gave: no process for tests of the arithmetic."""
-
-    def __init__(self, **state) -> None:
-        self.state = state
-
-    def step(self, level, action) -> Stepped:
-        after = step_ours(level, action)
-        return altered(after, **{name: change(getattr(after.state, name)) for name, change in self.state.items()})
 
 
 class TestWorlds:
@@ -279,10 +274,10 @@ class TestEpisodes:
 
 
 @pytest.fixture(scope="module")
-def report(pool) -> Report:
-    few = pool.lanes(np.arange(40))
+def report(pool, reference_after) -> Report:
+    """Of golden states and what the reference made of them, and an episode."""
     ticks: list[str] = []
-    found = one_step(few, Parrot(), ticks.append)  # pyright: ignore[reportArgumentType]
+    found = one_step(pool, lambda *_: reference_after, ticks.append)
     assert ticks == ["states"]
     pairs = episodes.Episodes(
         pairs=4,
@@ -299,22 +294,25 @@ def report(pool) -> Report:
 
 
 class TestReport:
-    def test_the_same_engine_is_not_off(self, report) -> None:
+    def test_golden_states_agree_or_are_explained(self, report) -> None:
         found = report.sizes[0].one_step
-        assert found.states == 40
-        assert found.off == []
-        assert all(row.largest == 0 for row in found.fields)
-        assert found.scenes[-1].scene == "all"
-        assert sum(row.states for row in found.scenes[:-1]) == 40
-        assert found.defect.differ[0] >= found.defect.differ[1]
+        assert found.states == BLOCK
+        motion = found.scenes[-1]
+        assert (motion.scene, motion.states) == ("all", BLOCK)
+        assert motion.within[-1] > 0.99
+        assert sum(row.states for row in found.scenes[:-1]) == BLOCK
+        assert [row.field for row in found.fields][:2] == ["position", "rotation"]
+        assert found.defect.differ[0] >= found.defect.differ[1] > 0
         report.check()
 
-    def test_an_engine_that_is_wrong_is_told(self, pool, report) -> None:
-        wrong = Parrot(velocity=lambda x: x + np.float32(0.1))
-        found = one_step(pool.lanes(np.arange(3)), wrong, lambda _: None)  # pyright: ignore[reportArgumentType]
-        assert len(found.off) == 3
+    def test_another_engine_is_told(self, pool, report) -> None:
+        """Ours with another constant: contacts are pushed apart a quarter faster."""
+        params = Params(contact_bias=0.25)
+        found = one_step(pool.lanes(np.arange(40)), lambda *given: step_ours(*given, params), lambda _: None)
+        wrong = [state for state in found.off if not state.explained]
+        assert len(wrong) > 5
         told = dataclasses.replace(report, sizes=[SizeReport("s", found, None, [])])
-        with pytest.raises(Failure, match=r"does not explain 3 differences.*size s, golden 0.*--json"):
+        with pytest.raises(Failure, match=rf"does not explain {len(wrong)} differences.*size s, golden.*--json"):
             told.check()
 
     def test_tables_and_json(self, report, capsys) -> None:
@@ -329,7 +327,7 @@ class TestReport:
         told = json.loads(file.getvalue())
         assert told["bench"] == "parity"
         assert told["sizes"][0]["episodes"]["same"] == 0.75
-        assert told["sizes"][0]["one_step"]["fields"][0]["largest"] == 0
+        assert told["sizes"][0]["one_step"]["fields"][0]["largest"] < 1e-4
 
 
 @pytest.mark.slow

@@ -66,7 +66,7 @@ def campaign(
             names, handmade = reference.handmade()
             pools, parts = _episodes(reference, _pairs(sampled, names, handmade, episodes), states, tick)
         pools.append(_scenes(reference, sampled, states, not named, tick))
-        result = one_step(distinct(pool_of(pools)), reference, tick)
+        result = one_step(distinct(pool_of(pools)), reference.step, tick)
     return SizeReport(size, result, summed(size, parts) if parts else None, names)
 
 

@@ -10,9 +10,9 @@ from jaxtyping import Int
 
 from levelgen.level import Level
 from physics.types import State
-from pipeline.bench.parity.causes import find_cause
+from pipeline.bench.parity.causes import Step, find_cause
 from pipeline.bench.parity.distance import OFF, UNITS, Distances, distances
-from pipeline.bench.parity.engines import RULES, Reference, Stepped, step_ours
+from pipeline.bench.parity.engines import RULES, Stepped, step_ours
 from pipeline.bench.parity.worlds import blocks, joined, lanes_of, starting_in
 
 LIMITS = (1e-6, 1e-5, 1e-4, 1e-3)
@@ -125,12 +125,12 @@ def picked(played: Pool, record: State, times: Int[np.ndarray, "pick lane"]) -> 
     )
 
 
-def one_step(pool: Pool, reference: Reference, tick: Callable[[str], None]) -> OneStep:
+def one_step(pool: Pool, step_theirs: Step, tick: Callable[[str], None]) -> OneStep:
     """Step the pool in both engines, and find out why states are off."""
     parts, off, defect = [], [], []
     for lanes in blocks(len(pool)):
         block, count = pool.lanes(lanes), int(lanes[-1] - lanes[0]) + 1  # the last block is filled up
-        theirs, ours = reference.step(block.level, block.action), step_ours(block.level, block.action)
+        theirs, ours = step_theirs(block.level, block.action), step_ours(block.level, block.action)
         fixed = step_ours(block.level, block.action, replace(RULES.physics, faithful_padding=False))
         apart = distances(block.level, ours, theirs)
         parts.append(_first(apart, count))

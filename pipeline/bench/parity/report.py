@@ -2,6 +2,7 @@
 
 import json
 import platform
+import statistics
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.bench.parity.campaign import SizeReport
-from pipeline.bench.parity.episodes import NOT_EXPLAINED
+from pipeline.bench.parity.episodes import FIRST_OFF, NOT_EXPLAINED
 from pipeline.bench.parity.onestep import DEFECT_OFF, LIMITS
 from pipeline.errors import Failure
 from pipeline.stack import device, versions
@@ -110,7 +111,7 @@ def tables(report: Report) -> list[tuple[str, Sequence[str], list[Sequence[str]]
             ("Whole episodes, share with the same outcome", EPISODE_HEAD, [_episode_row(one) for one in played]),
             (
                 "Why episodes part",
-                ("size", "reason", "episodes", "places first off at a contact"),
+                ("size", "reason", "episodes", *(f"off by {limit:.0e} at" for limit in FIRST_OFF), "at a contact"),
                 [row for one in played for row in _reason_rows(one)],
             ),
         ]
@@ -180,9 +181,15 @@ def _reason_rows(one: SizeReport) -> list[Sequence[str]]:
     assert one.episodes is not None
     rows = []
     for reason, count in one.episodes.reasons.items():
-        at_contact = sum(pair.at_contact for pair in one.episodes.parted if pair.reason == reason)
-        rows.append((one.size, reason, str(count), str(at_contact)))
+        of = [pair for pair in one.episodes.parted if pair.reason == reason]
+        medians = (_median([pair.first_off[k] for pair in of]) for k in range(len(FIRST_OFF)))
+        rows.append((one.size, reason, str(count), *medians, str(sum(pair.at_contact for pair in of))))
     return rows
+
+
+def _median(steps: Sequence[int | None]) -> str:
+    known = [step for step in steps if step is not None]
+    return f"env step {statistics.median(known):.0f}" if known else "-"
 
 
 def _rounded(value: Any) -> Any:
