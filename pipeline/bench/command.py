@@ -88,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--states", type=int, default=10_000, help="states a size to take one step from (default: 10,000)")
     sub.add_argument("--episodes", type=int, default=1_000, help="levels with actions to play, a size (default: 1,000)")
+    sub.add_argument("--keep", type=Path, help="folder for the reference's answers: next time only our side runs")
     return parser
 
 
@@ -121,7 +122,8 @@ def parity(given: argparse.Namespace) -> None:
 
     python = oracle.oracle_python()
     with Board(Console(stderr=True)).shown() as board:
-        sizes = [campaign(python, size, given.states, given.episodes, board, given.level_file) for size in given.size]
+        of = (given.states, given.episodes, board, given.level_file, given.keep)
+        sizes = [campaign(python, size, *of) for size in given.size]
     settings = {"states": given.states, "episodes": given.episodes, "stickiness": STICKINESS}
     report = Report.of(sizes, settings, oracle.versions(python))
     if given.json:

@@ -331,13 +331,14 @@ class TestReport:
 
 
 @pytest.mark.slow
-def test_a_small_campaign_for_real(reference, level_file) -> None:
+def test_a_small_campaign_for_real(reference, level_file, tmp_path) -> None:
     """As a user types it. Handmade levels, scenes, episodes: all that differs is rounding."""
     words = ["--size", "s", "--states", "120", "--episodes", "12", "--level-file", str(level_file), "--json"]
     code = "import sys; from pipeline.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "bench", "parity", *words]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
+    keep = ["--keep", str(tmp_path / "kept")]
+    done = subprocess.run([*command, *keep], capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
     assert done.returncode == Exit.DONE, done.stderr
     told = json.loads(done.stdout)
     (one,) = told["sizes"]
@@ -350,6 +351,8 @@ def test_a_small_campaign_for_real(reference, level_file) -> None:
     assert one["episodes"]["same"] >= 0.75
     assert told["versions"]["reference"]["jax2d"] == "1.0.1"
     assert "blocks" in done.stderr
+    again = subprocess.run([*command, *keep], capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
+    assert json.loads(again.stdout)["sizes"] == told["sizes"]  # from the answers that were kept
 
 
 class TestInput:

@@ -49,9 +49,24 @@ def size_of(text: str) -> Size:
 
 
 def campaign(
-    python: Path, size: str, states: int, episodes: int, board: Board, level_file: Path | None = None
+    python: Path,
+    size: str,
+    states: int,
+    episodes: int,
+    board: Board,
+    level_file: Path | None = None,
+    keep: Path | None = None,
 ) -> SizeReport:
     """Run it. Sizes without a name have no handmade levels and no episodes.
+
+    Args:
+        python: of the reference's environment.
+        size: see `size_of`.
+        states: to take one step from, at least about so many.
+        episodes: pairs of levels and actions.
+        board: shows how far it is.
+        level_file: sampled levels as the reference's arrays; by default it samples them.
+        keep: folder where the reference's answers are kept, so that only our side has to run again.
 
     Raises:
         UserError: the levels of `level_file` are of another size.
@@ -59,7 +74,7 @@ def campaign(
     """
     sampled, named = _sampled(python, size, level_file), size in SIZES
     tick = lambda what, more=0: board.tick(f"size {size}: {what}", more)
-    with Reference.started(python, size) as reference:
+    with Reference.of(python, size, keep) as reference:
         board.more(_blocks(states) + (3 * _blocks(episodes) if named else 0))
         names, pools, parts = [], [], []
         if named:

@@ -1,5 +1,6 @@
 """Both engines behind the same three questions: one physics step, one env step, an episode under given actions."""
 
+import hashlib
 import json
 import tempfile
 from collections.abc import Iterator
@@ -7,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -99,23 +100,25 @@ def play_ours(level: Level, start: State, action: np.ndarray, record: bool) -> P
 
 @dataclass
 class Reference:
-    """The reference's process for worlds of one size."""
+    """The reference for worlds of one size: its process, which starts when it is first asked something new."""
 
+    size: str
     process: Process
-    folder: Path
+    folder: Path  # of the arrays of the question under way
+    keep: Path | None  # folder of answers to questions asked before
+    awake: bool = False
 
     @staticmethod
     @contextmanager
-    def started(python: Path, size: str) -> Iterator["Reference"]:
+    def of(python: Path, size: str, keep: Path | None = None) -> Iterator["Reference"]:
         """Its process lives as long as the context."""
         cache = cache_folder() / "reference-jax"
-        cache.mkdir(parents=True, exist_ok=True)
+        for folder in filter(None, (cache, keep)):
+            folder.mkdir(parents=True, exist_ok=True)
         command = [python, oracle.HERE / "reference_parity.py", "--size", size, "--cache", cache]
         with ExitStack() as stack, tempfile.TemporaryFile("w+") as errors, tempfile.TemporaryDirectory() as folder:
             process = Process([str(word) for word in command], oracle.environment(), stack, errors)
-            process.wake()
-            process.answer()
-            yield Reference(process, Path(folder))
+            yield Reference(size, process, Path(folder), keep)
 
     def handmade(self) -> tuple[list[str], Level]:
         """Names and worlds of the handmade levels of this size; impulses they were saved with included."""
@@ -138,20 +141,46 @@ class Reference:
         self, what: str, worlds: tuple[Level, State, np.ndarray] | None = None, **more: bool
     ) -> tuple[dict, dict[str, np.ndarray]]:
         """What it answers, and the arrays it writes."""
-        request = {"do": what, "out": str(self.folder / "out.npz"), **more}
-        if worlds is not None:
-            level, start, actions = worlds
-            lanes = actions.shape[-1]
-            fields = state_to_kinetix(level, start, np.zeros(lanes, np.int32), np.full(lanes, -1, np.float32))
-            request["worlds"] = str(self.folder / "in.npz")
-            np.savez(request["worlds"], actions=actions, **fields)  # pyright: ignore[reportArgumentType]
-        self.process.go(json.dumps(request))
-        told = self.process.answer()
-        with np.load(request["out"]) as file:
-            return told, {name: file[name] for name in file.files}
+        request = {"do": what, **more}
+        fields = {} if worlds is None else _fields(*worlds)
+        kept = self.keep and self.keep / f"{self.size}-{what}-{_digest(request, fields)}.npz"
+        out = kept or self.folder / "out.npz"
+        told = out.with_suffix(".json")
+        if not (kept and told.is_file()):
+            told.write_text(json.dumps(self._answer(request, fields, out)))
+        with np.load(out) as file:
+            return json.loads(told.read_text()), {name: file[name] for name in file.files}
+
+    def _answer(self, request: dict[str, Any], fields: dict[str, np.ndarray], out: Path) -> dict:
+        if not self.awake:
+            self.process.wake()
+            self.process.answer()
+            self.awake = True
+        worlds = self.folder / "in.npz"
+        np.savez(worlds, **fields)  # pyright: ignore[reportArgumentType]
+        self.process.go(json.dumps(request | {"worlds": str(worlds), "out": str(out)}))
+        return self.process.answer()
 
     @staticmethod
     def _contacts(fields: dict[str, np.ndarray], name: str) -> np.ndarray:
         """In our numbering: first points of polygon pairs, second points, circle-polygon, circle-circle."""
         polygon, *others = (fields[f"{kind}/{name}"] for kind in MANIFOLDS)
         return np.moveaxis(np.concatenate([polygon[:, :, 0], polygon[:, :, 1], *others], 1), 0, -1)
+
+
+def _fields(level: Level, start: State, actions: np.ndarray) -> dict[str, np.ndarray]:
+    """Worlds and actions as the reference reads them."""
+    lanes = actions.shape[-1]
+    fields = state_to_kinetix(level, start, np.zeros(lanes, np.int32), np.full(lanes, -1, np.float32))
+    return {"actions": actions, **fields}
+
+
+def _digest(request: dict[str, Any], fields: dict[str, np.ndarray]) -> str:
+    """Of a question, and of the script that answers it."""
+    text = hashlib.sha256(json.dumps(request).encode())
+    text.update((oracle.HERE / "reference_parity.py").read_bytes())
+    text.update("\n".join(oracle.REQUIREMENTS).encode())
+    for name in sorted(fields):
+        text.update(f"{name} {fields[name].dtype} {fields[name].shape}".encode())
+        text.update(np.ascontiguousarray(fields[name]).tobytes())
+    return text.hexdigest()[:16]
