@@ -20,7 +20,7 @@ from pipeline.bench.parity.distance import distances, gap
 from pipeline.bench.parity.engines import Played, Stepped, play_ours, step_ours
 from pipeline.bench.parity.onestep import Pool, distinct, one_step, picked
 from pipeline.bench.parity.report import Report, tables
-from pipeline.bench.parity.worlds import BLOCK, blocks, lanes_of, nudged
+from pipeline.bench.parity.worlds import BLOCK, blocks, contact_bodies, lanes_of, nudged
 from pipeline.errors import Exit, Failure, UserError
 from tests.golden.load import HERE, load
 
@@ -212,7 +212,7 @@ class TestCauses:
 
     def test_impulses_alone_lead_to_the_body(self, pool, stepped) -> None:
         active = stepped.state.contact_active
-        a, b = causes.contact_bodies(pool.level)
+        a, b = contact_bodies(pool.level.size)
         lane = int(np.argmax(active[9:].any(0)))
         contact = 9 + int(np.argmax(active[9:, lane]))
         impulse = stepped.state.contact_normal_impulse.copy()

@@ -19,7 +19,7 @@ from physics.pairs import pairs_of
 from physics.types import State
 from pipeline.bench.parity.distance import CONTACT_IMPULSES, JOINT_IMPULSES, MOTION, OFF, evolving_gaps
 from pipeline.bench.parity.engines import Stepped
-from pipeline.bench.parity.worlds import BLOCK, lanes_of, nudged_tree
+from pipeline.bench.parity.worlds import BLOCK, contact_bodies, lanes_of, nudged_tree
 
 COPIES = BLOCK  # neighbours, the state itself first
 MOVES = (1, 4, 16)  # units in the last place
@@ -85,12 +85,20 @@ def find_cause(step: Step, level: Level, action: np.ndarray, theirs: Stepped) ->
 
 
 def neighbours(step: Step, level: Level, action: np.ndarray, most: int) -> Neighbours:
-    """Every float of the state moved by at most `most` units in its last place; those of the model too, beyond 1."""
+    """Worlds near to that of one lane, after a step."""
+    level = near_worlds(level, most)
+    return Neighbours(level, step(level, np.repeat(action, COPIES, -1)))
+
+
+def near_worlds(level: Level, most: int) -> Level:
+    """One lane with every float of its state moved by at most `most` units in its last place; beyond 1, its model too.
+
+    The world itself is the first lane of COPIES.
+    """
     level = lanes_of(level, np.zeros(COPIES, int))
     moved = nudged_tree((level.state, level.model), np.random.default_rng(0), most)
     state, model = jax.tree.map(_first_stays, (level.state, level.model), moved)
-    level = replace(level, state=state, model=model if most > 1 else level.model)
-    return Neighbours(level, step(level, np.repeat(action, COPIES, -1)))
+    return replace(level, state=state, model=model if most > 1 else level.model)
 
 
 def _first_stays(old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -146,7 +154,7 @@ class Bodies:
     @staticmethod
     def off(before: Level, ours: Stepped, theirs: Stepped) -> "Bodies":
         model, movable = before.model, (before.model.inverse_mass != 0)[:, 0]
-        a, b = contact_bodies(before)
+        a, b = contact_bodies(before.size)
         gaps = evolving_gaps(ours.state, theirs.state)
         by_thing = lambda names: np.max([gaps[name].reshape(len(gaps[name]), -1).max(-1) for name in names], 0)
         apart = by_thing(MOTION)
@@ -169,19 +177,11 @@ class Bodies:
         return Bodies(worst, group, active & (group[a] | group[b]))
 
 
-def contact_bodies(level: Level) -> tuple[np.ndarray, np.ndarray]:
-    """Both bodies of each contact, in the numbering of physics/pairs.py."""
-    pairs = pairs_of(level.size)
-    kinds = (pairs.polygon, pairs.polygon, pairs.circle_polygon, pairs.circle)
-    a, b = (np.array([body for kind in kinds for body in getattr(kind, end)], int) for end in "ab")
-    return a, b
-
-
 def _flipped_contact(before: Level, bodies: Bodies, after: Stepped, theirs: Stepped) -> str | None:
     """A contact that is found otherwise by some neighbour, or by the reference."""
     everyone = jax.tree.map(lambda x, y: np.concatenate([x, y], -1), after, theirs)
     active = everyone.state.contact_active
-    a, b = contact_bodies(before)
+    a, b = contact_bodies(before.size)
     near = bodies.group[a] | bodies.group[b]
     if (near & (active.any(-1) != active.all(-1))).any():
         return TOUCHING
@@ -220,7 +220,7 @@ def _deep(before: Level, bodies: Bodies, ours: Stepped) -> str | None:
     """Overlaps whose undoing takes impulses that are large beside what they leave."""
     pairs = pairs_of(before.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
-    a, b = contact_bodies(before)
+    a, b = contact_bodies(before.size)
     acts = bodies.contacts & before.model.collides[a, b, 0]
     depth = np.where(acts, ours.penetration[:, 0], 0)
     circle = slice(2 * n, 2 * n + m)
@@ -233,7 +233,7 @@ def _deep(before: Level, bodies: Bodies, ours: Stepped) -> str | None:
 def _held(before: Level, bodies: Bodies) -> str:
     """What holds the body that is off, and how it moves."""
     model, worst = before.model, bodies.worst
-    a, b = contact_bodies(before)
+    a, b = contact_bodies(before.size)
     acts = bodies.contacts & model.collides[a, b, 0]
     ends = np.stack([model.joint_a[:, 0], model.joint_b[:, 0]])
     joined = model.joint_active[:, 0] & bodies.group[ends].any(0)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from levelgen.level import Level
 from physics.types import State
 from pipeline.bench.parity.engines import Stepped
+from pipeline.bench.parity.worlds import contact_bodies
 
 OFF = 1e-3  # a state with a larger difference is looked into
 MOTION = ("position", "rotation", "velocity", "angular_velocity")
@@ -47,9 +48,12 @@ class Distances(NamedTuple):
 
 
 def distances(level: Level, ours: Stepped, theirs: Stepped) -> Distances:
-    """After a step of these levels. What inactive actuators are told is nobody's."""
+    """After a step of these levels.
+
+    Where both find a contact that does something, its geometry counts. What inactive actuators are told is nobody's.
+    """
     fields = {name: largest(gap) for name, gap in evolving_gaps(ours.state, theirs.state).items()}
-    both = ours.state.contact_active & theirs.state.contact_active
+    both = ours.state.contact_active & theirs.state.contact_active & level.model.collides[contact_bodies(level.size)]
     for name in GEOMETRY:
         apart = gap(getattr(ours, name), getattr(theirs, name))
         fields[name] = largest(np.where(both if apart.ndim == both.ndim else both[:, None], apart, 0))

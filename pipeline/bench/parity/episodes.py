@@ -13,6 +13,7 @@ import numpy as np
 
 from levelgen.level import Level
 from physics.types import State
+from pipeline.bench.parity.causes import MOVES, is_broken, near_worlds, reached
 from pipeline.bench.parity.distance import MOTION, OFF, evolving_gaps, gap, largest
 from pipeline.bench.parity.engines import Played, Reference, env_step_ours, play_ours
 from pipeline.bench.parity.onestep import Pool
@@ -150,13 +151,13 @@ def _part(pair: Pool, lane: int, ours: State, theirs: State, a: Outcome, b: Outc
     """Look into a pair, given records of its block, [..., step, lane]."""
     until = int(min(a.step[lane], b.step[lane])) + 1  # states before each action of both first episodes
     first, at_contact = _first_off(*(_until(states, lane, until) for states in (ours, theirs)))
-    step_off, amplified = _steps(pair.level, _until(theirs, lane, int(b.step[lane]) + 1), pair.action)
-    if near_starts:
+    step_off, explained = _steps(pair.level, _until(theirs, lane, int(b.step[lane]) + 1), pair.action)
+    if not explained:
+        reason = NOT_EXPLAINED
+    elif near_starts:
         reason = NEAR_STARTS_PART
-    elif step_off <= OFF:
-        reason = STEPS_AGREE
     else:
-        reason = STEP_AMPLIFIES if amplified else NOT_EXPLAINED
+        reason = STEPS_AGREE if step_off <= OFF else STEP_AMPLIFIES
     return Parted(
         scene=pair.scene[0],
         origin=pair.origin[0],
@@ -201,7 +202,7 @@ def _near_starts(level: Level, action: np.ndarray, lanes: np.ndarray, ours: Outc
 
 
 def _steps(level: Level, states: State, action: np.ndarray) -> tuple[float, bool]:
-    """Largest difference of our env steps from the reference's states, and whether neighbours spread as far.
+    """Largest difference of our env steps from the reference's states, and whether neighbours there reach as far.
 
     Args:
         level: one lane.
@@ -219,8 +220,7 @@ def _steps(level: Level, states: State, action: np.ndarray) -> tuple[float, bool
     worst = int(np.argmax(apart))
     if apart[worst] <= OFF:
         return float(apart[worst]), True
-    copies = lanes_of(worlds, np.full(BLOCK, worst))
-    moved = nudged_tree(copies.state, np.random.default_rng(2))
-    spread = env_step_ours(starting_in(copies, moved), np.repeat(action[lane[worst]], BLOCK, 1))
-    wide = max(np.ptp(getattr(spread, name), axis=-1).max() for name in MOTION)
-    return float(apart[worst]), bool(apart[worst] <= wide)
+    action_there = np.repeat(action[lane[worst]], BLOCK, 1)
+    world, there = lanes_of((worlds, lanes_of(states, lane + 1)), [worst])
+    reaches = (reached(env_step_ours(near_worlds(world, most), action_there), there) for most in MOVES)
+    return float(apart[worst]), any(reaches) or is_broken(there)

@@ -9,7 +9,8 @@ import numpy as np
 
 from levelgen.kinetix import state_from_kinetix
 from levelgen.level import Level
-from physics.types import State
+from physics.pairs import pairs_of
+from physics.types import Size, State
 
 BLOCK = 256  # lanes of every program, ours and the reference's: few compilations, however many worlds
 T = TypeVar("T")
@@ -34,6 +35,14 @@ def blocks(count: int, size: int = BLOCK) -> Iterator[np.ndarray]:
 def starting_in(level: Level, state: State) -> Level:
     """The level with another initial state."""
     return dataclasses.replace(level, state=state)
+
+
+def contact_bodies(size: Size) -> tuple[np.ndarray, np.ndarray]:
+    """Both bodies of each contact, in the numbering of physics/pairs.py."""
+    pairs = pairs_of(size)
+    kinds = (pairs.polygon, pairs.polygon, pairs.circle_polygon, pairs.circle)
+    a, b = (np.array([body for kind in kinds for body in getattr(kind, end)], int) for end in "ab")
+    return a, b
 
 
 def record_from_kinetix(fields: Mapping[str, np.ndarray]) -> State:
