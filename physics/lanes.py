@@ -21,6 +21,8 @@ Scalar = Int[Array, ""] | int
 
 def each(count: Scalar, do: Callable[[Any], None], first: Scalar = 0) -> None:
     """do(i) for i = first, ..., count - 1."""
+    if isinstance(count, int) and isinstance(first, int) and first >= count:
+        return  # not even traced: there may be no row to speak of
 
     def body(i, _):
         do(i)

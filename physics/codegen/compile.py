@@ -82,7 +82,7 @@ def _block(module: ir.Module, jaxpr: core.ClosedJaxpr, rooms: Sequence[Room], ou
     for i, (room, pointer) in enumerate(zip(rooms, function.args[1:], strict=True)):
         stride = INDEX(1) if not room.lanes else function.args[0] if i < outside else INDEX(LANES)
         memories.append(Memory(pointer, room.shape, room.dtype, room.lanes, stride))
-    lower(b, jaxpr.jaxpr, memories)
+    lower(b, jaxpr, memories)
     b.ret_void()
     return function
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 from jax.extend import core
+from jax.lax import RoundingMethod
 from llvmlite import ir
 
 from physics.codegen import primitives
@@ -33,40 +34,51 @@ class Memory:
         return b.gep(self.pointer, [b.mul(row, self.stride)], source_etype=STORED[self.dtype])
 
 
-def lower(b: ir.IRBuilder, jaxpr: core.Jaxpr, arguments: Sequence[Value | Memory]) -> list[Value]:
+def lower(b: ir.IRBuilder, jaxpr: core.ClosedJaxpr, arguments: Sequence[Value | Memory]) -> list[Value]:
     """Emit a jaxpr; its results."""
-    known: dict[Any, Any] = dict(zip(jaxpr.invars, arguments, strict=True))
+    known: dict[Any, Any] = dict(zip(jaxpr.jaxpr.invars, arguments, strict=True))
+    for constant_of, x in zip(jaxpr.jaxpr.constvars, jaxpr.consts, strict=True):
+        known[constant_of] = _as_said(b, _known(np.asarray(x)), constant_of.aval)
 
     def read(x):
-        return _literal(x) if isinstance(x, core.Literal) else known[x]
+        if not isinstance(x, core.Literal):
+            return known[x]
+        aval: Any = x.aval
+        return _known(np.asarray(x.val, aval.dtype))
 
-    for equation in jaxpr.eqns:
+    for equation in jaxpr.jaxpr.eqns:
         results = _equation(b, equation, [read(x) for x in equation.invars])
-        known.update(zip(equation.outvars, results, strict=True))
-    return [read(x) for x in jaxpr.outvars]
+        for x, result in zip(equation.outvars, results, strict=True):
+            known[x] = _as_said(b, result, x.aval)
+    return [read(x) for x in jaxpr.jaxpr.outvars]
 
 
-def _literal(x: core.Literal) -> Value:
-    aval: Any = x.aval
-    dtype = str(aval.dtype)
-    return Value(array((), lambda _: constant(x.val, dtype)), dtype, False)
+def _known(x: np.ndarray) -> Value:
+    """Numbers that are known before the kernel runs."""
+    dtype = str(x.dtype)
+    return Value(array(x.shape, lambda at: constant(x[at], dtype)), dtype, False)
 
 
-def _consts(closed: core.ClosedJaxpr) -> list[Value]:
-    """Constants that a kernel closes over: numbers only."""
-    return [Value(array((), lambda _, c=c: constant(c, str(c.dtype))), str(c.dtype), False) for c in closed.consts]
+def _as_said(b: ir.IRBuilder, x: Value | Memory, aval: Any) -> Value | Memory:
+    """Lanes where the shape ends in them."""
+    return primitives.with_lanes(b, x) if isinstance(x, Value) and has_lanes(aval.shape) else x
 
 
 def _equation(b: ir.IRBuilder, equation, operands: list) -> list:
     name, params = equation.primitive.name, equation.params
     out: Any = equation.outvars[0].aval if equation.outvars else None
+    if name == "round" and params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
+        raise NotImplementedError("a kernel rounds halves to even")
     if name in primitives.ELEMENTWISE:
         return [primitives.elementwise(b, name, operands, str(out.dtype))]
     match name:
         case "get":
-            return [_get(b, *_place(params, operands), out)]
+            return [_get(b, *_place(params, operands))]
         case "swap":
-            return [_swap(b, operands[1], *_place(params, operands, 2), out)]
+            place = _place(params, operands, 2)
+            before = [_get(b, *place)]
+            _swap(b, operands[1], *place)
+            return before
         case "addupdate":
             return _add(b, operands[1], *_place(params, operands, 2))
         case "convert_element_type":
@@ -78,21 +90,18 @@ def _equation(b: ir.IRBuilder, equation, operands: list) -> list:
         case "integer_pow":
             return [_power(b, operands[0], params["y"], str(out.dtype))]
         case "slice":
-            steps = params["strides"] or [1] * len(params["start_indices"])
-            cut = tuple(map(slice, params["start_indices"], params["limit_indices"], steps))
-            return [Value(operands[0].rows[cut[: operands[0].rows.ndim]], operands[0].dtype, operands[0].lanes)]
-        case "concatenate":
-            rows = np.concatenate([x.rows for x in operands], axis=params["dimension"])
-            return [Value(rows, operands[0].dtype, operands[0].lanes)]
-        case "stack":
-            return [
-                Value(np.stack([x.rows for x in operands], axis=params["axis"]), operands[0].dtype, operands[0].lanes)
-            ]
+            return [_slice(operands[0], params)]
+        case "concatenate" | "stack":
+            join, axis = (np.concatenate, "dimension") if name == "concatenate" else (np.stack, "axis")
+            pieces = [primitives.with_lanes(b, x) for x in operands] if any(x.lanes for x in operands) else operands
+            return [Value(join([x.rows for x in pieces], axis=params[axis]), pieces[0].dtype, pieces[0].lanes)]
         case "reduce_or" | "reduce_and" | "reduce_max" | "reduce_min" | "reduce_sum":
             return [primitives.reduction(b, name, operands[0], params["axes"], str(out.dtype))]
         case "iota":
             return [primitives.iota(params["shape"], params["dimension"], str(params["dtype"]))]
-        case "ref" | "new_ref" | "copy":  # a reference to an argument: the argument itself
+        case "copy":
+            return operands
+        case "new_ref" if isinstance(operands[0], Memory):  # to an argument: the argument itself
             return operands
         case "while":
             return _while(b, params, operands)
@@ -100,33 +109,63 @@ def _equation(b: ir.IRBuilder, equation, operands: list) -> list:
             return _scan(b, params, operands)
         case "cond":
             return _cond(b, params, operands, equation.outvars)
-    inner = params.get("jaxpr") or params.get("call_jaxpr")
-    if inner is None:
-        raise NotImplementedError(f"a kernel cannot use the primitive {name}")
-    return lower(b, inner.jaxpr, [*_consts(inner), *operands][-len(inner.jaxpr.invars) :] if operands else operands)
+        case "jit" | "closed_call":
+            return lower(b, params["jaxpr"], operands)
+        case "custom_jvp_call":
+            return lower(b, params["call_jaxpr"], operands)
+    raise NotImplementedError(f"a kernel cannot use the primitive {name}")
 
 
 def _power(b: ir.IRBuilder, x: Value, y: int, dtype: str) -> Value:
-    result = x
-    for _ in range(y - 1):
-        result = primitives.elementwise(b, "mul", [result, x], dtype)
-    return result
+    """By repeated squaring, in JAX's order."""
+    multiply = lambda p, q: primitives.elementwise(b, "mul", [p, q], dtype)
+    one = _known(np.ones((1,) * len(x.shape), dtype))
+    result, factor, left = None, x, abs(y)
+    while left:
+        if left % 2:
+            result = factor if result is None else multiply(result, factor)
+        left //= 2
+        factor = multiply(factor, factor) if left else factor
+    if result is None:
+        return primitives.broadcast_in_dim(b, one, x.shape, tuple(range(len(x.shape))))
+    return primitives.elementwise(b, "div", [one, result], dtype) if y < 0 else result
 
 
-def _place(params: dict, operands: list, first: int = 1) -> tuple[Memory, list[list]]:
+def _slice(x: Value, params: dict) -> Value:
+    steps = params["strides"] or [1] * len(params["start_indices"])
+    cut = tuple(map(slice, params["start_indices"], params["limit_indices"], steps))
+    if x.lanes and len(range(LANES)[cut[-1]]) != LANES:
+        raise NotImplementedError("a kernel cannot slice its lanes")
+    return Value(x.rows[cut[: x.rows.ndim]], x.dtype, x.lanes)
+
+
+def _place(params: dict, operands: list, first: int = 1) -> tuple[Memory, list]:
     """The memory that a reference names and, for each axis but the lanes, the row numbers that are meant."""
     memory = operands[0]
     transforms = jax.tree.unflatten(params["tree"], operands[first:])
     if not transforms:
         return memory, [list(range(size)) for size in memory.shape]
-    (indexer,) = transforms
-    axes = []
-    for index in indexer.indices[: len(memory.shape)]:
-        if hasattr(index, "stride"):
-            axes.append([index.start + i * index.stride for i in range(index.size)])
-        else:
-            axes.append(index.rows[()] if isinstance(index, Value) else int(index))
+    if len(transforms) > 1:
+        raise NotImplementedError("a kernel cannot index a reference to part of a reference")
+    shape = (*memory.shape, LANES) if memory.lanes else memory.shape
+    axes = [_axis(index, size) for index, size in zip(transforms[0].indices, shape, strict=True)]
+    if memory.lanes and axes.pop() != list(range(LANES)):
+        raise NotImplementedError("a kernel cannot index its lanes")
     return memory, axes
+
+
+def _axis(index: Any, size: int) -> list[int] | Operand | int:
+    """Row numbers along one axis: a list of them, or one, which may be known only at run time."""
+    if hasattr(index, "stride") and isinstance(index.start, int):
+        return [index.start + i * index.stride for i in range(index.size)]
+    if isinstance(index, Value) and not index.shape:
+        number = index.rows[()]
+        if not isinstance(number, ir.Constant):
+            return number  # has to be from 0 to size - 1 when it runs
+        index = number.constant
+    if isinstance(index, int) and -size <= index < size:
+        return index % size
+    raise NotImplementedError(f"a kernel cannot index {size} rows by {index}")
 
 
 def _rows(axes: list) -> tuple[tuple[int, ...], Callable[[tuple], list]]:
@@ -140,9 +179,9 @@ def _rows(axes: list) -> tuple[tuple[int, ...], Callable[[tuple], list]]:
     return shape, address
 
 
-def _get(b: ir.IRBuilder, memory: Memory, axes: list, out) -> Value:
+def _get(b: ir.IRBuilder, memory: Memory, axes: list) -> Value:
     shape, address = _rows(axes)
-    return Value(array(shape, lambda at: _load(b, memory, address(at))), memory.dtype, has_lanes(out.shape))
+    return Value(array(shape, lambda at: _load(b, memory, address(at))), memory.dtype, memory.lanes)
 
 
 def _load(b: ir.IRBuilder, memory: Memory, index: list) -> Operand:
@@ -162,21 +201,29 @@ def _store(b: ir.IRBuilder, memory: Memory, index: list, x: Operand) -> None:
     b.store(x, memory.at(b, index), align=STORED_BYTES[memory.dtype])
 
 
-def _swap(b: ir.IRBuilder, x: Value, memory: Memory, axes: list, out) -> Value | None:
-    """Write. What was there before is not read: no kernel of ours asks for it."""
+def _swap(b: ir.IRBuilder, x: Value, memory: Memory, axes: list) -> None:
+    """Write."""
     shape, address = _rows(axes)
-    rows = np.broadcast_to(x.rows, shape)
+    rows = np.broadcast_to(_written(b, x, memory).rows, shape)
     for at in np.ndindex(*shape):
         _store(b, memory, address(at), rows[at])
-    return None
 
 
 def _add(b: ir.IRBuilder, x: Value, memory: Memory, axes: list) -> list:
     shape, address = _rows(axes)
-    rows = np.broadcast_to(x.rows, shape)
+    rows = np.broadcast_to(_written(b, x, memory).rows, shape)
     for at in np.ndindex(*shape):
-        _store(b, memory, address(at), b.fadd(_load(b, memory, address(at)), rows[at]))
+        now = primitives.combine(b, "add", memory.dtype, _load(b, memory, address(at)), rows[at])
+        _store(b, memory, address(at), now)
     return []
+
+
+def _written(b: ir.IRBuilder, x: Value, memory: Memory) -> Value:
+    if memory.lanes:
+        return primitives.with_lanes(b, x)
+    if x.lanes:
+        raise NotImplementedError(f"a kernel writes arrays without lanes number by number, not {LANES} at once")
+    return x
 
 
 def _flat(values: Sequence[Value]) -> list[Operand]:
@@ -215,22 +262,22 @@ def _while(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
 
     def go_on(values):
-        return lower(b, test.jaxpr, [*_consts(test), *of_test, *values])[0].rows[()]
+        return lower(b, test, [*of_test, *values])[0].rows[()]
 
-    return _loop(b, start, go_on, lambda values: lower(b, body.jaxpr, [*_consts(body), *of_body, *values]))
+    return _loop(b, start, go_on, lambda values: lower(b, body, [*of_body, *values]))
 
 
 def _scan(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
     """A `fori_loop` of fixed length: a scan that neither reads nor writes sequences."""
     body, constants = params["jaxpr"], operands[: params["num_consts"]]
     start = operands[params["num_consts"] :]
-    if len(start) != params["num_carry"] or params["reverse"]:
+    if len(start) != params["num_carry"] or len(body.out_avals) != params["num_carry"]:
         raise NotImplementedError("a kernel cannot scan over sequences")
     counter = Value(array((), lambda _: constant(0, "int32")), "int32", False)
     length, one = constant(params["length"], "int32"), constant(1, "int32")
 
     def step(values):
-        after = lower(b, body.jaxpr, [*_consts(body), *constants, *values[1:]])
+        after = lower(b, body, [*constants, *values[1:]])
         return [Value(array((), lambda _: b.add(values[0].rows[()], one)), "int32", False), *after]
 
     return _loop(b, [counter, *start], lambda values: b.icmp_signed("<", values[0].rows[()], length), step)[1:]
@@ -246,10 +293,7 @@ def _cond(b: ir.IRBuilder, params: dict, operands: list, outvars) -> list[Value]
     ends = []
     for branch, block in zip(branches, blocks, strict=True):
         b.position_at_end(block)
-        values = lower(b, branch.jaxpr, [*_consts(branch), *operands])
-        values = [
-            primitives.with_lanes(b, x) if has_lanes(v.aval.shape) else x for x, v in zip(values, outvars, strict=True)
-        ]
+        values = [_as_said(b, x, v.aval) for x, v in zip(lower(b, branch, operands), outvars, strict=True)]
         ends.append((b.block, values))
         b.branch(after)
     b.position_at_end(after)

@@ -7,99 +7,154 @@ from functools import reduce
 import numpy as np
 from llvmlite import ir
 
-from physics.codegen.values import INDEX, Operand, Value, array, constant, has_lanes, llvm_type, splat
+from physics.codegen.values import INDEX, Operand, Value, array, constant, has_lanes, llvm_type, vector
 from physics.lanes import LANES
 
 Emit = Callable[..., Operand]
+FLOAT, INT, BOOL = "float32", "int32", "bool"
 COMPARE = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 
 
-def _call(b: ir.IRBuilder, name: str, *xs: Operand) -> Operand:
-    """An LLVM intrinsic on floats."""
-    kind = xs[0].type
-    suffix = f"v{LANES}f32" if isinstance(kind, ir.VectorType) else "f32"
-    function = b.module.globals.get(f"llvm.{name}.{suffix}")
+def _intrinsic(b: ir.IRBuilder, name: str, result: ir.Type, *xs: Operand) -> Operand:
+    """An LLVM intrinsic, by its full name."""
+    function = b.module.globals.get(f"llvm.{name}")
     if function is None:
-        function = ir.Function(b.module, ir.FunctionType(kind, [kind] * len(xs)), f"llvm.{name}.{suffix}")
+        function = ir.Function(b.module, ir.FunctionType(result, [x.type for x in xs]), f"llvm.{name}")
     return b.call(function, xs)
 
 
-def _is_float(x: Operand) -> bool:
-    return isinstance(getattr(x.type, "element", x.type), ir.FloatType)
+def _lanes_in_name(x: Operand) -> str:
+    return f"v{LANES}" if isinstance(x.type, ir.VectorType) else ""
 
 
-def _either(name: str) -> Emit:
-    """add, sub, mul of floats or integers."""
-    return lambda b, x, y: getattr(b, f"f{name}" if _is_float(x) else name)(x, y)
+def _call(name: str) -> Emit:
+    """An LLVM intrinsic from floats to a float."""
+    return lambda b, *xs: _intrinsic(b, f"{name}.{_lanes_in_name(xs[0])}f32", xs[0].type, *xs)
+
+
+def _number(x: Operand, number: float) -> ir.Constant:
+    """A constant of the type of x."""
+    return ir.Constant(x.type, [number] * LANES if isinstance(x.type, ir.VectorType) else number)
 
 
 def _extreme(order: str) -> Emit:
-    """max or min; NaN if either is, as XLA's."""
+    """max or min of floats: NaN if either is, as XLA's. Of two zeros, y."""
 
     def emit(b, x, y):
-        if not _is_float(x):
-            return b.select(b.icmp_signed(order, x, y), x, y)
         chosen = b.select(b.fcmp_ordered(order, x, y), x, y)  # y if either is NaN
         return b.select(b.fcmp_unordered("uno", x, x), x, chosen)
 
     return emit
 
 
-def _compare(order: str) -> Emit:
+def _extreme_int(order: str) -> Emit:
+    return lambda b, x, y: b.select(b.icmp_signed(order, x, y), x, y)
+
+
+def _compare(order: str) -> dict[str, Emit]:
+    of_floats = (
+        (lambda b, x, y: b.fcmp_unordered(order, x, y))
+        if order == "!="
+        else (lambda b, x, y: b.fcmp_ordered(order, x, y))
+    )
+    return {
+        FLOAT: of_floats,
+        INT: lambda b, x, y: b.icmp_signed(order, x, y),
+        BOOL: lambda b, x, y: b.icmp_unsigned(order, x, y),  # a signed True would be -1
+    }
+
+
+def _sign(b, x):
+    return b.select(b.fcmp_unordered("==", x, _number(x, 0.0)), x, _call("copysign")(b, _number(x, 1.0), x))
+
+
+def _sign_int(b, x):
+    zero, one = _number(x, 0), _number(x, 1)
+    return b.select(b.icmp_signed(">", x, zero), one, b.select(b.icmp_signed("<", x, zero), _number(x, -1), zero))
+
+
+def _quotient(name: str) -> Emit:
+    """div and rem of integers: as XLA defines them where the processor would stop the program.
+
+    x / 0 is -1, the rest is x; the lowest integer over -1 is itself, the rest 0.
+    """
+
     def emit(b, x, y):
-        if not _is_float(x):
-            return b.icmp_signed(order, x, y)
-        return b.fcmp_unordered(order, x, y) if order == "!=" else b.fcmp_ordered(order, x, y)
+        none = b.icmp_signed("==", y, _number(y, 0))
+        too_large = b.and_(b.icmp_signed("==", x, _number(x, -(2**31))), b.icmp_signed("==", y, _number(y, -1)))
+        result = getattr(b, name)(x, b.select(b.or_(none, too_large), _number(y, 1), y))
+        return b.select(none, _number(x, -1) if name == "sdiv" else x, result)
 
     return emit
 
 
-def _sign(b, x):
-    one = ir.Constant(x.type, [1.0] * LANES if isinstance(x.type, ir.VectorType) else 1.0)
-    return b.select(b.fcmp_unordered("ueq", x, b.fsub(x, x)), x, _call(b, "copysign", one, x))
+def _clamp(larger: Emit, smaller: Emit) -> Emit:
+    return lambda b, low, x, high: smaller(b, larger(b, x, low), high)
 
 
-ELEMENTWISE: dict[str, Emit] = {
-    "add": _either("add"),
-    "add_any": _either("add"),
-    "sub": _either("sub"),
-    "mul": _either("mul"),
-    "div": lambda b, x, y: b.fdiv(x, y) if _is_float(x) else b.sdiv(x, y),
-    "rem": lambda b, x, y: b.srem(x, y),
-    "max": _extreme(">"),
-    "min": _extreme("<"),
-    "neg": lambda b, x: b.fneg(x) if _is_float(x) else b.neg(x),
-    "abs": lambda b, x: _call(b, "fabs", x),
-    "sign": _sign,
-    "sqrt": lambda b, x: _call(b, "sqrt", x),
-    "floor": lambda b, x: _call(b, "floor", x),
-    "round": lambda b, x: _call(b, "rint", x),
-    "square": lambda b, x: b.fmul(x, x),
-    "and": lambda b, x, y: b.and_(x, y),
-    "or": lambda b, x, y: b.or_(x, y),
-    "xor": lambda b, x, y: b.xor(x, y),
-    "not": lambda b, x: b.not_(x),
-    "select_n": lambda b, which, x, y: b.select(which, y, x),
-    "clamp": lambda b, low, x, high: _extreme("<")(b, _extreme(">")(b, x, low), high),
+def _select(b, which, x, y):
+    return b.select(which, y, x)
+
+
+def _bits(name: str) -> dict[str, Emit]:
+    return dict.fromkeys((INT, BOOL), lambda b, *xs: getattr(b, name)(*xs))
+
+
+_MAX, _MIN, _MAX_INT, _MIN_INT = _extreme(">"), _extreme("<"), _extreme_int(">"), _extreme_int("<")
+_ADD: dict[str, Emit] = {FLOAT: lambda b, x, y: b.fadd(x, y), INT: lambda b, x, y: b.add(x, y)}
+
+# By the dtype of the last operand
+ELEMENTWISE: dict[str, dict[str, Emit]] = {
+    "add": _ADD,
+    "add_any": _ADD,
+    "sub": {FLOAT: lambda b, x, y: b.fsub(x, y), INT: lambda b, x, y: b.sub(x, y)},
+    "mul": {FLOAT: lambda b, x, y: b.fmul(x, y), INT: lambda b, x, y: b.mul(x, y)},
+    "div": {FLOAT: lambda b, x, y: b.fdiv(x, y), INT: _quotient("sdiv")},
+    "rem": {INT: _quotient("srem")},
+    "max": {FLOAT: _MAX, INT: _MAX_INT, BOOL: lambda b, x, y: b.or_(x, y)},
+    "min": {FLOAT: _MIN, INT: _MIN_INT, BOOL: lambda b, x, y: b.and_(x, y)},
+    "neg": {FLOAT: lambda b, x: b.fneg(x), INT: lambda b, x: b.neg(x)},
+    "abs": {FLOAT: _call("fabs"), INT: lambda b, x: b.select(b.icmp_signed("<", x, _number(x, 0)), b.neg(x), x)},
+    "sign": {FLOAT: _sign, INT: _sign_int},
+    "sqrt": {FLOAT: _call("sqrt")},
+    "floor": {FLOAT: _call("floor")},
+    "round": {FLOAT: _call("rint")},
+    "square": {FLOAT: lambda b, x: b.fmul(x, x), INT: lambda b, x: b.mul(x, x)},
+    "and": _bits("and_"),
+    "or": _bits("or_"),
+    "xor": _bits("xor"),
+    "not": _bits("not_"),
+    "select_n": dict.fromkeys((FLOAT, INT, BOOL), _select),
+    "clamp": {FLOAT: _clamp(_MAX, _MIN), INT: _clamp(_MAX_INT, _MIN_INT)},
     **{name: _compare(order) for name, order in COMPARE.items()},
 }
 
 
+def combine(b: ir.IRBuilder, name: str, dtype: str, *xs: Operand) -> Operand:
+    """One elementwise operation on operands of a dtype."""
+    if dtype not in ELEMENTWISE[name]:
+        raise NotImplementedError(f"a kernel cannot use the primitive {name} of {dtype}")
+    return ELEMENTWISE[name][dtype](b, *xs)
+
+
 def elementwise(b: ir.IRBuilder, name: str, operands: list[Value], dtype: str) -> Value:
     """One operation for each element; axes of length 1, and numbers without axes, apply to all."""
+    if name == "select_n" and operands[0].dtype != BOOL:
+        raise NotImplementedError(f"a kernel cannot use the primitive select_n by {operands[0].dtype}")
     lanes = any(x.lanes for x in operands)
+    of = operands[-1].dtype
     operands = [with_lanes(b, x) for x in operands] if lanes else operands
     shape = np.broadcast_shapes(*(x.rows.shape for x in operands))
     rows = [np.broadcast_to(x.rows, shape) for x in operands]
-    return Value(array(shape, lambda at: ELEMENTWISE[name](b, *(x[at] for x in rows))), dtype, lanes)
+    return Value(array(shape, lambda at: combine(b, name, of, *(x[at] for x in rows))), dtype, lanes)
 
 
 def with_lanes(b: ir.IRBuilder, x: Value) -> Value:
-    """x, its numbers in every lane: an axis of length 1 becomes the lanes."""
+    """x, its last axis the lanes: one number is put in every lane."""
     if x.lanes:
         return x
-    rows = x.rows[..., 0] if x.shape else x.rows
-    return Value(array(rows.shape, lambda at: splat(b, rows[at])), x.dtype, True)
+    rows = x.rows if x.shape else x.rows[None]
+    return Value(array(rows.shape[:-1], lambda at: vector(b, list(rows[at]))), x.dtype, True)
 
 
 def convert(b: ir.IRBuilder, x: Value, dtype: str) -> Value:
@@ -108,20 +163,24 @@ def convert(b: ir.IRBuilder, x: Value, dtype: str) -> Value:
     to = llvm_type(dtype, x.lanes)
 
     def one(v):
-        if dtype == "bool":
+        if dtype == BOOL:
             zero = constant(0, x.dtype, x.lanes)
-            return b.fcmp_unordered("!=", v, zero) if x.dtype == "float32" else b.icmp_signed("!=", v, zero)
-        if dtype == "float32":
-            return b.uitofp(v, to) if x.dtype == "bool" else b.sitofp(v, to)
-        return b.zext(v, to) if x.dtype == "bool" else b.fptosi(v, to)
+            return b.fcmp_unordered("!=", v, zero) if x.dtype == FLOAT else b.icmp_signed("!=", v, zero)
+        if dtype == FLOAT:
+            return b.uitofp(v, to) if x.dtype == BOOL else b.sitofp(v, to)
+        if x.dtype == BOOL:
+            return b.zext(v, to)
+        kind = _lanes_in_name(v)  # the nearest integer there is; 0 for NaN
+        return _intrinsic(b, f"fptosi.sat.{kind}i32.{kind}f32", to, v)
 
     return Value(array(x.rows.shape, lambda at: one(x.rows[at])), dtype, x.lanes)
 
 
 def broadcast_in_dim(b: ir.IRBuilder, x: Value, shape: tuple[int, ...], dimensions: tuple[int, ...]) -> Value:
-    lanes = has_lanes(shape)
+    lanes, along_lanes = has_lanes(shape), bool(dimensions) and dimensions[-1] == len(shape) - 1
+    if x.lanes and not (lanes and along_lanes):
+        raise NotImplementedError("a kernel cannot broadcast lanes to another axis than the last")
     if lanes and not x.lanes:
-        along_lanes = bool(dimensions) and dimensions[-1] == len(shape) - 1
         dimensions = dimensions[:-1] if along_lanes else dimensions
         x = with_lanes(b, x if along_lanes else reshape(x, (*x.shape, 1)))
     elif lanes:
@@ -134,6 +193,8 @@ def broadcast_in_dim(b: ir.IRBuilder, x: Value, shape: tuple[int, ...], dimensio
 
 
 def reshape(x: Value, shape: tuple[int, ...]) -> Value:
+    if x.lanes and not has_lanes(shape):
+        raise NotImplementedError("a kernel cannot reshape its lanes")
     return Value(x.rows.reshape(shape[:-1] if x.lanes else shape), x.dtype, x.lanes)
 
 
@@ -144,18 +205,18 @@ def reduction(b: ir.IRBuilder, name: str, x: Value, axes: tuple[int, ...], dtype
     along = tuple(axis for axis in axes if axis < x.rows.ndim)
     kept = [axis for axis in range(x.rows.ndim) if axis not in along]
     rows = x.rows.transpose(*kept, *along).reshape([x.rows.shape[axis] for axis in kept] + [-1])
-    fold = array(rows.shape[:-1], lambda at: reduce(lambda p, q: ELEMENTWISE[emit](b, p, q), rows[at]))
+    fold = array(rows.shape[:-1], lambda at: reduce(lambda p, q: combine(b, emit, x.dtype, p, q), rows[at]))
     if over_lanes:
-        fold = array(fold.shape, lambda at: _across(b, emit, fold[at]))
+        fold = array(fold.shape, lambda at: _across(b, name, x.dtype, fold[at]))
     return Value(fold, dtype, x.lanes and not over_lanes)
 
 
-def _across(b: ir.IRBuilder, emit: str, x: Operand) -> Operand:
-    """One number from the lanes of a vector of bools."""
-    if emit not in ("or", "and"):
-        raise NotImplementedError(f"reduction {emit} over lanes")
+def _across(b: ir.IRBuilder, name: str, dtype: str, x: Operand) -> Operand:
+    """One bool from the lanes of a vector of bools."""
+    if dtype != BOOL:
+        raise NotImplementedError(f"a kernel cannot use the primitive {name} of {dtype} over lanes")
     word = ir.IntType(LANES)
-    order, bound = ("!=", 0) if emit == "or" else ("==", -1)
+    order, bound = ("!=", 0) if name in ("reduce_or", "reduce_max") else ("==", -1)
     return b.icmp_unsigned(order, b.bitcast(x, word), word(bound))
 
 

@@ -1,5 +1,6 @@
 """Arrays of a kernel as LLVM values: one vector for each row of lanes, one scalar for each number without lanes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +33,8 @@ class Value:
 
 
 def llvm_type(dtype: str, lanes: bool) -> ir.Type:
+    if dtype not in ELEMENT:
+        raise NotImplementedError(f"a kernel cannot use numbers of type {dtype}")
     element = ELEMENT[dtype]
     return ir.VectorType(element, LANES) if lanes else element
 
@@ -39,17 +42,19 @@ def llvm_type(dtype: str, lanes: bool) -> ir.Type:
 def constant(x, dtype: str, lanes: bool = False) -> ir.Constant:
     """A number, in every lane."""
     number = float(x) if dtype == "float32" else int(x)
-    if lanes:
-        return ir.Constant(llvm_type(dtype, True), [number] * LANES)
-    return ir.Constant(ELEMENT[dtype], number)
+    return ir.Constant(llvm_type(dtype, lanes), [number] * LANES if lanes else number)
 
 
-def splat(builder: ir.IRBuilder, x: Operand) -> Operand:
-    """A scalar in every lane."""
-    kind = ir.VectorType(x.type, LANES)
-    undefined = ir.Constant(kind, ir.Undefined)
-    first = builder.insert_element(undefined, x, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES))
+def vector(builder: ir.IRBuilder, numbers: Sequence[Operand]) -> Operand:
+    """The numbers of all lanes from scalars: one for all, or one each."""
+    index = ir.IntType(32)
+    undefined = ir.Constant(ir.VectorType(numbers[0].type, LANES), ir.Undefined)
+    filled = undefined
+    for lane, number in enumerate(numbers):
+        filled = builder.insert_element(filled, number, ir.Constant(index, lane))
+    if len(numbers) == LANES:
+        return filled
+    return builder.shuffle_vector(filled, undefined, ir.Constant(ir.VectorType(index, LANES), [0] * LANES))
 
 
 def array(shape: tuple[int, ...], fill) -> np.ndarray:

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physics.step import step
-from physics.types import Params
+from physics.pairs import table_of
+from physics.step import step, step_unseen
+from physics.types import Params, Size
 from tests.golden.load import HERE, load
 from tests.physics.worlds import (
     BALL,
@@ -241,6 +242,13 @@ class TestLanes:
         alone, together = self.after(np.arange(count), size=size), self.after(np.arange(256), size=size)
         self.same_bits(alone, jax.tree.map(lambda x: x[..., :count], together))
 
+    @pytest.mark.parametrize("size", ["s", "m", "l"])
+    def test_being_watched_changes_no_bits(self, size: str) -> None:
+        """A step that writes no contacts down leads to the same state."""
+        of = load(HERE / f"{size}.npz")
+        given = of.level.model, of.state, of.motor, of.thrust
+        self.same_bits(host(jax.jit(step_unseen)(*given)), play(*given)[0])
+
     def test_one_model_serves_many_lanes(self) -> None:
         """A model with one lane broadcasts over the lanes of its states."""
         model, state = room()
@@ -272,6 +280,29 @@ class TestPadding:
         assert (after.contact_normal_impulse[-1] > 0).all()
         weight = MASS * 9.81 / 60
         np.testing.assert_allclose(after.contact_normal_impulse[-1], weight, rtol=0.2)
+
+    @pytest.mark.parametrize(
+        ("contact", "places", "gravity"),
+        [
+            (3, {BOX: (2.5, 5 - HALF + 0.005)}, 9.81),  # ceiling and box: first points
+            (7, {BOX: (2.5, 5 - HALF + 0.005)}, 9.81),  # second points
+            (17, {BOX: (2.5, FLOOR_TOP + HALF), OTHER: (2.5, FLOOR_TOP + 2 * HALF + RADIUS - 0.005)}, -9.81),
+        ],
+    )
+    def test_the_last_pair_of_each_kind(self, contact: int, places: dict, gravity: float) -> None:
+        """Ceiling and box, second circle and box; the two circles: above."""
+        model, state = room(gravity=gravity)
+        state = changed(state, position={BALL: (4.0, 2.0), OTHER: (1.0, 2.0)} | places)
+        for faithful in (True, False):
+            after, _ = play(model, state, *idle(), steps=4, params=Params(faithful_padding=faithful))
+            assert after.contact_active[contact].all()
+            assert ((after.contact_normal_impulse[contact] == 0) == faithful).all()
+
+    def test_a_kind_whose_last_batch_is_full_forgets_nothing(self) -> None:
+        """8 polygons and 8 circles: 22 polygon pairs, 64 circle-polygon pairs, 28 pairs of circles."""
+        forgotten = np.flatnonzero(table_of(Size(8, 8, 0, 0), faithful_padding=True).kept == 0)
+        assert forgotten.tolist() == [21, 43, 44 + 64 + 27]
+        assert (table_of(Size(8, 8, 0, 0), faithful_padding=False).kept == 1).all()
 
     def test_other_pairs_are_not_touched(self) -> None:
         """A box on the floor is not the last pair of its kind in a room with a ceiling."""

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from physics.pairs import pairs_of
-from physics.types import Model, Params, Size, State, initial_state
+from physics.types import FIXED_POLYGONS, Model, Params, Size, State, initial_state
 
 ROOM = Size(polygons=5, circles=2, joints=1, thrusters=1)  # one movable polygon (4) and two circles (5, 6)
 BOX, BALL, OTHER = 4, 5, 6
@@ -86,3 +86,76 @@ def changed(tree, **rows):
 def idle(lanes: int = LANES) -> tuple[np.ndarray, np.ndarray]:
     """Motors and thrusters off."""
     return np.zeros((ROOM.joints, lanes), np.float32), np.zeros((ROOM.thrusters, lanes), np.float32)
+
+
+def scattered(size: Size, lanes: int, seed: int = 1) -> tuple[Model, State, np.ndarray, np.ndarray]:
+    """Worlds of any size with everything in them, other in each lane: bodies strewn about a room, overlapping, thrown,
+    some missing, joined at random and remembering impulses of contacts; and controls of the motors and thrusters."""
+    random = np.random.default_rng(seed)
+    uniform = lambda low, high, *shape: random.uniform(low, high, (*shape, lanes)).astype(np.float32)
+    chance = lambda share, *shape: random.random((*shape, lanes)) < share
+    polygons, circles, joints, thrusters = size
+    bodies, contacts = size.bodies, pairs_of(size).contacts
+    fixed = (np.arange(bodies) < FIXED_POLYGONS)[:, None]
+
+    square = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)], np.float32)  # clockwise
+    vertices = square[:, :, None] * uniform(0.1, 0.5, polygons, 1, 2)
+    vertices[:FIXED_POLYGONS] = 5 * square[:, :, None]
+    triangle = chance(0.3, polygons) & ~fixed[:polygons]
+    corner = np.array([(0, 0.3), (0.3, -0.15), (-0.3, -0.15), (0, 0)], np.float32)
+    vertices = np.where(triangle[:, None, None], corner[:, :, None], vertices)
+
+    joint_a = random.integers(0, bodies, (joints, lanes), np.int32)
+    joint_b = (joint_a + random.integers(1, bodies, (joints, lanes), np.int32)) % bodies
+    joint_active, collides = chance(0.8, joints), np.ones((bodies, bodies, lanes), bool)
+    lane = np.arange(lanes)
+    for a, b, active in zip(joint_a, joint_b, joint_active, strict=True):
+        collides[a[active], b[active], lane[active]] = collides[b[active], a[active], lane[active]] = False
+    inverse_mass = np.where(fixed | chance(0.1, bodies), 0, uniform(0.2, 5, bodies))
+    low, high = np.sort(uniform(-1, 1, 2, joints), axis=0)
+    model = Model(
+        gravity=np.stack([uniform(-1, 1), uniform(-10, 0)]),
+        active=fixed | chance(0.9, bodies),
+        inverse_mass=inverse_mass.astype(np.float32),
+        inverse_inertia=np.where(inverse_mass == 0, 0, uniform(1, 100, bodies)).astype(np.float32),
+        friction=uniform(0, 1, bodies),
+        restitution=np.where(chance(0.5, bodies), 0, uniform(0, 1, bodies)).astype(np.float32),
+        collision_mode=np.where(fixed, 1, random.choice([0, 1, 1, 1, 2], (bodies, lanes))).astype(np.int32),
+        collides=collides,
+        vertices=vertices.astype(np.float32),
+        n_vertices=np.where(triangle, 3, 4).astype(np.int32),
+        radius=uniform(0.1, 0.5, circles),
+        joint_active=joint_active,
+        joint_a=joint_a,
+        joint_b=joint_b,
+        joint_anchor_a=uniform(-0.3, 0.3, joints, 2),
+        joint_anchor_b=uniform(-0.3, 0.3, joints, 2),
+        joint_fixed=chance(0.3, joints),
+        joint_rotation=uniform(-1, 1, joints),
+        joint_limited=chance(0.5, joints),
+        joint_min=low,
+        joint_max=high,
+        motor_on=chance(0.7, joints),
+        motor_speed=uniform(0, 2, joints),
+        motor_power=uniform(0, 2, joints),
+        thruster_active=chance(0.7, thrusters),
+        thruster_body=random.integers(FIXED_POLYGONS, bodies, (thrusters, lanes), np.int32),
+        thruster_position=uniform(-0.3, 0.3, thrusters, 2),
+        thruster_rotation=uniform(-3, 3, thrusters),
+        thruster_power=uniform(0, 2, thrusters),
+    )
+    walls = np.broadcast_to(np.array(WALLS, np.float32)[..., None], (FIXED_POLYGONS, 2, lanes))
+    still = lambda x: np.where(fixed.reshape(-1, *[1] * (x.ndim - 1)), np.float32(0), x)
+    remembered = chance(0.5, contacts)
+    state = State(
+        position=np.concatenate([walls, uniform(0.2, 4.8, bodies - FIXED_POLYGONS, 2)]),
+        rotation=still(uniform(-4, 4, bodies)),
+        velocity=still(uniform(-3, 3, bodies, 2)),
+        angular_velocity=still(uniform(-5, 5, bodies)),
+        contact_active=remembered,
+        contact_normal_impulse=remembered * uniform(0, 0.5, contacts),
+        contact_tangent_impulse=remembered * uniform(-0.1, 0.1, contacts),
+        joint_impulse=uniform(-0.1, 0.1, joints, 2),
+        joint_angular_impulse=uniform(-0.01, 0.01, joints),
+    )
+    return model, state, uniform(-1, 1, joints) * chance(0.7, joints), uniform(0, 1, thrusters)

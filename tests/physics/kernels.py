@@ -1,0 +1,94 @@
+"""Small kernels, run as machine code and as operations of XLA."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from physics.codegen.compile import bytes_of, compile_kernel
+from physics.lanes import LANES
+from physics.rooms import Room
+
+Arrays = Sequence[np.ndarray]
+
+
+class Kernel:
+    """A kernel of some arguments, results and scratch memory: `body(*references)`; the first argument has lanes."""
+
+    def __init__(
+        self,
+        body: Callable[..., None],
+        arguments: Sequence[Room],
+        results: Sequence[Room],
+        scratch: Sequence[Room] = (),
+    ) -> None:
+        self.body, self.arguments, self.results, self.scratch = body, arguments, results, scratch
+
+    @functools.cached_property
+    def _name(self) -> str:
+        """Compiled as `physics.step` compiles the step."""
+
+        def kernel(*arrays):
+            self.body(*map(jax.new_ref, arrays))
+
+        jaxpr = jax.make_jaxpr(kernel)(*(_shape(room) for room in self._rooms))
+        return compile_kernel(jaxpr, self.arguments, self.results, self.scratch)
+
+    @property
+    def _rooms(self) -> list[Room]:
+        return [*self.arguments, *self.results, *self.scratch]
+
+    def as_machine_code(self, *arguments: np.ndarray) -> list[np.ndarray]:
+        """What it makes of arguments of some blocks of lanes."""
+        return [np.asarray(x) for x in self._machine_code(arguments)[:-1]]
+
+    @functools.cached_property
+    def _machine_code(self) -> Any:
+        def call(arguments):
+            shapes = [_shape(room, arguments[0].shape[-1]) for room in self.results]
+            workspace = jax.ShapeDtypeStruct((sum(map(bytes_of, self.scratch)),), np.uint8)
+            return jax.ffi.ffi_call(self._name, [*shapes, workspace])(*arguments)
+
+        return jax.jit(call)
+
+    def as_xla(self, *arguments: np.ndarray) -> list[np.ndarray]:
+        """The same by XLA, block after block."""
+        blocks = []
+        for first in range(0, arguments[0].shape[-1], LANES):
+            block = [
+                x[..., first : first + LANES] if room.lanes else x
+                for x, room in zip(arguments, self.arguments, strict=True)
+            ]
+            blocks.append([np.asarray(x) for x in self._xla(block)])
+        return [
+            np.concatenate([block[i] for block in blocks], -1) if room.lanes else blocks[-1][i]
+            for i, room in enumerate(self.results)
+        ]
+
+    @functools.cached_property
+    def _xla(self) -> Any:
+        def run(block):
+            given = [jax.new_ref(jnp.asarray(x)) for x in block]
+            filled, scratch = (
+                [jax.new_ref(jnp.zeros(_shape(room).shape, room.dtype)) for room in rooms]
+                for rooms in (self.results, self.scratch)
+            )
+            self.body(*given, *filled, *scratch)
+            return [ref[...] for ref in filled]
+
+        return jax.jit(run)
+
+
+def _shape(room: Room, lanes: int = LANES) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((*room.shape, lanes) if room.lanes else room.shape, room.dtype)
+
+
+def same_bits(ours: Arrays, theirs: Arrays, zeros: bool = True) -> None:
+    """Every number alike; any NaN is as good as another. `zeros`: a zero's sign counts."""
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(a, b)
+        if zeros and a.dtype == np.float32:
+            np.testing.assert_array_equal(np.signbit(a) & ~np.isnan(a), np.signbit(b) & ~np.isnan(b))
