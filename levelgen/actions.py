@@ -1,7 +1,8 @@
 """What an action does: one entry per binding, each obeyed by every actuator bound to it.
 
 An action is multi-discrete: MOTOR_BINDINGS entries for motors (0 off, 1 forward, 2 backward), then
-THRUSTER_BINDINGS entries for thrusters (0 off, 1 on). Facts: `kinetix.environment.utils` 3.0.2.
+THRUSTER_BINDINGS entries for thrusters (0 off, 1 on). Environments take two other kinds, too: discrete (one
+actuator at a time) and continuous. Facts: `kinetix.environment.utils` 3.0.2.
 """
 
 import jax.numpy as jnp
@@ -12,19 +13,41 @@ from levelgen.level import ACTIONS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
 MOTOR_CHOICES = 3
 THRUSTER_CHOICES = 2
 CHOICES = (MOTOR_CHOICES,) * MOTOR_BINDINGS + (THRUSTER_CHOICES,) * THRUSTER_BINDINGS  # of each entry
+NOTHING = 2 * MOTOR_BINDINGS  # the discrete action that uses no actuator
+DISCRETE_ACTIONS = NOTHING + 1 + THRUSTER_BINDINGS
+
+Controls = tuple[Float[Array, "joint lane"], Float[Array, "thruster lane"]]  # motors in [-1, 1], thrusters in [0, 1]
 
 
-def controls(
-    level: Level, action: Int[Array, "6 lane"]
-) -> tuple[Float[Array, "joint lane"], Float[Array, "thruster lane"]]:
+def controls(level: Level, action: Int[Array, "6 lane"]) -> Controls:
     """What the engine's motors (-1, 0 or 1) and thrusters (0 or 1) are told to do.
 
     A joint that is `motor_auto` runs forward whatever the action says.
     """
     forward, backward = action[:MOTOR_BINDINGS] == 1, action[:MOTOR_BINDINGS] >= 2
-    motor = _bound(level.motor_binding, forward.astype(jnp.float32) - backward.astype(jnp.float32))
-    thrust = _bound(level.thruster_binding, (action[MOTOR_BINDINGS:] != 0).astype(jnp.float32))
-    return jnp.where(level.motor_auto, 1.0, motor), thrust
+    motor = forward.astype(jnp.float32) - backward.astype(jnp.float32)
+    return _obeyed(level, motor, (action[MOTOR_BINDINGS:] != 0).astype(jnp.float32))
+
+
+def discrete_controls(level: Level, action: Int[Array, " lane"]) -> Controls:
+    """The same for one of DISCRETE_ACTIONS numbers.
+
+    2k and 2k + 1 run the motors of entry k backward and forward, NOTHING does nothing, and NOTHING + 1 + k fires
+    the thrusters of entry k.
+    """
+    one = lambda number: (action == number).astype(jnp.float32)
+    motor = jnp.stack([one(2 * k + 1) - one(2 * k) for k in range(MOTOR_BINDINGS)])
+    return _obeyed(level, motor, jnp.stack([one(NOTHING + 1 + k) for k in range(THRUSTER_BINDINGS)]))
+
+
+def continuous_controls(level: Level, action: Float[Array, "6 lane"]) -> Controls:
+    """The same for numbers, clipped to [-1, 1] for motors and to [0, 1] for thrusters."""
+    return _obeyed(level, jnp.clip(action[:MOTOR_BINDINGS], -1.0, 1.0), jnp.clip(action[MOTOR_BINDINGS:], 0.0, 1.0))
+
+
+def _obeyed(level: Level, motor: Float[Array, "4 lane"], thrust: Float[Array, "2 lane"]) -> Controls:
+    motor = jnp.where(level.motor_auto, 1.0, _bound(level.motor_binding, motor))
+    return motor, _bound(level.thruster_binding, thrust)
 
 
 def _bound(

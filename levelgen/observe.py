@@ -95,47 +95,52 @@ def level_features(level: Level) -> Float[Array, "feature lane"]:
     model, size = level.model, level.size
     floor, movable = slice(0, 1), slice(FIXED_POLYGONS, size.polygons)
     blocks = [
-        _blocks(_body_rows(level, floor, seen_still=True) + _polygon_rows(model, floor), model.active[floor]),
-        _blocks(_body_rows(level, movable) + _polygon_rows(model, movable), model.active[movable]),
+        _blocks(body_rows(level, floor) + polygon_rows(model, floor), model.active[floor]),
+        _blocks(body_rows(level, movable, constant=True) + polygon_rows(model, movable), model.active[movable]),
     ]
     if size.circles:
         circles = slice(size.polygons, size.bodies)
         shape = [model.radius, jnp.ones_like(model.radius)]
-        blocks.append(_blocks(_body_rows(level, circles) + shape, model.active[circles]))
+        blocks.append(_blocks(body_rows(level, circles, constant=True) + shape, model.active[circles]))
+    one_hot = lambda body: _one_hot(body, size.bodies)
     if size.joints:
-        blocks.append(_blocks(_joint_rows(level), model.joint_active))
+        ends = one_hot(model.joint_b) + one_hot(model.joint_a)
+        blocks.append(_blocks(joint_rows(level) + ends, model.joint_active))
     if size.thrusters:
-        blocks.append(_blocks(_thruster_rows(level), model.thruster_active))
+        blocks.append(_blocks(thruster_rows(level) + one_hot(model.thruster_body), model.thruster_active))
     blocks.append(_tidy(model.gravity[1:] / GRAVITY_UNIT))
     lanes = max(block.shape[-1] for block in blocks)
     return jnp.concatenate([jnp.broadcast_to(block, (len(block), lanes)) for block in blocks])
 
 
-def _body_rows(level: Level, at: slice, seen_still: bool = False) -> list[Array]:
-    """Rows of some bodies, each [body, lane]; zero where a state decides them, unless they are `seen_still`."""
+def body_rows(level: Level, at: slice, constant: bool = False) -> list[Array]:
+    """Rows of some bodies in `level.state`, each [body, lane]; if `constant`, zero where a state decides them."""
     model, state = level.model, level.state
-    if seen_still:
+    if constant:
+        nothing = jnp.zeros_like(model.friction[at])
+        place, spin, turn = [nothing] * 4, nothing, [nothing] * 2
+    else:
         place = [*_split(state.position[at]), *_split(state.velocity[at])]
         spin, heading = jnp.tanh(state.angular_velocity[at] / SPIN_UNIT), state.rotation[at]
         turn = [jnp.sin(heading), jnp.cos(heading)]
-    else:
-        nothing = jnp.zeros_like(model.friction[at])
-        place, spin, turn = [nothing] * 4, nothing, [nothing] * 2
     mass = [model.inverse_mass[at], model.inverse_inertia[at], level.density[at]]
     surface = [model.friction[at], model.restitution[at]]
     return [*place, *mass, spin, *_one_hot(level.role[at], len(Role)), *turn, *surface]
 
 
-def _polygon_rows(model: Model, at: slice) -> list[Array]:
+def polygon_rows(model: Model, at: slice) -> list[Array]:
+    """What a polygon has beyond a body's rows."""
     count, vertices = model.n_vertices[at], model.vertices[at]
     corners = [jnp.where(k < count[:, None], vertices[:, k], NO_VERTEX) for k in range(MAX_VERTICES)]
     triangle = (count <= 3).astype(jnp.float32)
     return [jnp.zeros_like(triangle), *(row for corner in corners for row in _split(corner)), triangle]
 
 
-def _joint_rows(level: Level) -> list[Array]:
-    """As seen from body b: its anchor and its number come first."""
-    model, bodies = level.model, level.size.bodies
+def joint_rows(level: Level, seen_from_a: bool = False) -> list[Array]:
+    """Rows of joints as seen from one body, whose anchor comes first."""
+    model = level.model
+    anchors = [model.joint_anchor_b, model.joint_anchor_a]
+    near, far = anchors[::-1] if seen_from_a else anchors
     limit = lambda x: x * model.joint_limited
     motor = [
         model.motor_speed,
@@ -153,17 +158,15 @@ def _joint_rows(level: Level) -> list[Array]:
     return [
         model.joint_active,
         model.joint_fixed,
-        *_split(model.joint_anchor_b),
-        *_split(model.joint_anchor_a),
+        *_split(near),
+        *_split(far),
         jnp.sin(model.joint_rotation),
         jnp.cos(model.joint_rotation),
         *(jnp.where(model.joint_fixed, 0.0, row) for row in motor),
-        *_one_hot(model.joint_b, bodies),
-        *_one_hot(model.joint_a, bodies),
     ]
 
 
-def _thruster_rows(level: Level) -> list[Array]:
+def thruster_rows(level: Level) -> list[Array]:
     model = level.model
     return [
         model.thruster_active,
@@ -172,7 +175,6 @@ def _thruster_rows(level: Level) -> list[Array]:
         jnp.sin(model.thruster_rotation),
         jnp.cos(model.thruster_rotation),
         model.thruster_power,
-        *_one_hot(model.thruster_body, level.size.bodies),
     ]
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.actions import controls
+from levelgen.actions import Controls, controls
 from levelgen.level import Level, Role
 from physics.pairs import pairs_of
 from physics.step import step as physics_step
@@ -112,18 +112,26 @@ def advance(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
 ) -> tuple[TaskState, Outcome]:
     """One env step without reset: the next state, and what the step gave."""
-    return _advance(level, now, action, params, lambda *given: (step_unseen(*given), None))[:2]
+    return advance_driven(level, now, controls(level, action), params)[:2]
+
+
+def advance_driven(
+    level: Level, now: TaskState, driven: Controls, params: TaskParams
+) -> tuple[TaskState, Outcome, Float[Array, " lane"]]:
+    """The same under controls, whatever kind of action they come from; and the distance of the goal at the end, m."""
+    return _advance(level, now, driven, params, lambda *given: (step_unseen(*given), None))[:3]
 
 
 def advance_seen(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
 ) -> tuple[TaskState, Outcome, Manifold]:
     """The same, and the contacts of the last physics step."""
-    return _advance(level, now, action, params, physics_step)
+    after, outcome, _, seen = _advance(level, now, controls(level, action), params, physics_step)
+    return after, outcome, seen
 
 
-def _advance(level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams, physics) -> tuple:
-    motor, thrust = controls(level, action)
+def _advance(level: Level, now: TaskState, driven: Controls, params: TaskParams, physics) -> tuple:
+    motor, thrust = driven
 
     def frame(state, _):
         state, seen = physics(level.model, state, motor, thrust, params.physics)
@@ -144,7 +152,7 @@ def _advance(level: Level, now: TaskState, action: Int[Array, "6 lane"], params:
     shaping = jnp.where(now.last_distance == NO_DISTANCE, 0.0, params.dense_reward_scale * closer)
     reward = goal.astype(jnp.float32) - select(frames.fail, first).astype(jnp.float32) + shaping
     after = TaskState(state, timestep, jnp.where(done, NO_DISTANCE, distance))
-    return after, Outcome(reward, done, goal), jax.tree.map(lambda x: x[-1], frames.seen)
+    return after, Outcome(reward, done, goal), distance, jax.tree.map(lambda x: x[-1], frames.seen)
 
 
 def has_nan(state: State) -> Bool[Array, " lane"]:

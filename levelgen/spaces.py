@@ -1,0 +1,82 @@
+"""Spaces of actions and observations, with the attributes and methods of gymnax's."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Key
+
+
+class Space:
+    """What `sample` draws and `contains` knows."""
+
+    shape: tuple[int, ...]
+    dtype: Any
+
+    def sample(self, key: Key[Array, ""]) -> Any:
+        raise NotImplementedError
+
+    def contains(self, x: Any) -> Bool[Array, ""]:
+        raise NotImplementedError
+
+
+class Discrete(Space):
+    """0 .. n - 1."""
+
+    def __init__(self, n: int) -> None:
+        self.n, self.shape, self.dtype = n, (), jnp.int32
+
+    def sample(self, key: Key[Array, ""]) -> Array:
+        return jax.random.randint(key, (), 0, self.n, jnp.int32)
+
+    def contains(self, x: Any) -> Bool[Array, ""]:
+        x = jnp.asarray(x)
+        return (x >= 0) & (x < self.n)
+
+
+class MultiDiscrete(Space):
+    """Several numbers, each below its own bound; `n` is the sum of the bounds: logits a policy needs."""
+
+    def __init__(self, bounds: tuple[int, ...]) -> None:
+        self.number_of_dims_per_distribution = np.array(bounds, np.int32)
+        self.n, self.shape, self.dtype = sum(bounds), (len(bounds),), jnp.int32
+
+    def sample(self, key: Key[Array, ""]) -> Array:
+        return jax.random.randint(key, self.shape, 0, self.number_of_dims_per_distribution, jnp.int32)
+
+    def contains(self, x: Any) -> Bool[Array, ""]:
+        x = jnp.asarray(x)
+        return ((x >= 0) & (x < self.number_of_dims_per_distribution)).all()
+
+
+class Box(Space):
+    """An array of numbers between two bounds; whole numbers include both, truth values are False and True."""
+
+    def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any = jnp.float32) -> None:
+        self.low, self.high, self.shape, self.dtype = low, high, shape, dtype
+
+    def sample(self, key: Key[Array, ""]) -> Array:
+        if jnp.issubdtype(self.dtype, jnp.floating):
+            return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
+        return jax.random.randint(key, self.shape, int(self.low), int(self.high) + 1).astype(self.dtype)
+
+    def contains(self, x: Any) -> Bool[Array, ""]:
+        x = jnp.asarray(x)
+        return ((x >= self.low) & (x <= self.high)).all()
+
+
+class Dict(Space):
+    """Spaces by name."""
+
+    def __init__(self, spaces: Mapping[str, Space]) -> None:
+        self.spaces = dict(spaces)
+        self.num_spaces = len(self.spaces)
+
+    def sample(self, key: Key[Array, ""]) -> dict[str, Any]:
+        keys = jax.random.split(key, len(self.spaces))
+        return {name: space.sample(one) for one, (name, space) in zip(keys, self.spaces.items(), strict=True)}
+
+    def contains(self, x: Mapping[str, Any]) -> Bool[Array, ""]:
+        return jnp.stack([space.contains(x[name]) for name, space in self.spaces.items()]).all()
