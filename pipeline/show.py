@@ -144,16 +144,17 @@ def write_sheet(film: Film, path: Path) -> None:
 
 
 def write_mp4(film: Film, path: Path) -> None:
-    """By the program ffmpeg, where there is one.
+    """By the program ffmpeg: the machine's, or the one of the extra `video`.
 
     Raises:
         UserError: there is none.
         Failure: it fails.
     """
-    program = shutil.which("ffmpeg")
+    program = shutil.which("ffmpeg") or packaged_ffmpeg()
     if program is None:
         raise UserError(
-            f"Cannot draw to {path}: MP4 needs the program ffmpeg, install it or use a name ending in .gif."
+            f"Cannot draw to {path}: MP4 needs the program ffmpeg. "
+            "Run `pip install imageio-ffmpeg`, or use a name ending in .gif."
         )
     rate = 1 / film.seconds[0]
     rest = round(film.seconds[-1] * rate)
@@ -165,6 +166,15 @@ def write_mp4(film: Film, path: Path) -> None:
     done = subprocess.run([*command, str(path)], input=raw, capture_output=True, check=False)
     if done.returncode:
         raise Failure(f"ffmpeg could not write {path}: {done.stderr.decode(errors='replace').strip()[-200:]}")
+
+
+def packaged_ffmpeg() -> str | None:
+    """The ffmpeg that comes with the package imageio-ffmpeg, where it is installed."""
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        return None
+    return imageio_ffmpeg.get_ffmpeg_exe()
 
 
 WRITERS: dict[str, Callable[[Film, Path], None]] = {".gif": write_film, ".png": write_sheet, ".mp4": write_mp4}

@@ -1,7 +1,7 @@
 """Pictures of a real split: levels that solve themselves, replayed and committed as a work unit does."""
 
 import re
-import shutil
+import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -100,11 +100,14 @@ def test_a_file_that_cannot_be_written(split, tmp_path) -> None:
         show(split, 0, tmp_path / "file" / "level.gif")
 
 
+def test_a_film_as_mp4(split, tmp_path) -> None:
+    show(split, level_with(split, "solved"), tmp_path / "level.mp4")
+    assert (tmp_path / "level.mp4").read_bytes()[4:8] == b"ftyp"
+
+
 def test_mp4_needs_ffmpeg(split, tmp_path, monkeypatch) -> None:
-    if shutil.which("ffmpeg"):
-        show(split, level_with(split, "solved"), tmp_path / "level.mp4")
-        assert (tmp_path / "level.mp4").read_bytes()[4:8] == b"ftyp"
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(UserError, match="ffmpeg"):
         show(split, level_with(split, "solved"), tmp_path / "other.mp4")
 
