@@ -7,7 +7,7 @@ Facts: `kinetix.environment.env` and `spaces` 3.0.2.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from typing import Any
@@ -21,10 +21,11 @@ from levelgen.actions import CHOICES, DISCRETE_ACTIONS, Controls, continuous_con
 from levelgen.level import ACTIONS, Level
 from levelgen.observe import LIMIT, feature_count, symbolic_flat
 from levelgen.observe_entities import entities, padded_shape, symbolic_padded
+from levelgen.pixels import SIDE, pixels
 from levelgen.spaces import Box, Dict, Discrete, MultiDiscrete, Space
 from levelgen.task import TaskParams, TaskState
 from levelgen.vmapped import single
-from physics.types import Size
+from physics.types import Model, Size
 
 
 class ActionType(StrEnum):
@@ -41,6 +42,7 @@ class ObservationType(StrEnum):
     SYMBOLIC_FLAT = "symbolic_flat"
     SYMBOLIC_FLAT_PADDED = "symbolic_flat_padded"
     SYMBOLIC_ENTITY = "symbolic_entity"
+    PIXELS = "pixels"
 
 
 @jax.tree_util.register_dataclass
@@ -54,10 +56,27 @@ class EnvParams:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class EnvState:
-    """One environment, without an axis of lanes: its level, and the episode under way."""
+    """One environment, without an axis of lanes: what is constant in its level, and the episode under way."""
 
-    level: Level
+    model: Model
+    role: Int[Array, " body"]
+    density: Float[Array, " body"]
+    motor_binding: Int[Array, " joint"]
+    motor_auto: Bool[Array, " joint"]
+    thruster_binding: Int[Array, " thruster"]
     now: TaskState
+
+    @property
+    def level(self) -> Level:
+        """The level, its world as it is now."""
+        constant = {name: value for name, value in vars(self).items() if name != "now"}
+        return Level(state=self.now.state, **constant)
+
+    @staticmethod
+    def start(level: Level) -> "EnvState":
+        """An episode's beginning."""
+        constant = {name: value for name, value in vars(level).items() if name != "state"}
+        return EnvState(now=task.reset(level), **constant)
 
 
 Step = tuple[Any, EnvState, Float[Array, ""], Bool[Array, ""], dict[str, Array]]
@@ -70,6 +89,7 @@ LOOKS: dict[ObservationType, Callable[..., Any]] = {
     ObservationType.SYMBOLIC_FLAT: symbolic_flat,
     ObservationType.SYMBOLIC_FLAT_PADDED: symbolic_padded,
     ObservationType.SYMBOLIC_ENTITY: entities,
+    ObservationType.PIXELS: jax.vmap(pixels, -1, -1),
 }
 
 
@@ -96,6 +116,11 @@ def make(
     levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], count)), levels)
     env = Environment(levels, ActionType(action_type), ObservationType(observation_type), rules, auto_reset)
     return env, env.default_params
+
+
+def starts(levels: Level) -> EnvState:
+    """The first state of every level, level axis FIRST: what `vmap` maps over, and `override_reset_state` takes."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), EnvState.start(levels))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +204,9 @@ class Environment:
             return Box(-LIMIT, LIMIT, (feature_count(self.size),))
         if self.observation_type == ObservationType.SYMBOLIC_FLAT_PADDED:
             return Box(-LIMIT, LIMIT, padded_shape(self.size))
-        return _space_of(jax.eval_shape(lambda: self.reset(jax.random.key(0))[0]), self.size)
+        if self.observation_type == ObservationType.PIXELS:
+            return Dict({"image": Box(0.0, 1.0, (SIDE, SIDE, 3)), "global_info": Box(-jnp.inf, jnp.inf, (1,))})
+        return _space_of_entities(jax.eval_shape(lambda: self.reset(jax.random.key(0))[0]), self.size)
 
     def _restart(self, key, params: EnvParams | None, override: EnvState | None) -> tuple[Any, Array | int, Any]:
         """(levels to draw from, the one drawn, a state instead of them): what a reset in lanes needs."""
@@ -207,7 +234,7 @@ class Environment:
     def _advance(self, state: EnvState, action: Array) -> tuple[EnvState, Array, Array, dict[str, Array]]:
         driven = CONTROLS[self.action_type](state.level, action)
         now, outcome, distance = task.advance_driven(state.level, state.now, driven, self.rules)
-        return EnvState(state.level, now), outcome.reward, outcome.done, {"GoalR": outcome.goal, "distance": distance}
+        return replace(state, now=now), outcome.reward, outcome.done, {"GoalR": outcome.goal, "distance": distance}
 
     def _look(self, state: EnvState) -> Any:
         return LOOKS[self.observation_type](state.level, state.now.state)
@@ -221,12 +248,11 @@ def _detached(*given: Any) -> Any:
 def _first_state(levels: Any, index: Int[Array, " lane"], override: EnvState | None) -> EnvState:
     if override is not None:
         return override
-    level = jax.tree.map(lambda x: x[..., index], levels)
-    return EnvState(level, task.reset(level))
+    return EnvState.start(jax.tree.map(lambda x: x[..., index], levels))
 
 
-def _space_of(seen: Any, size: Size) -> Dict:
-    """Of entities: masks are truth values, numbers of bodies are below their count, the rest is unbounded."""
+def _space_of_entities(seen: Any, size: Size) -> Dict:
+    """Masks are truth values, numbers of bodies are below their count, the rest is unbounded."""
 
     def space(x: jax.ShapeDtypeStruct) -> Box:
         bounds = {"b": (0, 1), "i": (0, size.bodies - 1)}.get(x.dtype.kind, (-jnp.inf, jnp.inf))

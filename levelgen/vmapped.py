@@ -16,7 +16,7 @@ from jaxtyping import Array, Int
 OnLanes = Callable[[Any, Int[Array, " lane"], Any], Any]
 
 
-def single(on_lanes: OnLanes) -> Callable[[Any, Int[Array, ""], Any], Any]:
+def single(on_lanes: OnLanes) -> Callable[[Any, Int[Array, ""] | int, Any], Any]:
     """The function of one environment that a function of lanes amounts to.
 
     `on_lanes(table, index, given)` has lanes last in `index`, in every array of `given` and in its result. The table
@@ -39,7 +39,7 @@ def single(on_lanes: OnLanes) -> Callable[[Any, Int[Array, ""], Any], Any]:
         result = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], batch, lanes), -2, 0), result)
         return result, jax.tree.map(lambda _: True, result)
 
-    def of_one(table: Any, index: Int[Array, ""], given: Any) -> Any:
+    def of_one(table: Any, index: Int[Array, ""] | int, given: Any) -> Any:
         result = merged(table, jnp.asarray(index)[None], jax.tree.map(lambda x: jnp.asarray(x)[..., None], given))
         return jax.tree.map(lambda x: x[..., 0], result)
 
