@@ -3,12 +3,19 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
+from levelgen.proofs import Proof
+
 
 class Label(StrEnum):
-    """What is known of a level after its expert was trained."""
+    """What is known of a level."""
 
     SOLVED = "solved"  # a witness was replayed and reached the goal
     UNSOLVED = "unsolved"  # at this budget; no statement about larger ones
+    TRIVIAL = "trivial"  # solved by doing nothing: that is its witness, and no expert was trained
+    UNSOLVABLE = "unsolvable"  # by a proof; no expert was trained
+
+
+WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that stand on a witness
 
 
 @dataclass(frozen=True)
@@ -17,6 +24,7 @@ class Verdict:
 
     label: Label
     label_reason: str
+    failed_by_noop: bool  # doing nothing lets green touch red
     success_rate: float  # of the evaluated episodes, over all attempts; NaN: none ended
     steps_to_goal: int | None  # env steps of the witness's first episode
     steps_to_first_success: int | None  # env steps of training
@@ -34,3 +42,35 @@ def solved_reason(sampled: bool, episodes: int) -> str:
 def unsolved_reason(attempts: int, training_successes: bool) -> str:
     before = "the goal was reached in training" if training_successes else "the goal was never reached in training"
     return f"{before}; none of {attempts} evaluation records reached it in every finished episode"
+
+
+def trivial_reason(steps: int) -> str:
+    return f"doing nothing reaches the goal in {steps} env steps"
+
+
+ARGUMENTS = {
+    Proof.NOTHING_ACTS: "no action has an effect",
+    Proof.GOAL_STANDS: "no green and blue body that could touch ever move",
+    Proof.OUT_OF_REACH: "what acts cannot reach anything that moves",
+}
+
+
+def unsolvable_reason(proof: Proof, fails: bool) -> str:
+    how = "lets green touch red" if fails else "does not reach the goal"
+    return f"{ARGUMENTS[proof]}, and doing nothing {how}"
+
+
+def untrained(label: Label, reason: str, failed_by_noop: bool, steps_to_goal: int | None = None) -> Verdict:
+    """The verdict on a level that needs no expert: its evaluated episodes are those of doing nothing."""
+    return Verdict(
+        label=label,
+        label_reason=reason,
+        failed_by_noop=failed_by_noop,
+        success_rate=float(label in WITNESSED),
+        steps_to_goal=steps_to_goal,
+        steps_to_first_success=None,
+        env_steps=0,
+        learning_curve=[],
+        best_return=float("-inf"),
+        episodes=0,
+    )

@@ -1,5 +1,7 @@
 """Training: slots of experts side by side, each with its budget, then evaluation, witnesses and verdicts.
 
+Levels that need no expert (`experts.before`) get none, and use nothing of their budget.
+
 An expert's result depends on its level, its level id and the configuration alone: every slot has its own random
 streams, and the program always has the same number of slots, filled up with repetitions where levels are few.
 """
@@ -15,13 +17,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts import ppo, progress
+from experts.before import decide
 from experts.config import ExpertConfig
-from experts.labels import Label, Verdict, solved_reason, unsolved_reason
+from experts.labels import WITNESSED, Label, Verdict, solved_reason, unsolved_reason
 from experts.policy import ActorCritic
 from experts.ppo import Batch, Expert
 from experts.progress import NEVER, Progress
 from experts.rollout import Experience, repeat, rollout
-from experts.witness import RECORD_STEPS, Record, replay, steps_to_goal, succeeds
+from experts.witness import RECORD_STEPS, Record, replay, steps_to_goal, succeeds, take
 from levelgen import task
 from levelgen.identity import Stream, key_for
 from levelgen.level import Level
@@ -40,7 +43,7 @@ class UnitResult:
 
     level_ids: np.ndarray  # int64
     levels: Level
-    record: Record  # all zero where the level is not solved
+    record: Record  # all zero where the level has no witness
     verdicts: list[Verdict]
 
 
@@ -60,7 +63,7 @@ def train_levels(
     rules: TaskParams = DEFAULT_RULES,
     report: Report = lambda env_steps, solved: None,
 ) -> UnitResult:
-    """Train one expert per level and label the levels.
+    """Label the levels; train an expert for each that needs one.
 
     Args:
         levels: the levels, as their ids rebuild them.
@@ -68,7 +71,7 @@ def train_levels(
         budget: env steps that each expert may use.
         config: what an expert is.
         rules: of the task; records hold its rewards, training shapes with the configuration's.
-        report: called now and then with totals over all levels.
+        report: called now and then with totals over all experts.
 
     Raises:
         ValueError: the budget does not suffice for one update.
@@ -76,25 +79,29 @@ def train_levels(
     updates = updates_in(budget, config)
     level_ids = np.asarray(level_ids)
     levels = jax.tree.map(np.asarray, levels)
-    verdicts: list[Verdict] = []
-    actions = np.zeros((RECORD_STEPS, 6, len(level_ids)), np.int32)
-    for first, index in _batches(len(level_ids), slot_count(config)):
+    verdicts, failed = decide(levels, rules)
+    left = np.array([i for i, verdict in enumerate(verdicts) if verdict is None], int)
+    actions = np.zeros((RECORD_STEPS, 6, len(level_ids)), np.int32)  # doing nothing, where none are found
+    solved = 0
+    for first, places in _batches(len(left), slot_count(config)):
+        index = left[places]
         kept = len(np.unique(index))
-
-        solved = sum(v.label is Label.SOLVED for v in verdicts)
 
         def count(update: int, first=first, kept=kept, solved=solved) -> None:
             report((first * updates + kept * update) * config.steps_per_update, solved)
 
-        mine, ids = jax.tree.map(lambda x, i=index: x[..., i], levels), jnp.asarray(level_ids[index], jnp.int32)
+        mine, ids = take(levels, index), jnp.asarray(level_ids[index], jnp.int32)
         slots, curve = train(mine, ids, updates, config, rules, count)
-        judged, witness = judge(mine, ids, slots, curve, config, rules)
-        verdicts += judged[:kept]
-        actions[..., first : first + kept] = witness[..., :kept]
+        judged, witness = judge(mine, ids, slots, curve, config, rules, failed[index])
+        for place, verdict in zip(index[:kept], judged, strict=False):
+            verdicts[place] = verdict
+        actions[..., index[:kept]] = witness[..., :kept]
+        solved += sum(verdict.label is Label.SOLVED for verdict in judged[:kept])
+    known = [verdict for verdict in verdicts if verdict is not None]
     record = replay(levels, actions, rules)
-    solved = np.array([v.label is Label.SOLVED for v in verdicts])
-    record = jax.tree.map(lambda x: np.where(solved, x, np.zeros_like(x)), record)
-    return UnitResult(level_ids.astype(np.int64), levels, record, verdicts)
+    witnessed = np.array([verdict.label in WITNESSED for verdict in known])
+    record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
+    return UnitResult(level_ids.astype(np.int64), levels, record, known)
 
 
 def updates_in(budget: int, config: ExpertConfig) -> int:
@@ -210,6 +217,7 @@ def judge(
     curve: Float[np.ndarray, "update slot"],
     config: ExpertConfig,
     rules: TaskParams,
+    failed_by_noop: Bool[np.ndarray, " slot"],
 ) -> tuple[list[Verdict], Int[np.ndarray, "256 6 slot"]]:
     """Evaluate trained experts; verdicts, and the witnesses' actions (0 where there is none)."""
     action, done, goal = evaluate(levels, level_ids, slots.experts.params, config, rules)
@@ -227,6 +235,7 @@ def judge(
                 label_reason=solved_reason(attempt > 0, episodes)
                 if solved
                 else unsolved_reason(config.attempts, first != NEVER),
+                failed_by_noop=bool(failed_by_noop[i]),
                 success_rate=float(goal[:, i].sum() / ended) if ended else float("nan"),
                 steps_to_goal=int(steps_to_goal(record.done)[i]) if solved else None,
                 steps_to_first_success=None if first == NEVER else first,

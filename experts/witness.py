@@ -54,10 +54,8 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
     level = jax.tree.map(np.asarray, level)
     actions = np.asarray(action, np.int32)
     count = actions.shape[-1]
-    blocks = [
-        jax.device_get(_replay_block(_lanes(level, lanes), actions[..., lanes], rules)) for lanes in _blocks(count)
-    ]
-    return jax.tree.map(lambda *xs: np.ascontiguousarray(np.concatenate(xs, -1)[..., :count]), *blocks)
+    parts = [jax.device_get(_replay_block(take(level, lanes), actions[..., lanes], rules)) for lanes in blocks(count)]
+    return jax.tree.map(lambda *xs: np.ascontiguousarray(np.concatenate(xs, -1)[..., :count]), *parts)
 
 
 def succeeds(done: ArrayLike, goal: ArrayLike) -> Bool[np.ndarray, "..."]:
@@ -71,13 +69,14 @@ def steps_to_goal(done: ArrayLike) -> Int[np.ndarray, " level"]:
     return np.argmax(np.asarray(done), axis=0) + 1
 
 
-def _blocks(count: int) -> Iterator[np.ndarray]:
+def blocks(count: int) -> Iterator[np.ndarray]:
     """Lane numbers of each block; the last one is filled up with its last lane."""
     for first in range(0, count, LANES):
         yield np.minimum(np.arange(first, first + LANES), count - 1)
 
 
-def _lanes(tree: T, lanes: np.ndarray) -> T:
+def take(tree: T, lanes: np.ndarray) -> T:
+    """These lanes of every array."""
     return jax.tree.map(lambda x: x[..., lanes], tree)
 
 

@@ -39,16 +39,17 @@ def survey(split: Path, where: str | None = None, rows: int = 10) -> dict[str, A
     """The facts that `inspect` prints, as JSON's types."""
     manifest = require_manifest(split)
     chosen = select(manifest.table, where)
-    solved = select(chosen, "label = 'solved'")
-    labels = {entry["values"]: entry["counts"] for entry in chosen.column("label").value_counts().to_pylist()}
+    solved, tried = (select(chosen, f"label IN ({names})") for names in ("'solved'", "'solved', 'unsolved'"))
     stored = sum(stored_bytes(split / shard) for shard in manifest.shards)
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
     return {
         "split": str(split),
         "config_hash": manifest.config_hash,
         "levels": chosen.num_rows,
-        "labels": dict(sorted(labels.items())),
-        "solve_rate": solved.num_rows / chosen.num_rows if chosen.num_rows else None,
+        "labels": _counts(chosen, "label"),
+        "unsolvable": _counts(select(chosen, "label = 'unsolvable'"), "label_reason"),
+        "failed_by_noop": sum(chosen.column("failed_by_noop").to_pylist()),
+        "solve_rate": solved.num_rows / tried.num_rows if tried.num_rows else None,  # of the levels with an expert
         "steps_to_goal": _quantiles(solved, "steps_to_goal"),
         "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
         "env_steps": sum(chosen.column("env_steps").to_pylist()),
@@ -79,6 +80,12 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
             ) from None
 
 
+def _counts(table: pa.Table, column: str) -> dict[str, int]:
+    """How often each value of a column is there."""
+    entries = table.column(column).value_counts().to_pylist()
+    return dict(sorted((entry["values"], entry["counts"]) for entry in entries))
+
+
 def _quantiles(table: pa.Table, column: str) -> dict[str, float] | None:
     values = table.column(column).drop_null().to_numpy()
     if not len(values):
@@ -101,7 +108,9 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     lines = {
         "split": facts["split"],
         "levels": f"{facts['levels']} ({labels})",
-        "solve rate": f"{facts['solve_rate']:.1%}" if facts["solve_rate"] is not None else None,
+        "unsolvable": "; ".join(f"{count} {reason}" for reason, count in facts["unsolvable"].items()) or None,
+        "failed by doing nothing": str(facts["failed_by_noop"]),
+        "solve rate of experts": f"{facts['solve_rate']:.1%}" if facts["solve_rate"] is not None else None,
         "steps to goal": _told(facts["steps_to_goal"]),
         "training steps to first success": _told(facts["steps_to_first_success"]),
         "training env steps": f"{facts['env_steps']:,}",

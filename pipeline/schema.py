@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-MANIFEST_VERSION = 1
+MANIFEST_VERSION = 2
 SHARD_VERSION = 1
 RECORD_STEPS = 256  # of a record, with automatic reset inside
 
@@ -26,6 +26,7 @@ COLUMNS = pa.schema(
         pa.field("budget", pa.string(), nullable=False),  # as typed
         pa.field("label", pa.string(), nullable=False),  # solved, unsolved, unsolvable, trivial
         pa.field("label_reason", pa.string(), nullable=False),
+        pa.field("failed_by_noop", pa.bool_(), nullable=False),  # doing nothing lets green touch red
         pa.field("success_rate", pa.float32(), nullable=False),  # of the evaluated episodes
         pa.field("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: none
         pa.field("steps_to_first_success", pa.int64()),  # env steps of training; null: never
@@ -35,7 +36,7 @@ COLUMNS = pa.schema(
         ),  # success rate per update, NaN: no episode ended
         pa.field("best_return", pa.float32(), nullable=False),
         pa.field("episodes", pa.int64(), nullable=False),
-        pa.field("shard", pa.string()),  # path below the split; null: not solved
+        pa.field("shard", pa.string()),  # path below the split; null: no witness
         pa.field("row", pa.int32()),  # of the shard
         pa.field("config_hash", pa.string(), nullable=False),
         pa.field(

@@ -1,6 +1,7 @@
 """How far a split is: what the last command wanted, what is committed, what was given up, whether a run is at work."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ def status(split: Path, as_json: bool) -> None:
     if as_json:
         print(json.dumps(facts, indent=2))
         return
-    print(f"{split}: {facts['done']} of {facts['wanted']} levels committed, {facts['solved']} solved.")
+    counts = "".join(f", {count} {label}" for label, count in facts["labels"].items())
+    print(f"{split}: {facts['done']} of {facts['wanted']} levels committed{counts}.")
     for note in facts["quarantined"]:
         print(f"Given up: {split / QUARANTINE / note}")
     if facts["running"]:
@@ -48,7 +50,7 @@ def look(split: Path) -> dict[str, Any]:
         "split": str(split),
         "wanted": len(wanted),
         "done": len(inside),
-        "solved": inside.count("solved"),
+        "labels": dict(sorted(Counter(inside).items())),
         "quarantined": sorted(path.name for path in (split / QUARANTINE).glob("*.txt")),
         "running": is_written(split),
         "command": job["command"],

@@ -15,7 +15,7 @@ import numpy as np
 
 from configs.compose import again
 from configs.schema import JobConfig
-from experts.labels import Label, Verdict
+from experts.labels import WITNESSED, Label, Verdict
 from experts.train import UnitResult, train_levels
 from experts.witness import Record, replay, succeeds
 from levelgen.level import SIZES, Level
@@ -79,8 +79,10 @@ def check_witnesses(result: UnitResult, task: TaskParams) -> None:
     again = replay(result.levels, result.record.action, task)
     wrong, reached = unlike_fields(result.record, again), succeeds(np.asarray(again.done), np.asarray(again.goal))
     for i, (level_id, verdict) in enumerate(zip(result.level_ids, result.verdicts, strict=True)):
-        if verdict.label != Label.SOLVED:
+        if verdict.label not in WITNESSED:
             continue
+        if verdict.label == Label.TRIVIAL and result.record.action[..., i].any():
+            raise Failure(f"The witness of level {level_id}, which is called trivial, does something.")
         if i in wrong:
             raise Failure(f"The witness of level {level_id} does not replay: its {wrong[i]} differs.")
         if not reached[i]:
@@ -103,7 +105,7 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
     Raises:
         OSError: the disk refuses; nothing is committed.
     """
-    kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label == Label.SOLVED]
+    kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label in WITNESSED]
     shard = attempt_path(split, unit.name)
     rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
     for place, i in enumerate(kept):

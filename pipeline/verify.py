@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from configs.convert import ConfigError, typed
+from experts.labels import WITNESSED, Label
 from experts.witness import Record, replay, steps_to_goal, succeeds
 from levelgen.level import Level
 from levelgen.task import TaskParams
@@ -66,7 +67,7 @@ def examine(split: Path) -> Findings:
         ) from None
     by_shard: dict[str, list[dict[str, Any]]] = {}
     for row in manifest.table.to_pylist():
-        if (row["label"] == "solved") != (row["shard"] is not None):
+        if (row["label"] in WITNESSED) != (row["shard"] is not None):
             findings.wrong.append(f"Level {row['level_id']} is {row['label']}, and its shard is {row['shard']}.")
         if row["shard"] is not None:
             by_shard.setdefault(row["shard"], []).append(row)
@@ -97,6 +98,8 @@ def _examine_shard(path: Path, rows: list[dict[str, Any]], task: TaskParams, fin
             findings.wrong.append(f"The witness of level {level_id} does not replay: its {differs[i]} differs.")
         elif not reached[i]:
             findings.wrong.append(f"The witness of level {level_id} does not reach the goal when replayed.")
+        elif row["label"] == Label.TRIVIAL and np.any(record.action[..., i]):
+            findings.wrong.append(f"Level {level_id} is trivial, and its witness does something.")
         elif i not in differs and row["steps_to_goal"] != steps[i]:
             findings.wrong.append(
                 f"Level {level_id} reaches the goal in {steps[i]} steps, the manifest says {row['steps_to_goal']}."

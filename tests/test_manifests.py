@@ -22,7 +22,7 @@ IDS = np.array([row["level_id"] for row in ROWS])
 def test_it_describes_the_default_dataset() -> None:
     assert IDS.tolist() == list(range(64))
     assert {row["config_hash"] for row in ROWS} == {compose_job([]).hash}, "make it again: manifests/README.md"
-    assert {row["label"] for row in ROWS} == {"solved", "unsolved"}
+    assert {row["label"] for row in ROWS} == {"solved", "unsolved", "trivial", "unsolvable"}
 
 
 def test_every_level_starts_as_it_did() -> None:

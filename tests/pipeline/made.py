@@ -69,6 +69,7 @@ def made_verdict(label: Label = Label.SOLVED, **changes: Any) -> Verdict:
     verdict = Verdict(
         label=label,
         label_reason="made for a test",
+        failed_by_noop=False,
         success_rate=1.0 if solved else float("nan"),
         steps_to_goal=17 if solved else None,
         steps_to_first_success=640 if solved else None,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from configs.schema import JobConfig
-from experts.labels import Label
+from experts.labels import WITNESSED, Label
 from experts.train import UnitResult, train_levels
 from experts.witness import Record, replay
 from levelgen.level import SIZES, Level
@@ -76,6 +76,14 @@ def test_a_record_that_replays_but_misses_the_goal_does_not_pass(job: JobConfig,
         check_witnesses(dataclasses.replace(result, record=idle, verdicts=verdicts), job.task)
 
 
+def test_a_trivial_level_whose_witness_does_something_does_not_pass(job: JobConfig, result: UnitResult) -> None:
+    called = [
+        dataclasses.replace(v, label=Label.TRIVIAL if v.label is Label.SOLVED else v.label) for v in result.verdicts
+    ]
+    with pytest.raises(Failure, match="called trivial, does something"):
+        check_witnesses(dataclasses.replace(result, verdicts=called), job.task)
+
+
 def test_a_unit_is_committed_with_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
     seen: list[tuple[int, int]] = []
     summary = run_unit(job, tmp_path, UNIT, lambda steps, solved: seen.append((steps, solved)))
@@ -84,7 +92,7 @@ def test_a_unit_is_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
     assert summary == Summary(4, manifest.labels.tolist().count("solved"), sum(manifest.table["env_steps"].to_pylist()))
     assert seen == sorted(seen)
     for row in manifest.table.to_pylist():
-        assert (row["label"] == "solved") == (row["shard"] is not None)
+        assert (row["label"] in WITNESSED) == (row["shard"] is not None)
         if row["shard"]:
             assert Shard(tmp_path / row["shard"]).level_ids[row["row"]] == row["level_id"]
 

@@ -1,0 +1,53 @@
+"""What needs no expert: levels that doing nothing solves, and levels that are proved unsolvable."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Int
+
+from experts.labels import Label, Verdict, trivial_reason, unsolvable_reason, untrained
+from experts.witness import RECORD_STEPS, blocks, replay, steps_to_goal, succeeds, take
+from levelgen.level import ACTIONS, Level
+from levelgen.proofs import Proof, examine
+from levelgen.task import TaskParams
+
+
+class Known(NamedTuple):
+    """`levelgen.proofs.Facts` on the host."""
+
+    reaches: Bool[np.ndarray, " level"]
+    fails: Bool[np.ndarray, " level"]
+    proof: Int[np.ndarray, " level"]
+
+
+class Before(NamedTuple):
+    """What is known before training."""
+
+    verdicts: list[Verdict | None]  # None: an expert has to try
+    failed_by_noop: Bool[np.ndarray, " level"]
+
+
+def decide(levels: Level, rules: TaskParams) -> Before:
+    """Verdicts on levels that need no expert. Every lane on its own, in blocks of one compiled program."""
+    count = levels.role.shape[-1]
+    facts = facts_of(levels, rules)
+    verdicts: list[Verdict | None] = [None] * count
+    falls = np.flatnonzero(facts.reaches)
+    if len(falls):
+        idle = replay(take(levels, falls), np.zeros((RECORD_STEPS, ACTIONS, len(falls)), np.int32), rules)
+        done = np.asarray(idle.done)
+        for i, solved, steps in zip(falls, succeeds(done, idle.goal), steps_to_goal(done), strict=True):
+            if solved:
+                verdicts[i] = untrained(Label.TRIVIAL, trivial_reason(int(steps)), False, int(steps))
+    for i in np.flatnonzero(facts.proof != Proof.NONE):
+        fails = bool(facts.fails[i])
+        verdicts[i] = untrained(Label.UNSOLVABLE, unsolvable_reason(Proof(int(facts.proof[i])), fails), fails)
+    return Before(verdicts, facts.fails)
+
+
+def facts_of(levels: Level, rules: TaskParams) -> Known:
+    """`levelgen.proofs.examine` for any number of levels, on the host; it watches one record's length."""
+    count, watched = levels.role.shape[-1], min(RECORD_STEPS, rules.max_timesteps)
+    parts = [jax.device_get(examine(take(levels, lanes), rules, watched)) for lanes in blocks(count)]
+    return Known(*(np.concatenate(x, -1)[:count] for x in zip(*parts, strict=True)))
