@@ -85,7 +85,7 @@ def test_a_wrong_setting_is_refused_in_one_sentence(tmp_path: Path, arguments: l
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("arguments", [[], ["generat"], ["inspect"], ["show", "x"], ["inspect", "x", "--rows", "a"]])
+@pytest.mark.parametrize("arguments", [[], ["generat"], ["inspect"], ["show"], ["inspect", "x", "--rows", "a"]])
 def test_a_command_that_is_none_gets_the_usage(tmp_path: Path, arguments: list[str]) -> None:
     done = run(arguments, tmp_path)
     assert done.returncode == 2
@@ -249,9 +249,19 @@ def test_a_closed_pipe_is_no_error(made: Path) -> None:
 @pytest.mark.slow
 def test_the_readme_s_reader_reads(made: Path) -> None:
     text = (ROOT / "README.md").read_text()
-    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    program, _ = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     assert "data/128k/s" in program
     command = [sys.executable, "-c", program.replace("data/128k/s", "data/5k/s")]
     done = subprocess.run(command, cwd=made, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[ True]"
+
+
+@pytest.mark.slow
+def test_the_readme_s_environment_steps(tmp_path: Path) -> None:
+    _, program = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    command = [sys.executable, "-c", program + "\nprint(obs.shape, reward.shape)"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["(256,", "140)", "(256,)"]

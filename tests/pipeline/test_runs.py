@@ -133,8 +133,9 @@ def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path) -> N
 
 def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
     process = start(COMMAND, tmp_path)
-    until(lambda: workers(process), process)
-    os.kill(workers(process)[0], signal.SIGKILL)
+    found: list[int] = []
+    until(lambda: found.extend(workers(process)) or found, process)
+    os.kill(found[0], signal.SIGKILL)
     _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, err
     assert "trying again" in err
