@@ -20,6 +20,9 @@ from physics.types import MAX_VERTICES, Model
 from physics.vector import Vec, nonzero, where
 
 FLIP_BIAS = 0.01  # m; b must separate this much more than a to become the reference polygon (Jax2D `epsilon`)
+# rad; the reference turns edges by a quarter turn in single precision, whose cosine is not 0: of equally deep corners,
+# the one nearer to the face's start comes first (docs/physics.md)
+TILT = 4.371139e-8
 FAR = 1e30  # m; stands for a vertex or edge that does not exist
 MARGIN = 0.01  # m; bodies whose boxes are farther apart cannot touch, whatever the rounding
 
@@ -192,8 +195,9 @@ def _polygon_polygon(a: Outline, b: Outline) -> list[Contact]:
     along = along.scale(1 / nonzero(length))
     reach = jnp.where(missing, FAR, normal.dot(incident - start))  # negative: inside the reference polygon
     offset = along.dot(incident - start)
-    first = _first(reach == reach.min(0))
-    rest = jnp.where(jnp.arange(MAX_VERTICES)[:, None] == first, 2 * FAR, reach)
+    deepest = reach + TILT * offset
+    first = _first(deepest == deepest.min(0))
+    rest = jnp.where(jnp.arange(MAX_VERTICES)[:, None] == first, 2 * FAR, deepest)
     second = _first(rest == rest.min(0))
 
     def contact(number, depth, active):
