@@ -20,8 +20,8 @@ from physics.types import MAX_VERTICES, Model
 from physics.vector import Vec, nonzero, where
 
 FLIP_BIAS = 0.01  # m; b must separate this much more than a to become the reference polygon (Jax2D `epsilon`)
-# rad; the reference turns edges by a quarter turn in single precision, whose cosine is not 0: of equally deep corners,
-# the one nearer to the face's start comes first (docs/physics.md)
+# rad; Jax2D turns edges into normals by rmat(pi / 2) in single precision, whose cosine is -4.371139e-8: its faces lean
+# by that much, so of equally deep corners the one nearer to the face's start is first (docs/physics.md, "Ties")
 TILT = 4.371139e-8
 FAR = 1e30  # m; stands for a vertex or edge that does not exist
 MARGIN = 0.01  # m; bodies whose boxes are farther apart cannot touch, whatever the rounding

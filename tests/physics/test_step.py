@@ -130,6 +130,16 @@ class TestRest:
         np.testing.assert_allclose(after.velocity[body, :, 0], 0, atol=0.02)
         np.testing.assert_allclose(after.rotation[body, 0], 0, atol=0.02)
 
+    @pytest.mark.parametrize(("wall", "height", "side"), [(0, FLOOR_TOP + HALF - 0.005, -1), (3, 4.805, 1)])
+    def test_of_a_flat_boxs_corners_the_one_at_the_faces_start_comes_first(self, wall, height, side) -> None:
+        """As in the reference. Faces run clockwise: the floor's to the right, the ceiling's to the left."""
+        model, state = room()
+        state = changed(state, position={BOX: (1.5, height)})
+        _, manifold = play(model, state, *idle())
+        first, second = wall, 4 + wall
+        assert manifold.active[[first, second]].all()
+        np.testing.assert_allclose(manifold.point[[first, second], 0, 0] - 1.5, [side * HALF, -side * HALF], atol=1e-5)
+
     def test_everything_comes_down_and_nothing_leaves_the_room(self) -> None:
         model, state = room()
         after, _ = play(model, state, *idle(), steps=240)
