@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from configs.convert import ConfigError, flat, plain, suggestion, typed
 from configs.schema import JobConfig
-from experts.config import ExpertConfig
+from experts.config import ExpertConfig, StopConfig
 from levelgen.distribution import Distribution
 from levelgen.task import TaskParams
 
@@ -53,7 +53,8 @@ def again(job: JobConfig) -> str:
 
 
 def _composed(overrides: list[str]) -> dict[str, Any]:
-    code = {"distribution": plain(Distribution()), "task": plain(TaskParams()), "expert": plain(ExpertConfig())}
+    classes = {"distribution": Distribution, "task": TaskParams, "expert": ExpertConfig, "stop": StopConfig}
+    code = {name: plain(of()) for name, of in classes.items()}
     ConfigStore.instance().store(name="code", node=code)
     try:
         with initialize_config_module("configs", version_base="1.3"):

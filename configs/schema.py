@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from configs.convert import ConfigError, plain
 from configs.numbers import parse_count
-from experts.config import ExpertConfig
+from experts.config import ExpertConfig, StopConfig
 from levelgen.distribution import Distribution
 from levelgen.identity import SAMPLER_VERSION
 from levelgen.task import TaskParams
@@ -34,6 +34,7 @@ class JobConfig:
     distribution: Distribution
     task: TaskParams
     expert: ExpertConfig
+    stop: StopConfig
 
     def __post_init__(self) -> None:
         last = self.first_level + parse_count(self.levels, "levels") - 1

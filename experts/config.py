@@ -1,6 +1,24 @@
-"""What an expert is and how it learns. Defaults: the hyperparameters of the reference's PPO, vmapped per level."""
+"""What an expert is, how it learns, when it stops and what counts as a witness."""
 
 from dataclasses import dataclass
+from enum import StrEnum
+
+RECORD_STEPS = 256  # env steps of a record
+
+
+class Rule(StrEnum):
+    """When a level leaves its slot."""
+
+    BUDGET = "budget"  # every expert gets its whole budget
+    SOLVED = "solved"  # or until its evaluation succeeds
+    HALVING = "halving"  # or until, at a rung, its learning does not move
+
+
+class Choice(StrEnum):
+    """Which of a level's successes becomes its witness."""
+
+    RECORD = "record"  # the first attempt whose every finished episode reached the goal, automatic reset and all
+    SHORTEST = "shortest"  # the shortest successful episode of any attempt, repeated to fill the record
 
 
 @dataclass(frozen=True)
@@ -14,6 +32,8 @@ class ExpertConfig:
     environments: int = 32  # lanes an expert acts in
     horizon: int = 64  # env steps in each lane between updates
     dense_reward_scale: float = 0.2  # 1/m; shaping while training, see levelgen.task.TaskParams
+    rehearsals: int = 0  # lanes that repeat the first success of training, once there is one
+    persistence: float = 0.0  # chance that these lanes repeat their last action, before
     # PPO (Schulman et al. 2017, arXiv:1707.06347)
     epochs: int = 4  # passes over the experience of an update
     minibatches: int = 4  # per epoch
@@ -25,8 +45,13 @@ class ExpertConfig:
     clip: float = 0.2  # of the probability ratio, and of the value's change
     value_weight: float = 0.5
     entropy_weight: float = 0.01
-    # evaluation
-    attempts: int = 8  # records rolled out at the end: the first by the most probable actions, the others sampled
+    # evaluation: each lane rolls out one record
+    attempts: int = 8  # lanes as they are: the first by the most probable actions, the others sampled
+    sticky_attempts: int = 8  # lanes where an action is sometimes repeated against the expert's will
+    moved_attempts: int = 8  # lanes that start with other velocities
+    # witness
+    witness: Choice = Choice.RECORD
+    exploration: bool = False  # a success of training is a witness, too, where evaluation has none
     # machine
     slots: int = 0  # experts that train side by side in one program; 0: as many as suit the device
 
@@ -41,17 +66,54 @@ class ExpertConfig:
         for name in ("discount", "gae_lambda", "clip"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be between 0 and 1")
-        for name in ("dense_reward_scale", "value_weight", "entropy_weight", "slots"):
+        not_negative = ("dense_reward_scale", "value_weight", "entropy_weight", "slots")
+        for name in (*not_negative, "rehearsals", "sticky_attempts", "moved_attempts"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
         if self.steps_per_update % self.minibatches:
             raise ValueError(
                 f"minibatches is {self.minibatches}: it must divide environments x horizon = {self.steps_per_update}"
             )
-        if self.attempts > self.environments:
-            raise ValueError(f"attempts is {self.attempts}: it must not be above environments = {self.environments}")
+        if self.rehearsals > self.environments:
+            raise ValueError(
+                f"rehearsals is {self.rehearsals}: it must not be above environments = {self.environments}"
+            )
+        lanes = self.attempts + self.sticky_attempts + self.moved_attempts
+        if lanes > self.environments:
+            raise ValueError(
+                f"attempts, sticky_attempts and moved_attempts are {lanes} together: "
+                f"they must not be above environments = {self.environments}"
+            )
 
     @property
     def steps_per_update(self) -> int:
         """Environment steps of one expert between updates."""
         return self.environments * self.horizon
+
+    @property
+    def record_rollouts(self) -> int:
+        """Rollouts that a record takes."""
+        return -(-RECORD_STEPS // self.horizon)
+
+
+@dataclass(frozen=True)
+class StopConfig:
+    """When a level leaves its slot (hashable: pass as a static argument)."""
+
+    rule: Rule = Rule.SOLVED
+    successes: int = 8  # attempts that must succeed, the first of them, for a level to be decided as solved
+    share: float = 0.9  # of an update's finished episodes that must reach the goal before an evaluation is worth it
+    wait: int = 2048  # env steps of training between an evaluation that failed and the next; doubles each time
+    polish: int = 0  # env steps of training after a level is solved, for a shorter way to the goal
+    first_rung: int = 16_384  # env steps of training at the first rung; each is twice the one before
+    gain: float = 0.05  # that the best return must have grown by since the rung before
+
+    def __post_init__(self) -> None:
+        for name in ("successes", "first_rung"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
+        for name in ("wait", "polish", "gain"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"share is {self.share}: it must be between 0 and 1")

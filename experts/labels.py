@@ -15,6 +15,15 @@ class Label(StrEnum):
     UNSOLVABLE = "unsolvable"  # by a proof; no expert was trained
 
 
+class Source(StrEnum):
+    """Where a witness comes from."""
+
+    MOST_PROBABLE = "most probable"  # the expert's most probable actions
+    SAMPLED = "sampled"  # actions sampled from the expert's policy in its evaluation
+    EXPLORATION = "exploration"  # actions of an episode of training
+    NOTHING = "nothing"  # a trivial level's
+
+
 WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that stand on a witness
 
 
@@ -25,7 +34,12 @@ class Verdict:
     label: Label
     label_reason: str
     failed_by_noop: bool  # doing nothing lets green touch red
-    success_rate: float  # of the evaluated episodes, over all attempts; NaN: none ended
+    witness: Source | None
+    # of the last evaluation; NaN: no episode ended
+    success_rate: float  # of the episodes of sampled attempts
+    most_probable_succeeds: bool  # every episode of the attempt that takes the most probable actions
+    sticky_success_rate: float  # of attempts where an action is sometimes repeated, first episodes
+    moved_success_rate: float  # of attempts that start with slightly other velocities, first episodes
     steps_to_goal: int | None  # env steps of the witness's first episode
     steps_to_first_success: int | None  # env steps of training
     env_steps: int  # of training
@@ -34,9 +48,9 @@ class Verdict:
     episodes: int  # of training
 
 
-def solved_reason(sampled: bool, episodes: int) -> str:
-    how = "sampled" if sampled else "most probable"
-    return f"the witness, {how} actions, reaches the goal in all {episodes} of its finished episodes"
+def solved_reason(source: Source, episodes: int) -> str:
+    how = "actions of training" if source is Source.EXPLORATION else f"{source} actions"
+    return f"the witness, {how}, reaches the goal in all {episodes} of its finished episodes"
 
 
 def unsolved_reason(attempts: int, training_successes: bool) -> str:
@@ -66,7 +80,11 @@ def untrained(label: Label, reason: str, failed_by_noop: bool, steps_to_goal: in
         label=label,
         label_reason=reason,
         failed_by_noop=failed_by_noop,
+        witness=Source.NOTHING if label in WITNESSED else None,
         success_rate=float(label in WITNESSED),
+        most_probable_succeeds=label in WITNESSED,
+        sticky_success_rate=float("nan"),
+        moved_success_rate=float("nan"),
         steps_to_goal=steps_to_goal,
         steps_to_first_success=None,
         env_steps=0,

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax.typing import VariableDict as Params
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from levelgen.actions import CHOICES
 from levelgen.observe import dynamic_features
@@ -136,14 +136,17 @@ def most_probable(logits: Float[Array, "logit lane"]) -> Int[Array, "6 lane"]:
     return jnp.stack([jnp.argmax(entry, axis=0).astype(jnp.int32) for entry in _entries(logits)])
 
 
-def log_probability(logits: Float[Array, "logit lane"], action: Int[Array, "6 lane"]) -> Float[Array, " lane"]:
-    """Of a whole action; entries are independent."""
+def log_probability(
+    logits: Float[Array, "logit lane"], action: Int[Array, "6 lane"], live: Bool[Array, "6 lane"]
+) -> Float[Array, " lane"]:
+    """Of what matters of an action: entries are independent, and those that nothing obeys do not count."""
     total = jnp.zeros(logits.shape[-1])
-    for entry, chosen in zip(_entries(logits), action, strict=True):
-        total += sum(jnp.where(chosen == k, row, 0.0) for k, row in enumerate(entry))
+    for entry, chosen, counts in zip(_entries(logits), action, live, strict=True):
+        total += jnp.where(counts, sum(jnp.where(chosen == k, row, 0.0) for k, row in enumerate(entry)), 0.0)
     return total
 
 
-def entropy(logits: Float[Array, "logit lane"]) -> Float[Array, " lane"]:
-    """Sum over the entries, nats."""
-    return -sum((jnp.exp(entry) * entry).sum(0) for entry in _entries(logits))  # type: ignore[return-value]
+def entropy(logits: Float[Array, "logit lane"], live: Bool[Array, "6 lane"]) -> Float[Array, " lane"]:
+    """Sum over the entries that something obeys, nats."""
+    entries = zip(_entries(logits), live, strict=True)
+    return -sum(jnp.where(counts, (jnp.exp(entry) * entry).sum(0), 0.0) for entry, counts in entries)  # type: ignore[return-value]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from experts.config import ExpertConfig
 from experts.policy import ActorCritic, Params, entropy, forward, log_probability
@@ -22,6 +22,13 @@ class Expert(NamedTuple):
 
     params: Params
     optimiser: optax.OptState
+
+
+class Seen(NamedTuple):
+    """What is constant within a level."""
+
+    constant: Float[Array, " feature"]  # the observation's constant rows, see levelgen.observe
+    live: Bool[Array, "6"]  # entries of an action that something obeys
 
 
 class Batch(NamedTuple):
@@ -68,12 +75,11 @@ def advantages(
     return estimates
 
 
-def loss(
-    params: Params, network: ActorCritic, constant: Float[Array, " feature"], batch: Batch, config: ExpertConfig
-) -> Float[Array, ""]:
+def loss(params: Params, network: ActorCritic, seen: Seen, batch: Batch, config: ExpertConfig) -> Float[Array, ""]:
     """Clipped policy surrogate, clipped value error, entropy bonus; means over the minibatch."""
-    logits, value = forward(network, params, constant, batch.moving)
-    ratio = jnp.exp(log_probability(logits, batch.action) - batch.log_probability)  # type: ignore[arg-type]
+    logits, value = forward(network, params, seen.constant, batch.moving)
+    live = seen.live[:, None]
+    ratio = jnp.exp(log_probability(logits, batch.action, live) - batch.log_probability)  # type: ignore[arg-type]
     gain = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + ADVANTAGE_EPSILON)
     clipped_ratio = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
     surrogate = jnp.minimum(ratio * gain, clipped_ratio * gain).mean()
@@ -81,14 +87,14 @@ def loss(
     target = batch.value + batch.advantage
     near = batch.value + jnp.clip(value - batch.value, -config.clip, config.clip)
     error = 0.5 * jnp.maximum(jnp.square(value - target), jnp.square(near - target)).mean()
-    return config.value_weight * error - surrogate - config.entropy_weight * entropy(logits).mean()
+    return config.value_weight * error - surrogate - config.entropy_weight * entropy(logits, live).mean()
 
 
 def update(
     expert: Expert,
     key: Key[Array, ""],
     network: ActorCritic,
-    constant: Float[Array, " feature"],
+    seen: Seen,
     samples: Float[Array, "sample column"],
     config: ExpertConfig,
 ) -> Expert:
@@ -96,7 +102,7 @@ def update(
     transform = optimiser(config)
 
     def learn(expert, minibatch):
-        gradient = jax.grad(loss)(expert.params, network, constant, from_samples(minibatch.T), config)
+        gradient = jax.grad(loss)(expert.params, network, seen, from_samples(minibatch.T), config)
         change, state = transform.update(gradient, expert.optimiser, expert.params)
         params: Any = optax.apply_updates(expert.params, change)
         return Expert(params, state), None

@@ -4,7 +4,7 @@ Lane `i * environments + j` is environment j of level i.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,28 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts.policy import ActorCritic, forward, log_probability, most_probable, sample
 from levelgen import task
-from levelgen.actions import CHOICES
+from levelgen.actions import CHOICES, action_mask
 from levelgen.level import Level
 from levelgen.observe import level_features, state_features
 from levelgen.task import TaskParams, TaskState
+
+T = TypeVar("T")
+
+
+class Acting(NamedTuple):
+    """Episodes under way."""
+
+    world: TaskState
+    last_action: Int[Array, "6 lane"]  # in this episode; 0 at its start
+
+
+class Manner(NamedTuple):
+    """How lanes choose their actions, where it is not by sampling."""
+
+    greedy: Bool[Array, " lane"]  # the most probable one
+    stickiness: Float[Array, " lane"]  # chance of the last one again
+    rehearsing: Bool[Array, " lane"]  # as in `rehearsal`
+    rehearsal: Int[Array, "256 6 level"]  # by env step of the episode
 
 
 class Experience(NamedTuple):
@@ -28,61 +46,80 @@ class Experience(NamedTuple):
     reward: Float[Array, "time level environment"]
     done: Bool[Array, "time level environment"]
     goal: Bool[Array, "time level environment"]
+    timestep: Int[Array, "time level environment"]  # env steps of the episode before this one
 
 
-def repeat(level: Level, environments: int) -> Level:
+def repeat(tree: T, environments: int) -> T:
     """Each level in as many neighbouring lanes."""
-    return jax.tree.map(lambda x: jnp.repeat(x, environments, axis=-1), level)
+    return jax.tree.map(lambda x: jnp.repeat(x, environments, axis=-1), tree)
+
+
+def start(lanes: Level) -> Acting:
+    """The first state of every lane's level."""
+    world = task.reset(lanes)
+    return Acting(world, jnp.zeros((len(CHOICES), *world.timestep.shape), jnp.int32))
 
 
 def rollout(
     network: ActorCritic,
     params,
     levels: Level,
-    world: TaskState,
+    acting: Acting,
     keys: Key[Array, " level"],
-    greedy: Bool[Array, " environment"],
+    manner: Manner,
     steps: int,
     rules: TaskParams,
-) -> tuple[TaskState, Experience, Float[Array, "level environment"]]:
+) -> tuple[Acting, Experience, Float[Array, "level environment"]]:
     """Act for `steps` env steps, with automatic reset.
 
     Args:
         network: the shape of the experts' networks.
         params: of every expert, level axis first.
         levels: one per expert.
-        world: episodes under way, one per lane.
+        acting: episodes under way, one per lane.
         keys: one per expert, used up.
-        greedy: environments that take the most probable action instead of a sampled one.
+        manner: how actions are chosen.
         steps: env steps in each lane.
         rules: of the task.
 
     Returns:
         The episodes afterwards, the experience, and the value of the last observation.
     """
-    environments = len(greedy)
     level_count = keys.shape[0]
+    environments = len(manner.greedy) // level_count
     lanes = repeat(levels, environments)
-    constant = level_features(levels)
+    constant, live = level_features(levels), action_mask(lanes)
     per_level = lambda x: x.reshape(*x.shape[:-1], level_count, environments)
+    flat = lambda x: x.reshape(*x.shape[:-2], -1)
     each = jax.vmap(partial(forward, network), in_axes=(0, 1, 1), out_axes=(-2, 0))
 
-    def look(world):
+    def look(world: TaskState):
         moving = per_level(state_features(lanes, world.state))
         logits, value = each(params, constant, moving)
-        return moving, logits, value
+        return moving, flat(logits), value
 
-    def act(world, t):
+    def draw(key, t):
+        return jax.random.uniform(jax.random.fold_in(key, t), (len(CHOICES) + 1, environments))
+
+    def act(acting: Acting, t):
+        world, last = acting
         moving, logits, value = look(world)
-        draw = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, t), (len(CHOICES), environments)))
-        flat = lambda x: x.reshape(*x.shape[:-2], -1)
-        logits, uniform = flat(logits), flat(jnp.moveaxis(draw(keys), 0, 1))
-        action = jnp.where(jnp.tile(greedy, level_count), most_probable(logits), sample(logits, uniform))
-        chance = log_probability(logits, action)
-        world, outcome = task.step(lanes, world, action, rules)
-        action, chance, reward, done, goal = map(per_level, (action, chance, *outcome))
-        seen = Experience(moving, action, chance, value, reward, done, goal)
-        return world, seen
+        uniform = flat(jnp.moveaxis(jax.vmap(draw, in_axes=(0, None))(keys, t), 0, 1))
+        action = jnp.where(manner.greedy, most_probable(logits), sample(logits, uniform[:-1]))
+        action = jnp.where(uniform[-1] < manner.stickiness, last, action)
+        action = jnp.where(manner.rehearsing, rehearsed(manner.rehearsal, world.timestep), action)
+        action = jnp.where(live, action, 0)
+        chance = log_probability(logits, action, live)
+        after, outcome = task.step(lanes, world, action, rules)
+        played, chance, reward, done, goal, timestep = map(per_level, (action, chance, *outcome, world.timestep))
+        seen = Experience(moving, played, chance, value, reward, done, goal, timestep)
+        return Acting(after, jnp.where(outcome.done, 0, action)), seen
 
-    world, experience = jax.lax.scan(act, world, jnp.arange(steps))
-    return world, experience, look(world)[2]
+    acting, experience = jax.lax.scan(act, acting, jnp.arange(steps))
+    return acting, experience, look(acting.world)[2]
+
+
+def rehearsed(actions: Int[Array, "time 6 level"], timestep: Int[Array, " lane"]) -> Int[Array, "6 lane"]:
+    """The action of each lane's env step."""
+    environments = len(timestep) // actions.shape[-1]
+    return actions[timestep, :, jnp.arange(len(timestep)) // environments].T.astype(jnp.int32)

@@ -1,40 +1,41 @@
-"""Training: slots of experts side by side, each with its budget, then evaluation, witnesses and verdicts.
+"""Training: levels go through the slots, then witnesses are chosen and verdicts given.
 
 Levels that need no expert (`experts.before`) get none, and use nothing of their budget.
-
-An expert's result depends on its level, its level id and the configuration alone: every slot has its own random
-streams, and the program always has the same number of slots, filled up with repetitions where levels are few.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Int
 
-from experts import ppo, progress
 from experts.before import decide
-from experts.config import ExpertConfig
-from experts.labels import WITNESSED, Label, Verdict, solved_reason, unsolved_reason
-from experts.policy import ActorCritic
-from experts.ppo import Batch, Expert
-from experts.progress import NEVER, Progress
-from experts.rollout import Experience, repeat, rollout
-from experts.witness import RECORD_STEPS, Record, replay, steps_to_goal, succeeds, take
-from levelgen import task
-from levelgen.identity import Stream, key_for
-from levelgen.level import Level
-from levelgen.observe import dynamic_features, feature_count, level_features
-from levelgen.task import DEFAULT_RULES, TaskParams, TaskState
+from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
+from experts.judge import Evaluation, Trained, judge, witness_of
+from experts.labels import WITNESSED, Label, Verdict
+from experts.slots import Begun, Mode, Queue, Slots, advance, begin, empty_slots
+from experts.witness import Record, replay, take
+from levelgen.level import ACTIONS, Level
+from levelgen.task import DEFAULT_RULES, TaskParams
 
 LANES_IN_CACHE = 128  # their physics and one minibatch fit the cache of a core
 LANES_ON_ACCELERATOR = 32_768
+BLOCK = 16  # experts that one call of `begin` makes
+DEFAULT_STOP = StopConfig()
 
-Report = Callable[[int, int], None]  # (env steps so far, levels solved so far)
+Tell = Callable[[int, float, int], None]  # totals so far: env steps, levels (parts count), solved levels
+
+
+class Spent(NamedTuple):
+    """Env steps of all lanes."""
+
+    trained: int
+    evaluated: int
+    idle: int  # in slots that had no level
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,8 @@ class UnitResult:
     levels: Level
     record: Record  # all zero where the level has no witness
     verdicts: list[Verdict]
-
-
-class Slots(NamedTuple):
-    """Everything that changes while experts train."""
-
-    experts: Expert  # level axis first
-    world: TaskState  # lanes: levels x environments
-    progress: Progress
+    spent: Spent
+    experts: dict[int, Begun] = field(default_factory=dict)  # by level id, where they are kept
 
 
 def train_levels(
@@ -60,8 +55,9 @@ def train_levels(
     level_ids: np.ndarray,
     budget: int,
     config: ExpertConfig,
+    stopping: StopConfig = DEFAULT_STOP,
     rules: TaskParams = DEFAULT_RULES,
-    report: Report = lambda env_steps, solved: None,
+    report: Tell = lambda env_steps, levels, solved: None,
 ) -> UnitResult:
     """Label the levels; train an expert for each that needs one.
 
@@ -70,6 +66,7 @@ def train_levels(
         level_ids: their ids; the seeds of all randomness.
         budget: env steps that each expert may use.
         config: what an expert is.
+        stopping: when a level leaves its slot.
         rules: of the task; records hold its rewards, training shapes with the configuration's.
         report: called now and then with totals over all experts.
 
@@ -79,29 +76,21 @@ def train_levels(
     updates = updates_in(budget, config)
     level_ids = np.asarray(level_ids)
     levels = jax.tree.map(np.asarray, levels)
-    verdicts, failed = decide(levels, rules)
-    left = np.array([i for i, verdict in enumerate(verdicts) if verdict is None], int)
-    actions = np.zeros((RECORD_STEPS, 6, len(level_ids)), np.int32)  # doing nothing, where none are found
-    solved = 0
-    for first, places in _batches(len(left), slot_count(config)):
-        index = left[places]
-        kept = len(np.unique(index))
-
-        def count(update: int, first=first, kept=kept, solved=solved) -> None:
-            report((first * updates + kept * update) * config.steps_per_update, solved)
-
-        mine, ids = take(levels, index), jnp.asarray(level_ids[index], jnp.int32)
-        slots, curve = train(mine, ids, updates, config, rules, count)
-        judged, witness = judge(mine, ids, slots, curve, config, rules, failed[index])
-        for place, verdict in zip(index[:kept], judged, strict=False):
-            verdicts[place] = verdict
-        actions[..., index[:kept]] = witness[..., :kept]
-        solved += sum(verdict.label is Label.SOLVED for verdict in judged[:kept])
-    known = [verdict for verdict in verdicts if verdict is not None]
+    before, failed = decide(levels, rules)
+    left = np.array([i for i, verdict in enumerate(before) if verdict is None], int)
+    known_before = len(before) - len(left)
+    tell = lambda env_steps, through, solved: report(env_steps, known_before + through, solved)
+    trained, spent = train(take(levels, left), level_ids[left], updates, config, stopping, rules, tell)
+    judged, witness = judge(take(levels, left), trained, config, rules, failed[left])
+    verdicts = {int(i): verdict for i, verdict in zip(left, judged, strict=True)}
+    known = [verdict or verdicts[i] for i, verdict in enumerate(before)]
+    actions = np.zeros((RECORD_STEPS, ACTIONS, len(level_ids)), np.int32)  # doing nothing, where none are found
+    actions[..., left] = witness
     record = replay(levels, actions, rules)
     witnessed = np.array([verdict.label in WITNESSED for verdict in known])
     record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
-    return UnitResult(level_ids.astype(np.int64), levels, record, known)
+    report(spent.trained, len(known), sum(verdict.label is Label.SOLVED for verdict in known))
+    return UnitResult(level_ids.astype(np.int64), levels, record, known, spent)
 
 
 def updates_in(budget: int, config: ExpertConfig) -> int:
@@ -126,155 +115,59 @@ def slot_count(config: ExpertConfig) -> int:
     return max(1, lanes // config.environments)
 
 
-def _batches(count: int, slots: int) -> Iterator[tuple[int, np.ndarray]]:
-    """First level and level numbers of each batch; the last is filled up with its last level."""
-    for first in range(0, count, slots):
-        yield first, np.minimum(np.arange(first, first + slots), count - 1)
-
-
 def train(
     levels: Level,
-    level_ids: Int[Array, " slot"],
+    level_ids: Int[np.ndarray, " level"],
     updates: int,
     config: ExpertConfig,
+    stopping: StopConfig,
     rules: TaskParams,
-    count: Callable[[int], None] = lambda update: None,
-) -> tuple[Slots, Float[np.ndarray, "update slot"]]:
-    """Train a batch of experts for so many updates; their learning curves."""
-    slots = _start(levels, level_ids, config)
+    report: Tell = lambda env_steps, levels, solved: None,
+) -> tuple[list[Trained], Spent]:
+    """Each level through a slot, until it is decided or has had so many updates."""
+    count = len(level_ids)
+    if not count:
+        return [], Spent(0, 0, 0)
     shaped = replace(rules, dense_reward_scale=config.dense_reward_scale)
-    greedy = jnp.zeros(config.environments, bool)
-    curve = []
-    for update in range(updates):
-        keys = _keys(level_ids, Stream.EXPERT, update + 1)
-        world, experience, last_value = _act(slots.experts.params, levels, slots.world, keys, greedy, config, shaped)
-        slots, share = _learn(slots._replace(world=world), levels, keys, experience, last_value, config)
-        curve.append(share)
-        if update:  # one update behind, so that the device never waits for the host
-            curve[-2].block_until_ready()
-            count(update)
-    count(updates)
-    return slots, np.stack(jax.device_get(curve))
+    queue = queue_of(levels, level_ids, updates, config)
+    slots = empty_slots(slot_count(config), queue, config)
+    curves: list[list[float]] = [[] for _ in range(count)]
+    evaluations: list[list[Evaluation]] = [[] for _ in range(count)]
+    rollouts, left, solved = Counter(), 0, 0
+    while left < count:
+        slots, now = advance(slots, queue, config, stopping, shaped)
+        seen = jax.device_get(now)
+        rollouts.update(seen.mode.tolist())
+        for slot in np.flatnonzero(seen.mode == Mode.TRAIN):
+            curves[seen.place[slot]].append(float(seen.share[slot]))
+        for slot in np.flatnonzero(seen.evaluated).tolist():
+            evaluations[seen.place[slot]].append(evaluation_of(slots, slot, config))
+        for place in seen.place[seen.left]:
+            left, solved = left + 1, solved + (witness_of(evaluations[place], config) is not None)
+        under_way = sum(len(curves[place]) for place in seen.place[~seen.left & (seen.mode != Mode.EMPTY)])
+        report(rollouts[Mode.TRAIN] * config.steps_per_update, left + under_way / updates, solved)
+    spent = (rollouts[mode] * config.steps_per_update for mode in (Mode.TRAIN, Mode.EVALUATE, Mode.EMPTY))
+    return [Trained(*of) for of in zip(curves, evaluations, strict=True)], Spent(*spent)
 
 
-def network_of(levels: Level, config: ExpertConfig) -> ActorCritic:
-    return ActorCritic(levels.size, config.width, config.depth)
+def queue_of(levels: Level, level_ids: Int[np.ndarray, " level"], updates: int, config: ExpertConfig) -> Queue:
+    """The levels as a queue on the device. Its capacity is a power of two: few shapes are compiled."""
+    count = len(level_ids)
+    places = np.minimum(np.arange(max(BLOCK, 1 << (count - 1).bit_length())), count - 1)
+    levels, ids = take(levels, places), np.asarray(level_ids, np.int32)[places]
+    blocks = [np.arange(first, first + BLOCK) for first in range(0, len(places), BLOCK)]
+    begun = [begin(take(levels, block), ids[block], config) for block in blocks]
+    joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *begun)
+    levels, ids = jax.device_put((levels, ids))
+    return Queue(levels, ids, jnp.int32(count), jnp.int32(updates), joined)
 
 
-@partial(jax.jit, static_argnames=("stream",))
-def _keys(level_ids: Int[Array, " slot"], stream: Stream, index) -> Key[Array, " slot"]:
-    return jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, stream), index))(level_ids)
-
-
-@partial(jax.jit, static_argnames="config")
-def _start(levels: Level, level_ids: Int[Array, " slot"], config: ExpertConfig) -> Slots:
-    size, network = levels.size, network_of(levels, config)
-    dynamic = len(dynamic_features(size))
-    fresh = lambda key: ppo.init(key, network, feature_count(size), dynamic, config)
-    experts = jax.vmap(fresh)(_keys(level_ids, Stream.EXPERT, 0))
-    world = task.reset(repeat(levels, config.environments))
-    return Slots(experts, world, progress.start(len(level_ids), config.environments))
-
-
-@partial(jax.jit, static_argnames=("config", "rules"))
-def _act(params, levels: Level, world: TaskState, keys, greedy, config: ExpertConfig, rules: TaskParams):
-    """One rollout of every slot. Training and evaluation share this program."""
-    network = network_of(levels, config)
-    return rollout(network, params, levels, world, keys, greedy, config.horizon, rules)
-
-
-@partial(jax.jit, static_argnames="config", donate_argnames="slots")
-def _learn(
-    slots: Slots,
-    levels: Level,
-    keys: Key[Array, " slot"],
-    experience: Experience,
-    last_value: Float[Array, "slot environment"],
-    config: ExpertConfig,
-) -> tuple[Slots, Float[Array, " slot"]]:
-    """One update of every slot."""
-    network, constant = network_of(levels, config), level_features(levels)
-    seen, share = progress.follow(slots.progress, experience.reward, experience.done, experience.goal)
-    advantage = ppo.advantages(experience.value, experience.reward, experience.done, last_value, config)
-    chance = experience.log_probability
-    batch = Batch(experience.moving, experience.action, chance, experience.value, advantage)
-    samples = jax.vmap(ppo.as_samples, in_axes=-2)(batch)
-
-    def learn(slot):
-        expert, key, constant, samples = slot
-        shuffling = jax.random.fold_in(key, config.horizon)  # the rollout used 0 .. horizon - 1
-        return ppo.update(expert, shuffling, network, constant, samples, config)
-
-    # one expert after another: an expert's minibatch stays in a core's cache
-    experts = jax.lax.map(learn, (slots.experts, keys, constant.T, samples))
-    return Slots(experts, slots.world, seen), share
-
-
-def judge(
-    levels: Level,
-    level_ids: Int[Array, " slot"],
-    slots: Slots,
-    curve: Float[np.ndarray, "update slot"],
-    config: ExpertConfig,
-    rules: TaskParams,
-    failed_by_noop: Bool[np.ndarray, " slot"],
-) -> tuple[list[Verdict], Int[np.ndarray, "256 6 slot"]]:
-    """Evaluate trained experts; verdicts, and the witnesses' actions (0 where there is none)."""
-    action, done, goal = evaluate(levels, level_ids, slots.experts.params, config, rules)
-    chosen, record = choose(levels, action, done, goal, rules)
-    witness = action[..., np.arange(len(chosen)), np.maximum(chosen, 0)]
-    totals = jax.device_get(slots.progress)
-    verdicts = []
-    for i, attempt in enumerate(chosen):
-        solved, first = attempt >= 0, int(totals.first_success[i])
-        ended = int(done[:, i].sum())
-        episodes = int(record.done[:, i].sum())
-        verdicts.append(
-            Verdict(
-                label=Label.SOLVED if solved else Label.UNSOLVED,
-                label_reason=solved_reason(attempt > 0, episodes)
-                if solved
-                else unsolved_reason(config.attempts, first != NEVER),
-                failed_by_noop=bool(failed_by_noop[i]),
-                success_rate=float(goal[:, i].sum() / ended) if ended else float("nan"),
-                steps_to_goal=int(steps_to_goal(record.done)[i]) if solved else None,
-                steps_to_first_success=None if first == NEVER else first,
-                env_steps=int(totals.env_steps),
-                learning_curve=curve[:, i].tolist(),
-                best_return=float(totals.best_return[i]),
-                episodes=int(totals.episodes[i]),
-            )
-        )
-    return verdicts, np.where(chosen >= 0, witness, 0)
-
-
-def evaluate(
-    levels: Level, level_ids: Int[Array, " slot"], params, config: ExpertConfig, rules: TaskParams
-) -> tuple[
-    Int[np.ndarray, "256 6 slot attempt"], Bool[np.ndarray, "256 slot attempt"], Bool[np.ndarray, "256 slot attempt"]
-]:
-    """Actions, ends and goals of every attempt at a record. Attempt 0 takes the most probable actions."""
-    shaped = replace(rules, dense_reward_scale=config.dense_reward_scale)  # the training's program
-    world = task.reset(repeat(levels, config.environments))
-    greedy = jnp.arange(config.environments) == 0
-    parts = []
-    for part in range(-(-RECORD_STEPS // config.horizon)):
-        keys = _keys(level_ids, Stream.EVALUATION, part)
-        world, seen, _ = _act(params, levels, world, keys, greedy, config, shaped)
-        parts.append(jax.device_get((seen.action, seen.done, seen.goal)))
-    action, done, goal = (np.concatenate(x)[:RECORD_STEPS, ..., : config.attempts] for x in zip(*parts, strict=True))
-    return action, done, goal
-
-
-def choose(levels: Level, action, done, goal, rules: TaskParams) -> tuple[Int[np.ndarray, " slot"], Record]:
-    """The first attempt of each level that succeeds, and does so again when its actions are replayed; -1: none."""
-    attempts = done.shape[-1]
-    promising = succeeds(done, goal)
-    while True:
-        chosen = np.where(promising.any(-1), promising.argmax(-1), -1)
-        index = np.arange(len(chosen)), np.maximum(chosen, 0)
-        record = replay(levels, action[..., *index], rules)
-        failed = (chosen >= 0) & ~succeeds(record.done, record.goal)
-        if not failed.any():
-            return chosen, record
-        promising &= ~(failed[:, None] & (np.arange(attempts) == chosen[:, None]))
+def evaluation_of(slots: Slots, slot: int, config: ExpertConfig) -> Evaluation:
+    """What the evaluation that has just ended in a slot showed."""
+    mine = jax.tree.map(
+        lambda x: x[slot], (slots.slot.trial, slots.slot.training.progress, slots.slot.training.success)
+    )
+    trial, progress, success = jax.device_get(mine)
+    record = slice(0, RECORD_STEPS)
+    done, goal = trial.done[record], trial.goal[record]
+    return Evaluation(trial.action[record].astype(np.int32), done, goal, progress, success)

@@ -23,7 +23,6 @@ from physics.pairs import pairs_of
 from physics.types import Manifold, State
 from physics.vector import select, unvec, vec
 
-RECORD_STEPS = 256
 LANES = 64
 
 T = TypeVar("T")

@@ -34,19 +34,19 @@ class Worker:
 
     def __init__(self, core: int | None) -> None:
         prepare_jax(core)
-        self._progress = 0, 0
+        self._progress = 0, 0.0, 0
 
     def attempt(self, job: JobConfig, split: Path, unit: WorkUnit) -> Outcome:
         from pipeline.unit import attempt  # imports what reads the settings made in __init__
 
-        def report(env_steps: int, solved: int) -> None:
-            self._progress = env_steps, solved
+        def report(env_steps: int, levels: float, solved: int) -> None:
+            self._progress = env_steps, levels, solved
 
-        self._progress = 0, 0
+        self._progress = 0, 0.0, 0
         return attempt(job, split, unit, report)
 
-    def progress(self) -> tuple[int, int]:
-        """Env steps and solved levels of the unit under way."""
+    def progress(self) -> tuple[int, float, int]:
+        """Env steps, levels and solved levels of the unit under way."""
         return self._progress
 
 

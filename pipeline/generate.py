@@ -7,7 +7,6 @@ from pathlib import Path
 from rich.console import Console
 
 from configs.schema import JobConfig
-from experts.train import updates_in
 from pipeline.errors import Exit, Failure
 from pipeline.layout import quarantine_path
 from pipeline.manifest import Manifest, read_manifest
@@ -35,8 +34,7 @@ def generate(job: JobConfig, overrides: list[str], console: Console) -> Exit:
         note_job(split, job, overrides)
         if queue.waiting:
             solved = _labels(manifest, job)["solved"]
-            per_level = updates_in(job.env_steps, job.expert) * job.expert.steps_per_update
-            board = Board(Tally(len(wanted), len(done), solved, per_level), console)
+            board = Board(Tally(len(wanted), len(done), solved), console)
             board.say(_opening(job, split, len(done)))
             try:
                 with board.shown():

@@ -17,8 +17,8 @@ def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Outcome], N
     with interruptible():
         while unit := queue.take():
 
-            def report(env_steps: int, solved: int, unit=unit) -> None:
-                board.tally.progress(unit, env_steps, solved)
+            def report(env_steps: int, levels: float, solved: int, unit=unit) -> None:
+                board.tally.progress(unit, env_steps, levels, solved)
                 board.refresh()
 
             board.refresh()

@@ -22,8 +22,7 @@ class Tally:
     levels: int  # wanted
     done: int  # committed, those of earlier runs included
     solved: int
-    budget: int  # env steps per level
-    running: dict[WorkUnit, tuple[int, int]] = field(default_factory=dict)  # env steps, solved
+    running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
     env_steps: int = 0  # of this run's committed units
     history: deque[tuple[float, int]] = field(default_factory=deque)  # time, env steps of this run
 
@@ -31,8 +30,8 @@ class Tally:
         self.at_start = self.share
         self.first = time.monotonic()
 
-    def progress(self, unit: WorkUnit, env_steps: int, solved: int) -> None:
-        self.running[unit] = env_steps, solved
+    def progress(self, unit: WorkUnit, env_steps: int, levels: float, solved: int) -> None:
+        self.running[unit] = env_steps, levels, solved
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
         """A unit was committed, or an attempt at it failed (`None`)."""
@@ -44,7 +43,7 @@ class Tally:
 
     def tick(self, now: float) -> None:
         """Note where the job is at time `now`, s. The clock starts with the first env step: compiling is no pace."""
-        steps = self.env_steps + sum(steps for steps, _ in self.running.values())
+        steps = self.env_steps + sum(steps for steps, _, _ in self.running.values())
         if not steps:  # nothing yet: the clock has not started
             self.first = now
             self.history.clear()
@@ -54,20 +53,17 @@ class Tally:
 
     @property
     def share(self) -> float:
-        """Of the whole job, 0 to 1; units under way count by their env steps."""
-        under_way = sum(min(steps / self.budget, len(unit.level_ids)) for unit, (steps, _) in self.running.items())
-        return min(1.0, (self.done + under_way) / self.levels)
+        """Of the whole job, 0 to 1; levels under way count by the part of their budget that they have had."""
+        return min(1.0, (self.done + sum(levels for _, levels, _ in self.running.values())) / self.levels)
 
     @property
     def trained(self) -> int:
-        """Levels whose experts have had their budget, committed or not."""
-        return self.done + sum(
-            min(steps // self.budget, len(unit.level_ids)) for unit, (steps, _) in self.running.items()
-        )
+        """Levels that are decided, committed or not."""
+        return self.done + int(sum(levels for _, levels, _ in self.running.values()))
 
     @property
     def solved_so_far(self) -> int:
-        return self.solved + sum(solved for _, solved in self.running.values())
+        return self.solved + sum(solved for _, _, solved in self.running.values())
 
     @property
     def rate(self) -> float:

@@ -43,7 +43,9 @@ class Summary:
 
     levels: int
     solved: int
-    env_steps: int
+    env_steps: int  # of training
+    evaluated: int  # env steps of evaluations
+    idle: int  # env steps in slots without a level
 
 
 @dataclass(frozen=True)

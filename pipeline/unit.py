@@ -30,7 +30,7 @@ from pipeline.schedule import Outcome, Summary, WorkUnit
 from pipeline.shard import write_shard
 from pipeline.stack import device, versions
 
-Report = Callable[[int, int], None]  # env steps done so far, levels solved so far
+Report = Callable[[int, float, int], None]  # so far: env steps, levels, solved levels
 # The disk refuses: the next attempt would train for nothing.
 FATAL = {
     errno.ENOSPC: "the disk is full: free some space",
@@ -63,11 +63,11 @@ def run_unit(job: JobConfig, split: Path, unit: WorkUnit, report: Report) -> Sum
     """
     ids = np.asarray(unit.level_ids, np.int32)
     levels = sample_levels(jnp.asarray(ids), SIZES[job.size], job.distribution)
-    result = train_levels(levels, ids, job.env_steps, job.expert, job.task, report)
+    result = train_levels(levels, ids, job.env_steps, job.expert, job.stop, job.task, report)
     check_witnesses(result, job.task)
     commit(job, split, unit, result)
     labels = [verdict.label for verdict in result.verdicts]
-    return Summary(len(labels), labels.count(Label.SOLVED), sum(verdict.env_steps for verdict in result.verdicts))
+    return Summary(len(labels), labels.count(Label.SOLVED), *result.spent)
 
 
 def check_witnesses(result: UnitResult, task: TaskParams) -> None:

@@ -14,6 +14,7 @@ from levelgen.level import SIZES
 from levelgen.observe import dynamic_features, feature_count
 
 SIZE = SIZES["s"]
+ALL = jnp.ones((len(CHOICES), 1), bool)
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +60,21 @@ def test_gradient_reaches_kernels_of_constant_features(network) -> None:
 def test_probabilities_of_all_actions_sum_to_one() -> None:
     logits = jax.random.normal(jax.random.key(1), (sum(CHOICES), 1)) * 3
     actions = np.array(list(itertools.product(*map(range, CHOICES)))).T
-    chances = policy.log_probability(jnp.repeat(logits, actions.shape[1], axis=1), jnp.asarray(actions))
+    many = jnp.repeat(logits, actions.shape[1], axis=1)
+    chances = policy.log_probability(many, jnp.asarray(actions), ALL)
     assert float(jnp.exp(chances).sum()) == pytest.approx(1, abs=1e-5)
-    assert float(policy.entropy(logits)[0]) == pytest.approx(float(-(jnp.exp(chances) * chances).sum()), abs=1e-4)
+    assert float(policy.entropy(logits, ALL)[0]) == pytest.approx(float(-(jnp.exp(chances) * chances).sum()), abs=1e-4)
+
+
+def test_entries_that_nothing_obeys_do_not_count() -> None:
+    logits = jax.random.normal(jax.random.key(4), (sum(CHOICES), 2))
+    live = jnp.array([False, True, False, False, False, True])[:, None]
+    alone = jax.nn.log_softmax(logits[3:6], axis=0)[2] + jax.nn.log_softmax(logits[14:16], axis=0)[1]
+    for others in (0, 1):
+        action = jnp.full((6, 2), others).at[1].set(2).at[5].set(1)
+        np.testing.assert_allclose(policy.log_probability(logits, action, live), alone, rtol=1e-6)
+    dead = jnp.zeros((6, 1), bool)
+    np.testing.assert_array_equal(policy.entropy(logits, dead), 0)
 
 
 def test_samples_follow_the_probabilities() -> None:

@@ -8,7 +8,7 @@ import pytest
 from experts import ppo
 from experts.config import ExpertConfig
 from experts.policy import ActorCritic, forward, log_probability, sample
-from experts.ppo import Batch
+from experts.ppo import Batch, Seen
 from levelgen.actions import CHOICES
 from levelgen.level import SIZES
 from levelgen.observe import dynamic_features, feature_count
@@ -45,20 +45,20 @@ def test_samples_keep_every_number_at_its_place() -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_learns_a_bandit(seed: int) -> None:
     """One action entry pays when it is 2: after a few updates it is chosen nearly always."""
-    config = ExpertConfig(environments=16, horizon=16, learning_rate=3e-3)
+    config = ExpertConfig(environments=32, horizon=8, learning_rate=3e-3)
     network, samples = ActorCritic(SIZE, 16, 2), config.steps_per_update
     expert = ppo.init(jax.random.key(seed), network, FEATURES, DYNAMIC, config)
-    constant, moving = jnp.zeros(FEATURES), jnp.ones((DYNAMIC, samples))
+    seen, moving = Seen(jnp.zeros(FEATURES), jnp.ones(len(CHOICES), bool)), jnp.ones((DYNAMIC, samples))
 
     @jax.jit
     def learn(expert, key):
-        logits, value = forward(network, expert.params, constant, moving)
+        logits, value = forward(network, expert.params, seen.constant, moving)
         action = sample(logits, jax.random.uniform(key, (len(CHOICES), samples)))
         reward = (action[1] == 2).astype(jnp.float32)
-        chance = log_probability(logits, action)
+        chance = log_probability(logits, action, seen.live[:, None])
         batch = Batch(moving[None], action[None], chance[None], value[None], (reward - value)[None])
         rows = ppo.as_samples(batch)
-        return ppo.update(expert, jax.random.fold_in(key, 1), network, constant, rows, config), reward.mean()
+        return ppo.update(expert, jax.random.fold_in(key, 1), network, seen, rows, config), reward.mean()
 
     rewards = []
     for key in jax.random.split(jax.random.key(seed), 40):

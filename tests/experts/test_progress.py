@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from experts import progress
 
-STEPS, LEVELS, ENVIRONMENTS = 6, 2, 3
+STEPS, ENVIRONMENTS = 6, 3
 follow = jax.jit(progress.follow)
 
 
@@ -15,32 +15,30 @@ follow = jax.jit(progress.follow)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0, 1))
 def test_totals(seed: int, p_done: float, p_goal: float) -> None:
     rng, rollouts = np.random.default_rng(seed), 3
-    shape = (rollouts, STEPS, LEVELS, ENVIRONMENTS)
+    shape = (rollouts, STEPS, ENVIRONMENTS)
     reward = rng.integers(-2, 3, shape).astype(np.float32)
     done = rng.random(shape) < p_done
     goal = done & (rng.random(shape) < p_goal)
+    own = np.array([True, True, rng.random() < 0.5])
 
-    totals, shares = progress.start(LEVELS, ENVIRONMENTS), []
+    totals, shares = progress.start(ENVIRONMENTS), []
     for r in range(rollouts):
-        totals, share = follow(totals, reward[r], done[r], goal[r])
+        totals, share = follow(totals, reward[r], done[r], goal[r], own)
         shares.append(share)
 
-    long = lambda x: x.reshape(-1, LEVELS, ENVIRONMENTS)
-    for level in range(LEVELS):
-        returns = []
-        for e in range(ENVIRONMENTS):
-            running = 0.0
-            for r, d in zip(long(reward)[:, level, e], long(done)[:, level, e], strict=True):
-                running += r
-                if d:
-                    returns.append(running)
-                    running = 0.0
-        hits = np.flatnonzero(long(goal)[:, level].any(-1))
-        first = (hits[0] + 1) * ENVIRONMENTS if len(hits) else progress.NEVER
-        assert totals.episodes[level] == len(returns)
-        assert totals.best_return[level] == max(returns, default=-np.inf)
-        assert totals.first_success[level] == first
-        ended, reached = done[:, :, level].sum((1, 2)), goal[:, :, level].sum((1, 2))
-        expected = np.where(ended > 0, reached / np.maximum(ended, 1), np.nan)
-        np.testing.assert_allclose([s[level] for s in shares], expected, rtol=1e-6)
+    long = lambda x: x.reshape(-1, ENVIRONMENTS)
+    returns = []
+    for e in range(ENVIRONMENTS):
+        running = 0.0
+        for r, d in zip(long(reward)[:, e], long(done)[:, e], strict=True):
+            running += r
+            if d:
+                returns.append(running)
+                running = 0.0
+    hits = np.flatnonzero(long(goal).any(-1))
+    assert totals.episodes == len(returns)
+    assert totals.best_return == max(returns, default=-np.inf)
+    assert totals.first_success == ((hits[0] + 1) * ENVIRONMENTS if len(hits) else progress.NEVER)
+    ended, reached = (done & own).sum((1, 2)), (goal & own).sum((1, 2))
+    np.testing.assert_allclose(shares, np.where(ended > 0, reached / np.maximum(ended, 1), np.nan), rtol=1e-6)
     assert totals.env_steps == rollouts * STEPS * ENVIRONMENTS

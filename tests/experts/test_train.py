@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.config import ExpertConfig
+from experts.config import ExpertConfig, Rule, StopConfig
 from experts.labels import Label
 from experts.train import UnitResult, train_levels, updates_in
 from experts.witness import LANES, RECORD_STEPS, replay, steps_to_goal, succeeds
@@ -14,7 +14,8 @@ from levelgen.level import SIZES, Level
 from levelgen.sampler import sample_levels
 
 IDS = np.array([0, 2, 3, 4, 6, 7])  # levels that need an expert
-CONFIG = ExpertConfig(environments=16, horizon=64, width=32, attempts=4, slots=4)
+CONFIG = ExpertConfig(environments=16, horizon=64, width=32, attempts=4, sticky_attempts=4, moved_attempts=4, slots=4)
+WHOLE = StopConfig(rule=Rule.BUDGET)
 BUDGET = 20_000  # 19 updates
 
 
@@ -24,13 +25,13 @@ def levels() -> Level:
 
 
 @pytest.fixture(scope="module")
-def reports() -> list[tuple[int, int]]:
+def reports() -> list[tuple[int, float, int]]:
     return []
 
 
 @pytest.fixture(scope="module")
 def result(levels: Level, reports) -> UnitResult:
-    return train_levels(levels, IDS, BUDGET, CONFIG, report=lambda *now: reports.append(now))
+    return train_levels(levels, IDS, BUDGET, CONFIG, WHOLE, report=lambda *now: reports.append(now))
 
 
 def same(a, b) -> None:
@@ -64,16 +65,18 @@ def test_a_solved_level_has_a_witness_and_no_other_has(levels: Level, result: Un
 
 def test_a_result_depends_on_the_level_alone(levels: Level, result: UnitResult) -> None:
     at = [4, 1, 2]
-    some = train_levels(jax.tree.map(lambda x: x[..., at], levels), IDS[at], BUDGET, CONFIG)
+    some = train_levels(jax.tree.map(lambda x: x[..., at], levels), IDS[at], BUDGET, CONFIG, WHOLE)
     for i, verdict in zip(at, some.verdicts, strict=True):
         np.testing.assert_equal(vars(verdict), vars(result.verdicts[i]))
     same(some.record, jax.tree.map(lambda x: x[..., at], result.record))
 
 
-def test_progress_is_reported(reports: list[tuple[int, int]], result: UnitResult) -> None:
-    steps = [step for step, _ in reports]
-    assert steps == sorted(steps)
-    assert steps[-1] == len(IDS) * 19 * 1024
+def test_progress_is_reported(reports: list[tuple[int, float, int]], result: UnitResult) -> None:
+    for totals in zip(*reports, strict=True):
+        assert list(totals) == sorted(totals)
+    solved = sum(v.label is Label.SOLVED for v in result.verdicts)
+    assert reports[-1] == (len(IDS) * 19 * 1024, len(IDS), solved)
+    assert result.spent.trained == reports[-1][0]
 
 
 def test_replay_is_the_same_at_every_count(levels: Level) -> None:
@@ -115,7 +118,8 @@ def test_a_budget_below_one_update_is_refused() -> None:
     [
         ({"width": 0}, "width is 0"),
         ({"minibatches": 3}, "must divide"),
-        ({"attempts": 64}, "attempts is 64"),
+        ({"attempts": 64}, "are 80 together"),
+        ({"rehearsals": 33}, "rehearsals is 33"),
         ({"clip": 2.0}, "clip is 2.0"),
     ],
 )

@@ -13,8 +13,8 @@ import numpy as np
 
 from configs.compose import compose_job
 from configs.schema import JobConfig
-from experts.labels import Label, Verdict
-from experts.train import UnitResult
+from experts.labels import Label, Source, Verdict
+from experts.train import Spent, UnitResult
 from experts.witness import Record, replay, succeeds
 from levelgen.level import ACTIONS, SIZES, Level
 from levelgen.sampler import sample_levels
@@ -26,6 +26,7 @@ from pipeline.schema import RECORD_STEPS
 from pipeline.unit import commit
 
 PLAYED = 64  # levels of `played_split`
+SPENT = Spent(0, 0, 0)
 
 
 def made(kind: type, size: Size, count: int, rng: np.random.Generator, *, time: bool = False) -> Any:
@@ -70,7 +71,11 @@ def made_verdict(label: Label = Label.SOLVED, **changes: Any) -> Verdict:
         label=label,
         label_reason="made for a test",
         failed_by_noop=False,
+        witness=Source.SAMPLED if solved else None,
         success_rate=1.0 if solved else float("nan"),
+        most_probable_succeeds=False,
+        sticky_success_rate=0.5 if solved else float("nan"),
+        moved_success_rate=0.75 if solved else float("nan"),
         steps_to_goal=17 if solved else None,
         steps_to_first_success=640 if solved else None,
         env_steps=4096,
@@ -85,7 +90,7 @@ def made_result(level_ids: list[int], labels: list[Label], size: str = "s") -> U
     """Random bits, not a solution: for what writes and reads, not for what replays."""
     count = len(level_ids)
     verdicts = [made_verdict(label) for label in labels]
-    return UnitResult(np.array(level_ids), made_level(size, count), made_record(size, count), verdicts)
+    return UnitResult(np.array(level_ids), made_level(size, count), made_record(size, count), verdicts, SPENT)
 
 
 def made_job(out: str = "data", *overrides: str) -> JobConfig:
@@ -105,5 +110,10 @@ def played_split(folder: Path) -> Path:
     verdicts = [made_verdict(Label.SOLVED if good else Label.UNSOLVED) for good in solved]
     path = split_path(job.out, job.budget, job.size)
     path.mkdir(parents=True)
-    commit(job, path, WorkUnit(tuple(int(i) for i in ids)), UnitResult(ids.astype(np.int64), levels, record, verdicts))
+    commit(
+        job,
+        path,
+        WorkUnit(tuple(int(i) for i in ids)),
+        UnitResult(ids.astype(np.int64), levels, record, verdicts, SPENT),
+    )
     return path

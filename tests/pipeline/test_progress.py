@@ -12,24 +12,24 @@ UNIT = WorkUnit(tuple(range(16)))
 
 
 def tally(done: int = 0) -> Tally:
-    return Tally(levels=64, done=done, solved=done // 2, budget=1000)
+    return Tally(levels=64, done=done, solved=done // 2)
 
 
-def test_the_share_grows_with_env_steps_and_never_beyond_the_unit() -> None:
+def test_the_share_grows_with_the_levels() -> None:
     now = tally()
     assert now.share == 0
-    now.progress(UNIT, 8_000, 3)
-    assert now.share == pytest.approx(8 / 64)
-    assert now.solved_so_far == 3
-    now.progress(UNIT, 999_999, 3)
+    now.progress(UNIT, 8_000, 7.5, 3)
+    assert now.share == pytest.approx(7.5 / 64)
+    assert (now.trained, now.solved_so_far) == (7, 3)
+    now.progress(UNIT, 9_000, 16, 3)
     assert now.share == pytest.approx(16 / 64)
-    now.ended(UNIT, Summary(levels=16, solved=5, env_steps=16_000))
+    now.ended(UNIT, Summary(levels=16, solved=5, env_steps=16_000, evaluated=0, idle=0))
     assert (now.share, now.done, now.solved_so_far) == (pytest.approx(16 / 64), 16, 5)
 
 
 def test_a_failed_attempt_takes_its_progress_back() -> None:
     now = tally()
-    now.progress(UNIT, 8_000, 3)
+    now.progress(UNIT, 8_000, 8.0, 3)
     now.ended(UNIT, None)
     assert (now.share, now.solved_so_far) == (0, 0)
 
@@ -40,7 +40,7 @@ def test_rate_and_time_left_do_not_count_the_compiling() -> None:
         now.tick(float(second))
         assert "compiling" in now.text(second)
     for second in range(100, 110):
-        now.progress(UNIT, (second - 99) * 800, 0)  # 0.8 levels of 1000 env steps a second
+        now.progress(UNIT, (second - 99) * 800, (second - 99) * 0.8, 0)
         now.tick(float(second))
     assert now.rate == pytest.approx(800)
     left = now.left(109.0)
@@ -61,7 +61,7 @@ def test_lines_where_there_is_no_terminal() -> None:
     with board.shown():
         board.refresh()
         board.refresh()
-        board.ended(UNIT, Summary(16, 5, 16_000))
+        board.ended(UNIT, Summary(16, 5, 16_000, 0, 0))
     lines = text.getvalue().splitlines()
     assert len(lines) == 2  # not one for every refresh
     assert "16/64 levels · 5 solved" in lines[1]
@@ -71,20 +71,10 @@ def test_a_bar_on_a_terminal() -> None:
     text = io.StringIO()
     board = Board(tally(), Console(file=text, force_terminal=True, width=160))
     with board.shown():
-        board.ended(UNIT, Summary(16, 5, 16_000))
+        board.ended(UNIT, Summary(16, 5, 16_000, 0, 0))
     assert "16/64 levels · 5 solved" in text.getvalue()
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (89, "89 s"), (90, "2 min"), (5400, "1.5 h")])
 def test_durations(seconds: float, text: str) -> None:
     assert duration(seconds) == text
-
-
-def test_levels_count_when_their_experts_are_trained() -> None:
-    now = tally(done=16)
-    now.progress(UNIT, 3_999, 1)
-    assert now.trained == 16 + 3
-    now.tick(0.0)
-    assert now.text(0.0).startswith("19/64 levels")
-    now.progress(UNIT, 999_999, 1)
-    assert now.trained == 32

@@ -1,0 +1,146 @@
+"""From what training and evaluation showed of a level to its witness and its verdict."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from experts.config import RECORD_STEPS, Choice, ExpertConfig
+from experts.labels import Label, Source, Verdict, solved_reason, unsolved_reason
+from experts.progress import NEVER, Progress
+from experts.success import Success
+from experts.witness import replay, steps_to_goal, succeeds
+from levelgen.actions import CHOICES
+from levelgen.level import Level
+from levelgen.task import TaskParams
+
+
+class Evaluation(NamedTuple):
+    """One evaluation, on the host; environments in the order of `experts.slots._manner`."""
+
+    action: Int[np.ndarray, "256 6 attempt"]
+    done: Bool[np.ndarray, "256 environment"]
+    goal: Bool[np.ndarray, "256 environment"]
+    progress: Progress  # of training until then
+    success: Success  # the first of training
+
+
+class Trained(NamedTuple):
+    """A level that has left its slot."""
+
+    curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
+    evaluations: list[Evaluation]  # those that solved it, and the last
+
+
+class Witness(NamedTuple):
+    """Actions that reach the goal."""
+
+    action: Int[np.ndarray, "256 6"]
+    source: Source
+    steps: int  # of the first episode
+
+
+def judge(
+    levels: Level,
+    trained: Sequence[Trained],
+    config: ExpertConfig,
+    rules: TaskParams,
+    failed_by_noop: Bool[np.ndarray, " level"],
+) -> tuple[list[Verdict], Int[np.ndarray, "256 6 level"]]:
+    """Verdicts, and the witnesses' actions (0 where there is none). A witness counts only if it replays."""
+    best = [witness_of(of.evaluations, config) for of in trained]
+    actions = np.zeros((RECORD_STEPS, len(CHOICES), len(trained)), np.int32)
+    for i, witness in enumerate(best):
+        if witness is not None:
+            actions[..., i] = witness.action
+    record = replay(levels, actions, rules)
+    replays, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
+    verdicts = []
+    for i, (of, witness) in enumerate(zip(trained, best, strict=True)):
+        if witness is not None and not (replays[i] and steps[i] == witness.steps):
+            witness, actions[..., i] = None, 0
+        verdicts.append(verdict_of(of, witness, int(record.done[:, i].sum()), config, bool(failed_by_noop[i])))
+    return verdicts, actions
+
+
+def witness_of(evaluations: Sequence[Evaluation], config: ExpertConfig) -> Witness | None:
+    """The best witness there is: of any evaluation, the one with the shortest way to the goal."""
+    found = [witness for e in evaluations for witness in witnesses_in(e, config)]
+    if not found and config.exploration and evaluations[-1].success.length:
+        action, steps = np.asarray(evaluations[-1].success.action), int(evaluations[-1].success.length)
+        found = [Witness(repeated(action, steps), Source.EXPLORATION, steps)]
+    return min(found, key=lambda witness: witness.steps, default=None)
+
+
+def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
+    """One witness of an evaluation, or none."""
+    attempts = evaluation.action.shape[-1]
+    done, goal = evaluation.done[:, :attempts], evaluation.goal[:, :attempts]
+    source = lambda attempt: Source.SAMPLED if attempt else Source.MOST_PROBABLE
+    if config.witness == Choice.RECORD:
+        usable = np.flatnonzero(succeeds(done, goal))[:1]
+        return [Witness(evaluation.action[..., i], source(i), int(steps_to_goal(done)[i])) for i in usable]
+    episodes = [(end - start, attempt, start) for attempt in range(attempts)
+                for start, end in successful_episodes(done[:, attempt], goal[:, attempt])]  # fmt: skip
+    if not episodes:
+        return []
+    steps, attempt, start = min(episodes)
+    action = evaluation.action[start : start + steps, :, attempt]
+    return [Witness(repeated(action, steps), source(attempt), steps)]
+
+
+def successful_episodes(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:
+    """First step and the step after the last of every episode that reached the goal."""
+    ends = np.flatnonzero(done) + 1
+    return [(int(start), int(end)) for start, end in pairwise([0, *ends]) if goal[end - 1]]
+
+
+def repeated(action: Int[np.ndarray, "time 6"], steps: int) -> Int[np.ndarray, "256 6"]:
+    """An episode's actions again and again: the world starts anew after each, so each reaches the goal."""
+    return np.asarray(action, np.int32)[np.arange(RECORD_STEPS) % steps]
+
+
+def verdict_of(
+    trained: Trained, witness: Witness | None, episodes: int, config: ExpertConfig, failed_by_noop: bool
+) -> Verdict:
+    last = trained.evaluations[-1]
+    attempts, sticky, moved = shares(last, config)
+    first = int(last.progress.first_success)
+    if witness is not None:
+        reason = solved_reason(witness.source, episodes)
+    else:
+        reason = unsolved_reason(config.attempts, first != NEVER)
+    return Verdict(
+        label=Label.UNSOLVED if witness is None else Label.SOLVED,
+        label_reason=reason,
+        failed_by_noop=failed_by_noop,
+        witness=None if witness is None else witness.source,
+        success_rate=attempts,
+        most_probable_succeeds=bool(succeeds(last.done[:, 0], last.goal[:, 0])),
+        sticky_success_rate=sticky,
+        moved_success_rate=moved,
+        steps_to_goal=None if witness is None else witness.steps,
+        steps_to_first_success=None if first == NEVER else first,
+        env_steps=int(last.progress.env_steps),
+        learning_curve=trained.curve,
+        best_return=float(last.progress.best_return),
+        episodes=int(last.progress.episodes),
+    )
+
+
+def shares(evaluation: Evaluation, config: ExpertConfig) -> tuple[float, float, float]:
+    """Success rates of the sampled attempts' episodes, and of the first episodes of sticky and of moved attempts.
+
+    Only a first episode starts with other velocities. NaN: no episode ended, or there are no such attempts.
+    """
+    done, goal = evaluation.done, evaluation.goal
+    sampled = slice(1 if config.attempts > 1 else 0, config.attempts)
+    ended = int(done[:, sampled].sum())
+    rate = float(goal[:, sampled].sum() / ended) if ended else float("nan")
+    first = np.where(done.any(0), goal[np.argmax(done, 0), np.arange(done.shape[1])], False)
+    sticky = first[config.attempts : config.attempts + config.sticky_attempts]
+    moved = first[config.attempts + config.sticky_attempts :][: config.moved_attempts]
+    mean = lambda x: float(x.mean()) if len(x) else float("nan")
+    return rate, mean(sticky), mean(moved)

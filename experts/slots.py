@@ -1,0 +1,365 @@
+"""Continuous batching: a fixed number of slots, each with an expert in training or under evaluation.
+
+One compiled program, `advance`, takes every slot a rollout further. A level that is decided leaves its slot, and the
+next of the queue takes its place, on the device. What becomes of a level depends on the level, its id and the
+configuration alone: not on its slot, its neighbours or when it came.
+
+An evaluation interrupts the training of its slot and leaves no trace in it.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from enum import IntEnum
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from experts import ppo, progress, stop
+from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
+from experts.policy import ActorCritic
+from experts.ppo import Batch, Expert, Seen
+from experts.progress import Progress
+from experts.rollout import Acting, Experience, Manner, repeat, rollout, start
+from experts.stop import Course
+from experts.success import Success, find, no_success, remember
+from levelgen.actions import CHOICES, action_mask
+from levelgen.identity import Stream, key_for
+from levelgen.level import Level
+from levelgen.observe import dynamic_features, feature_count, level_features
+from levelgen.task import TaskParams
+
+STICKINESS = 0.25  # of sticky attempts (Machado et al. 2018, arXiv:1709.06009)
+MOVED = 0.1  # m/s and rad/s, the most by which velocities of moved attempts differ from the level's
+
+
+class Mode(IntEnum):
+    EMPTY = 0
+    TRAIN = 1
+    EVALUATE = 2
+
+
+class Training(NamedTuple):
+    """An expert and what its training has shown."""
+
+    expert: Expert
+    progress: Progress
+    course: Course
+    success: Success  # the first
+    recent: Int[Array, "time 6 environment"]  # the last actions, enough for an episode that ends in the next rollout
+
+
+class Begun(NamedTuple):
+    """All that decides how training goes on."""
+
+    training: Training
+    acting: Acting  # [..., environment]
+
+
+class Trial(NamedTuple):
+    """An evaluation: every environment rolls out a record."""
+
+    part: Int[Array, ""]  # rollouts of it that are done
+    final: Bool[Array, ""]  # the level leaves afterwards
+    action: Int[Array, "time 6 attempt"]
+    done: Bool[Array, "time environment"]
+    goal: Bool[Array, "time environment"]
+
+
+class Slot(NamedTuple):
+    """One place. In `Slots` every array has the slots first."""
+
+    mode: Int[Array, ""]
+    place: Int[Array, ""]  # of the level in the queue
+    deadline: Int[Array, ""]  # updates after which the last evaluation comes
+    training: Training
+    trial: Trial
+
+
+class Slots(NamedTuple):
+    """All of them."""
+
+    slot: Slot
+    acting: Acting  # of training; lanes, slot by slot
+    trial: Acting  # of evaluation
+    taken: Int[Array, ""]  # levels that have left the queue
+
+
+class Queue(NamedTuple):
+    """Levels that wait, in order."""
+
+    levels: Level  # [..., level]
+    level_ids: Int[Array, " level"]
+    count: Int[Array, ""]  # the rest fills up
+    updates: Int[Array, ""]  # that an expert may use
+    begun: Begun  # where their experts go on, level axis first
+
+
+class Report(NamedTuple):
+    """What one call of `advance` did in each slot."""
+
+    place: Int[Array, " slot"]  # of the level in the queue
+    mode: Int[Array, " slot"]  # while it did
+    share: Float[Array, " slot"]  # of a trained slot's finished episodes that reached the goal
+    evaluated: Bool[Array, " slot"]  # an evaluation ended that solved the level, or after which it left
+    left: Bool[Array, " slot"]
+
+
+def network_of(levels: Level, config: ExpertConfig) -> ActorCritic:
+    return ActorCritic(levels.size, config.width, config.depth)
+
+
+def over_slots(function: Callable, *slots: Any) -> Any:
+    """One slot after another on a CPU: its minibatch stays in a core's cache, and `cond` skips what it can."""
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda xs: function(*xs), slots)
+    return jax.vmap(function)(*slots)
+
+
+@partial(jax.jit, static_argnames="config")
+def begin(levels: Level, level_ids: Int[Array, " level"], config: ExpertConfig) -> Begun:
+    """Experts that have seen nothing, level axis first."""
+    size, network, lanes = levels.size, network_of(levels, config), config.environments
+
+    def training(level_id) -> Training:
+        key = jax.random.fold_in(key_for(level_id, Stream.EXPERT), 0)
+        expert = ppo.init(key, network, feature_count(size), len(dynamic_features(size)), config)
+        recent = jnp.zeros((RECORD_STEPS, len(CHOICES), lanes), jnp.int8)
+        return Training(expert, progress.start(lanes), stop.begin(), no_success(), recent)
+
+    return Begun(jax.vmap(training)(level_ids), _by_slot(start(repeat(levels, lanes)), lanes))
+
+
+@partial(jax.jit, static_argnames=("count", "config"))
+def empty_slots(count: int, queue: Queue, config: ExpertConfig) -> Slots:
+    """Slots without levels."""
+    blank = lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype)
+    training, acting = jax.tree.map(blank, queue.begun)
+    rows, zeros = config.record_rollouts * config.horizon, jnp.zeros(count, jnp.int32)
+    trial = Trial(
+        zeros,
+        zeros.astype(bool),
+        jnp.zeros((count, rows, len(CHOICES), config.attempts), jnp.int8),
+        *jnp.zeros((2, count, rows, config.environments), bool),
+    )
+    acting = _lanes(acting)
+    return Slots(Slot(zeros, zeros, zeros, training, trial), acting, acting, jnp.int32(0))
+
+
+@partial(jax.jit, static_argnames=("config", "stopping", "rules"), donate_argnames="slots")
+def advance(
+    slots: Slots, queue: Queue, config: ExpertConfig, stopping: StopConfig, rules: TaskParams
+) -> tuple[Slots, Report]:
+    """A rollout in every slot, and what follows from it: an update, a part of an evaluation, another level.
+
+    Args:
+        slots: used up.
+        queue: the levels that wait.
+        config: what an expert is.
+        stopping: when a level leaves.
+        rules: of the task; their reward trains.
+    """
+    slots = refill(slots, queue, config)
+    slot = slots.slot
+    levels = jax.tree.map(lambda x: x[..., slot.place], queue.levels)
+    keys = jax.vmap(_key)(queue.level_ids[slot.place], slot)
+    lanes = repeat(levels, config.environments)
+    evaluating = slot.mode == Mode.EVALUATE
+
+    trains = repeat(~evaluating, config.environments)
+    fresh = repeat(slot.trial.part == 0, config.environments)
+    trial = _where(fresh, _moved_start(lanes, keys, config), slots.trial)
+    acting = _where(trains, slots.acting, trial)
+
+    network = network_of(levels, config)
+    manner = _manner(slot, evaluating, config)
+    acting, experience, last_value = rollout(
+        network, slot.training.expert.params, levels, acting, keys, manner, config.horizon, rules
+    )
+    now = _split(levels, keys, experience, last_value, manner, config)
+    slot, share, mode = over_slots(partial(_follow, network=network, config=config, stopping=stopping), slot, now)
+    left = (slot.mode == Mode.EMPTY) & (mode == Mode.EVALUATE)
+    ended = (mode == Mode.EVALUATE) & (slot.trial.part == config.record_rollouts)
+    evaluated = ended & (left | stop.solves(slot.trial.done, slot.trial.goal, stopping, config))
+    after = Slots(slot, _where(trains, acting, slots.acting), acting, slots.taken)
+    return after, Report(slot.place, mode, share, evaluated, left)
+
+
+def refill(slots: Slots, queue: Queue, config: ExpertConfig) -> Slots:
+    """Slots that are empty take the next levels of the queue."""
+    free = slots.slot.mode == Mode.EMPTY
+    place = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
+    takes = free & (place < queue.count)
+
+    def fill() -> tuple[Slot, Acting]:
+        begun = jax.tree.map(lambda x: x[place], queue.begun)
+        choose = lambda new, old: jnp.where(takes.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+        put = lambda new, old: jax.tree.map(choose, new, old)
+        slot = slots.slot._replace(
+            mode=put(jnp.full_like(place, Mode.TRAIN), slots.slot.mode),
+            place=put(place, slots.slot.place),
+            deadline=put(jnp.full_like(place, queue.updates), slots.slot.deadline),
+            training=put(begun.training, slots.slot.training),
+        )
+        return slot, _where(repeat(takes, config.environments), _lanes(begun.acting), slots.acting)
+
+    slot, acting = jax.lax.cond(takes.any(), fill, lambda: (slots.slot, slots.acting))
+    return Slots(slot, acting, slots.trial, slots.taken + takes.sum(dtype=jnp.int32))
+
+
+class _Now(NamedTuple):
+    """What one slot's rollout gave."""
+
+    seen: Seen
+    key: Key[Array, ""]
+    samples: Float[Array, "sample column"]
+    action: Int[Array, "time 6 environment"]
+    reward: Float[Array, "time environment"]
+    done: Bool[Array, "time environment"]
+    goal: Bool[Array, "time environment"]
+    timestep: Int[Array, "time environment"]
+    rehearsing: Bool[Array, " environment"]
+
+
+def _split(
+    levels: Level,
+    keys: Key[Array, " slot"],
+    experience: Experience,
+    last_value: Float[Array, "slot environment"],
+    manner: Manner,
+    config: ExpertConfig,
+) -> _Now:
+    """By slot, slots first."""
+    seen = experience
+    advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
+    batch = Batch(seen.moving, seen.action, seen.log_probability, seen.value, advantage)
+    samples = jax.vmap(ppo.as_samples, in_axes=-2)(batch)
+    by_slot = lambda x: jnp.moveaxis(x, -2, 0)
+    return _Now(
+        Seen(level_features(levels).T, action_mask(levels).T),
+        keys,
+        samples,
+        by_slot(seen.action.astype(jnp.int8)),
+        by_slot(seen.reward),
+        by_slot(seen.done),
+        by_slot(seen.goal),
+        by_slot(seen.timestep),
+        manner.rehearsing.reshape(-1, config.environments),
+    )
+
+
+def _follow(
+    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopConfig
+) -> tuple[Slot, Float[Array, ""], Int[Array, ""]]:
+    """What follows from a slot's rollout; also the share of successes, and the mode it was in."""
+    nothing = jnp.float32(jnp.nan)
+    branches = (
+        lambda: (slot, nothing),
+        lambda: _learn(slot, now, network, config, stopping),
+        lambda: (_collect(slot, now, config, stopping), nothing),
+    )
+    after, share = jax.lax.switch(slot.mode, branches)
+    return after, share, slot.mode
+
+
+def _learn(
+    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopConfig
+) -> tuple[Slot, Float[Array, ""]]:
+    """One update, and whether an evaluation comes next."""
+    training = slot.training
+    totals, share = progress.follow(training.progress, now.reward, now.done, now.goal, ~now.rehearsing)
+    recent = jnp.concatenate([training.recent, now.action])
+    success = remember(training.success, find(recent, now.goal, now.timestep))
+    shuffling = jax.random.fold_in(now.key, config.horizon)  # the rollout used 0 .. horizon - 1
+    expert = ppo.update(training.expert, shuffling, network, now.seen, now.samples, config)
+    course, evaluate, final = stop.after_update(training.course, totals, share, slot.deadline, config, stopping)
+    training = Training(expert, totals, course, success, recent[config.horizon :])
+    trial = slot.trial._replace(part=jnp.int32(0), final=final)
+    return slot._replace(mode=jnp.where(evaluate, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share
+
+
+def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) -> Slot:
+    """A part of an evaluation; after the last, whether the level leaves."""
+    first = slot.trial.part * config.horizon
+    put = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, first, 0)
+    trial = Trial(
+        slot.trial.part + 1,
+        slot.trial.final,
+        put(slot.trial.action, now.action[..., : config.attempts]),
+        put(slot.trial.done, now.done),
+        put(slot.trial.goal, now.goal),
+    )
+    hopeless = ~trial.final & stop.fails(now.done, now.goal, stopping, config)
+    ended = (trial.part == config.record_rollouts) | hopeless
+    solved = ~hopeless & stop.solves(trial.done, trial.goal, stopping, config)
+    course, leaves, deadline = stop.after_evaluation(
+        slot.training.course, solved, trial.final, slot.deadline, config, stopping
+    )
+    keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, old)
+    mode = jnp.where(leaves, Mode.EMPTY, Mode.TRAIN)
+    training = slot.training._replace(course=keep(course, slot.training.course))
+    return Slot(keep(mode, slot.mode), slot.place, keep(deadline, slot.deadline), training, trial)
+
+
+def _key(level_id: Int[Array, ""], slot: Slot) -> Key[Array, ""]:
+    """The key of a slot's next rollout."""
+    update = slot.training.course.updates
+    learning = jax.random.fold_in(key_for(level_id, Stream.EXPERT), update + 1)
+    evaluation = jax.random.fold_in(jax.random.fold_in(key_for(level_id, Stream.EVALUATION), update), slot.trial.part)
+    return jnp.where(slot.mode == Mode.EVALUATE, evaluation, learning)
+
+
+def _manner(slot: Slot, evaluating: Bool[Array, " slot"], config: ExpertConfig) -> Manner:
+    """Evaluations: attempts, then sticky ones, then moved ones. Training: rehearsals in the last environments."""
+    number = jnp.arange(config.environments)
+    sticky = (number >= config.attempts) & (number < config.attempts + config.sticky_attempts)
+    succeeded = slot.training.success.length > 0
+    guides = number >= config.environments - config.rehearsals
+    per_lane = lambda slots, environments: (slots[:, None] & environments).reshape(-1)
+    stickiness = STICKINESS * per_lane(evaluating, sticky) + config.persistence * per_lane(
+        ~evaluating & ~succeeded, guides
+    )
+    return Manner(
+        per_lane(evaluating, number == 0),
+        stickiness,
+        per_lane(~evaluating & succeeded, guides),
+        jnp.moveaxis(slot.training.success.action, 0, -1),
+    )
+
+
+def _moved_start(lanes: Level, keys: Key[Array, " slot"], config: ExpertConfig) -> Acting:
+    """The first state of each lane's level; bodies of the moved attempts start with slightly other velocities."""
+    number = jnp.arange(config.environments)
+    first = config.attempts + config.sticky_attempts
+    moved = jnp.tile((number >= first) & (number < first + config.moved_attempts), len(keys))
+    acting = start(lanes)
+    state, movable = acting.world.state, (lanes.model.inverse_mass > 0) & lanes.model.active
+
+    def noise(key):
+        shape = (3, len(movable), config.environments)
+        return jax.random.uniform(jax.random.fold_in(key, config.horizon), shape, minval=-MOVED, maxval=MOVED)
+
+    drawn = jnp.moveaxis(jax.vmap(noise)(keys), 0, -2).reshape(3, len(movable), -1)
+    drawn = jnp.where(movable & moved, drawn, 0.0)
+    state = replace(
+        state,
+        velocity=state.velocity + jnp.moveaxis(drawn[:2], 0, 1),
+        angular_velocity=state.angular_velocity + drawn[2],
+    )
+    return acting._replace(world=replace(acting.world, state=state))
+
+
+def _lanes(tree: Any) -> Any:
+    """[slot, ..., environment] -> [..., lane]."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1), tree)
+
+
+def _by_slot(tree: Any, environments: int) -> Any:
+    """[..., lane] -> [slot, ..., environment]."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, environments), -2, 0), tree)
+
+
+def _where(lanes: Bool[Array, " lane"], a: Any, b: Any) -> Any:
+    return jax.tree.map(lambda x, y: jnp.where(lanes, x, y), a, b)

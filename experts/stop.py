@@ -1,0 +1,106 @@
+"""When a level leaves its slot: rules on what training and evaluation of that level alone have shown."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from experts.progress import NEVER, Progress
+
+MOST_DOUBLINGS = 6  # of the wait between evaluations
+
+
+class Course(NamedTuple):
+    """How far an expert is, and what comes next."""
+
+    updates: Int[Array, ""]  # done
+    next_evaluation: Int[Array, ""]  # updates before which none is worth it
+    failed: Int[Array, ""]  # evaluations that did not solve the level
+    solved: Bool[Array, ""]  # by an evaluation
+    rung_return: Float[Array, ""]  # the best return at the last rung
+
+
+def begin() -> Course:
+    return Course(jnp.int32(0), jnp.int32(0), jnp.int32(0), jnp.bool_(False), jnp.float32(-jnp.inf))
+
+
+def after_update(
+    course: Course,
+    progress: Progress,
+    share: Float[Array, ""],
+    deadline: Int[Array, ""],
+    config: ExpertConfig,
+    stopping: StopConfig,
+) -> tuple[Course, Bool[Array, ""], Bool[Array, ""]]:
+    """The course, whether an evaluation comes next, and whether the level leaves after it."""
+    updates = course.updates + 1
+    final = updates >= deadline
+    evaluate = jnp.bool_(False)
+    rung_return = course.rung_return
+    if stopping.rule != Rule.BUDGET:
+        evaluate = (share >= stopping.share) & (updates >= course.next_evaluation) & ~course.solved
+        final |= jnp.bool_(config.exploration) & (progress.first_success != NEVER)
+    if stopping.rule == Rule.HALVING:
+        at_rung = is_rung(updates, updates_in(stopping.first_rung, config))
+        moves = (progress.first_success != NEVER) | (progress.best_return >= rung_return + stopping.gain)
+        final |= at_rung & ~moves
+        rung_return = jnp.where(at_rung, progress.best_return, rung_return)
+    return course._replace(updates=updates, rung_return=rung_return), evaluate | final, final
+
+
+def after_evaluation(
+    course: Course,
+    solved: Bool[Array, ""],
+    final: Bool[Array, ""],
+    deadline: Int[Array, ""],
+    config: ExpertConfig,
+    stopping: StopConfig,
+) -> tuple[Course, Bool[Array, ""], Int[Array, ""]]:
+    """The course, whether the level leaves, and its deadline."""
+    polish = stopping.polish // config.steps_per_update
+    leaves = final | solved if not polish else final
+    deadline = jnp.where(solved & ~final, jnp.minimum(deadline, course.updates + polish), deadline)
+    wait = updates_in(stopping.wait, config) << jnp.minimum(course.failed, MOST_DOUBLINGS)
+    tried = course._replace(
+        next_evaluation=course.updates + wait,
+        failed=course.failed + ~solved,
+        solved=solved,
+    )
+    # the last one leaves no trace: an expert that goes on with more budget goes on as if it had not been
+    course = Course(*(jnp.where(final, old, new) for old, new in zip(course, tried, strict=True)))
+    return course, leaves, deadline
+
+
+def solves(
+    done: Bool[Array, "... time environment"],
+    goal: Bool[Array, "... time environment"],
+    stopping: StopConfig,
+    config: ExpertConfig,
+) -> Bool[Array, "..."]:
+    """Whether the first attempts, as many as must, succeed: every episode that ended, ended in the goal."""
+    first = slice(0, min(stopping.successes, config.attempts))
+    done, goal = done[..., :RECORD_STEPS, first], goal[..., :RECORD_STEPS, first]
+    return (done.any(-2) & (goal | ~done).all(-2)).all(-1)
+
+
+def fails(
+    done: Bool[Array, "time environment"],
+    goal: Bool[Array, "time environment"],
+    stopping: StopConfig,
+    config: ExpertConfig,
+) -> Bool[Array, ""]:
+    """Whether an evaluation can no longer solve its level: an attempt that must succeed has not."""
+    first = slice(0, min(stopping.successes, config.attempts))
+    return (done & ~goal)[:, first].any()
+
+
+def is_rung(updates: Int[Array, ""], first: int) -> Bool[Array, ""]:
+    """Whether it is `first` times a power of two."""
+    times = updates // first
+    return (updates % first == 0) & (times > 0) & ((times & (times - 1)) == 0)
+
+
+def updates_in(env_steps: int, config: ExpertConfig) -> int:
+    """How many updates so many env steps are, at least one."""
+    return max(1, env_steps // config.steps_per_update)

@@ -1,0 +1,49 @@
+"""Successes of training: the actions of an episode that reached the goal."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from experts.config import RECORD_STEPS
+from levelgen.actions import CHOICES
+
+
+class Success(NamedTuple):
+    """A successful episode; episodes start in the level's own state, so its actions reach the goal again."""
+
+    action: Int[Array, "256 6"]  # zeros after its end
+    length: Int[Array, ""]  # env steps; 0: there is none
+
+
+def no_success() -> Success:
+    return Success(jnp.zeros((RECORD_STEPS, len(CHOICES)), jnp.int8), jnp.int32(0))
+
+
+def remember(known: Success, new: Success) -> Success:
+    """The first one stays."""
+    return jax.tree.map(lambda a, b: jnp.where(known.length > 0, a, b), known, new)
+
+
+def find(
+    recent: Int[Array, "history 6 environment"],
+    goal: Bool[Array, "time environment"],
+    timestep: Int[Array, "time environment"],
+) -> Success:
+    """The first success of a rollout, if there is one that a record can hold.
+
+    Args:
+        recent: actions, those of the rollout last.
+        goal: steps of the rollout that reached the goal.
+        timestep: env steps of the episode before each step.
+    """
+    length = timestep + 1
+    usable = goal & (length <= RECORD_STEPS)
+    at = jnp.argmax(usable.reshape(-1))
+    time, environment = jnp.divmod(at, goal.shape[1])
+    steps = jnp.where(usable.any(), length[time, environment], 0)
+    first = len(recent) - len(goal) + time + 1 - steps
+    row = jnp.arange(RECORD_STEPS)
+    action = recent[jnp.clip(first + row, 0, len(recent) - 1), :, environment]
+    return Success(jnp.where((row < steps)[:, None], action, 0).astype(jnp.int8), steps.astype(jnp.int32))

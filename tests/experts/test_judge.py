@@ -1,0 +1,95 @@
+"""Which witness is chosen, and what evaluations say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experts import progress
+from experts.config import RECORD_STEPS, Choice, ExpertConfig
+from experts.judge import Evaluation, repeated, shares, successful_episodes, witness_of
+from experts.labels import Source
+from experts.success import Success
+
+CONFIG = ExpertConfig(environments=8, attempts=3, sticky_attempts=2, moved_attempts=2)
+
+
+def evaluation(*episodes: list[tuple[int, bool]], success: int = 0) -> Evaluation:
+    """Environments with these episodes: (last step, whether it reached the goal). Actions count the steps."""
+    done, goal = np.zeros((2, RECORD_STEPS, CONFIG.environments), bool)
+    for environment, ends in enumerate(episodes):
+        for end, reached in ends:
+            done[end, environment], goal[end, environment] = True, reached
+    action = np.arange(RECORD_STEPS)[:, None, None] + 1000 * np.arange(CONFIG.attempts) + np.zeros((1, 6, 1), int)
+    played = Success(np.full((RECORD_STEPS, 6), 7, np.int8), np.int32(success))
+    return Evaluation(action, done, goal, progress.start(CONFIG.environments), played)
+
+
+def test_a_record_is_the_first_attempt_without_failure() -> None:
+    one = evaluation([(9, True), (20, False)], [(99, True), (199, True)], [(30, True)])
+    witness = witness_of([one], CONFIG)
+    assert witness is not None
+    assert (witness.source, witness.steps) == (Source.SAMPLED, 100)
+    np.testing.assert_array_equal(witness.action[:, 0], np.arange(RECORD_STEPS) + 1000)
+
+
+def test_the_shortest_success_is_repeated() -> None:
+    one = evaluation([(9, True), (14, True), (20, False)], [(99, True)], [(30, True)])
+    witness = witness_of([one], replace(CONFIG, witness=Choice.SHORTEST))
+    assert witness is not None
+    assert (witness.source, witness.steps) == (Source.MOST_PROBABLE, 5)
+    np.testing.assert_array_equal(witness.action[:12, 0], [10, 11, 12, 13, 14] * 2 + [10, 11])
+
+
+def test_the_best_of_several_evaluations_counts() -> None:
+    before, polished = evaluation([(99, True)]), evaluation([(49, True)])
+    failed = evaluation([(9, False)])
+    for several in ([before, polished], [polished, before], [polished, failed]):
+        witness = witness_of(several, CONFIG)
+        assert witness is not None
+        assert witness.steps == 50
+
+
+def test_exploration_is_a_witness_only_if_wanted_and_only_where_there_is_no_other() -> None:
+    wants = replace(CONFIG, exploration=True)
+    failed, solved = evaluation([(9, False)], success=4), evaluation([(9, True)], success=4)
+    assert witness_of([failed], CONFIG) is None
+    assert witness_of([evaluation([(9, False)])], wants) is None
+    explored, own = witness_of([failed], wants), witness_of([solved], wants)
+    assert explored is not None
+    assert own is not None
+    assert (explored.source, explored.steps) == (Source.EXPLORATION, 4)
+    assert own.source is Source.MOST_PROBABLE
+
+
+def test_shares() -> None:
+    """Attempts 0 to 2, two sticky ones, two moved ones, one to spare."""
+    one = evaluation(
+        [(9, False)],
+        [(9, True), (19, False)],
+        [(5, True)],
+        [(9, True), (19, False)],
+        [(9, False), (19, True)],
+        [],
+        [(3, True)],
+        [(3, True)],
+    )
+    rate, sticky, moved = shares(one, CONFIG)
+    assert rate == pytest.approx(2 / 3)
+    assert (sticky, moved) == (0.5, 0.5)
+    nothing = shares(evaluation(), ExpertConfig(environments=8, attempts=3, sticky_attempts=0, moved_attempts=0))
+    assert np.isnan(nothing).all()
+
+
+def test_episodes() -> None:
+    done, goal = np.zeros((2, RECORD_STEPS), bool)
+    done[[3, 10, 255]], goal[[3, 255]] = True, True
+    assert successful_episodes(done, goal) == [(0, 4), (11, 256)]
+    assert successful_episodes(done & False, goal & False) == []
+
+
+def test_repeating_fills_the_record() -> None:
+    action = np.arange(18).reshape(3, 6)
+    filled = repeated(action, 3)
+    assert filled.shape == (RECORD_STEPS, 6)
+    np.testing.assert_array_equal(filled[255], action[0])

@@ -1,0 +1,128 @@
+"""Continuous batching on real levels: who leaves when, and that nothing of it shows in a result."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from experts.config import ExpertConfig, Rule, StopConfig
+from experts.judge import Trained
+from experts.labels import Label, Source
+from experts.slots import Mode, advance, empty_slots
+from experts.train import queue_of, train, train_levels
+from experts.witness import take
+from levelgen.level import SIZES, Level
+from levelgen.sampler import sample_levels
+from levelgen.task import DEFAULT_RULES
+
+IDS = np.array([0, 2, 3, 4, 6, 7, 9])  # levels that need an expert
+CONFIG = ExpertConfig(
+    environments=16, horizon=32, width=16, attempts=4, sticky_attempts=4, moved_attempts=4, slots=2, rehearsals=2
+)
+SOLVED = StopConfig(successes=2, share=0.6, wait=2048)
+WHOLE = StopConfig(rule=Rule.BUDGET)
+UPDATES = 24  # 12,288 env steps
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
+
+
+@pytest.fixture(scope="module")
+def solved(levels: Level) -> list[Trained]:
+    return train(levels, IDS, UPDATES, CONFIG, SOLVED, DEFAULT_RULES)[0]
+
+
+@pytest.fixture(scope="module")
+def whole(levels: Level) -> list[Trained]:
+    return train(levels, IDS, UPDATES, CONFIG, WHOLE, DEFAULT_RULES)[0]
+
+
+def same(a, b) -> None:
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_levels_leave_when_they_are_solved(solved: list[Trained], whole: list[Trained]) -> None:
+    steps = [len(of.curve) for of in solved]
+    assert min(steps) < UPDATES, "one of these levels should be solved early"
+    assert max(steps) == UPDATES, "one of these levels should not be solved"
+    assert [len(of.curve) for of in whole] == [UPDATES] * len(IDS)
+    for of in solved:
+        assert int(of.evaluations[-1].progress.env_steps) == len(of.curve) * CONFIG.steps_per_update
+
+
+def test_an_evaluation_leaves_no_trace_in_training(solved: list[Trained], whole: list[Trained]) -> None:
+    for early, late in zip(solved, whole, strict=True):
+        np.testing.assert_array_equal(early.curve, late.curve[: len(early.curve)])
+
+
+@pytest.mark.parametrize("at", [[5, 1, 3], [6], [2, 6, 5, 4, 0]])
+def test_a_result_depends_neither_on_slot_nor_on_neighbours(
+    levels: Level, solved: list[Trained], at: list[int]
+) -> None:
+    some, _ = train(take(levels, np.array(at)), IDS[at], UPDATES, CONFIG, SOLVED, DEFAULT_RULES)
+    for i, of in zip(at, some, strict=True):
+        same(of, solved[i])
+
+
+def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
+    """No slot is empty while a level waits, and every level has one place."""
+    queue = queue_of(levels, IDS, 2, CONFIG)
+    slots = empty_slots(2, queue, CONFIG)
+    modes, places = [], []
+    for _ in range(400):
+        slots, seen = advance(slots, queue, CONFIG, WHOLE, DEFAULT_RULES)
+        modes.append(np.asarray(seen.mode))
+        places.append(np.where(modes[-1] == Mode.EMPTY, -1, np.asarray(seen.place)))
+        if (modes[-1] == Mode.EMPTY).all():
+            break
+    modes, places = np.array(modes), np.array(places)
+    assert sorted(set(places.reshape(-1)) - {-1}) == list(range(len(IDS)))
+    waited_for = (places == len(IDS) - 1).any(1).argmax()  # the last level has come
+    assert (modes[:waited_for] != Mode.EMPTY).all()
+    for place in range(len(IDS)):
+        rows, slot = np.nonzero(places == place)
+        assert len(set(slot)) == 1
+        assert (np.diff(rows) == 1).all()
+        assert (modes[rows, slot[0]] == [Mode.TRAIN] * 2 + [Mode.EVALUATE] * CONFIG.record_rollouts).all()
+
+
+def test_nothing_is_compiled_again(levels: Level) -> None:
+    """Another number of levels and another budget use the same program."""
+    train(take(levels, np.arange(3)), IDS[:3], 2, CONFIG, SOLVED, DEFAULT_RULES)
+    before = advance._cache_size()
+    train(levels, IDS, 3, CONFIG, SOLVED, DEFAULT_RULES)
+    assert advance._cache_size() == before
+
+
+def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) -> None:
+    stopping = StopConfig(rule=Rule.HALVING, successes=4, first_rung=4 * 512, gain=10.0)
+    halved, spent = train(levels, IDS, UPDATES, CONFIG, stopping, DEFAULT_RULES)
+    never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
+    assert never
+    for i in never:
+        assert len(halved[i].curve) in (4, 8)  # at the first rung there is nothing to compare with
+    assert spent.trained == sum(len(of.curve) for of in halved) * CONFIG.steps_per_update
+
+
+def test_a_success_of_training_is_a_witness_if_wanted(levels: Level) -> None:
+    config = replace(CONFIG, exploration=True)
+    result = train_levels(levels, IDS, UPDATES * 512, config, StopConfig(successes=4))
+    for verdict in result.verdicts:
+        explored = verdict.steps_to_first_success is not None
+        assert (verdict.label is Label.SOLVED) == explored
+        if explored:
+            assert verdict.env_steps - verdict.steps_to_first_success < config.steps_per_update
+    assert Source.EXPLORATION in {verdict.witness for verdict in result.verdicts}
+
+
+def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[Trained]) -> None:
+    polished, _ = train(levels, IDS, UPDATES, CONFIG, replace(SOLVED, polish=4 * 512), DEFAULT_RULES)
+    early = [i for i, of in enumerate(solved) if len(of.curve) < UPDATES - 4]
+    assert early
+    for i in early:
+        assert len(polished[i].curve) == len(solved[i].curve) + 4
+        assert len(polished[i].evaluations) == 2
+        same(polished[i].evaluations[0], solved[i].evaluations[0])

@@ -1,0 +1,91 @@
+"""The rules by which a level leaves its slot."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experts import progress, stop
+from experts.config import ExpertConfig, Rule, StopConfig
+
+CONFIG = ExpertConfig(environments=16, horizon=64, sticky_attempts=4, moved_attempts=4)  # 1024 env steps an update
+SOLVED, HALVING = StopConfig(wait=2048, share=0.9), StopConfig(rule=Rule.HALVING, first_rung=4096, gain=0.1)
+
+
+def after(updates: int, share: float, stopping: StopConfig, best: float = 0.0, first: int = progress.NEVER, **course):
+    now = stop.begin()._replace(updates=jnp.int32(updates - 1), **course)
+    totals = progress.start(16)._replace(best_return=jnp.float32(best), first_success=jnp.int32(first))
+    now, evaluate, final = stop.after_update(now, totals, jnp.float32(share), jnp.int32(100), CONFIG, stopping)
+    assert int(now.updates) == updates
+    return now, bool(evaluate), bool(final)
+
+
+@pytest.mark.parametrize("stopping", [StopConfig(rule=Rule.BUDGET), SOLVED, HALVING])
+def test_a_budget_ends_in_an_evaluation(stopping: StopConfig) -> None:
+    assert after(99, float("nan"), stopping)[1:] == (False, False)
+    assert after(100, float("nan"), stopping)[1:] == (True, True)
+
+
+def test_success_is_worth_an_evaluation() -> None:
+    assert after(7, 0.95, SOLVED)[1:] == (True, False)
+    assert after(7, 0.85, SOLVED)[1:] == (False, False)
+    assert after(7, 1.0, SOLVED, next_evaluation=jnp.int32(8))[1:] == (False, False)
+    assert after(7, 1.0, StopConfig(rule=Rule.BUDGET))[1:] == (False, False)
+
+
+def test_a_success_of_training_ends_it_where_it_is_a_witness() -> None:
+    config = replace(CONFIG, exploration=True)
+    totals = progress.start(16)._replace(first_success=jnp.int32(5))
+    for stopping, ends in ((SOLVED, True), (StopConfig(rule=Rule.BUDGET), False)):
+        _, evaluate, final = stop.after_update(stop.begin(), totals, jnp.float32(0.1), jnp.int32(100), config, stopping)
+        assert bool(evaluate) == bool(final) == ends
+
+
+def test_at_a_rung_learning_has_to_move() -> None:
+    """Rungs are at 4, 8, 16, 32 and 64 updates."""
+    low = jnp.float32(0.5)
+    assert after(8, 0.0, HALVING, best=0.55, rung_return=low)[1:] == (True, True)
+    moved, evaluate, final = after(8, 0.0, HALVING, best=0.65, rung_return=low)
+    assert (evaluate, final, float(moved.rung_return)) == (False, False, pytest.approx(0.65))
+    assert after(8, 0.0, HALVING, best=0.55, rung_return=low, first=77)[1:] == (False, False)
+    between, evaluate, final = after(12, 0.0, HALVING, best=0.55, rung_return=low)
+    assert (evaluate, final, float(between.rung_return)) == (False, False, 0.5)
+
+
+def test_rungs() -> None:
+    assert [u for u in range(1, 200) if bool(stop.is_rung(jnp.int32(u), 3))] == [3, 6, 12, 24, 48, 96, 192]
+
+
+def test_what_follows_from_an_evaluation() -> None:
+    course = stop.begin()._replace(updates=jnp.int32(10))
+    decide = lambda solved, final, stopping: stop.after_evaluation(
+        course, jnp.bool_(solved), jnp.bool_(final), jnp.int32(100), CONFIG, stopping
+    )
+    failed, leaves, deadline = decide(False, False, SOLVED)
+    assert (int(failed.next_evaluation), bool(leaves), int(deadline)) == (12, False, 100)
+    assert bool(decide(True, False, SOLVED)[1])
+    assert bool(decide(False, True, SOLVED)[1])
+    polished, leaves, deadline = decide(True, False, replace(SOLVED, polish=5 * 1024))
+    assert (bool(polished.solved), bool(leaves), int(deadline)) == (True, False, 15)
+
+
+def test_a_last_evaluation_leaves_no_trace_in_what_goes_on() -> None:
+    """So that more budget later continues as if there had been none."""
+    course = stop.begin()._replace(updates=jnp.int32(10), next_evaluation=jnp.int32(9))
+    ended, _, _ = stop.after_evaluation(course, jnp.bool_(False), jnp.bool_(True), jnp.int32(10), CONFIG, SOLVED)
+    np.testing.assert_equal(tuple(map(np.asarray, ended)), tuple(map(np.asarray, course)))
+
+
+def test_solving_takes_all_of_the_first_attempts() -> None:
+    stopping = StopConfig(successes=2)
+    done = np.zeros((256, 16), bool)
+    goal = done.copy()
+    done[[9, 255]] = goal[[9, 255]] = True
+    goal[255, 2:] = False
+    assert bool(stop.solves(done, goal, stopping, CONFIG))
+    assert not bool(stop.fails(done, goal, stopping, CONFIG))
+    goal[255, 1] = False
+    assert not bool(stop.solves(done, goal, stopping, CONFIG))
+    assert bool(stop.fails(done, goal, stopping, CONFIG))
+    assert not bool(stop.solves(done & False, goal & False, stopping, CONFIG)), "no episode has ended"
