@@ -6,8 +6,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
+from experts.config import RECORD_STEPS
 from experts.labels import Label, Verdict, trivial_reason, unsolvable_reason, untrained
-from experts.witness import RECORD_STEPS, blocks, replay, steps_to_goal, succeeds, take
+from experts.witness import blocks, replay, steps_to_goal, succeeds, take
 from levelgen.level import ACTIONS, Level
 from levelgen.proofs import Proof, examine
 from levelgen.task import TaskParams

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from experts.before import decide, facts_of
-from experts.config import ExpertConfig
+from experts.config import RECORD_STEPS, ExpertConfig
 from experts.labels import Label, Verdict
 from experts.train import train_levels
-from experts.witness import RECORD_STEPS, replay, succeeds, take
+from experts.witness import replay, succeeds, take
 from levelgen.level import SIZES, Level
 from levelgen.proofs import Proof
 from levelgen.sampler import sample_levels

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.config import ExpertConfig, Rule, StopConfig
+from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.labels import Label
 from experts.train import UnitResult, train_levels, updates_in
-from experts.witness import LANES, RECORD_STEPS, replay, steps_to_goal, succeeds
+from experts.witness import LANES, replay, steps_to_goal, succeeds
 from levelgen.distribution import Distribution
 from levelgen.level import SIZES, Level
 from levelgen.sampler import sample_levels
