@@ -30,14 +30,14 @@ class ExpertConfig:
     depth: int = 2  # hidden layers of the policy and of the value function, which share none
     # experience
     environments: int = 32  # lanes an expert acts in
-    horizon: int = 64  # env steps in each lane between updates
+    horizon: int = 32  # env steps in each lane between updates
     dense_reward_scale: float = 0.2  # 1/m; shaping while training, see levelgen.task.TaskParams
-    rehearsals: int = 0  # lanes that repeat the first success of training, once there is one
-    persistence: float = 0.0  # chance that these lanes repeat their last action, before
+    rehearsals: int = 8  # lanes that repeat the first success of training, once there is one
+    persistence: float = 0.9  # chance that these lanes repeat their last action, before
     # PPO (Schulman et al. 2017, arXiv:1707.06347)
     epochs: int = 4  # passes over the experience of an update
     minibatches: int = 4  # per epoch
-    learning_rate: float = 3e-4
+    learning_rate: float = 2e-3
     adam_epsilon: float = 1e-5
     max_gradient_norm: float = 1.0  # global norm of one expert's gradient
     discount: float = 0.995  # per env step
@@ -101,8 +101,8 @@ class StopConfig:
     """When a level leaves its slot (hashable: pass as a static argument)."""
 
     rule: Rule = Rule.SOLVED
-    successes: int = 8  # attempts that must succeed, the first of them, for a level to be decided as solved
-    share: float = 0.9  # of an update's finished episodes that must reach the goal before an evaluation is worth it
+    successes: int = 1  # attempts of an evaluation that must succeed for a level to be decided as solved
+    share: float = 0.25  # of an update's finished episodes that must reach the goal before an evaluation is worth it
     wait: int = 2048  # env steps of training between an evaluation that failed and the next; doubles each time
     polish: int = 0  # env steps of training after a level is solved, for a shorter way to the goal
     first_rung: int = 16_384  # env steps of training at the first rung; each is twice the one before

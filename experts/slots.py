@@ -291,7 +291,8 @@ def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) 
         put(slot.trial.done, now.done),
         put(slot.trial.goal, now.goal),
     )
-    hopeless = ~trial.final & stop.fails(now.done, now.goal, stopping, config)
+    steps = trial.part * config.horizon
+    hopeless = ~trial.final & stop.fails(trial.done, trial.goal, steps, stopping, config)
     ended = (trial.part == config.record_rollouts) | hopeless
     solved = ~hopeless & stop.solves(trial.done, trial.goal, stopping, config)
     course, leaves, deadline = stop.after_evaluation(

@@ -78,21 +78,27 @@ def solves(
     stopping: StopConfig,
     config: ExpertConfig,
 ) -> Bool[Array, "..."]:
-    """Whether the first attempts, as many as must, succeed: every episode that ended, ended in the goal."""
-    first = slice(0, min(stopping.successes, config.attempts))
-    done, goal = done[..., :RECORD_STEPS, first], goal[..., :RECORD_STEPS, first]
-    return (done.any(-2) & (goal | ~done).all(-2)).all(-1)
+    """Whether enough attempts succeed: every episode that ended, ended in the goal."""
+    done, goal = (x[..., :RECORD_STEPS, : config.attempts] for x in (done, goal))
+    succeed = done.any(-2) & (goal | ~done).all(-2)
+    return succeed.sum(-1) >= enough(stopping, config)
 
 
 def fails(
     done: Bool[Array, "time environment"],
     goal: Bool[Array, "time environment"],
+    steps: Int[Array, ""],
     stopping: StopConfig,
     config: ExpertConfig,
 ) -> Bool[Array, ""]:
-    """Whether an evaluation can no longer solve its level: an attempt that must succeed has not."""
-    first = slice(0, min(stopping.successes, config.attempts))
-    return (done & ~goal)[:, first].any()
+    """Whether an evaluation can no longer solve its level, after so many steps: too many attempts have failed."""
+    failed = (done & ~goal & (jnp.arange(len(done)) < steps)[:, None])[:, : config.attempts].any(0)
+    return config.attempts - failed.sum() < enough(stopping, config)
+
+
+def enough(stopping: StopConfig, config: ExpertConfig) -> int:
+    """How many attempts have to succeed."""
+    return min(stopping.successes, config.attempts)
 
 
 def is_rung(updates: Int[Array, ""], first: int) -> Bool[Array, ""]:

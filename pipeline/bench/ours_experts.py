@@ -13,6 +13,7 @@ REFERENCE = {
     "width": 64,
     "depth": 2,
     "rehearsals": 0,
+    "persistence": 0.0,
     "epochs": 4,
     "minibatches": 4,
     "learning_rate": 3e-4,

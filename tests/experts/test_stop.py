@@ -77,15 +77,16 @@ def test_a_last_evaluation_leaves_no_trace_in_what_goes_on() -> None:
     np.testing.assert_equal(tuple(map(np.asarray, ended)), tuple(map(np.asarray, course)))
 
 
-def test_solving_takes_all_of_the_first_attempts() -> None:
-    stopping = StopConfig(successes=2)
+def test_solving_takes_enough_attempts() -> None:
+    stopping = StopConfig(successes=7)
     done = np.zeros((256, 16), bool)
     goal = done.copy()
     done[[9, 255]] = goal[[9, 255]] = True
-    goal[255, 2:] = False
+    goal[255, 7:] = False  # one of the attempts, and all that are sticky or moved
     assert bool(stop.solves(done, goal, stopping, CONFIG))
-    assert not bool(stop.fails(done, goal, stopping, CONFIG))
+    assert not bool(stop.fails(done, goal, 256, stopping, CONFIG))
     goal[255, 1] = False
     assert not bool(stop.solves(done, goal, stopping, CONFIG))
-    assert bool(stop.fails(done, goal, stopping, CONFIG))
+    assert bool(stop.fails(done, goal, 256, stopping, CONFIG))
+    assert not bool(stop.fails(done, goal, 255, stopping, CONFIG)), "what follows is of an earlier evaluation"
     assert not bool(stop.solves(done & False, goal & False, stopping, CONFIG)), "no episode has ended"
