@@ -9,6 +9,8 @@ import json
 import subprocess
 import sys
 
+from pipeline.bench.oracle import environment, oracle_python
+
 LEVELS = 4096
 BATCH = 512  # of the reference: its memory grows with the batch
 
@@ -47,12 +49,11 @@ print(json.dumps({"first": first, "rate": count * batch / (time.perf_counter() -
 
 def measured(python: object, program: str, *arguments: object) -> dict[str, float]:
     command = [str(python), "-c", program, *map(str, arguments)]
-    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
 
 
 def main() -> None:
-    from pipeline.bench.oracle import oracle_python
-
     print("| size | first call, s | reference | levels/s | reference | ratio |\n|---|---|---|---|---|---|")
     for size in sys.argv[1:] or "sml":
         ours = measured(sys.executable, OURS, size, LEVELS)

@@ -2,6 +2,8 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -14,13 +16,13 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from configs.convert import ConfigError, flat, plain, suggestion, typed
-from configs.schema import JobConfig
+from configs.schema import JobConfig, hash_of
 from experts.config import ExpertConfig, StopConfig
 from levelgen.distribution import Distribution
 from levelgen.task import TaskParams
 
 JOB = "generate"
-WORDS = frozenset({"levels", "budget", "out"})  # kept as typed: 007 stays 007
+WORDS = frozenset({"size", "levels", "budget", "out"})  # kept as typed: 007 stays 007
 
 
 def compose_job(overrides: Sequence[str]) -> JobConfig:
@@ -46,10 +48,36 @@ def listing() -> str:
 
 def again(job: JobConfig) -> str:
     """The shortest command, but for `first_level`, `levels` and `out`, with the same results as `job`."""
-    defaults = flat(compose_job([f"size={job.size}", f"budget={job.budget}"]).results)
-    changed = {key: value for key, value in flat(job.results).items() if defaults[key] != value}
-    words = [f"size={job.size}", f"budget={job.budget}", *(f"{key}={_hydra(value)}" for key, value in changed.items())]
-    return " ".join(["levelproof", "generate", *map(shlex.quote, words)])
+    fixed, wanted = [f"size={job.size}", f"budget={job.budget}"], flat(job.results)
+    default = replace(_default(), size=job.size, budget=job.budget)
+    commands = []
+    for name, preset in distributions().items():
+        named = [] if preset == default.distribution else [f"distribution={name}"]
+        start = flat(replace(default, distribution=preset).results)
+        changed = [f"{key}={_hydra(value)}" for key, value in wanted.items() if start[key] != value]
+        commands.append(shlex.join(["levelproof", "generate", *fixed, *named, *changed]))
+    return min(commands, key=len)
+
+
+@cache
+def _default() -> JobConfig:
+    return compose_job([])
+
+
+@cache
+def distributions() -> dict[str, Distribution]:
+    """The presets in configs/distribution/ by name."""
+    return {name: compose_job([f"distribution={name}"]).distribution for name in _choices()["distribution"]}
+
+
+def identified(distribution: Distribution) -> tuple[str | None, str]:
+    """Name, where it is a preset's, and short hash of a distribution: the same hash, the same levels for the same ids.
+
+    One sampler version and size provided. Made from all its settings, so manifests written before a setting was
+    added compare, too.
+    """
+    name = next((name for name, preset in distributions().items() if preset == distribution), None)
+    return name, hash_of(plain(distribution))
 
 
 def _composed(overrides: list[str]) -> dict[str, Any]:

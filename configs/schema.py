@@ -8,11 +8,15 @@ from typing import Any, Literal
 from configs.convert import ConfigError, plain
 from configs.numbers import parse_count
 from experts.config import ExpertConfig, StopConfig
-from levelgen.distribution import Distribution
+from levelgen.distribution import CONTROL_WEIGHTS, Distribution
 from levelgen.identity import SAMPLER_VERSION
+from levelgen.level import MOST_THINGS, SIZES, size_of
+from levelgen.sampler import check_size, controls
 from levelgen.task import TaskParams
 
 HASH_DIGITS = 16
+# Levels per work unit by the number of bodies: about as long to train, and multiples of the experts side by side
+UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (2 * MOST_THINGS, 4))
 MAX_LEVEL_ID = 2**31 - 1  # level ids are folded into random keys as 32-bit integers
 
 # Where, how many and by whom: these change neither a level nor its expert, so one split may mix them.
@@ -23,12 +27,12 @@ WITHOUT_EFFECT = frozenset({"levels", "first_level", "out", "unit", "executor", 
 class JobConfig:
     """What `levelproof generate` makes."""
 
-    size: Literal["s", "m", "l"]
+    size: str  # as `levelgen.level.size_of` reads it
     levels: str  # how many, as typed
     first_level: int
     budget: str  # as typed: it names the folder
     out: str
-    unit: int  # levels per work unit
+    unit: int | None  # levels per work unit; None: by the size
     executor: Literal["ray", "inline"]
     workers: int  # 0: one per core or GPU
     distribution: Distribution
@@ -37,6 +41,7 @@ class JobConfig:
     stop: StopConfig
 
     def __post_init__(self) -> None:
+        self._check_size()
         last = self.first_level + parse_count(self.levels, "levels") - 1
         if self.first_level < 0 or last > MAX_LEVEL_ID:
             raise ConfigError(f"level ids {self.first_level} to {last} do not fit: they run from 0 to {MAX_LEVEL_ID}.")
@@ -45,12 +50,31 @@ class JobConfig:
                 f"budget is {self.budget}: one update of an expert takes {self.expert.steps_per_update} env steps "
                 f"({self.expert.environments} environments x {self.expert.horizon}), so give at least that many."
             )
-        if self.unit < 1:
+        if self.unit is not None and self.unit < 1:
             raise ConfigError(f"unit is {self.unit}: a work unit needs at least 1 level.")
         if self.workers < 0:
             raise ConfigError(f"workers is {self.workers}: use 0 for one per core or GPU, or a number from 1.")
         if not self.out:
             raise ConfigError("out is empty: name a folder, as in out=data.")
+
+    def _check_size(self) -> None:
+        try:
+            size = size_of(self.size)
+            check_size(size)
+        except ValueError as error:
+            raise ConfigError(f"{error}.") from None
+        if not controls(size, self.distribution):
+            raise ConfigError(
+                f"size is {self.size}: it has no room for what must act, of which {', '.join(CONTROL_WEIGHTS)} in "
+                "distribution are the weights (a motor needs a joint and a third body beside the scenery)."
+            )
+
+    @property
+    def levels_per_unit(self) -> int:
+        if self.unit is not None:
+            return self.unit
+        bodies = size_of(self.size).bodies
+        return next(levels for most, levels in UNITS if bodies <= most)
 
     @property
     def level_ids(self) -> range:

@@ -34,9 +34,9 @@ def choose(weights: Float[Array, "choice lane"], u: Float[Array, " lane"]) -> Bo
     return jnp.arange(len(weights))[:, None] == pick(weights, u)
 
 
-def first_of_two(a: Array, b: Array, u: Float[Array, " lane"]) -> Bool[Array, " lane"]:
-    """Whether a is taken: a fair choice among those that are True; a where neither is."""
-    return ~b | (a & (u >= 0.5))
+def first_of_two(a: Array, b: Array, u: Float[Array, " lane"], chance_of_b: float = 0.5) -> Bool[Array, " lane"]:
+    """Whether a is taken: a choice among those that are True; a where neither is."""
+    return ~b | (a & (u >= chance_of_b))
 
 
 def between(u: Array, low: Array | float, high: Array | float) -> Array:

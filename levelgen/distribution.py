@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields
 HALF_WORLD = 2.5  # m; green and blue bodies may be placed within one half of the world
 # Largest reach of a free body from its centre, so that it finds a place in half a world
 MAX_REACH = HALF_WORLD / 2
+CONTROL_WEIGHTS = ("motor_only_weight", "thruster_only_weight", "motor_and_thruster_weight")
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,13 @@ class Distribution:
     goal_lowered_chance: float = 0.6  # added for green, blue, red [fixate_shape_bottom_bias_special_role]
     red_weight: float = 1 / 3  # of a new red body, while there is none, against 1 of a plain one (util.get_role)
 
+    # What must act, in proportion; what a size has no room for is left out (distributions.sample_kinetix_level)
+    motor_only_weight: float = 1.0
+    thruster_only_weight: float = 1.0
+    motor_and_thruster_weight: float = 1.0
+
     # Connected bodies
+    connected_circle_chance: float = 0.5  # rather than a rectangle, if there is room for both (as above)
     fixed_target_weight: float = 0.05  # of a fixed body as the one to connect to [connect_to_fixated_prob_coeff]
     polygon_connections: int = 2  # more joints only if all polygons have these (mutators.mutate_add_connected_shape)
     min_revolute_joints: int = 2  # the first ones are revolute [min_rjoints_bias]
@@ -110,8 +117,12 @@ class Distribution:
             raise ValueError(
                 f"floor_red_chance is {self.floor_red_chance}: the floor's chances add up to {floor}, over 1"
             )
-        if self.connected_weight + self.free_weight + self.empty_weight == 0:
-            raise ValueError("empty_weight is 0: one of connected_weight, free_weight and empty_weight must be more")
+        for names in (
+            ("connected_weight", "free_weight", "empty_weight"),
+            CONTROL_WEIGHTS,
+        ):
+            if not any(getattr(self, name) for name in names):
+                raise ValueError(f"{names[-1]} is 0: one of {names[0]}, {names[1]} and {names[2]} must be more")
 
     def _check_shapes(self) -> None:
         for name, factor in (("max_size", 1.0), ("goal_size_factor", self.goal_size_factor)):

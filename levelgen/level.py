@@ -3,6 +3,7 @@
 Batches of levels have the level axis LAST, like everything else (a batch of levels is a batch of lanes).
 """
 
+import re
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -16,6 +17,7 @@ SIZES: dict[str, Size] = {
     "m": Size(polygons=6, circles=3, joints=2, thrusters=2),
     "l": Size(polygons=12, circles=4, joints=6, thrusters=2),
 }
+MOST_THINGS = 64  # of a kind in a level; a level file with so many of each has 3 MB
 MOTOR_BINDINGS = 4  # entries of an action that motors obey
 THRUSTER_BINDINGS = 2  # entries that thrusters obey
 ACTIONS = MOTOR_BINDINGS + THRUSTER_BINDINGS
@@ -47,3 +49,32 @@ class Level:
     @property
     def size(self) -> Size:
         return self.model.size
+
+
+def size_of(name: str) -> Size:
+    """The size with this name: one of SIZES, or four numbers as in `8-8-8-4`.
+
+    The numbers count polygons (the scenery's four included), circles, joints and thrusters.
+
+    Raises:
+        ValueError: it is no name of a size, or not its only one; the message starts with `size`.
+    """
+    if name in SIZES:
+        return SIZES[name]
+    if not re.fullmatch(r"(0|[1-9][0-9]{0,3})(-(0|[1-9][0-9]{0,3})){3}", name):
+        raise ValueError(
+            f"size is {name!r}: choose one of {', '.join(SIZES)}, or write how many polygons (4 of them scenery), "
+            "circles, joints and thrusters there is room for, as in 8-8-8-4"
+        )
+    size = Size(*map(int, name.split("-")))
+    if name_of(size) != name:
+        raise ValueError(f"size is {name}: that is {name_of(size)}, so write that")
+    for kind, count in zip(size._fields, size, strict=True):
+        if count > MOST_THINGS:
+            raise ValueError(f"size is {name}: at most {MOST_THINGS} {kind} fit into a level")
+    return size
+
+
+def name_of(size: Size) -> str:
+    """The name that `size_of` reads."""
+    return next((name for name, known in SIZES.items() if known == size), "-".join(map(str, size)))

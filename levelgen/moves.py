@@ -94,7 +94,8 @@ def propose_connected(level: Level, d: BodyDraws, revolute: Flag, dist: Distribu
     any_polygon = model.active[FIXED_POLYGONS:polygons].any(0)
     any_circle = (weight[polygons:] > 0).any(0)
     target_is_polygon = first_of_two(any_polygon, any_circle, d.target_is_polygon) | ~room_polygon
-    is_polygon = first_of_two(room_polygon, room_circle, d.is_polygon) | (~target_is_polygon & room_polygon)
+    is_polygon = first_of_two(room_polygon, room_circle, d.is_polygon, dist.connected_circle_chance)
+    is_polygon |= ~target_is_polygon & room_polygon  # no circle to a circle
     shape = draw_shape(d, is_polygon, dist.max_size, dist)
     target = choose_target(level, weight, target_is_polygon, d.target)
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Int
 from levelgen.chance import at, deal, pick
 from levelgen.distribution import Distribution
 from levelgen.identity import MAX_LEVEL_ID, Stream, key_for
-from levelgen.level import Level, Role
+from levelgen.level import Level, Role, name_of
 from levelgen.moves import ThrusterDraws, add_thruster, propose_connected, propose_free
 from levelgen.overlap import Circles, count_contacts
 from levelgen.proposal import BodyDraws, Flag, Lane, Proposal, corners_in_world, insert
@@ -86,8 +86,8 @@ def check_size(size: Size) -> None:
     """Raises ValueError where no level of this size can have a goal."""
     if size.polygons < FIXED_POLYGONS or size.bodies < FIXED_POLYGONS + GOAL_BODIES or min(size) < 0:
         raise ValueError(
-            f"a level with {size.polygons} polygons and {size.circles} circles has no room for the {FIXED_POLYGONS} "
-            f"polygons of the scenery, a green and a blue body"
+            f"size is {name_of(size)}: {size.polygons} polygons and {size.circles} circles leave no room for the "
+            f"{FIXED_POLYGONS} polygons of the scenery, a green and a blue body"
         )
 
 
@@ -97,7 +97,7 @@ def sample_block(level_ids: Int[Array, " lane"], size: Size, distribution: Distr
     keys = jax.vmap(lambda level_id: key_for(level_id, Stream.LEVEL))(level_ids)
     once, kinds, bodies, thrusters, order = deal(keys, hands(size, distribution))
     level = set_floor(empty_level(size, len(level_ids)), once.floor, distribution)
-    motor, thruster = draw_control(once.control, size)
+    motor, thruster = draw_control(once.control, size, distribution)
     plan = plan_bodies(level, once.first_moves, motor, kinds, distribution)
     level, active = add_bodies(level, plan, bodies, distribution)
     level = add_thrusters(level, thruster, active[min(GOAL_BODIES, len(active) - 1)], thrusters, distribution)
@@ -127,12 +127,22 @@ def set_floor(level: Level, u: Lane, dist: Distribution) -> Level:
     return replace(level, role=level.role.at[0].set(pick(jnp.array(chances)[:, None], u)))
 
 
-def draw_control(u: Lane, size: Size) -> tuple[Flag, Flag]:
-    """Whether there must be a motor and a thruster: one, the other or both, as far as the size has room for them."""
-    possible = (size.joints > 0 and turns(size) > GOAL_BODIES, size.thrusters > 0)
-    kinds = [kind for kind in ((False, True), (True, False), (True, True)) if np.all(np.array(possible) >= kind)]
-    table = jnp.array(kinds or [(False, False)])
-    motor, thruster = table[(u * len(table)).astype(jnp.int32)].T
+def controls(size: Size, dist: Distribution) -> dict[tuple[bool, bool], float]:
+    """The weight of a motor, of a thruster and of both having to be there, as far as the size has room for them."""
+    weights = {
+        (False, True): dist.thruster_only_weight,
+        (True, False): dist.motor_only_weight,
+        (True, True): dist.motor_and_thruster_weight,
+    }
+    room = (size.joints > 0 and turns(size) > GOAL_BODIES, size.thrusters > 0)
+    return {kind: weight for kind, weight in weights.items() if weight and np.all(np.array(room) >= kind)}
+
+
+def draw_control(u: Lane, size: Size, dist: Distribution) -> tuple[Flag, Flag]:
+    """Whether there must be a motor and a thruster; neither where the size has no room for what the weights allow."""
+    kinds = controls(size, dist) or {(False, False): 1.0}
+    upper = np.cumsum(list(kinds.values()), dtype=np.float32)[:, None]
+    motor, thruster = jnp.array(list(kinds))[(u * upper[-1] >= upper[:-1]).sum(0)].T
     return motor, thruster
 
 

@@ -89,6 +89,15 @@ def _parser() -> argparse.ArgumentParser:
     sub.set_defaults(parser=sub)
 
     sub = command(
+        "sample",
+        _sample,
+        "draw random levels, before anything is trained",
+        "levelproof sample size=m distribution=clutter -o sheet.png",
+    )
+    sub.add_argument("settings", nargs="*", metavar="NAME=VALUE", help="as for generate, but levels=15 by default")
+    sub.add_argument("-o", "--out", type=Path, default=Path("sheet.png"), help="file to write (default: sheet.png)")
+
+    sub = command(
         "inspect",
         _inspect,
         "show what is in a split",
@@ -158,6 +167,14 @@ def _generate(arguments: argparse.Namespace) -> int:
     from pipeline.generate import generate
 
     return generate(job, arguments.settings, Console(stderr=True))
+
+
+def _sample(arguments: argparse.Namespace) -> int:
+    from configs.compose import compose_job
+    from pipeline.sample import LEVELS, sample
+
+    sample(compose_job([f"levels={LEVELS}", *arguments.settings]), arguments.out)
+    return Exit.DONE
 
 
 def _inspect(arguments: argparse.Namespace) -> int:

@@ -30,7 +30,7 @@ def generate(job: JobConfig, overrides: list[str], console: Console) -> Exit:
     with writing(job) as (split, manifest):
         wanted = set(job.level_ids)
         done = wanted.intersection(manifest.level_ids.tolist())
-        queue = Queue.of(plan_units(job.level_ids, done, job.unit))
+        queue = Queue.of(plan_units(job.level_ids, done, job.levels_per_unit))
         note_job(split, job, overrides)
         if queue.waiting:
             solved = _labels(manifest, job)["solved"]

@@ -11,8 +11,11 @@ import pyarrow as pa
 from rich.console import Console
 from rich.table import Table
 
+from configs.compose import identified
+from configs.convert import typed
+from levelgen.distribution import Distribution
 from pipeline.errors import UserError
-from pipeline.manifest import require_manifest
+from pipeline.manifest import Manifest, require_manifest
 from pipeline.schema import RECORD_STEPS
 from pipeline.shard import stored_bytes
 
@@ -45,6 +48,7 @@ def survey(split: Path, where: str | None = None, rows: int = 10) -> dict[str, A
     return {
         "split": str(split),
         "config_hash": manifest.config_hash,
+        "distribution": dict(zip(("name", "hash"), _distribution(manifest), strict=True)),
         "levels": chosen.num_rows,
         "labels": _counts(chosen, "label"),
         "unsolvable": _counts(select(chosen, "label = 'unsolvable'"), "label_reason"),
@@ -57,6 +61,10 @@ def survey(split: Path, where: str | None = None, rows: int = 10) -> dict[str, A
         "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
         "rows": [_plain(row) for row in chosen.slice(0, max(rows, 0)).to_pylist()],
     }
+
+
+def _distribution(manifest: Manifest) -> tuple[str | None, str]:
+    return identified(typed(Distribution, (manifest.config or {})["distribution"], "distribution"))
 
 
 def select(table: pa.Table, where: str | None) -> pa.Table:
@@ -105,8 +113,10 @@ def _plain(value: Any) -> Any:
 
 def _print(facts: dict[str, Any], console: Console) -> None:
     labels = ", ".join(f"{count} {label}" for label, count in facts["labels"].items()) or "none"
+    distribution = facts["distribution"]
     lines = {
         "split": facts["split"],
+        "distribution": f"{distribution['name'] or 'of its own'} ({distribution['hash']})",
         "levels": f"{facts['levels']} ({labels})",
         "unsolvable": "; ".join(f"{count} {reason}" for reason, count in facts["unsolvable"].items()) or None,
         "failed by doing nothing": str(facts["failed_by_noop"]),

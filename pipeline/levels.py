@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from configs.convert import typed
-from levelgen.level import SIZES, Level
+from levelgen.level import Level, size_of
 from levelgen.level_file import LevelFile, LevelFileError, read_level_file
 from levelgen.sampler import Distribution, sample_levels
 from pipeline.errors import UserError
@@ -42,7 +42,7 @@ def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
         return tree_of(Level, Shard(manifest.split / row["shard"]).read([row["row"]]), "level/")
     prepare_jax()
     distribution = typed(Distribution, (manifest.config or {})["distribution"])
-    return sample_levels(jnp.array([row["level_id"]], jnp.int32), SIZES[row["size"]], distribution)
+    return sample_levels(jnp.array([row["level_id"]], jnp.int32), size_of(row["size"]), distribution)
 
 
 def is_level_file(source: Path) -> bool:

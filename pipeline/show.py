@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from PIL import Image
 
 from configs.convert import typed
-from levelgen.level import SIZES, Level
+from levelgen.level import Level, name_of
 from levelgen.render import Caption, draw, sheet, write_gif, write_png
 from levelgen.task import TaskParams
 from physics.types import State
@@ -112,7 +112,7 @@ def still(manifest: Manifest, row: dict[str, Any]) -> Film:
 def file_still(path: Path) -> Film:
     """The initial world of a level file."""
     level = level_file(path).level
-    size = next((name for name, size in SIZES.items() if size == level.size), "custom")
+    size = name_of(level.size)
     title = " ".join(path.stem.split())[:MOST_LETTERS]
     told = f"{path.name}, a level of size {size}: a level file has no witness, so this is its initial world"
     return Film([draw(level, level.state, caption=Caption(f"{title} · size {size}", "0.0 s"))], [LAST_SECONDS], told)

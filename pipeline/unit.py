@@ -18,7 +18,7 @@ from configs.schema import JobConfig
 from experts.labels import WITNESSED, Label, Verdict
 from experts.train import UnitResult, train_levels
 from experts.witness import Record, replay, succeeds
-from levelgen.level import SIZES, Level
+from levelgen.level import Level, size_of
 from levelgen.sampler import sample_levels
 from levelgen.task import TaskParams
 from pipeline.errors import Failure
@@ -62,7 +62,7 @@ def run_unit(job: JobConfig, split: Path, unit: WorkUnit, report: Report) -> Sum
         OSError: the disk refuses; nothing is committed.
     """
     ids = np.asarray(unit.level_ids, np.int32)
-    levels = sample_levels(jnp.asarray(ids), SIZES[job.size], job.distribution)
+    levels = sample_levels(jnp.asarray(ids), size_of(job.size), job.distribution)
     result = train_levels(levels, ids, job.env_steps, job.expert, job.stop, job.task, report)
     check_witnesses(result, job.task)
     commit(job, split, unit, result)

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 import pipeline
-from levelgen.level import SIZES
+from levelgen.level import size_of
 from physics.types import FIXED_POLYGONS
 from pipeline.bench import oracle
 from pipeline.bench.actions import STICKINESS, sticky_actions
@@ -20,7 +20,7 @@ from pipeline.bench.report import Result, summary, write_json, write_table
 from pipeline.errors import Exit, UserError
 from pipeline.runtime import own_cores, prepare_jax
 
-CUSTOM = "8,8,8,4"  # a size without a name, for parity
+CUSTOM = "8-8-8-4"  # a size without a name, for parity
 OURS, PINNED, FREE = "ours", "reference, process per core", "reference, one process"
 
 
@@ -84,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         type=_size,
         default=["s", "m", "l", CUSTOM],
-        help=f"of the worlds: s, m, l or POLYGONS,CIRCLES,JOINTS,THRUSTERS (default: s m l {CUSTOM})",
+        help=f"of the worlds: s, m, l or POLYGONS-CIRCLES-JOINTS-THRUSTERS (default: s m l {CUSTOM})",
     )
     sub.add_argument("--states", type=int, default=10_000, help="states a size to take one step from (default: 10,000)")
     sub.add_argument("--episodes", type=int, default=1_000, help="levels with actions to play, a size (default: 1,000)")
@@ -94,13 +94,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def _size(text: str) -> str:
     """One that both engines can have."""
-    numbers = text.split(",")
-    if text in SIZES or (len(numbers) == 4 and all(map(str.isdecimal, numbers)) and int(numbers[0]) > FIXED_POLYGONS):
-        return text
-    raise argparse.ArgumentTypeError(
-        f"{text} is no size: give s, m, l, or numbers such as {CUSTOM} (polygons, the scenery's {FIXED_POLYGONS} "
-        "included, circles, joints, thrusters)"
-    )
+    try:
+        size = size_of(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    if size.polygons <= FIXED_POLYGONS:
+        raise argparse.ArgumentTypeError(f"size is {text}: the scenes need a polygon more than the scenery's")
+    return text
 
 
 def _race(run: Callable[[argparse.Namespace], Result], given: argparse.Namespace) -> None:

@@ -39,13 +39,13 @@ def flatten(state, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def static_of(size: str):
-    """The reference's static parameters of `s`, `m`, `l` or of `POLYGONS,CIRCLES,JOINTS,THRUSTERS`."""
+    """The reference's static parameters of `s`, `m`, `l` or of `POLYGONS-CIRCLES-JOINTS-THRUSTERS`."""
     from kinetix.environment import static_env_params_from_size
 
-    if "," not in size:
+    if "-" not in size:
         return static_env_params_from_size(size)
     names = ("num_polygons", "num_circles", "num_joints", "num_thrusters")
-    return static_env_params_from_size("s").replace(**dict(zip(names, map(int, size.split(",")), strict=True)))
+    return static_env_params_from_size("s").replace(**dict(zip(names, map(int, size.split("-")), strict=True)))
 
 
 def load_levels(path: str, size: str, first: int, count: int):

@@ -2,15 +2,17 @@
 
 import dataclasses
 import shlex
+from importlib.resources import files
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
 
-from configs.compose import again, compose_job, listing
+from configs.compose import again, compose_job, distributions, identified, listing
 from configs.convert import ConfigError, flat
 from experts.config import ExpertConfig
-from levelgen.sampler import Distribution
+from levelgen.distribution import Distribution
 from levelgen.task import TaskParams
 
 
@@ -40,7 +42,12 @@ def test_out_may_be_any_path(text: str) -> None:
 @pytest.mark.parametrize(
     ("override", "sentence"),
     [
-        ("size=x", "no size x.*: choose one of l, m, s"),
+        ("size=x", "size is .x.: choose one of s, m, l, or write how many polygons"),
+        ("size=5-2-1-1", "size is 5-2-1-1: that is s, so write that"),
+        ("size=4-1-1-1", "size is 4-1-1-1: 4 polygons and 1 circles leave no room"),
+        ("size=8-8-0-0", "size is 8-8-0-0: it has no room for what must act"),
+        ("size=5-1-1-0", "size is 5-1-1-0: it has no room for what must act"),
+        ("size=99-1-1-1", "at most 64 polygons"),
         ("levels=abc", "levels is 'abc': write a whole number such as"),
         ("levels=0", "levels is '0'"),
         ("levels=1.5", "not a whole number"),
@@ -59,7 +66,7 @@ def test_out_may_be_any_path(text: str) -> None:
         ("unit=0", "unit is 0"),
         ("workers=-1", "workers is -1"),
         ("out=", "out is empty"),
-        ("size=s,m", "several values"),
+        ("executor=ray,inline", "several values"),
         ("+new=1", "can be changed, not added"),
         ("~levels", "NAME=VALUE"),
         ("levels", "NAME=VALUE"),
@@ -87,7 +94,14 @@ def test_the_hash_follows_results_and_nothing_else() -> None:
     job = compose_job([])
     for same in ("levels=7", "first_level=3", "out=x", "unit=2", "executor=inline", "workers=1", "budget=128000"):
         assert compose_job([same]).hash == job.hash, same
-    for other in ("size=m", "budget=129k", "expert.width=32", "task.frame_skip=1", "distribution.swap_chance=0"):
+    for other in (
+        "size=m",
+        "distribution=free",
+        "budget=129k",
+        "expert.width=32",
+        "task.frame_skip=1",
+        "distribution.swap_chance=0",
+    ):
         assert compose_job([other]).hash != job.hash, other
 
 
@@ -98,13 +112,66 @@ def test_every_setting_that_decides_results_is_hashed() -> None:
 
 
 @pytest.mark.parametrize(
-    "overrides", [[], ["size=l", "budget=64k"], ["expert.width=32", "task.physics.faithful_padding=false"]]
+    "overrides",
+    [
+        [],
+        ["size=l", "budget=64k"],
+        ["expert.width=32", "task.physics.faithful_padding=false"],
+        ["size=8-8-8-4", "distribution=vehicles"],
+        ["distribution=clutter", "distribution.max_size=0.5"],
+    ],
 )
 def test_again_makes_the_same_results(overrides: list[str]) -> None:
     job = compose_job(overrides)
     words = shlex.split(again(job))
     assert words[:2] == ["levelproof", "generate"]
     assert compose_job(words[2:]).results == job.results
+
+
+def test_a_preset_is_called_by_its_name() -> None:
+    job = compose_job(["size=m", "distribution=clutter", "budget=5k"])
+    assert again(job) == "levelproof generate size=m budget=5k distribution=clutter"
+    spelled = [f"distribution.{key}={value}" for key, value in dataclasses.asdict(job.distribution).items()]
+    assert again(compose_job(["size=m", "budget=5k", *spelled])) == again(job)
+
+
+def test_the_default_distribution_is_that_of_kinetix() -> None:
+    assert compose_job([]).distribution == distributions()["kinetix"] == Distribution()
+
+
+def test_presets_are_different_and_change_little() -> None:
+    """Overrides of the defaults only; none repeats a default."""
+    presets = distributions()
+    assert len(set(presets.values())) == len(presets) >= 5
+    default = dataclasses.asdict(Distribution())
+    for name in presets:
+        written = OmegaConf.load(str(files("configs") / f"distribution/{name}.yaml"))
+        assert all(written[key] != default[key] for key in written), name
+
+
+def test_a_distribution_is_known_by_name_and_hash() -> None:
+    job = compose_job(["distribution=clutter", "size=m", "budget=5k"])
+    name, mark = identified(job.distribution)
+    assert name == "clutter"
+    assert identified(compose_job(["distribution=clutter", "size=l"]).distribution) == (name, mark)
+    other = compose_job(["distribution=clutter", "distribution.max_size=0.5"]).distribution
+    assert identified(other)[0] is None
+    assert identified(other)[1] != mark
+
+
+def test_a_unit_by_the_size() -> None:
+    units = {
+        size: compose_job([f"size={size}"]).levels_per_unit
+        for size in ("s", "m", "l", "6-2-1-1", "8-8-8-4", "24-24-9-9")
+    }
+    assert units == {"s": 16, "m": 16, "l": 8, "6-2-1-1": 16, "8-8-8-4": 8, "24-24-9-9": 4}
+    assert compose_job(["size=l", "unit=3"]).levels_per_unit == 3
+
+
+def test_a_distribution_that_lets_nothing_act_in_a_size_is_refused() -> None:
+    with pytest.raises(ConfigError, match="size is 5-5-2-0: it has no room for what must act"):
+        compose_job(["size=5-5-2-0", "distribution=thrusters"])
+    assert compose_job(["size=5-5-2-0", "distribution=vehicles"]).size == "5-5-2-0"
 
 
 def test_the_listing_can_be_typed_back() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from configs.compose import distributions
 from levelgen.actions import action_mask
 from levelgen.distribution import Distribution
 from levelgen.kinetix import state_to_kinetix
@@ -218,7 +219,7 @@ def test_any_size(size: Size) -> None:
 
 @pytest.mark.parametrize("size", [Size(4, 1, 1, 1), Size(3, 4, 1, 1), Size(5, 2, -1, 0)], ids=str)
 def test_sizes_without_room_are_refused(size: Size) -> None:
-    with pytest.raises(ValueError, match="no room for"):
+    with pytest.raises(ValueError, match="leave no room for"):
         sample_levels(np.arange(1), size)
 
 
@@ -237,6 +238,13 @@ def test_ids_out_of_range_are_refused(level_id: int) -> None:
         ({"proposals": 0}, "proposals is 0: it must be more than 0"),
         ({"max_limit": float("nan")}, "max_limit is nan: it must be a finite number"),
         ({"max_motor_speed": 0.1}, "min_motor_speed is 0.4: it must be at most max_motor_speed, 0.1"),
+        ({"connected_circle_chance": 2.0}, "connected_circle_chance is 2.0: it must be between 0 and 1"),
+        ({"motor_only_weight": -1.0}, "motor_only_weight is -1.0: it must be 0 or more"),
+        (
+            {"motor_only_weight": 0.0, "thruster_only_weight": 0.0, "motor_and_thruster_weight": 0.0},
+            "motor_and_thruster_weight is 0: one of motor_only_weight, thruster_only_weight and "
+            "motor_and_thruster_weight must be more",
+        ),
         ({"floor_blue_chance": 0.95}, "floor_red_chance is 0.08: the floor's chances add up to 1.03, over 1"),
         ({"max_size": 0.1}, "max_size is 0.1: shapes would be smaller than min_half_side or min_radius"),
         ({"max_size": 1.5}, "max_size is 1.5: shapes would reach 1.50 m, over 1.25 m"),
@@ -247,6 +255,47 @@ def test_a_wrong_distribution_says_what_is_wrong(changes: dict[str, float], mess
     with pytest.raises(ValueError, match="is") as refused:
         Distribution(**changes)  # type: ignore[arg-type]
     assert str(refused.value) == message
+
+
+def test_what_must_act_follows_its_weights() -> None:
+    """A thruster always; a motor too in three levels of four. Size s has no bodies joined but for a motor's sake."""
+    changed = Distribution(motor_only_weight=0.0, motor_and_thruster_weight=3.0)
+    model = sampled(SIZES["s"], COUNTS["s"], changed).model
+    assert model.thruster_active.any(0).all()
+    assert abs(model.joint_active.any(0).mean() - 0.75) < 0.03
+
+
+@pytest.mark.parametrize("chance", [0.0, 1.0])
+def test_wheels_follow_their_chance(chance: float) -> None:
+    """Green, blue and a body joined to one of them: a rectangle to anything, or a circle to rectangles."""
+    of = {"thruster_only_weight": 0.0, "connected_weight": 0.0, "free_weight": 0.0, "proposals": 1}
+    size = Size(7, 3, 1, 1)
+    model = sampled(size, BLOCK, Distribution(connected_circle_chance=chance, **of)).model  # type: ignore[arg-type]
+    circles, joint = model.active[size.polygons :].sum(0), model.joint_active[0]
+    assert joint.all()
+    assert circles.min() == chance  # of the levels whose green and blue are rectangles
+
+
+@pytest.mark.parametrize("name", distributions())
+def test_presets_are_what_they_say(name: str) -> None:
+    level = sampled(SIZES["m"], BLOCK, distributions()[name])
+    model = level.model
+    movable = np.s_[FIXED_POLYGONS:]
+    there, fixed = model.active[movable], (model.inverse_mass == 0)[movable] & model.active[movable]
+    says = {
+        "kinetix": fixed.any() and model.motor_on.any() and model.thruster_active.any(),
+        "free": not fixed.any(),
+        "thrusters": not model.motor_on.any() and model.thruster_active.any(0).all(),
+        "vehicles": model.motor_on[model.joint_active].all()
+        and model.joint_active.any(0).all()
+        and not model.thruster_active.any(),
+        "clutter": there.all() and not fixed.any(),
+        "obstacles": fixed.sum() > there.sum() / 2,
+    }
+    assert says[name]
+    assert np.asarray(action_mask(level)).any(0).all()
+    for role in (Role.GREEN, Role.BLUE):
+        assert ((model.active & (level.role == role)).sum(0) == 1).all()
 
 
 def test_a_floor_that_is_green_or_blue_comes_with_the_other() -> None:

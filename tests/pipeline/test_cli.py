@@ -15,7 +15,7 @@ import pytest
 from pipeline.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import ROOT, TINY, assert_refused, run
 
-COMMANDS = ("generate", "inspect", "show", "export", "status", "verify", "bench")
+COMMANDS = ("generate", "sample", "inspect", "show", "export", "status", "verify", "bench")
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import pytest
 from physics.types import FIXED_POLYGONS, Params
 from pipeline.bench import main, oracle
 from pipeline.bench.parity import causes, episodes, scenes
-from pipeline.bench.parity.campaign import SizeReport, size_of
+from pipeline.bench.parity.campaign import SizeReport
 from pipeline.bench.parity.distance import distances, gap
 from pipeline.bench.parity.engines import Played, Stepped, play_ours, step_ours
 from pipeline.bench.parity.onestep import Pool, distinct, one_step, picked
@@ -358,18 +358,21 @@ def test_a_small_campaign_for_real(reference, level_file, tmp_path) -> None:
 class TestInput:
     def test_levels_of_another_size(self, level_file, monkeypatch) -> None:
         monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
-        with pytest.raises(UserError, match=r"are of size 5,2,1,1: --size is m\.$"):
+        with pytest.raises(UserError, match=r"are of size s: --size is m\.$"):
             main(["parity", "--size", "m", "--level-file", str(level_file)])
         with pytest.raises(UserError, match="levels of one size"):
             main(["parity", "--level-file", str(level_file)])
 
-    def test_sizes(self) -> None:
-        assert size_of("8,7,6,5") == (8, 7, 6, 5)
-        assert size_of("s").polygons == 5
-
-    @pytest.mark.parametrize("size", ["xl", "8,8,8", "4,1,1,1", "8,8,-1,4"])
-    def test_no_size(self, size, capsys) -> None:
+    @pytest.mark.parametrize(
+        ("size", "sentence"),
+        [
+            ("xl", "'xl': choose one of s, m, l"),
+            ("8,8,8,4", "'8,8,8,4': choose one of s, m, l"),
+            ("4-1-1-1", "4-1-1-1: the scenes need a polygon more"),
+        ],
+    )
+    def test_no_size(self, size, sentence, capsys) -> None:
         with pytest.raises(SystemExit) as error:
             main(["parity", "--size", size])
         assert error.value.code == 2
-        assert f"{size} is no size: give s, m, l" in " ".join(capsys.readouterr().err.split())
+        assert f"size is {sentence}" in " ".join(capsys.readouterr().err.split())

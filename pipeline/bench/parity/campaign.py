@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from levelgen.level import SIZES, Level, Role
+from levelgen.level import SIZES, Level, Role, name_of, size_of
 from levelgen.sampler import sample_levels
-from physics.types import Size
 from pipeline.bench import oracle
 from pipeline.bench.actions import sticky_actions
 from pipeline.bench.parity.engines import Reference
@@ -39,15 +38,6 @@ class SizeReport:
     handmade: list[str]  # names of the handmade levels that were played
 
 
-def size_of(text: str) -> Size:
-    """`s`, `m`, `l` or `POLYGONS,CIRCLES,JOINTS,THRUSTERS`.
-
-    Raises:
-        ValueError: it is neither.
-    """
-    return SIZES[text] if text in SIZES else Size(*map(int, text.split(",")))
-
-
 def campaign(
     python: Path,
     size: str,
@@ -61,7 +51,7 @@ def campaign(
 
     Args:
         python: of the reference's environment.
-        size: see `size_of`.
+        size: see `levelgen.level.size_of`.
         states: to take one step from, at least about so many.
         episodes: pairs of levels and actions.
         board: shows how far it is.
@@ -94,7 +84,7 @@ def _sampled(python: Path, size: str, level_file: Path | None) -> Level:
         count = len(file["gravity"])
     levels = load_levels(str(path), 0, count)
     if levels.size != size_of(size):
-        raise UserError(f"The levels of {path} are of size {','.join(map(str, levels.size))}: --size is {size}.")
+        raise UserError(f"The levels of {path} are of size {name_of(levels.size)}: --size is {size}.")
     return levels
 
 
