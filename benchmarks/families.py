@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.fidelity import between_marks
+from benchmarks.document import between_marks
 from configs.compose import compose_job, distributions
 from experts.before import facts_of
 from levelgen.level import SIZES

@@ -11,7 +11,6 @@ that `--keep` names.
 """
 
 import argparse
-import json
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ import jax
 import numpy as np
 from scipy import stats
 
-from benchmarks.sampler import OURS, measured
+from benchmarks.document import between_marks
 from experts.before import facts_of
 from levelgen.kinetix import level_from_kinetix, state_to_kinetix
 from levelgen.level import SIZES, Level
@@ -41,11 +40,11 @@ CODES = ("role", "roles", "kinds", "place", "binding")  # last words of statisti
 MARK = "fidelity"
 
 REFERENCE = """
-import dataclasses, json, sys, time
+import dataclasses, sys
 import jax, numpy as np
 from kinetix.environment import EnvParams, static_env_params_from_size
 from kinetix.environment.ued.ued import make_reset_fn_sample_kinetix_level
-path, size, count, seed, batch = sys.argv[1], sys.argv[2], *map(int, sys.argv[3:])
+path, size, (count, seed, batch) = sys.argv[1], sys.argv[2], map(int, sys.argv[3:])
 def flatten(state, prefix=""):
     fields = {}
     for field in dataclasses.fields(state):
@@ -53,15 +52,9 @@ def flatten(state, prefix=""):
         fields |= flatten(value, name + "/") if dataclasses.is_dataclass(value) else {name: np.asarray(value)}
     return fields
 sample = jax.jit(jax.vmap(make_reset_fn_sample_kinetix_level(EnvParams(), static_env_params_from_size(size))))
-keys, parts, start = jax.random.split(jax.random.PRNGKey(seed), -(-count // batch) * batch), [], time.perf_counter()
-for first in range(0, len(keys), batch):
-    parts.append(flatten(sample(keys[first : first + batch])))
-    if first == 0:
-        compiled = time.perf_counter()
-seconds = [compiled - start, time.perf_counter() - compiled]
-fields = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
-rate = (len(keys) - batch) / seconds[1] if len(parts) > 1 else 0.0
-np.savez_compressed(path, about=json.dumps({"first": seconds[0], "rate": rate}), **fields)
+keys = jax.random.split(jax.random.PRNGKey(seed), -(-count // batch) * batch).reshape(-1, batch, 2)
+parts = [flatten(sample(some)) for some in keys]
+np.savez_compressed(path, **{name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]})
 """
 BATCH = 500  # of the reference: its memory grows with the batch
 
@@ -81,16 +74,14 @@ class SizeReport:
     size: str
     levels: int
     statistics: dict[str, Compared]
-    ours: dict[str, float]  # seconds of the first call, levels/s
-    theirs: dict[str, float]
 
     @property
     def differ(self) -> list[str]:
         return [name for name, c in self.statistics.items() if c.corrected is not None and c.corrected < SIGNIFICANT]
 
 
-def reference_levels(folder: Path, size: str, count: int, seed: int) -> tuple[Level, dict[str, float]]:
-    """Levels of the reference's sampler with the seconds they took, from `folder` if they are there."""
+def reference_levels(folder: Path, size: str, count: int, seed: int) -> Level:
+    """Levels of the reference's sampler, from `folder` if they are there."""
     path = folder / f"levels-{size}-{count}-{seed}.npz"
     if not path.is_file():
         tell(f"Sampling {count} levels of size {size} with the reference ...")
@@ -100,8 +91,7 @@ def reference_levels(folder: Path, size: str, count: int, seed: int) -> tuple[Le
         subprocess.run(list(words), env=environment(), check=True)
         unfinished.replace(path)
     with np.load(path) as file:
-        about = json.loads(str(file["about"]))
-        return level_from_kinetix({name: file[name] for name in file.files if name != "about"}), about
+        return level_from_kinetix({name: file[name] for name in file.files})
 
 
 def samples(level: Level) -> dict[str, np.ndarray]:
@@ -166,16 +156,14 @@ def told(name: str, values: np.ndarray) -> str:
 
 
 def report(size: str, count: int, seed: int, keep: Path) -> SizeReport:
-    level, theirs = reference_levels(keep, size, count, seed)
-    speed = measured(sys.executable, OURS, size, count)
+    theirs = reference_levels(keep, size, count, seed)
     ours = jax.tree.map(np.asarray, sample_levels(np.arange(count), SIZES[size]))
-    return SizeReport(size, count, compare(samples(ours), samples(level)), speed, theirs)
+    return SizeReport(size, count, compare(samples(ours), samples(theirs)))
 
 
 def summary(reports: Sequence[SizeReport]) -> str:
     """What it comes to, a column a size."""
     p = [[c for c in r.statistics.values() if c.corrected is not None] for r in reports]
-    speeds = [(r.ours["rate"], r.theirs["rate"]) for r in reports]
     lines: dict[str, list[Any]] = {
         "levels of each": [f"{r.levels:,}" for r in reports],
         "statistics": [len(r.statistics) for r in reports],
@@ -185,11 +173,6 @@ def summary(reports: Sequence[SizeReport]) -> str:
         "smallest p": [f"{min(c.p for c in of):.2g}" for of in p],  # type: ignore[type-var]
         "smallest corrected p": [f"{min(c.corrected for c in of):.2g}" for of in p],  # type: ignore[type-var]
         f"differ (corrected p < {SIGNIFICANT:g})": [len(r.differ) for r in reports],
-        "first call with compiling, s": [f"{r.ours['first']:.1f}" for r in reports],
-        "the reference's": [f"{r.theirs['first']:.0f}" for r in reports],
-        "levels/s": [f"{ours:,.0f}" for ours, _ in speeds],
-        "levels/s of the reference": [f"{theirs:,.0f}" for _, theirs in speeds],
-        "ratio": [f"{ours / theirs:.1f}" if theirs else "" for ours, theirs in speeds],
     }
     head = f"| | {' | '.join(r.size for r in reports)} |\n|---{'|---' * len(reports)}|\n"
     return head + "".join(f"| {name} | {' | '.join(map(str, values))} |\n" for name, values in lines.items())
@@ -211,15 +194,6 @@ def _cells(c: Compared | None) -> str:
     if c is None:
         return " | | |"
     return f" {c.ours} | {c.theirs} | {'' if c.p is None else f'{c.p:.2g}'} |"
-
-
-def between_marks(text: str, mark: str, made: str) -> str:
-    """A document with `made` between its lines `<!-- MARK -->` and `<!-- end of MARK -->`."""
-    before, begin, rest = text.partition(f"<!-- {mark} -->\n")
-    _, end, after = rest.partition(f"<!-- end of {mark} -->\n")
-    if not end:
-        raise SystemExit(f"The document has no lines <!-- {mark} --> and <!-- end of {mark} -->.")
-    return f"{before}{begin}\n{made.strip()}\n\n{end}{after}"
 
 
 def main() -> int:

@@ -1,17 +1,21 @@
 """Levels a second of our sampler and of the reference's, and the seconds of their first calls, compile included.
 
-    python -m benchmarks.sampler [SIZE ...]
+    python -m benchmarks.sampler [SIZE ...] [--write docs/benchmarks.md]
 
 No cache of compiled code; one process each, one after the other, each with all cores and threads as its user has them.
 """
 
+import argparse
 import json
 import subprocess
 import sys
+from pathlib import Path
 
+from benchmarks.document import between_marks
 from pipeline.bench.oracle import environment, oracle_python
 
 LEVELS = 4096
+MARK = "sampler"
 BATCH = 512  # of the reference: its memory grows with the batch
 
 OURS = """
@@ -54,15 +58,21 @@ def measured(python: object, program: str, *arguments: object) -> dict[str, floa
 
 
 def main() -> None:
-    print("| size | first call, s | reference | levels/s | reference | ratio |\n|---|---|---|---|---|---|")
-    for size in sys.argv[1:] or "sml":
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.sampler", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("size", nargs="*", default=list("sml"), help="s, m or l (default: all)")
+    parser.add_argument("--write", type=Path, help="document to put the table into, between its marks")
+    given = parser.parse_args()
+    lines = ["| size | first call, s | reference | levels/s | reference | ratio |", "|---|---|---|---|---|---|"]
+    for size in given.size:
         ours = measured(sys.executable, OURS, size, LEVELS)
         reference = measured(oracle_python(), REFERENCE, size, LEVELS, BATCH)
-        print(
+        lines.append(
             f"| {size} | {ours['first']:.1f} | {reference['first']:.0f} | {ours['rate']:,.0f} "
-            f"| {reference['rate']:,.0f} | {ours['rate'] / reference['rate']:.1f} |",
-            flush=True,
+            f"| {reference['rate']:,.0f} | {ours['rate'] / reference['rate']:.1f} |"
         )
+    print("\n".join(lines))
+    if given.write:
+        given.write.write_text(between_marks(given.write.read_text(), MARK, "\n".join(lines)))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from benchmarks.fidelity import MARK, between_marks, compare, holm, p_value, told
+from benchmarks.document import between_marks
+from benchmarks.fidelity import MARK, compare, holm, p_value, told
 
 RNG = np.random.default_rng(0)
 Draw = Callable[[int], np.ndarray]
