@@ -111,11 +111,20 @@ def _parser() -> argparse.ArgumentParser:
     _json(sub)
 
     sub = command(
-        "show", _show, "draw a level's witness as a moving picture", "levelproof show data/128k/s 7 -o level.gif"
+        "show",
+        _show,
+        "draw a level's witness, or what doing nothing does",
+        "levelproof show data/128k/s 7 -o level.gif",
     )
     sub.add_argument("source", type=Path, metavar="SPLIT", help=f"{SPLIT}; or a level file, such as level.json")
     sub.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help="a level of the split")
-    sub.add_argument("-o", "--out", type=Path, default=Path("level.gif"), help="file to write (default: level.gif)")
+    sub.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("level.gif"),
+        help="file to write: .gif, .mp4, .svg or .png (default: level.gif)",
+    )
 
     sub = command(
         "export", _export, "write a level as a file that Kinetix opens", "levelproof export data/128k/s 7 -o level.json"

@@ -1,47 +1,56 @@
-"""One level as a picture or a film: its witness, or the initial world where it has none."""
+"""One level as a picture or a film: its witness, or what doing nothing does where it has none."""
 
 import shutil
 import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
-from PIL import Image
+from jaxtyping import Array, Bool
 
 from configs.convert import typed
-from levelgen.level import Level, name_of
-from levelgen.render import Caption, draw, sheet, write_gif, write_png
-from levelgen.task import TaskParams
+from levelgen.level import ACTIONS, Level, name_of
+from levelgen.render import rasterised, sheet, write_gif, write_png
+from levelgen.scene import Caption, Scene, scene_of
+from levelgen.svg import write_svg
+from levelgen.task import Outcome, TaskParams, TaskState, advance, has_nan, reset
 from physics.types import State
 from pipeline.errors import Failure, UserError
 from pipeline.fields import tree_of
 from pipeline.levels import find_row, is_level_file, level_file, level_of
 from pipeline.manifest import Manifest, require_manifest
+from pipeline.runtime import prepare_jax
 from pipeline.shard import Shard
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures a second
 LAST_SECONDS = 1.5  # how long a film rests on its last picture
-MOST_LETTERS = 40  # of a file's name in a picture
+MOST_STEPS = 256  # env steps of doing nothing that are shown
+MOST_FRAMES = 2048  # and physics steps, whatever a level file's rules say
+SHOWN_SECONDS = (0.02, 2.0)  # shortest and longest of a picture; rules may have any time step
 SHEET = (3, 2)  # columns and rows of a still
 
 
 def show(source: Path, level_id: int | None, out: Path) -> None:
     """Draw a level of a split, or that of a level file, to `out`, and tell in one line what was drawn.
 
-    `.gif` and `.mp4` are films of the witness's first episode, `.png` is a sheet of pictures of it.
+    `.gif`, `.mp4` and `.svg` are films: of the witness's first episode, or of doing nothing where there is no witness.
+    `.png` is a sheet of pictures of the witness, or the initial world.
 
     Raises:
         UserError: no such level, or a file that cannot be read or written.
         Failure: the split is damaged.
     """
-    write = WRITERS.get(out.suffix.lower())
+    suffix = out.suffix.lower()
+    write = WRITERS.get(suffix)
     if write is None:
         raise UserError(f"Cannot draw to {out}: its name has to end in {', '.join(WRITERS)}.")
-    film = film_of(source, level_id)
+    film = film_of(source, level_id, plays=suffix != ".png")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         write(film, out)
@@ -52,15 +61,15 @@ def show(source: Path, level_id: int | None, out: Path) -> None:
 
 @dataclass(frozen=True)
 class Film:
-    """Pictures, the time of each, and what they show."""
+    """Scenes of one level, the time of each, and what they show."""
 
-    pictures: Sequence[Image.Image]
+    scenes: Sequence[Scene]
     seconds: Sequence[float]  # how long each is shown
     told: str
 
 
-def film_of(source: Path, level_id: int | None) -> Film:
-    """What there is to see of a level.
+def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
+    """What there is to see of a level; `plays`: doing nothing may be a film.
 
     Raises:
         UserError: no such level, or a file that cannot be read.
@@ -69,12 +78,12 @@ def film_of(source: Path, level_id: int | None) -> Film:
     if is_level_file(source):
         if level_id is not None:
             raise UserError(f"{source} is a level file, which has one level: leave out the id {level_id}.")
-        return file_still(source)
+        return file_film(source, plays)
     manifest = require_manifest(source)
     if level_id is None:
         raise UserError(f"Which level of {source}? Add its id, such as {manifest.level_ids[0]}.")
     row = find_row(manifest, level_id)
-    return witness_film(manifest, row) if row["shard"] else still(manifest, row)
+    return witness_film(manifest, row) if row["shard"] else row_film(manifest, row, plays)
 
 
 def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
@@ -84,38 +93,82 @@ def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
     states = tree_of(State, _below(arrays, "record/state/"))
     done, goal, action = (arrays[f"record/{name}"][..., 0] for name in ("done", "goal", "action"))
     first, last = first_success(done, goal)
-    rules = typed(TaskParams, (manifest.config or {})["task"])
+    rules = _rules(manifest)
     second = rules.frame_skip * rules.physics.dt  # of an env step
     shown = [*range(first, last + 1, STEPS_A_PICTURE), last + 1]
-    pictures = []
+    scenes = []
     for step in shown:
         state = _at(states, step) if step <= last else _touch(_at(states, last), rules)
         caption = Caption(_title(row), f"{(step - first) * second:.1f} s", "goal reached" if step > last else "")
-        pictures.append(draw(level, state, action=action[min(step, last)], caption=caption))
+        scenes.append(scene_of(level, state, action=action[min(step, last)], caption=caption))
     seconds = [second * (after - step) for step, after in pairwise(shown)] + [LAST_SECONDS]
     steps = last - first + 1
     told = f"solved in {steps} step{'s' if steps > 1 else ''} ({steps * second:.1f} s)"
-    return Film(pictures, seconds, f"level {row['level_id']} of size {row['size']}, {told}")
+    return Film(scenes, seconds, f"level {row['level_id']} of size {row['size']}, {told}")
 
 
-def still(manifest: Manifest, row: dict[str, Any]) -> Film:
-    """The initial world of a level without a witness."""
-    level = level_of(manifest, row)
-    caption = Caption(_title(row), "0.0 s", row["label"], good=False)
-    told = (
-        f"level {row['level_id']} of size {row['size']} is {row['label']} ({row['label_reason']}): "
-        "there is no witness, so this is its initial world"
-    )
-    return Film([draw(level, level.state, caption=caption)], [LAST_SECONDS], told)
+def row_film(manifest: Manifest, row: dict[str, Any], plays: bool) -> Film:
+    """A level without a witness."""
+    caption = Caption(_title(row), outcome=row["label"], good=False)
+    told = f"level {row['level_id']} of size {row['size']} is {row['label']} ({row['label_reason']})"
+    return _without_witness(level_of(manifest, row), _rules(manifest), caption, f"{told}: there is no witness", plays)
 
 
-def file_still(path: Path) -> Film:
-    """The initial world of a level file."""
-    level = level_file(path).level
-    size = name_of(level.size)
-    title = " ".join(path.stem.split())[:MOST_LETTERS]
-    told = f"{path.name}, a level of size {size}: a level file has no witness, so this is its initial world"
-    return Film([draw(level, level.state, caption=Caption(f"{title} · size {size}", "0.0 s"))], [LAST_SECONDS], told)
+def file_film(path: Path, plays: bool) -> Film:
+    """A level file."""
+    file = level_file(path)
+    size = name_of(file.level.size)
+    caption = Caption(f"{' '.join(path.stem.split())} · size {size}")
+    told = f"{path.name}, a level of size {size}: a level file has no witness"
+    return _without_witness(file.level, file.rules, caption, told, plays)
+
+
+def _without_witness(level: Level, rules: TaskParams, caption: Caption, told: str, plays: bool) -> Film:
+    """What doing nothing does, or the initial world."""
+    if not plays:
+        scene = scene_of(level, level.state, caption=replace(caption, clock="0.0 s"))
+        return Film([scene], [LAST_SECONDS], f"{told}, so this is its initial world")
+    every = STEPS_A_PICTURE * rules.frame_skip
+    states, end = do_nothing(level, rules)
+    shown, nothing = [*range(0, len(states) - 1, every), len(states) - 1], np.zeros(ACTIONS, np.int32)
+    scenes = []
+    for frame in shown:
+        now = replace(caption, clock=f"doing nothing · {frame * rules.physics.dt:.1f} s")
+        if end and frame == shown[-1]:
+            now = replace(now, outcome=end, good=end == GOAL)
+        scenes.append(scene_of(level, states[frame], action=nothing, caption=now))
+    shortest, longest = SHOWN_SECONDS
+    times = [min(max(rules.physics.dt * (after - frame), shortest), longest) for frame, after in pairwise(shown)]
+    length = f"{shown[-1] * rules.physics.dt:.1f} s"
+    told = f"{told}, so this is what doing nothing does ({f'{end} after' if end else 'the first'} {length})"
+    return Film(scenes, [*times, LAST_SECONDS], told)
+
+
+GOAL, FAIL, LATE, BROKEN = "goal reached", "touched red", "time is up", "world breaks down"
+
+
+def do_nothing(level: Level, rules: TaskParams) -> tuple[list[State], str]:
+    """The worlds before and after each physics step of the first episode, and how it ends; "" if it lasts longer."""
+    prepare_jax()
+    frames = min(MOST_STEPS * rules.frame_skip, MOST_FRAMES)
+    limit = min(rules.max_timesteps * rules.frame_skip, MOST_FRAMES + 1)
+    frame = replace(rules, frame_skip=1, max_timesteps=limit, dense_reward_scale=0.0)
+    now = reset(level)
+    states = [now.state]
+    for _ in range(frames):
+        now, outcome, broken = _idle_frame(level, now, frame)
+        if broken[0]:
+            return states, BROKEN
+        states.append(now.state)
+        if outcome.done[0]:
+            return states, GOAL if outcome.goal[0] else FAIL if outcome.reward[0] < 0 else LATE
+    return states, ""
+
+
+@partial(jax.jit, static_argnames="frame")
+def _idle_frame(level: Level, now: TaskState, frame: TaskParams) -> tuple[TaskState, Outcome, Bool[Array, " lane"]]:
+    after, outcome = advance(level, now, jnp.zeros((ACTIONS, 1), jnp.int32), frame)
+    return after, outcome, has_nan(after.state)
 
 
 def first_success(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time"]) -> tuple[int, int]:
@@ -133,14 +186,18 @@ def first_success(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time
 
 
 def write_film(film: Film, path: Path) -> None:
-    write_gif(film.pictures, path, film.seconds)
+    write_gif(map(rasterised, film.scenes), path, film.seconds)
 
 
 def write_sheet(film: Film, path: Path) -> None:
     """A few of the film's pictures, the first and the last among them."""
     columns, rows = SHEET
-    chosen = np.unique(np.linspace(0, len(film.pictures) - 1, columns * rows).round().astype(int))
-    write_png(sheet([film.pictures[i] for i in chosen], columns), path)
+    chosen = np.unique(np.linspace(0, len(film.scenes) - 1, columns * rows).round().astype(int))
+    write_png(sheet([rasterised(film.scenes[i]) for i in chosen], columns), path)
+
+
+def write_vectors(film: Film, path: Path) -> None:
+    write_svg(film.scenes, path, film.seconds)
 
 
 def write_mp4(film: Film, path: Path) -> None:
@@ -158,11 +215,11 @@ def write_mp4(film: Film, path: Path) -> None:
         )
     rate = 1 / film.seconds[0]
     rest = round(film.seconds[-1] * rate)
-    width, height = film.pictures[0].size
+    pictures = list(map(rasterised, film.scenes))
+    width, height = pictures[0].size
     command = [program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
     command += ["-r", f"{rate:.6g}", "-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
-    pictures = [*film.pictures, *[film.pictures[-1]] * (rest - 1)]
-    raw = b"".join(picture.tobytes() for picture in pictures)
+    raw = b"".join(picture.tobytes() for picture in [*pictures, *pictures[-1:] * (rest - 1)])
     done = subprocess.run([*command, str(path)], input=raw, capture_output=True, check=False)
     if done.returncode:
         raise Failure(f"ffmpeg could not write {path}: {done.stderr.decode(errors='replace').strip()[-200:]}")
@@ -177,7 +234,16 @@ def packaged_ffmpeg() -> str | None:
     return imageio_ffmpeg.get_ffmpeg_exe()
 
 
-WRITERS: dict[str, Callable[[Film, Path], None]] = {".gif": write_film, ".png": write_sheet, ".mp4": write_mp4}
+WRITERS: dict[str, Callable[[Film, Path], None]] = {
+    ".gif": write_film,
+    ".png": write_sheet,
+    ".mp4": write_mp4,
+    ".svg": write_vectors,
+}
+
+
+def _rules(manifest: Manifest) -> TaskParams:
+    return typed(TaskParams, (manifest.config or {})["task"])
 
 
 def _below(arrays: dict[str, np.ndarray], path: str) -> dict[str, np.ndarray]:

@@ -8,17 +8,14 @@ import pytest
 from PIL import Image
 
 from levelgen.level import WORLD_SIDE, Role
-from levelgen.render import (
+from levelgen.render import draw, sheet, write_gif, write_png
+from levelgen.scene import (
     BINDING_COLOUR,
     BORDER,
     HEADER,
     ROLE_COLOUR,
     Caption,
-    draw,
     live_entries,
-    sheet,
-    write_gif,
-    write_png,
 )
 from tests.golden.load import HERE, load
 

@@ -99,11 +99,14 @@ def test_a_damaged_shard_is_no_level(split, tmp_path, capsys) -> None:
 
 
 def test_a_level_file_is_drawn(file, tmp_path, capsys) -> None:
-    for suffix in (".png", ".gif"):
+    for suffix in (".png", ".gif", ".mp4", ".svg"):
         assert main(["show", str(file), "-o", str(tmp_path / f"level{suffix}")]) == 0
-    told = capsys.readouterr().out
-    assert "level.json, a level of size s: a level file has no witness" in told
+    still, *films = capsys.readouterr().out.splitlines()
+    told = "level.json, a level of size s: a level file has no witness, so this is"
+    assert still.endswith(f"{told} its initial world")
+    assert all(f"{told} what doing nothing does (" in film for film in films)
     assert (tmp_path / "level.gif").read_bytes().startswith(b"GIF8")
+    assert "doing nothing · 0.0 s" in (tmp_path / "level.svg").read_text()
 
 
 def refused(capsys, words: list[str]) -> str:
@@ -149,4 +152,5 @@ def test_a_level_with_extreme_values_is_drawn(file, tmp_path) -> None:
     model = dataclasses.replace(far.model, inverse_mass=still, inverse_inertia=still)
     state = dataclasses.replace(far.state, velocity=level.state.velocity, angular_velocity=still)
     write_level_file(LevelFile(dataclasses.replace(far, model=model, state=state), TaskParams()), tmp_path / "far.json")
-    assert main(["show", str(tmp_path / "far.json"), "-o", str(tmp_path / "far.png")]) == 0
+    for suffix in (".png", ".gif", ".svg"):
+        assert main(["show", str(tmp_path / "far.json"), "-o", str(tmp_path / f"far{suffix}")]) == 0
