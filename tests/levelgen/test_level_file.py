@@ -183,6 +183,34 @@ def test_a_joint_from_a_body_to_itself() -> None:
         from_document(made)
 
 
+@pytest.mark.parametrize(
+    ("kind", "binding", "most", "names"),
+    [
+        ("joint", 4, 3, "motor"),
+        ("joint", 255, 3, "motor"),
+        ("thruster", 2, 1, "thruster"),
+        ("thruster", 3, 1, "thruster"),
+    ],
+)
+def test_active_actuators_have_bindings_that_exist(kind: str, binding: int, most: int, names: str) -> None:
+    """A motor that is off and a fixed joint, too: a policy reads their bindings."""
+    for switches in ({}, {"motor_on": False}, {"is_fixed_joint": True}):
+        made = changed(f"env_state.{kind}.0.{names}_binding", binding)
+        made["env_state"][kind][0] |= {"active": True, **(switches if kind == "joint" else {})}
+        with pytest.raises(LevelFileError, match=rf"^env_state\.{kind}\[0\] has a {names}_binding beyond {most}$"):
+            from_document(made)
+
+
+@pytest.mark.parametrize("kind", ["motor", "thruster"])
+@pytest.mark.parametrize("binding", [-1, 256, 1.0, None])
+def test_bindings_of_no_kind_are_refused_everywhere(kind: str, binding: object) -> None:
+    thing = "joint" if kind == "motor" else kind
+    made = changed(f"env_state.{thing}.0.{kind}_binding", binding)
+    made["env_state"][thing][0]["active"] = False
+    with pytest.raises(LevelFileError, match=rf"{kind}_binding is .*, it has to be a whole number from 0 to 255$"):
+        from_document(made)
+
+
 def test_actuators_that_are_not_there_may_be_bound_to_anything() -> None:
     """As two thrusters of the reference's own levels are."""
     made = changed("env_state.thruster.0.thruster_binding", 3)
