@@ -10,6 +10,7 @@ from jaxtyping import Bool, Int
 from experts.config import RECORD_STEPS, Choice, ExpertConfig
 from experts.labels import Label, Source, Verdict, solved_reason, unsolved_reason
 from experts.progress import NEVER, Progress
+from experts.slots import Begun
 from experts.success import Success
 from experts.witness import replay, steps_to_goal, succeeds
 from levelgen.actions import CHOICES
@@ -27,11 +28,19 @@ class Evaluation(NamedTuple):
     success: Success  # the first of training
 
 
+class Kept(NamedTuple):
+    """An expert that can go on later."""
+
+    begun: Begun
+    curve: list[float]  # so far, as in `Trained`
+
+
 class Trained(NamedTuple):
     """A level that has left its slot."""
 
     curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
     evaluations: list[Evaluation]  # those that solved it, and the last
+    expert: Kept | None = None  # if it is kept
 
 
 class Witness(NamedTuple):

@@ -62,6 +62,7 @@ class Trial(NamedTuple):
     """An evaluation: every environment rolls out a record."""
 
     part: Int[Array, ""]  # rollouts of it that are done
+    due: Bool[Array, ""]  # by what training showed
     final: Bool[Array, ""]  # the level leaves afterwards
     action: Int[Array, "time 6 attempt"]
     done: Bool[Array, "time environment"]
@@ -140,6 +141,7 @@ def empty_slots(count: int, queue: Queue, config: ExpertConfig) -> Slots:
     rows, zeros = config.record_rollouts * config.horizon, jnp.zeros(count, jnp.int32)
     trial = Trial(
         zeros,
+        zeros.astype(bool),
         zeros.astype(bool),
         jnp.zeros((count, rows, len(CHOICES), config.attempts), jnp.int8),
         *jnp.zeros((2, count, rows, config.environments), bool),
@@ -274,10 +276,10 @@ def _learn(
     success = remember(training.success, find(recent, now.goal, now.timestep))
     shuffling = jax.random.fold_in(now.key, config.horizon)  # the rollout used 0 .. horizon - 1
     expert = ppo.update(training.expert, shuffling, network, now.seen, now.samples, config)
-    course, evaluate, final = stop.after_update(training.course, totals, share, slot.deadline, config, stopping)
+    course, due, final = stop.after_update(training.course, totals, share, slot.deadline, config, stopping)
     training = Training(expert, totals, course, success, recent[config.horizon :])
-    trial = slot.trial._replace(part=jnp.int32(0), final=final)
-    return slot._replace(mode=jnp.where(evaluate, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share
+    trial = slot.trial._replace(part=jnp.int32(0), due=due, final=final)
+    return slot._replace(mode=jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share
 
 
 def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) -> Slot:
@@ -286,6 +288,7 @@ def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) 
     put = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, first, 0)
     trial = Trial(
         slot.trial.part + 1,
+        slot.trial.due,
         slot.trial.final,
         put(slot.trial.action, now.action[..., : config.attempts]),
         put(slot.trial.done, now.done),
@@ -296,7 +299,7 @@ def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) 
     ended = (trial.part == config.record_rollouts) | hopeless
     solved = ~hopeless & stop.solves(trial.done, trial.goal, stopping, config)
     course, leaves, deadline = stop.after_evaluation(
-        slot.training.course, solved, trial.final, slot.deadline, config, stopping
+        slot.training.course, solved, trial.due, trial.final, slot.deadline, config, stopping
     )
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, old)
     mode = jnp.where(leaves, Mode.EMPTY, Mode.TRAIN)

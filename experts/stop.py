@@ -33,7 +33,7 @@ def after_update(
     config: ExpertConfig,
     stopping: StopConfig,
 ) -> tuple[Course, Bool[Array, ""], Bool[Array, ""]]:
-    """The course, whether an evaluation comes next, and whether the level leaves after it."""
+    """The course, whether an evaluation is due, and whether the level leaves after one, due or not."""
     updates = course.updates + 1
     final = updates >= deadline
     evaluate = jnp.bool_(False)
@@ -46,12 +46,13 @@ def after_update(
         moves = (progress.first_success != NEVER) | (progress.best_return >= rung_return + stopping.gain)
         final |= at_rung & ~moves
         rung_return = jnp.where(at_rung, progress.best_return, rung_return)
-    return course._replace(updates=updates, rung_return=rung_return), evaluate | final, final
+    return course._replace(updates=updates, rung_return=rung_return), evaluate, final
 
 
 def after_evaluation(
     course: Course,
     solved: Bool[Array, ""],
+    due: Bool[Array, ""],
     final: Bool[Array, ""],
     deadline: Int[Array, ""],
     config: ExpertConfig,
@@ -67,8 +68,8 @@ def after_evaluation(
         failed=course.failed + ~solved,
         solved=solved,
     )
-    # the last one leaves no trace: an expert that goes on with more budget goes on as if it had not been
-    course = Course(*(jnp.where(final, old, new) for old, new in zip(course, tried, strict=True)))
+    # one that only the deadline asked for leaves no trace: an expert that goes on later goes on as if it had not been
+    course = Course(*(jnp.where(due, new, old) for old, new in zip(course, tried, strict=True)))
     return course, leaves, deadline
 
 

@@ -4,8 +4,10 @@ Levels that need no expert (`experts.before`) get none, and use nothing of their
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -15,7 +17,7 @@ from jaxtyping import Int
 
 from experts.before import decide
 from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
-from experts.judge import Evaluation, Trained, judge, witness_of
+from experts.judge import Evaluation, Kept, Trained, judge, witness_of
 from experts.labels import WITNESSED, Label, Verdict
 from experts.slots import Begun, Mode, Queue, Slots, advance, begin, empty_slots
 from experts.witness import Record, replay, take
@@ -26,6 +28,7 @@ LANES_IN_CACHE = 128  # their physics and one minibatch fit the cache of a core
 LANES_ON_ACCELERATOR = 32_768
 BLOCK = 16  # experts that one call of `begin` makes
 DEFAULT_STOP = StopConfig()
+NOTHING_BEGUN: Mapping[int, Kept] = MappingProxyType({})
 
 Tell = Callable[[int, float, int], None]  # totals so far: env steps, levels (parts count), solved levels
 
@@ -47,7 +50,7 @@ class UnitResult:
     record: Record  # all zero where the level has no witness
     verdicts: list[Verdict]
     spent: Spent
-    experts: dict[int, Begun] = field(default_factory=dict)  # by level id, where they are kept
+    experts: dict[int, Kept] = field(default_factory=dict)  # by level id, where they are kept
 
 
 def train_levels(
@@ -58,6 +61,8 @@ def train_levels(
     stopping: StopConfig = DEFAULT_STOP,
     rules: TaskParams = DEFAULT_RULES,
     report: Tell = lambda env_steps, levels, solved: None,
+    begun: Mapping[int, Kept] = NOTHING_BEGUN,
+    keep: bool = False,
 ) -> UnitResult:
     """Label the levels; train an expert for each that needs one.
 
@@ -69,6 +74,8 @@ def train_levels(
         stopping: when a level leaves its slot.
         rules: of the task; records hold its rewards, training shapes with the configuration's.
         report: called now and then with totals over all experts.
+        begun: by level id, experts that go on with what they have left of the budget; the others begin.
+        keep: whether the result has the experts.
 
     Raises:
         ValueError: the budget does not suffice for one update.
@@ -80,7 +87,8 @@ def train_levels(
     left = np.array([i for i, verdict in enumerate(before) if verdict is None], int)
     known_before = len(before) - len(left)
     tell = lambda env_steps, through, solved: report(env_steps, known_before + through, solved)
-    trained, spent = train(take(levels, left), level_ids[left], updates, config, stopping, rules, tell)
+    mine = {place: begun[level_id] for place, level_id in enumerate(level_ids[left].tolist()) if level_id in begun}
+    trained, spent = train(take(levels, left), level_ids[left], updates, config, stopping, rules, tell, mine, keep)
     judged, witness = judge(take(levels, left), trained, config, rules, failed[left])
     verdicts = {int(i): verdict for i, verdict in zip(left, judged, strict=True)}
     known = [verdict or verdicts[i] for i, verdict in enumerate(before)]
@@ -90,7 +98,9 @@ def train_levels(
     witnessed = np.array([verdict.label in WITNESSED for verdict in known])
     record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
     report(spent.trained, len(known), sum(verdict.label is Label.SOLVED for verdict in known))
-    return UnitResult(level_ids.astype(np.int64), levels, record, known, spent)
+    ended = zip(level_ids[left].tolist(), trained, strict=True)
+    experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
+    return UnitResult(level_ids.astype(np.int64), levels, record, known, spent, experts)
 
 
 def updates_in(budget: int, config: ExpertConfig) -> int:
@@ -123,16 +133,19 @@ def train(
     stopping: StopConfig,
     rules: TaskParams,
     report: Tell = lambda env_steps, levels, solved: None,
+    begun: Mapping[int, Kept] = NOTHING_BEGUN,
+    keep: bool = False,
 ) -> tuple[list[Trained], Spent]:
-    """Each level through a slot, until it is decided or has had so many updates."""
+    """Each level through a slot, until it is decided or has had so many updates. `begun` is by place."""
     count = len(level_ids)
     if not count:
         return [], Spent(0, 0, 0)
     shaped = replace(rules, dense_reward_scale=config.dense_reward_scale)
-    queue = queue_of(levels, level_ids, updates, config)
+    queue = queue_of(levels, level_ids, updates, config, begun)
     slots = empty_slots(slot_count(config), queue, config)
-    curves: list[list[float]] = [[] for _ in range(count)]
+    curves = [list(begun[place].curve) if place in begun else [] for place in range(count)]
     evaluations: list[list[Evaluation]] = [[] for _ in range(count)]
+    experts: list[Kept | None] = [None] * count
     rollouts, left, solved = Counter(), 0, 0
     while left < count:
         slots, now = advance(slots, queue, config, stopping, shaped)
@@ -142,24 +155,46 @@ def train(
             curves[seen.place[slot]].append(float(seen.share[slot]))
         for slot in np.flatnonzero(seen.evaluated).tolist():
             evaluations[seen.place[slot]].append(evaluation_of(slots, slot, config))
-        for place in seen.place[seen.left]:
+        for slot in np.flatnonzero(seen.left).tolist():
+            place = seen.place[slot]
             left, solved = left + 1, solved + (witness_of(evaluations[place], config) is not None)
+            if keep:
+                experts[place] = Kept(expert_of(slots, slot, config), curves[place])
         under_way = sum(len(curves[place]) for place in seen.place[~seen.left & (seen.mode != Mode.EMPTY)])
         report(rollouts[Mode.TRAIN] * config.steps_per_update, left + under_way / updates, solved)
     spent = (rollouts[mode] * config.steps_per_update for mode in (Mode.TRAIN, Mode.EVALUATE, Mode.EMPTY))
-    return [Trained(*of) for of in zip(curves, evaluations, strict=True)], Spent(*spent)
+    return [Trained(*of) for of in zip(curves, evaluations, experts, strict=True)], Spent(*spent)
 
 
-def queue_of(levels: Level, level_ids: Int[np.ndarray, " level"], updates: int, config: ExpertConfig) -> Queue:
+def queue_of(
+    levels: Level,
+    level_ids: Int[np.ndarray, " level"],
+    updates: int,
+    config: ExpertConfig,
+    begun: Mapping[int, Kept] = NOTHING_BEGUN,
+) -> Queue:
     """The levels as a queue on the device. Its capacity is a power of two: few shapes are compiled."""
     count = len(level_ids)
     places = np.minimum(np.arange(max(BLOCK, 1 << (count - 1).bit_length())), count - 1)
     levels, ids = take(levels, places), np.asarray(level_ids, np.int32)[places]
     blocks = [np.arange(first, first + BLOCK) for first in range(0, len(places), BLOCK)]
-    begun = [begin(take(levels, block), ids[block], config) for block in blocks]
-    joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *begun)
-    levels, ids = jax.device_put((levels, ids))
-    return Queue(levels, ids, jnp.int32(count), jnp.int32(updates), joined)
+    fresh = [jax.device_get(begin(take(levels, block), ids[block], config)) for block in blocks]
+    experts = jax.tree.map(lambda *parts: np.concatenate(parts), *fresh)
+    for place, expert in begun.items():
+        jax.tree.map(partial(_put, place), experts, expert.begun)
+    levels, ids, experts = jax.device_put((levels, ids, experts))
+    return Queue(levels, ids, jnp.int32(count), jnp.int32(updates), experts)
+
+
+def _put(place: int, rows: np.ndarray, row: np.ndarray) -> None:
+    rows[place] = row
+
+
+def expert_of(slots: Slots, slot: int, config: ExpertConfig) -> Begun:
+    """The expert that has just left a slot, on the host, as it would go on."""
+    lanes = np.arange(slot * config.environments, (slot + 1) * config.environments)
+    training, acting = jax.tree.map(lambda x: x[slot], slots.slot.training), take(slots.acting, lanes)
+    return jax.device_get(Begun(training, acting))
 
 
 def evaluation_of(slots: Slots, slot: int, config: ExpertConfig) -> Evaluation:

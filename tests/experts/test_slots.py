@@ -126,3 +126,15 @@ def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[T
         assert len(polished[i].curve) == len(solved[i].curve) + 4
         assert len(polished[i].evaluations) == 2
         same(polished[i].evaluations[0], solved[i].evaluations[0])
+
+
+@pytest.mark.parametrize("stopping", [WHOLE, SOLVED], ids=["budget", "solved"])
+def test_going_on_equals_having_trained_through(levels: Level, stopping: StopConfig) -> None:
+    through, _ = train(levels, IDS, UPDATES, CONFIG, stopping, DEFAULT_RULES)
+    first, _ = train(levels, IDS, UPDATES // 3, CONFIG, stopping, DEFAULT_RULES, keep=True)
+    left = [i for i, of in enumerate(through) if len(of.curve) > UPDATES // 3]
+    kept = {place: first[i].expert for place, i in enumerate(left)}
+    later, spent = train(take(levels, np.array(left)), IDS[left], UPDATES, CONFIG, stopping, DEFAULT_RULES, begun=kept)  # type: ignore[arg-type]
+    assert spent.trained == sum(len(through[i].curve) - UPDATES // 3 for i in left) * CONFIG.steps_per_update
+    for i, of in zip(left, later, strict=True):
+        same(of, through[i])

@@ -16,15 +16,15 @@ SOLVED, HALVING = StopConfig(wait=2048, share=0.9), StopConfig(rule=Rule.HALVING
 def after(updates: int, share: float, stopping: StopConfig, best: float = 0.0, first: int = progress.NEVER, **course):
     now = stop.begin()._replace(updates=jnp.int32(updates - 1), **course)
     totals = progress.start(16)._replace(best_return=jnp.float32(best), first_success=jnp.int32(first))
-    now, evaluate, final = stop.after_update(now, totals, jnp.float32(share), jnp.int32(100), CONFIG, stopping)
+    now, due, final = stop.after_update(now, totals, jnp.float32(share), jnp.int32(100), CONFIG, stopping)
     assert int(now.updates) == updates
-    return now, bool(evaluate), bool(final)
+    return now, bool(due), bool(final)
 
 
 @pytest.mark.parametrize("stopping", [StopConfig(rule=Rule.BUDGET), SOLVED, HALVING])
 def test_a_budget_ends_in_an_evaluation(stopping: StopConfig) -> None:
     assert after(99, float("nan"), stopping)[1:] == (False, False)
-    assert after(100, float("nan"), stopping)[1:] == (True, True)
+    assert after(100, float("nan"), stopping)[1:] == (False, True)
 
 
 def test_success_is_worth_an_evaluation() -> None:
@@ -38,14 +38,14 @@ def test_a_success_of_training_ends_it_where_it_is_a_witness() -> None:
     config = replace(CONFIG, exploration=True)
     totals = progress.start(16)._replace(first_success=jnp.int32(5))
     for stopping, ends in ((SOLVED, True), (StopConfig(rule=Rule.BUDGET), False)):
-        _, evaluate, final = stop.after_update(stop.begin(), totals, jnp.float32(0.1), jnp.int32(100), config, stopping)
-        assert bool(evaluate) == bool(final) == ends
+        _, due, final = stop.after_update(stop.begin(), totals, jnp.float32(0.1), jnp.int32(100), config, stopping)
+        assert (bool(due), bool(final)) == (False, ends)
 
 
 def test_at_a_rung_learning_has_to_move() -> None:
     """Rungs are at 4, 8, 16, 32 and 64 updates."""
     low = jnp.float32(0.5)
-    assert after(8, 0.0, HALVING, best=0.55, rung_return=low)[1:] == (True, True)
+    assert after(8, 0.0, HALVING, best=0.55, rung_return=low)[1:] == (False, True)
     moved, evaluate, final = after(8, 0.0, HALVING, best=0.65, rung_return=low)
     assert (evaluate, final, float(moved.rung_return)) == (False, False, pytest.approx(0.65))
     assert after(8, 0.0, HALVING, best=0.55, rung_return=low, first=77)[1:] == (False, False)
@@ -60,7 +60,7 @@ def test_rungs() -> None:
 def test_what_follows_from_an_evaluation() -> None:
     course = stop.begin()._replace(updates=jnp.int32(10))
     decide = lambda solved, final, stopping: stop.after_evaluation(
-        course, jnp.bool_(solved), jnp.bool_(final), jnp.int32(100), CONFIG, stopping
+        course, jnp.bool_(solved), jnp.bool_(not final), jnp.bool_(final), jnp.int32(100), CONFIG, stopping
     )
     failed, leaves, deadline = decide(False, False, SOLVED)
     assert (int(failed.next_evaluation), bool(leaves), int(deadline)) == (12, False, 100)
@@ -73,8 +73,12 @@ def test_what_follows_from_an_evaluation() -> None:
 def test_a_last_evaluation_leaves_no_trace_in_what_goes_on() -> None:
     """So that more budget later continues as if there had been none."""
     course = stop.begin()._replace(updates=jnp.int32(10), next_evaluation=jnp.int32(9))
-    ended, _, _ = stop.after_evaluation(course, jnp.bool_(False), jnp.bool_(True), jnp.int32(10), CONFIG, SOLVED)
+    yes, no = jnp.bool_(True), jnp.bool_(False)
+    ended, leaves, _ = stop.after_evaluation(course, no, no, yes, jnp.int32(10), CONFIG, SOLVED)
+    assert bool(leaves)
     np.testing.assert_equal(tuple(map(np.asarray, ended)), tuple(map(np.asarray, course)))
+    due, _, _ = stop.after_evaluation(course, no, yes, yes, jnp.int32(10), CONFIG, SOLVED)
+    assert (int(due.failed), int(due.next_evaluation)) == (1, 12), "it would have been made with more budget, too"
 
 
 def test_solving_takes_enough_attempts() -> None:
