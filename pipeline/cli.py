@@ -107,7 +107,15 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--where", metavar="SQL", help="count only rows for which this condition on the manifest's columns holds"
     )
-    sub.add_argument("--rows", type=int, default=10, help="rows to show (default: 10)")
+    sub.add_argument(
+        "--against",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="PATH",
+        help="look for the same levels in another split, a level file, or a folder of them (may be repeated)",
+    )
+    sub.add_argument("--rows", type=int, default=10, help="rows, and pairs of duplicates, to show (default: 10)")
     _json(sub)
 
     sub = command(
@@ -189,7 +197,7 @@ def _sample(arguments: argparse.Namespace) -> int:
 def _inspect(arguments: argparse.Namespace) -> int:
     from pipeline.inspect import inspect
 
-    inspect(arguments.split, arguments.where, arguments.rows, arguments.json)
+    inspect(arguments.split, arguments.where, arguments.rows, arguments.json, arguments.against)
     return Exit.DONE
 
 

@@ -1,7 +1,11 @@
-"""What is in a split: counts, rates, quantiles and rows, by DuckDB over the manifest. Reads no shard's data."""
+"""What is in a split: counts, rates, quantiles, duplicates and rows, by DuckDB over the manifest.
+
+Reads no shard's data.
+"""
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +18,7 @@ from rich.table import Table
 from configs.compose import identified
 from configs.convert import typed
 from levelgen.distribution import Distribution
+from pipeline import duplicates
 from pipeline.errors import UserError
 from pipeline.manifest import Manifest, require_manifest
 from pipeline.schema import RECORD_STEPS
@@ -23,14 +28,16 @@ QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps")
 
 
-def inspect(split: Path, where: str | None, rows: int, as_json: bool) -> None:
+def inspect(split: Path, where: str | None, rows: int, as_json: bool, against: Sequence[Path] = ()) -> None:
     """Print what is in `split`, of the rows for which the SQL condition `where` holds.
 
+    The same levels are looked for in `against`: other splits, level files, folders of level files.
+
     Raises:
-        UserError: no split, or a condition that DuckDB cannot use.
+        UserError: no split, a condition that DuckDB cannot use, or nothing to look in.
         Failure: a fragment is damaged.
     """
-    facts = survey(split, where, rows)
+    facts = survey(split, where, rows, against)
     if as_json:
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)
         print()
@@ -38,11 +45,12 @@ def inspect(split: Path, where: str | None, rows: int, as_json: bool) -> None:
         _print(facts, Console(highlight=False))
 
 
-def survey(split: Path, where: str | None = None, rows: int = 10) -> dict[str, Any]:
+def survey(split: Path, where: str | None = None, rows: int = 10, against: Sequence[Path] = ()) -> dict[str, Any]:
     """The facts that `inspect` prints, as JSON's types."""
     manifest = require_manifest(split)
     chosen = select(manifest.table, where)
     solved, tried = (select(chosen, f"label IN ({names})") for names in ("'solved'", "'solved', 'unsolved'"))
+    levels, shown = duplicates.compared(chosen), max(rows, 0)
     stored = sum(stored_bytes(split / shard) for shard in manifest.shards)
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
     return {
@@ -56,10 +64,12 @@ def survey(split: Path, where: str | None = None, rows: int = 10) -> dict[str, A
         "solve_rate": solved.num_rows / tried.num_rows if tried.num_rows else None,  # of the levels with an expert
         "steps_to_goal": _quantiles(solved, "steps_to_goal"),
         "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
+        "duplicates": duplicates.within(levels, shown),
+        "against": {str(other): duplicates.between(levels, duplicates.compared_in(other), shown) for other in against},
         "env_steps": sum(chosen.column("env_steps").to_pylist()),
         "split_bytes": stored,  # of all the split's shards, whatever the condition
         "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
-        "rows": [_plain(row) for row in chosen.slice(0, max(rows, 0)).to_pylist()],
+        "rows": [_plain(row) for row in chosen.slice(0, shown).to_pylist()],
     }
 
 
@@ -123,13 +133,15 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         "solve rate of experts": f"{facts['solve_rate']:.1%}" if facts["solve_rate"] is not None else None,
         "steps to goal": _told(facts["steps_to_goal"]),
         "training steps to first success": _told(facts["steps_to_first_success"]),
+        "duplicates": duplicates.told(facts["duplicates"]),
+        **{f"duplicates in {other}": duplicates.told(found) for other, found in facts["against"].items()},
         "training env steps": f"{facts['env_steps']:,}",
         "shards": f"{facts['split_bytes']:,} bytes",
         "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
     }
     for name, text in lines.items():
         if text is not None:
-            console.print(f"{name + ':':33}{text}", markup=False, soft_wrap=True)
+            console.print(f"{name + ':':32} {text}", markup=False, soft_wrap=True)
     table = Table(*SHOWN, box=None, pad_edge=False, padding=(0, 1, 0, 0))  # fits 80 columns
     for row in facts["rows"]:
         table.add_row(*(_cell(row[name]) for name in SHOWN))

@@ -151,7 +151,7 @@ def read_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest
     return Manifest(split, fragments, table.take(first).replace_schema_metadata(None), shards)
 
 
-def require_manifest(split: Path) -> Manifest:
+def require_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest:
     """As `read_manifest`, for questions about a split that should be there.
 
     Raises:
@@ -162,7 +162,7 @@ def require_manifest(split: Path) -> Manifest:
         raise UserError(
             f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
         )
-    manifest = read_manifest(split)
+    manifest = read_manifest(split, columns)
     if not manifest.fragments:
         raise UserError(
             f"Nothing is committed in {split} yet: give a folder such as data/128k/s that `levelproof generate` made."

@@ -22,6 +22,8 @@ CONFIG_KEY = b"levelproof.config"  # the settings that decide results, as JSON
 COLUMNS = pa.schema(
     [
         pa.field("level_id", pa.int64(), nullable=False),
+        pa.field("content_hash", pa.string(), nullable=False),  # levelgen.content
+        pa.field("signature", pa.list_(pa.string()), nullable=False),  # levelgen.signature
         pa.field("size", pa.string(), nullable=False),
         pa.field("budget", pa.string(), nullable=False),  # as typed
         pa.field("label", pa.string(), nullable=False),  # solved, unsolved, unsolvable, trivial

@@ -18,8 +18,10 @@ from configs.schema import JobConfig
 from experts.labels import WITNESSED, Label, Verdict
 from experts.train import UnitResult, train_levels
 from experts.witness import Record, replay, succeeds
+from levelgen.content import content_hashes
 from levelgen.level import Level, size_of
 from levelgen.sampler import sample_levels
+from levelgen.signature import signatures
 from levelgen.task import TaskParams
 from pipeline.errors import Failure
 from pipeline.fields import arrays_of, map_arrays, same_bits
@@ -108,6 +110,8 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
     kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label in WITNESSED]
     shard = attempt_path(split, unit.name)
     rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
+    for row, content, signature in zip(rows, content_hashes(result.levels), signatures(result.levels), strict=True):
+        row |= {"content_hash": content, "signature": signature}
     for place, i in enumerate(kept):
         rows[i] |= {"shard": str(shard.relative_to(split)), "row": place}
     with committing(split):
@@ -129,7 +133,7 @@ def shard_arrays(levels: Level, record: Record, kept: list[int]) -> dict[str, np
 
 
 def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, Any]:
-    """A level's row, without a shard."""
+    """A level's row, without its identity and without a shard."""
     return asdict(verdict) | {
         "level_id": level_id,
         "size": job.size,

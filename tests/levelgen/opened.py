@@ -13,6 +13,13 @@ from pipeline.bench import oracle
 ROOT = Path(__file__).parents[2]
 
 
+def handmade_levels(python: Path) -> Path:
+    """The folder of the level files in the reference's installation."""
+    code = "from importlib.util import find_spec; print(find_spec('kinetix').origin)"
+    told = subprocess.run([python, "-c", code], env=oracle.environment(), capture_output=True, text=True, check=True)
+    return Path(told.stdout.strip()).parent / "levels"
+
+
 class Played(NamedTuple):
     """What the reference made of some files."""
 

@@ -1,7 +1,6 @@
 """Level files against the reference: all of its handmade levels, and ours, opened by it. Skipped where it is not."""
 
 import functools
-import subprocess
 from pathlib import Path
 
 import jax
@@ -14,8 +13,7 @@ from levelgen.level_file import LevelFile, read_level_file, write_level_file
 from levelgen.sampler import Distribution, sample_levels
 from levelgen.task import TaskParams, TaskState, advance
 from physics.types import Size
-from pipeline.bench import oracle
-from tests.levelgen.opened import Played, open_in_reference
+from tests.levelgen.opened import Played, handmade_levels, open_in_reference
 
 pytestmark = pytest.mark.slow
 HANDMADE = {"s": 10, "m": 24, "l": 40}
@@ -26,9 +24,7 @@ OURS = 4  # levels of our sampler that are opened with the handmade ones
 @pytest.fixture(scope="module")
 def handmade(reference: Path) -> dict[str, list[Path]]:
     """The level files of the reference's installation by size."""
-    code = "from importlib.util import find_spec; print(find_spec('kinetix').origin)"
-    told = subprocess.run([reference, "-c", code], env=oracle.environment(), capture_output=True, text=True, check=True)
-    folder = Path(told.stdout.strip()).parent / "levels"
+    folder = handmade_levels(reference)
     return {size: sorted((folder / size).glob("*.json")) for size in SIZES}
 
 

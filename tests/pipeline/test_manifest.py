@@ -27,6 +27,7 @@ def commit(split: Path, job: JobConfig, level_ids: list[int], label: Label = Lab
     path = fragment_path(split, unit_name(level_ids[0], level_ids[-1]))
     rows = [manifest_row(job, i, made_verdict(label)) for i in level_ids]
     rows = [row | {"shard": f"shards/{path.stem}-ab.zarr", "row": i} for i, row in enumerate(rows)]
+    rows = [row | {"content_hash": f"c1:{row['level_id']}", "signature": ["n1:a", "n1:b"]} for row in rows]
     write_fragment(path, rows, job.hash, job.results)
     return path
 
@@ -114,7 +115,7 @@ def test_another_version_is_refused(tmp_path: Path, job: JobConfig) -> None:
     table = pq.read_table(path)
     metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"9"}
     pq.write_table(table.replace_schema_metadata(metadata), path)
-    with pytest.raises(Failure, match="has manifest version 9, this program reads 2"):
+    with pytest.raises(Failure, match="has manifest version 9, this program reads 3"):
         read_manifest(tmp_path)
 
 
