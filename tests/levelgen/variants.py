@@ -103,6 +103,9 @@ def names(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def with_names(level: Level, motor: np.ndarray, thruster: np.ndarray, backward: np.ndarray) -> Level:
+    # handmade levels have bindings beyond the last where nothing is active
+    flames = np.minimum(level.thruster_binding, THRUSTER_BINDINGS - 1)
+    level = edited(level, motor_binding=np.minimum(level.motor_binding, MOTOR_BINDINGS - 1))
     against = backward[level.motor_binding] & ~level.motor_auto
     level = swapped(level, against & weakened(level))  # a limit's motor runs the other way by its sides alone
     speed = np.where(against & ~weakened(level), -1, 1).astype(np.float32) * level.model.motor_speed
@@ -110,7 +113,7 @@ def with_names(level: Level, motor: np.ndarray, thruster: np.ndarray, backward: 
         level,
         {"motor_speed": speed},
         motor_binding=motor[level.motor_binding].astype(np.int32),
-        thruster_binding=thruster[level.thruster_binding].astype(np.int32),
+        thruster_binding=thruster[flames].astype(np.int32),
     )
 
 
