@@ -22,7 +22,8 @@ from levelgen.distribution import Distribution
 from levelgen.task import TaskParams
 
 JOB = "generate"
-WORDS = frozenset({"size", "levels", "budget", "out"})  # kept as typed: 007 stays 007
+BY_HAND = frozenset({"size", "budget", "sampler_version"})  # results that are not settings, or have their own word
+WORDS = frozenset({"size", "levels", "budget", "out", "continue_from"})  # kept as typed: 007 stays 007
 
 
 def compose_job(overrides: Sequence[str]) -> JobConfig:
@@ -57,6 +58,14 @@ def again(job: JobConfig) -> str:
         changed = [f"{key}={_hydra(value)}" for key, value in wanted.items() if start[key] != value]
         commands.append(shlex.join(["levelproof", "generate", *fixed, *named, *changed]))
     return min(commands, key=len)
+
+
+def words_for(results: Mapping[str, Any]) -> list[str]:
+    """The settings, but for the budget, that a job with these `JobConfig.results` has and the default has not."""
+    default, known = flat(replace(_default(), size=results["size"]).results), flat(results)
+    changed = [name for name in known if name not in BY_HAND and known[name] != default.get(name, known[name])]
+    unknown = [name for name in known if name not in default]
+    return [f"size={results['size']}", *(f"{name}={_hydra(known[name])}" for name in [*changed, *unknown])]
 
 
 @cache

@@ -20,7 +20,9 @@ UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8
 MAX_LEVEL_ID = 2**31 - 1  # level ids are folded into random keys as 32-bit integers
 
 # Where, how many and by whom: these change neither a level nor its expert, so one split may mix them.
-WITHOUT_EFFECT = frozenset({"levels", "first_level", "out", "unit", "executor", "workers"})
+WITHOUT_EFFECT = frozenset(
+    {"levels", "first_level", "out", "unit", "executor", "workers", "keep_experts", "continue_from"}
+)
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class JobConfig:
     unit: int | None  # levels per work unit; None: by the size
     executor: Literal["ray", "inline"]
     workers: int  # 0: one per core or GPU
+    keep_experts: bool
+    continue_from: str  # a split that has kept its experts; empty: none
     distribution: Distribution
     task: TaskParams
     expert: ExpertConfig

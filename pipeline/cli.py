@@ -89,6 +89,21 @@ def _parser() -> argparse.ArgumentParser:
     sub.set_defaults(parser=sub)
 
     sub = command(
+        "regenerate",
+        _regenerate,
+        "train a manifest's levels at another budget",
+        "levelproof regenerate manifest=data/256k/s budget=1M where=\"label = 'unsolved'\"",
+    )
+    sub.add_argument(
+        "words",
+        nargs="*",
+        metavar="NAME=VALUE",
+        help="manifest=SPLIT and budget=N; where=SQL: only its levels for which this condition on the manifest's "
+        "columns holds; continue=true: experts that the split has kept (keep_experts=true) go on; "
+        "and any setting of generate, such as out=NAME",
+    )
+
+    sub = command(
         "sample",
         _sample,
         "draw random levels, before anything is trained",
@@ -183,7 +198,15 @@ def _generate(arguments: argparse.Namespace) -> int:
 
     from pipeline.generate import generate
 
-    return generate(job, arguments.settings, Console(stderr=True))
+    return generate(job, ["levelproof", "generate", *arguments.settings], Console(stderr=True))
+
+
+def _regenerate(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from pipeline.regenerate import regenerate
+
+    return regenerate(arguments.words, Console(stderr=True))
 
 
 def _sample(arguments: argparse.Namespace) -> int:

@@ -2,12 +2,15 @@
 
 import shlex
 from collections import Counter
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 
 from configs.schema import JobConfig
 from pipeline.errors import Exit, Failure
+from pipeline.kept import require_same_experts
 from pipeline.layout import quarantine_path
 from pipeline.manifest import Manifest, read_manifest
 from pipeline.progress import Board, Tally
@@ -15,27 +18,29 @@ from pipeline.schedule import ATTEMPTS, Outcome, Queue, plan_units
 from pipeline.split import note_job, writing
 
 
-def generate(job: JobConfig, overrides: list[str], console: Console) -> Exit:
+def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids: Sequence[int] | None = None) -> Exit:
     """Make what is missing of the job's levels, and commit it unit by unit.
 
     Args:
         job: what to make.
-        overrides: the settings as typed, for the hints of what to type next.
+        command: as typed, for the hint of how to go on.
         console: where progress is shown.
+        level_ids: which levels, if not those of the job.
 
     Raises:
-        UserError, Failure: see `pipeline.split.writing`; or the disk refuses.
+        UserError, Failure: see `pipeline.split.writing` and `pipeline.kept.require_same_experts`; or the disk refuses.
         KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; what is committed stays.
     """
+    require_same_experts(job)
     with writing(job) as (split, manifest):
-        wanted = set(job.level_ids)
+        wanted = set(job.level_ids if level_ids is None else map(int, level_ids))
         done = wanted.intersection(manifest.level_ids.tolist())
-        queue = Queue.of(plan_units(job.level_ids, done, job.levels_per_unit))
-        note_job(split, job, overrides)
+        queue = Queue.of(plan_units(sorted(wanted), done, job.levels_per_unit))
+        note_job(split, job, command, sorted(wanted))
         if queue.waiting:
-            solved = _labels(manifest, job)["solved"]
+            solved = _labels(manifest, wanted)["solved"]
             board = Board(Tally(len(wanted), len(done), solved), console)
-            board.say(_opening(job, split, len(done)))
+            board.say(_opening(job, split, len(wanted), len(done)))
             try:
                 with board.shown():
                     _work(job, split, queue, board)
@@ -47,7 +52,7 @@ def generate(job: JobConfig, overrides: list[str], console: Console) -> Exit:
             manifest = read_manifest(split, ["label"])
         else:
             print(f"Nothing to do: all {len(wanted)} levels are there.")
-        _closing(job, split, manifest, queue)
+        _closing(split, manifest, wanted, queue)
     return Exit.QUARANTINED if queue.quarantined else Exit.DONE
 
 
@@ -75,20 +80,19 @@ def _work(job: JobConfig, split: Path, queue: Queue, board: Board) -> None:
     run(job, split, queue, settle, board)
 
 
-def _labels(manifest: Manifest, job: JobConfig) -> Counter[str]:
-    """How many of the job's levels have which label."""
-    wanted, ids = job.level_ids, manifest.level_ids
-    return Counter(manifest.labels[(wanted.start <= ids) & (ids < wanted.stop)].tolist())
+def _labels(manifest: Manifest, wanted: Collection[int]) -> Counter[str]:
+    """How many of these levels have which label."""
+    return Counter(manifest.labels[np.isin(manifest.level_ids, list(wanted))].tolist())
 
 
-def _opening(job: JobConfig, split: Path, done: int) -> str:
+def _opening(job: JobConfig, split: Path, levels: int, done: int) -> str:
     there = f", {done} are there already" if done else ""
-    return f"{len(job.level_ids)} levels of size {job.size}, {job.budget} env steps each, into {split}{there}"
+    return f"{levels} levels of size {job.size}, {job.budget} env steps each, into {split}{there}"
 
 
-def _closing(job: JobConfig, split: Path, manifest: Manifest, queue: Queue) -> None:
+def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: Queue) -> None:
     """Where it is, what came of it, and what to type next. On stdout."""
-    labels, folder = _labels(manifest, job), shlex.quote(str(split))
+    labels, folder = _labels(manifest, wanted), shlex.quote(str(split))
     total = sum(labels.values())
     counts = ", ".join(f"{count} {label}" for label, count in labels.most_common())
     print(f"{split}: {total} levels, {counts}." if total else f"{split}: nothing is committed.")

@@ -2,6 +2,7 @@
 
 manifest/000000000000-000000000015.parquet          a fragment: the commit marker of a work unit
 shards/000000000000-000000000015-5f0c2a9b.zarr      data of one attempt at that unit
+experts/000000000000-000000000015-5f0c2a9b         experts of one attempt at that unit, if they are kept
 quarantine/000000000000-000000000015.txt            why a unit was given up
 job.json                                            what the last command wanted
 .writer.lock, .commit.lock                          see pipeline/locks.py
@@ -10,7 +11,7 @@ job.json                                            what the last command wanted
 import secrets
 from pathlib import Path
 
-MANIFEST, SHARDS, QUARANTINE = "manifest", "shards", "quarantine"
+MANIFEST, SHARDS, EXPERTS, QUARANTINE = "manifest", "shards", "experts", "quarantine"
 WRITER_LOCK, COMMIT_LOCK, JOB = ".writer.lock", ".commit.lock", "job.json"
 DIGITS = 12  # of a level id in file names, so that names sort as ids do
 
@@ -28,9 +29,10 @@ def fragment_path(split: Path, unit: str) -> Path:
     return split / MANIFEST / f"{unit}.parquet"
 
 
-def attempt_path(split: Path, unit: str) -> Path:
-    """A new shard path, used by no other attempt at this unit."""
-    return split / SHARDS / f"{unit}-{secrets.token_hex(4)}.zarr"
+def attempt_paths(split: Path, unit: str) -> tuple[Path, Path]:
+    """New paths for a shard and for experts, used by no other attempt at this unit."""
+    name = f"{unit}-{secrets.token_hex(4)}"
+    return split / SHARDS / f"{name}.zarr", split / EXPERTS / name
 
 
 def fragment_of(shard: Path) -> Path:

@@ -103,6 +103,7 @@ class Manifest:
     fragments: tuple[Fragment, ...]
     table: pa.Table
     shards: frozenset[str]  # that any fragment names; paths below the split
+    experts: frozenset[str]  # likewise
 
     @property
     def level_ids(self) -> np.ndarray:
@@ -127,12 +128,12 @@ def read_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest
 
     Args:
         split: the folder `{out}/{budget}/{size}`.
-        columns: which to read (default: all); `level_id` and `shard` are always among them.
+        columns: which to read (default: all); `level_id`, `shard` and `experts` are always among them.
 
     Raises:
         Failure: a fragment is damaged, or fragments of several configurations lie side by side.
     """
-    names = None if columns is None else list(dict.fromkeys(["level_id", "shard", *columns]))
+    names = None if columns is None else list(dict.fromkeys(["level_id", "shard", "experts", *columns]))
     read = [read_fragment(path, names) for path in fragment_paths(split)]
     fragments = tuple(fragment for fragment, _ in read)
     for fragment in fragments[1:]:
@@ -147,8 +148,10 @@ def read_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest
         pa.concat_tables([part for _, part in read]).select(schema.names).cast(schema) if read else schema.empty_table()
     )
     _, first = np.unique(table.column("level_id").to_numpy(), return_index=True)  # sorts; a level counts once
-    shards = frozenset(name for name in table.column("shard").unique().to_pylist() if name)
-    return Manifest(split, fragments, table.take(first).replace_schema_metadata(None), shards)
+    shards, experts = (
+        frozenset(name for name in table.column(of).unique().to_pylist() if name) for of in ("shard", "experts")
+    )
+    return Manifest(split, fragments, table.take(first).replace_schema_metadata(None), shards, experts)
 
 
 def require_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest:

@@ -25,7 +25,7 @@ class WorkUnit:
         return f"{self.level_ids[0]} to {self.level_ids[-1]}"
 
 
-def plan_units(wanted: range, done: Collection[int], unit: int) -> list[WorkUnit]:
+def plan_units(wanted: Iterable[int], done: Collection[int], unit: int) -> list[WorkUnit]:
     """Units that cover what is wanted and not done.
 
     A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same places.

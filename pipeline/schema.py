@@ -45,6 +45,7 @@ COLUMNS = pa.schema(
         pa.field("episodes", pa.int64(), nullable=False),
         pa.field("shard", pa.string()),  # path below the split; null: no witness
         pa.field("row", pa.int32()),  # of the shard
+        pa.field("experts", pa.string()),  # path below the split of the checkpoint with its expert; null: none is kept
         pa.field("config_hash", pa.string(), nullable=False),
         pa.field(
             "versions",

@@ -4,13 +4,15 @@ import json
 import os
 import shlex
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from configs.schema import JobConfig
 from pipeline.errors import UserError
-from pipeline.layout import JOB, MANIFEST, SHARDS, split_path
+from pipeline.layout import EXPERTS, JOB, MANIFEST, SHARDS, split_path
 from pipeline.locks import Locked, nobody_commits, only_writer
 from pipeline.manifest import Manifest, differences, read_manifest, told
 
@@ -52,7 +54,7 @@ def require_same(manifest: Manifest, job: JobConfig) -> None:
 
 
 def clean(split: Path) -> Manifest:
-    """Remove shards that no fragment names and half-written files; what is committed stays, and is returned.
+    """Remove shards and experts that no fragment names and half-written files; what is committed stays.
 
     Done while nobody commits: a worker of a killed run may still be about to name its shard.
     """
@@ -61,23 +63,32 @@ def clean(split: Path) -> Manifest:
         for path in (split / SHARDS).glob("*.zarr"):
             if f"{SHARDS}/{path.name}" not in manifest.shards:
                 shutil.rmtree(path)
+        for path in (split / EXPERTS).glob("*"):
+            if f"{EXPERTS}/{path.name}" not in manifest.experts:
+                shutil.rmtree(path)
         for path in [*(split / MANIFEST).glob(".*"), *split.glob(f".{JOB}.*")]:
             path.unlink()
     return manifest
 
 
-def note_job(split: Path, job: JobConfig, overrides: list[str]) -> None:
+def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[int]) -> None:
     """Write down what this command wants, for `levelproof status`."""
-    wanted = job.level_ids
     note = {
-        "command": " ".join(["levelproof", "generate", *map(shlex.quote, overrides)]),
-        "first_level": wanted.start,
-        "levels": len(wanted),
+        "command": shlex.join(command),
+        "level_ids": runs(wanted),
         "config_hash": job.hash,
     }
     temporary = split / f".{JOB}.{os.getpid()}"
     temporary.write_text(json.dumps(note, indent=2) + "\n")
     temporary.replace(split / JOB)
+
+
+def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of each run of consecutive numbers, ascending."""
+    ordered = np.unique(np.asarray(numbers, np.int64))
+    firsts = np.flatnonzero(np.diff(ordered, prepend=-2) != 1)
+    lasts = np.append(firsts[1:], len(ordered)) - 1
+    return [(int(ordered[a]), int(ordered[b])) for a, b in zip(firsts, lasts, strict=True)]
 
 
 def _make_writable(split: Path) -> None:

@@ -36,7 +36,7 @@ def look(split: Path) -> dict[str, Any]:
     """The facts that `status` prints."""
     try:
         job = json.loads((split / JOB).read_text())
-        wanted = range(job["first_level"], job["first_level"] + job["levels"])
+        wanted = [(int(first), int(last)) for first, last in job["level_ids"]]
     except FileNotFoundError:
         raise UserError(
             f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
@@ -45,10 +45,10 @@ def look(split: Path) -> dict[str, Any]:
         raise UserError(f"The file {split / JOB} is damaged: run `levelproof generate` for this split again.") from None
     manifest = read_manifest(split, ["label"])
     labels = dict(zip(manifest.level_ids.tolist(), manifest.table.column("label").to_pylist(), strict=True))
-    inside = [labels[level_id] for level_id in labels if level_id in wanted]
+    inside = [label for level_id, label in labels.items() if any(a <= level_id <= b for a, b in wanted)]
     return {
         "split": str(split),
-        "wanted": len(wanted),
+        "wanted": sum(last - first + 1 for first, last in wanted),
         "done": len(inside),
         "labels": dict(sorted(Counter(inside).items())),
         "quarantined": sorted(path.name for path in (split / QUARANTINE).glob("*.txt")),

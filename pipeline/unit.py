@@ -25,7 +25,8 @@ from levelgen.signature import signatures
 from levelgen.task import TaskParams
 from pipeline.errors import Failure
 from pipeline.fields import arrays_of, map_arrays, same_bits
-from pipeline.layout import attempt_path, fragment_path
+from pipeline.kept import experts_for, save_experts
+from pipeline.layout import attempt_paths, fragment_path
 from pipeline.locks import committing
 from pipeline.manifest import write_fragment
 from pipeline.schedule import Outcome, Summary, WorkUnit
@@ -65,7 +66,17 @@ def run_unit(job: JobConfig, split: Path, unit: WorkUnit, report: Report) -> Sum
     """
     ids = np.asarray(unit.level_ids, np.int32)
     levels = sample_levels(jnp.asarray(ids), size_of(job.size), job.distribution)
-    result = train_levels(levels, ids, job.env_steps, job.expert, job.stop, job.task, report)
+    result = train_levels(
+        levels,
+        ids,
+        job.env_steps,
+        job.expert,
+        job.stop,
+        job.task,
+        report,
+        begun=experts_for(job, unit.level_ids),
+        keep=job.keep_experts,
+    )
     check_witnesses(result, job.task)
     commit(job, split, unit, result)
     labels = [verdict.label for verdict in result.verdicts]
@@ -108,13 +119,18 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
         OSError: the disk refuses; nothing is committed.
     """
     kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label in WITNESSED]
-    shard = attempt_path(split, unit.name)
+    shard, experts = attempt_paths(split, unit.name)
     rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
     for row, content, signature in zip(rows, content_hashes(result.levels), signatures(result.levels), strict=True):
         row |= {"content_hash": content, "signature": signature}
     for place, i in enumerate(kept):
         rows[i] |= {"shard": str(shard.relative_to(split)), "row": place}
+    for row in rows if result.experts else ():
+        if row["level_id"] in result.experts:
+            row["experts"] = str(experts.relative_to(split))
     with committing(split):
+        if result.experts:
+            save_experts(experts, result.experts)
         if kept:
             write_shard(
                 shard, [int(result.level_ids[i]) for i in kept], shard_arrays(result.levels, result.record, kept)
@@ -140,6 +156,7 @@ def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, A
         "budget": job.budget,
         "shard": None,
         "row": None,
+        "experts": None,
         "config_hash": job.hash,
         "versions": versions(),
         "device": device(),
