@@ -50,12 +50,12 @@ def listing() -> str:
 def again(job: JobConfig) -> str:
     """The shortest command, but for `first_level`, `levels` and `out`, with the same results as `job`."""
     fixed, wanted = [f"size={job.size}", f"budget={job.budget}"], flat(job.results)
-    default = replace(_default(), size=job.size, budget=job.budget)
+    default = replace(_default(), size=job.size)  # with its own budget: this one may be too small for its experts
     commands = []
     for name, preset in distributions().items():
         named = [] if preset == default.distribution else [f"distribution={name}"]
         start = flat(replace(default, distribution=preset).results)
-        changed = [f"{key}={_hydra(value)}" for key, value in wanted.items() if start[key] != value]
+        changed = [f"{key}={_hydra(value)}" for key, value in wanted.items() if key not in BY_HAND and start[key] != value]
         commands.append(shlex.join(["levelproof", "generate", *fixed, *named, *changed]))
     return min(commands, key=len)
 

@@ -59,6 +59,8 @@ def judge(
     failed_by_noop: Bool[np.ndarray, " level"],
 ) -> tuple[list[Verdict], Int[np.ndarray, "256 6 level"]]:
     """Verdicts, and the witnesses' actions (0 where there is none). A witness counts only if it replays."""
+    if not trained:
+        return [], np.zeros((RECORD_STEPS, len(CHOICES), 0), np.int32)
     best = [witness_of(of.evaluations, config) for of in trained]
     actions = np.zeros((RECORD_STEPS, len(CHOICES), len(trained)), np.int32)
     for i, witness in enumerate(best):

@@ -86,9 +86,8 @@ def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequen
 def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
     """First and last of each run of consecutive numbers, ascending."""
     ordered = np.unique(np.asarray(numbers, np.int64))
-    firsts = np.flatnonzero(np.diff(ordered, prepend=-2) != 1)
-    lasts = np.append(firsts[1:], len(ordered)) - 1
-    return [(int(ordered[a]), int(ordered[b])) for a, b in zip(firsts, lasts, strict=True)]
+    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
 
 
 def _make_writable(split: Path) -> None:

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from configs.compose import again, compose_job, distributions, identified, listing
 from configs.convert import ConfigError, flat
+from configs.schema import WITHOUT_EFFECT
 from experts.config import ExpertConfig
 from levelgen.distribution import Distribution
 from levelgen.task import TaskParams
@@ -52,7 +53,7 @@ def test_out_may_be_any_path(text: str) -> None:
         ("levels=0", "levels is '0'"),
         ("levels=1.5", "not a whole number"),
         ("budget=0", "budget is '0'"),
-        ("budget=1k", "one update of an expert takes 2048 env steps"),
+        ("budget=1000", "one update of an expert takes 1024 env steps"),
         ("budget=", "budget is ''"),
         ("budgt=1k", r"no setting budgt \(did you mean budget\?\)"),
         ("expert.lerning_rate=1", r"no setting expert.lerning_rate \(did you mean expert.learning_rate\?\)"),
@@ -108,7 +109,8 @@ def test_the_hash_follows_results_and_nothing_else() -> None:
 def test_every_setting_that_decides_results_is_hashed() -> None:
     job = compose_job([])
     names = {field.name for field in dataclasses.fields(job)}
-    assert names - set(job.results) == {"levels", "first_level", "out", "unit", "executor", "workers"}
+    assert names - set(job.results) == WITHOUT_EFFECT
+    assert "stop" in job.results
 
 
 @pytest.mark.parametrize(
@@ -164,7 +166,7 @@ def test_a_unit_by_the_size() -> None:
         size: compose_job([f"size={size}"]).levels_per_unit
         for size in ("s", "m", "l", "6-2-1-1", "8-8-8-4", "24-24-9-9")
     }
-    assert units == {"s": 16, "m": 16, "l": 8, "6-2-1-1": 16, "8-8-8-4": 8, "24-24-9-9": 4}
+    assert units == {"s": 32, "m": 16, "l": 8, "6-2-1-1": 16, "8-8-8-4": 8, "24-24-9-9": 4}
     assert compose_job(["size=l", "unit=3"]).levels_per_unit == 3
 
 

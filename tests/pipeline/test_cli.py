@@ -60,7 +60,7 @@ def test_every_command_has_help_with_an_example(tmp_path: Path, command: str) ->
 
 def test_the_help_of_generate_lists_every_setting(tmp_path: Path) -> None:
     text = run(["generate", "--help"], tmp_path).stdout
-    for line in ("levels=64", "budget='128k'", "expert.learning_rate=0.0003", "task.frame_skip=2"):
+    for line in ("levels=64", "budget='128k'", "expert.learning_rate=0.002", "stop.rule='solved'", "task.frame_skip=2"):
         assert line in text
     assert "distribution.floor_red_chance=" in text
 
@@ -72,9 +72,11 @@ def test_version(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["size=xl"], ["there is no size xl", "choose one of l, m, s"]),
+        (["size=xl"], ["size is 'xl'", "choose one of s, m, l"]),
         (["budget=0"], ["budget is '0'", "at least 1"]),
-        (["budget=2000"], ["2048"]),
+        (["budget=1000"], ["1024"]),
+        (["stop=never"], ["there is no stop never", "choose one of budget, halving, solved"]),
+        (["stop.rule=never"], ["stop.rule", "never"]),
         (["levels=abc"], ["levels is 'abc'", "64k"]),
         (["levls=5"], ["no setting levls", "did you mean levels?"]),
         (["64"], ["NAME=VALUE"]),

@@ -25,7 +25,7 @@ from pipeline.unit import commit
 from tests.levelgen.opened import handmade_levels
 from tests.levelgen.variants import edited, more_room, one, renamed, renumbered, turned
 from tests.pipeline.command import assert_refused, run
-from tests.pipeline.made import made_job, made_record, made_verdict
+from tests.pipeline.made import SPENT, made_job, made_record, made_verdict
 
 NONE = {"levels": 0, "pairs": []}
 COUNT = 12
@@ -92,7 +92,10 @@ def committed(folder: Path, levels: list[Level]) -> Path:
     side_by_side = jax.tree.map(lambda *x: np.concatenate(x, -1), *levels)
     verdicts = [made_verdict(Label.SOLVED)] * len(levels)
     commit(
-        job, path, WorkUnit(tuple(ids.tolist())), UnitResult(ids, side_by_side, made_record("s", len(ids)), verdicts)
+        job,
+        path,
+        WorkUnit(tuple(ids.tolist())),
+        UnitResult(ids, side_by_side, made_record("s", len(ids)), verdicts, SPENT),
     )
     return path
 

@@ -63,7 +63,7 @@ def test_a_level_counts_once_and_all_its_shards_are_kept(tmp_path: Path, job: Jo
 
 def test_columns_asked_for_are_enough(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [0])
-    assert read_manifest(tmp_path, ["label"]).table.column_names == ["level_id", "shard", "label"]
+    assert read_manifest(tmp_path, ["label"]).table.column_names == ["level_id", "shard", "experts", "label"]
 
 
 def test_nothing_committed_is_an_empty_manifest(tmp_path: Path) -> None:
