@@ -1,5 +1,6 @@
 """Levels that are there twice are found: in a split, between splits, and among level files."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import pyarrow as pa
 import pytest
 
 from experts.labels import Label
-from experts.train import UnitResult
 from levelgen.content import content_hashes
 from levelgen.level import Level
 from levelgen.level_file import LevelFile, read_level_file, write_level_file
@@ -25,7 +25,7 @@ from pipeline.unit import commit
 from tests.levelgen.opened import handmade_levels
 from tests.levelgen.variants import edited, more_room, one, renamed, renumbered, turned
 from tests.pipeline.command import assert_refused, run
-from tests.pipeline.made import SPENT, made_job, made_record, made_verdict
+from tests.pipeline.made import made_job, made_result
 
 NONE = {"levels": 0, "pairs": []}
 COUNT = 12
@@ -87,16 +87,11 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def committed(folder: Path, levels: list[Level]) -> Path:
     job = made_job(str(folder), "size=s", f"levels={len(levels)}")
-    path, ids = split_path(job.out, job.budget, job.size), np.arange(len(levels))
+    path, ids = split_path(job.out, job.budget, job.size), list(range(len(levels)))
     path.mkdir(parents=True)
     side_by_side = jax.tree.map(lambda *x: np.concatenate(x, -1), *levels)
-    verdicts = [made_verdict(Label.SOLVED)] * len(levels)
-    commit(
-        job,
-        path,
-        WorkUnit(tuple(ids.tolist())),
-        UnitResult(ids, side_by_side, made_record("s", len(ids)), verdicts, SPENT),
-    )
+    result = dataclasses.replace(made_result(ids, [Label.SOLVED] * len(ids)), levels=side_by_side)
+    commit(job, path, WorkUnit(tuple(ids)), result)
     return path
 
 
