@@ -1,0 +1,105 @@
+"""How the unsolved share falls with budget: a plot, and its numbers."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.solved.results import Results, count, share, wilson
+from benchmarks.solved.tables import markdown, order
+from pipeline.errors import UserError
+
+MARK = "unsolved-by-budget"
+FROM = 4_000  # env steps where the axis begins
+MARKS = (64_000, 256_000, 1_000_000, 4_000_000)
+TICKS = (4_000, 16_000, *MARKS)
+COLOURS = ("#2a85c7", "#d55e00", "#009e73", "#b3679b", "#b8860b")  # all show on white and on black
+GREY = "#7d8590"  # of axes and text: so does it
+
+
+def checked(results: Sequence[Results]) -> list[Results]:
+    """What can be drawn, in order.
+
+    Raises:
+        UserError: some file cannot.
+    """
+    for each in results:
+        if not each.header.stops_early:
+            raise UserError(
+                f"{each.header.text} gave every level its whole budget, so it does not tell when one was solved: "
+                "give files of variants that stop early."
+            )
+        if not each.trained or each.header.budget <= FROM:
+            raise UserError(f"{each.header.text} has nothing beyond {count(FROM)} env steps to show: leave it out.")
+    return sorted(results, key=order)
+
+
+def unsolved(results: Results, within: float) -> int:
+    """Levels with an expert that have not left their slots as solved after so many env steps."""
+    return len(results.trained) - len(results.solved(within))
+
+
+def curve(results: Results) -> tuple[list[float], list[int]]:
+    """Env steps where the number of unsolved levels changes, and that number; first and last point at the ends."""
+    budget = results.header.budget
+    left = sorted(results.trained[level_id]["env_steps"] for level_id in results.solved())
+    steps = [FROM, *sorted({x for x in left if FROM < x < budget}), budget]
+    return [float(x) for x in steps], [unsolved(results, x) for x in steps]
+
+
+def names(results: Sequence[Results]) -> list[str]:
+    """What tells the files apart."""
+    single = len({each.header.variant for each in results}) == 1
+    text = lambda each: f"size {each.header.size}" + ("" if single else f", {each.header.variant}")
+    short = [text(each) for each in results]
+    again = len(set(short)) < len(short)
+    return [
+        f"{name}, {count(each.header.budget)}" if again else name for name, each in zip(short, results, strict=True)
+    ]
+
+
+def table(results: Sequence[Results]) -> str:
+    """Markdown: the unsolved share at the marks and at the end."""
+    marks = sorted({mark for each in results for mark in (*MARKS, each.header.budget) if mark <= each.header.budget})
+    rows = []
+    for name, each in zip(names(results), results, strict=True):
+        levels = len(each.trained)
+        cells = [share(unsolved(each, mark), levels) if mark <= each.header.budget else "-" for mark in marks]
+        rows.append([name, str(levels), *cells])
+    return markdown(
+        ("", "levels with an expert", *(f"unsolved at {count(mark)} (95% interval)" for mark in marks)), rows
+    )
+
+
+def draw(results: Sequence[Results], out: Path) -> None:
+    """The plot, as SVG without a background."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    matplotlib.rcParams.update({"svg.hashsalt": "levelproof", "svg.fonttype": "none", "font.size": 9})
+    matplotlib.rcParams.update(
+        {f"{part}color": GREY for part in ("text.", "axes.label", "axes.edge", "xtick.", "ytick.")}
+    )
+    import matplotlib.pyplot as plt
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator, PercentFormatter
+
+    figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
+    for i, (name, each) in enumerate(zip(names(results), results, strict=True)):
+        colour, levels = COLOURS[i % len(COLOURS)], len(each.trained)
+        steps, left = curve(each)
+        low, high = zip(*(wilson(k, levels) for k in left), strict=True)
+        axes.fill_between(steps, low, high, step="post", color=colour, alpha=0.2, linewidth=0)
+        axes.plot(steps, [k / levels for k in left], drawstyle="steps-post", color=colour, linewidth=1.6, label=name)
+        marks = [mark for mark in MARKS if mark <= each.header.budget]
+        axes.plot(marks, [unsolved(each, x) / levels for x in marks], "o", color=colour, markersize=4)
+    end = max(each.header.budget for each in results)
+    axes.set(xscale="log", xlim=(FROM, end * 1.05), ylim=(0, None))
+    axes.set(xlabel="training env steps of a level", ylabel="levels not yet solved")
+    axes.xaxis.set_major_locator(FixedLocator([tick for tick in TICKS if tick <= end]))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: count(x)))
+    axes.yaxis.set_major_formatter(PercentFormatter(1, 0))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.3, linewidth=0.5, color=GREY)
+    axes.legend(frameon=False)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, transparent=True, metadata={"Date": None})
+    plt.close(figure)

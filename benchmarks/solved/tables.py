@@ -1,0 +1,92 @@
+"""Tables of how many levels each variant solves, and comparisons level by level."""
+
+import statistics
+from collections.abc import Sequence
+
+from benchmarks.solved.results import Results, count, mcnemar, mean, share
+from benchmarks.solved.variants import VARIANTS
+
+MARK = "solved"
+QUARTER = "ours"  # the variant whose quarter of the budget is compared with the reference's whole
+SIZES = ("s", "m", "l")  # in this order; others follow
+HEAD = (
+    "variant", "levels with an expert", "solved (95% interval)", "at a quarter of the budget", "env steps a level",
+    "core-seconds a solved level", "success rate", "steps to goal",
+)  # fmt: skip
+PAIRED_HEAD = ("variant", "against", "levels of both", "only the first solves", "only the other solves", "p")
+
+
+def tables(results: Sequence[Results]) -> str:
+    """Markdown: for each size and budget the variants, and the pairs of them."""
+    groups: dict[tuple[str, int], list[Results]] = {}
+    for each in sorted(results, key=order):
+        groups.setdefault((each.header.size, each.header.budget), []).append(each)
+    parts = []
+    for (size, budget), group in groups.items():
+        parts.append(f"**Size {size}, {count(budget)} env steps**, {ids_of(group)}:")
+        parts.append(markdown(HEAD, [line(each) for each in group]))
+        if pairs := paired(group):
+            parts.append("Level by level:")
+            parts.append(markdown(PAIRED_HEAD, pairs))
+    names = {each.header.variant for each in results}
+    parts.append("\n".join(f"- `{name}`: {each.text}" for name, each in VARIANTS.items() if name in names))
+    return "\n\n".join(parts)
+
+
+def order(results: Results) -> tuple:
+    header, names = results.header, list(VARIANTS)
+    size = SIZES.index(header.size) if header.size in SIZES else len(SIZES)
+    variant = names.index(header.variant) if header.variant in names else len(names)
+    return size, header.size, header.budget, variant
+
+
+def ids_of(group: Sequence[Results]) -> str:
+    ids = {level_id for each in group for level_id in each.rows}
+    return f"levels {min(ids):,} to {max(ids):,}" if ids else "no levels"
+
+
+def line(results: Results) -> list[str]:
+    """A variant's row."""
+    header, trained, solved = results.header, results.trained, results.solved()
+    rows = [trained[level_id] for level_id in solved]
+    seconds = sum(row["cpu_s"] for row in results.rows.values())
+    quarter = len(results.solved(header.budget / 4))
+    rate = mean([row["success_rate"] for row in rows])
+    return [
+        f"`{header.variant}`",
+        f"{len(trained)} of {len(results.rows)}",
+        share(len(solved), len(trained)),
+        share(quarter, len(trained)) if header.stops_early else "-",
+        count(mean([row["env_steps"] for row in trained.values()]) or 0),
+        f"{seconds / len(solved):.3g}" if solved else "-",
+        f"{rate:.3f}" if rate is not None else "-",
+        f"{statistics.median(row['steps_to_goal'] for row in rows):.0f}" if rows else "-",
+    ]
+
+
+def paired(group: Sequence[Results]) -> list[list[str]]:
+    """A row for each variant and the one it is compared with, where both are there."""
+    by_name, lines = {each.header.variant: each for each in group}, []
+    for name, one in by_name.items():
+        other = by_name.get(VARIANTS[name].against) if name in VARIANTS else None
+        if not other:
+            continue
+        against = f"`{other.header.variant}`"
+        lines.append([f"`{name}`", against, *discordant(one, other, one.solved())])
+        if name == QUARTER and one.header.stops_early:
+            early = one.solved(one.header.budget / 4)
+            lines.append([f"`{name}`, a quarter of the budget", against, *discordant(one, other, early)])
+    return lines
+
+
+def discordant(one: Results, other: Results, solved: set[int]) -> list[str]:
+    """Levels that both tried, that only one solved, and p."""
+    both = one.trained.keys() & other.trained.keys()
+    solved, theirs = solved & both, other.solved() & both
+    p = mcnemar(len(solved - theirs), len(theirs - solved))
+    return [str(len(both)), str(len(solved - theirs)), str(len(theirs - solved)), f"{p:.2g}"]
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
