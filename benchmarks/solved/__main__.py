@@ -20,7 +20,7 @@ from benchmarks.solved.variants import VARIANTS
 from configs.convert import ConfigError, plain
 from configs.numbers import parse_count
 from levelgen.level import size_of
-from pipeline.errors import LevelproofError, UserError
+from pipeline.errors import Exit, LevelproofError, UserError
 
 RESULTS = Path(__file__).parent.parent / "results"
 
@@ -29,15 +29,12 @@ def main() -> int:
     given = parser().parse_args()
     try:
         given.command(given)
-    except ConfigError as error:
+    except (ConfigError, LevelproofError) as error:
         print(error, file=sys.stderr)
-        return UserError.exit_code
-    except LevelproofError as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
+        return error.exit_code if isinstance(error, LevelproofError) else Exit.INPUT
     except KeyboardInterrupt:
         print("Stopped; run the same command again to go on.", file=sys.stderr)
-        return 130
+        return Exit.INTERRUPTED
     return 0
 
 
@@ -73,7 +70,10 @@ def run(given: argparse.Namespace) -> None:
         raise UserError(f"--budget is {budget}: one update takes {variant.expert.steps_per_update} env steps.")
     if given.first < 0:
         raise UserError(f"--first is {given.first}: level ids are 0 and above.")
-    size_of(given.size)
+    try:
+        size_of(given.size)
+    except ValueError as error:
+        raise UserError(f"--{error}.") from None
     settings = {"expert": plain(variant.expert), "stop": plain(variant.stop)}
     header = Header(given.variant, given.size, budget, settings)
     out = given.out or RESULTS / f"{given.size}-{count(budget)}-{given.variant}.jsonl"

@@ -75,9 +75,10 @@ def draw(results: Sequence[Results], out: Path) -> None:
 
     matplotlib.use("svg")
     matplotlib.rcParams.update({"svg.hashsalt": "levelproof", "svg.fonttype": "none", "font.size": 9})
-    matplotlib.rcParams.update(
-        {f"{part}color": GREY for part in ("text.", "axes.label", "axes.edge", "xtick.", "ytick.")}
-    )
+    matplotlib.rc("text", color=GREY)
+    matplotlib.rc("axes", labelcolor=GREY, edgecolor=GREY)
+    matplotlib.rc("xtick", color=GREY)
+    matplotlib.rc("ytick", color=GREY)
     import matplotlib.pyplot as plt
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator, PercentFormatter
 

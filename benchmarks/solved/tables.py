@@ -57,7 +57,7 @@ def line(results: Results) -> list[str]:
         f"{len(trained)} of {len(results.rows)}",
         share(len(solved), len(trained)),
         share(quarter, len(trained)) if header.stops_early else "-",
-        count(mean([row["env_steps"] for row in trained.values()]) or 0),
+        f"{mean([row['env_steps'] for row in trained.values()]) or 0:,.0f}",
         f"{seconds / len(solved):.3g}" if solved else "-",
         f"{rate:.3f}" if rate is not None else "-",
         f"{statistics.median(row['steps_to_goal'] for row in rows):.0f}" if rows else "-",
