@@ -55,7 +55,9 @@ def again(job: JobConfig) -> str:
     for name, preset in distributions().items():
         named = [] if preset == default.distribution else [f"distribution={name}"]
         start = flat(replace(default, distribution=preset).results)
-        changed = [f"{key}={_hydra(value)}" for key, value in wanted.items() if key not in BY_HAND and start[key] != value]
+        changed = [
+            f"{key}={_hydra(value)}" for key, value in wanted.items() if key not in BY_HAND and start[key] != value
+        ]
         commands.append(shlex.join(["levelproof", "generate", *fixed, *named, *changed]))
     return min(commands, key=len)
 

@@ -82,9 +82,9 @@ def test_what_cannot_go_on_is_refused(folder: Path, tmp_path: Path) -> None:
     assert "give a larger budget" in refused("budget=8k")
     assert "expert.width was 16, now 32" in refused("budget=24k", "expert.width=32")
     without = tmp_path / "data"
-    assert run(["generate", *SETTINGS, "levels=2", "budget=1k", f"out={without}"], tmp_path).returncode == 0
+    assert run(["generate", *SETTINGS, "levels=2", "budget=2k", f"out={without}"], tmp_path).returncode == 0
     with pytest.raises(UserError, match="has kept no experts: make it with keep_experts=true"):
-        require_same_experts(made_job("x", "budget=24k", f"continue_from={without / '1k/s'}"))
+        require_same_experts(made_job("x", "budget=24k", f"continue_from={without / '2k/s'}"))
 
 
 @pytest.mark.slow
