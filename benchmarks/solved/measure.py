@@ -4,6 +4,7 @@ import json
 import math
 import multiprocessing
 import queue
+import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,6 +133,7 @@ def rows_there(out: Path, header: Header) -> dict[int, dict[str, Any]]:
 
 def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> None:
     """One process: train units until none is left. Compiling is not measured."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the first process ends the others
     prepare_jax(core)
     import jax.numpy as jnp
     import numpy as np
