@@ -10,13 +10,14 @@ from configs.numbers import parse_count
 from experts.config import ExpertConfig, StopConfig
 from levelgen.distribution import CONTROL_WEIGHTS, Distribution
 from levelgen.identity import SAMPLER_VERSION
-from levelgen.level import MOST_THINGS, SIZES, size_of
+from levelgen.level import SIZES, size_of
 from levelgen.sampler import check_size, controls
 from levelgen.task import TaskParams
 
 HASH_DIGITS = 16
+MOST_BODIES = 48  # the most that was tried; compiling takes minutes from there
 # Levels per work unit by the number of bodies: about as long to train, and multiples of the experts side by side
-UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (2 * MOST_THINGS, 4))
+UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MOST_BODIES, 4))
 MAX_LEVEL_ID = 2**31 - 1  # level ids are folded into random keys as 32-bit integers
 
 # Where, how many and by whom: these change neither a level nor its expert, so one split may mix them.
@@ -67,6 +68,8 @@ class JobConfig:
             check_size(size)
         except ValueError as error:
             raise ConfigError(f"{error}.") from None
+        if size.bodies > MOST_BODIES:
+            raise ConfigError(f"size is {self.size}: experts train among at most {MOST_BODIES} polygons and circles.")
         if not controls(size, self.distribution):
             raise ConfigError(
                 f"size is {self.size}: it has no room for what must act, of which {', '.join(CONTROL_WEIGHTS)} in "

@@ -48,6 +48,7 @@ def test_out_may_be_any_path(text: str) -> None:
         ("size=4-1-1-1", "size is 4-1-1-1: 4 polygons and 1 circles leave no room"),
         ("size=8-8-0-0", "size is 8-8-0-0: it has no room for what must act"),
         ("size=5-1-1-0", "size is 5-1-1-0: it has no room for what must act"),
+        ("size=25-24-1-1", "size is 25-24-1-1: experts train among at most 48 polygons and circles"),
         ("size=99-1-1-1", "at most 64 polygons"),
         ("levels=abc", "levels is 'abc': write a whole number such as"),
         ("levels=0", "levels is '0'"),
