@@ -5,7 +5,7 @@ import shlex
 from importlib.resources import files
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
@@ -83,6 +83,7 @@ def test_mistakes_are_named(override: str, sentence: str) -> None:
 
 
 @given(st.text(max_size=20))
+@settings(deadline=None)
 def test_any_text_is_a_setting_or_refused(text: str) -> None:
     sentence = ""
     try:
