@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts.config import ExpertConfig
 from experts.policy import ActorCritic, Params, entropy, forward, log_probability
@@ -108,11 +108,24 @@ def update(
         return Expert(params, state), None
 
     def epoch(expert, key):
-        order = jnp.argsort(jax.random.bits(key, (len(samples),)))
-        minibatches = samples[order].reshape(config.minibatches, -1, samples.shape[1])
+        minibatches = samples[shuffled(key, config)].reshape(config.minibatches, -1, samples.shape[1])
         return jax.lax.scan(learn, expert, minibatches)
 
     return jax.lax.scan(epoch, expert, jax.random.split(key, config.epochs))[0]
+
+
+def shuffled(key: Key[Array, ""], config: ExpertConfig) -> Int[Array, " sample"]:
+    """A random order of an update's samples, in which every run of `environments` has one of each environment.
+
+    The env steps are shuffled, by another shift in each environment, and so are the environments: that takes sorting
+    `horizon + environments` numbers, where sorting all of them takes a seventh of the update.
+    """
+    by_time, by_environment, by_shift = jax.random.split(key, 3)
+    times = jnp.argsort(jax.random.bits(by_time, (config.horizon,)))
+    environments = jnp.argsort(jax.random.bits(by_environment, (config.environments,)))
+    shift = jax.random.randint(by_shift, (config.environments,), 0, config.horizon)
+    time = times[(jnp.arange(config.horizon)[:, None] + shift) % config.horizon]
+    return (time * config.environments + environments).reshape(-1)
 
 
 def as_samples(batch: Batch) -> Float[Array, "sample column"]:

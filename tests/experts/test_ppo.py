@@ -66,3 +66,33 @@ def test_learns_a_bandit(seed: int) -> None:
         rewards.append(float(reward))
     assert rewards[0] < 0.5
     assert rewards[-1] > 0.95
+
+
+@pytest.mark.parametrize(("environments", "horizon"), [(32, 16), (7, 5), (1, 9), (6, 1)])
+def test_shuffling(environments: int, horizon: int) -> None:
+    config = ExpertConfig(
+        environments=environments,
+        horizon=horizon,
+        minibatches=1,
+        rehearsals=0,
+        attempts=1,
+        sticky_attempts=0,
+        moved_attempts=0,
+    )
+    orders = [np.asarray(ppo.shuffled(jax.random.key(seed), config)) for seed in range(20)]
+    for order in orders:
+        assert sorted(order) == list(range(environments * horizon))
+        for run in order.reshape(horizon, environments):
+            assert sorted(run % environments) == list(range(environments))
+    if environments * horizon > 10:
+        assert len({tuple(order) for order in orders}) == len(orders)
+
+
+def test_every_sample_can_come_first() -> None:
+    config = ExpertConfig(
+        environments=4, horizon=4, minibatches=1, rehearsals=0, attempts=1, sticky_attempts=0, moved_attempts=0
+    )
+    orders = jax.vmap(lambda key: ppo.shuffled(key, config))(jax.random.split(jax.random.key(0), 4000))
+    counts = np.bincount(np.asarray(orders)[:, 0], minlength=16)
+    assert counts.min() > 250 - 5 * 16
+    assert counts.max() < 250 + 5 * 16
