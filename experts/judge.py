@@ -54,11 +54,15 @@ class Witness(NamedTuple):
 def judge(
     levels: Level,
     trained: Sequence[Trained],
+    updates: int,
     config: ExpertConfig,
     rules: TaskParams,
     failed_by_noop: Bool[np.ndarray, " level"],
 ) -> tuple[list[Verdict], Int[np.ndarray, "256 6 level"]]:
-    """Verdicts, and the witnesses' actions (0 where there is none). A witness counts only if it replays."""
+    """Verdicts, and the witnesses' actions (0 where there is none). A witness counts only if it replays.
+
+    `updates` are those that the budget paid for.
+    """
     if not trained:
         return [], np.zeros((RECORD_STEPS, len(CHOICES), 0), np.int32)
     best = [witness_of(of.evaluations, config) for of in trained]
@@ -72,7 +76,8 @@ def judge(
     for i, (of, witness) in enumerate(zip(trained, best, strict=True)):
         if witness is not None and not (replays[i] and steps[i] == witness.steps):
             witness, actions[..., i] = None, 0
-        verdicts.append(verdict_of(of, witness, int(record.done[:, i].sum()), config, bool(failed_by_noop[i])))
+        episodes, halted = int(record.done[:, i].sum()), len(of.curve) < updates
+        verdicts.append(verdict_of(of, witness, episodes, halted, config, bool(failed_by_noop[i])))
     return verdicts, actions
 
 
@@ -114,15 +119,21 @@ def repeated(action: Int[np.ndarray, "time 6"], steps: int) -> Int[np.ndarray, "
 
 
 def verdict_of(
-    trained: Trained, witness: Witness | None, episodes: int, config: ExpertConfig, failed_by_noop: bool
+    trained: Trained,
+    witness: Witness | None,
+    episodes: int,
+    halted: bool,
+    config: ExpertConfig,
+    failed_by_noop: bool,
 ) -> Verdict:
+    """A level's verdict: `episodes` are those of its record, `halted` tells that it left before its budget ended."""
     last = trained.evaluations[-1]
     attempts, sticky, moved = shares(last, config)
     first = int(last.progress.first_success)
     if witness is not None:
         reason = solved_reason(witness.source, episodes)
     else:
-        reason = unsolved_reason(config.attempts, first != NEVER)
+        reason = unsolved_reason(config.attempts, first != NEVER, halted)
     return Verdict(
         label=Label.UNSOLVED if witness is None else Label.SOLVED,
         label_reason=reason,

@@ -53,9 +53,10 @@ def solved_reason(source: Source, episodes: int) -> str:
     return f"the witness, {how}, reaches the goal in all {episodes} of its finished episodes"
 
 
-def unsolved_reason(attempts: int, training_successes: bool) -> str:
+def unsolved_reason(attempts: int, training_successes: bool, halted: bool) -> str:
     before = "the goal was reached in training" if training_successes else "the goal was never reached in training"
-    return f"{before}; none of {attempts} evaluation records reached it in every finished episode"
+    why = ", and at a rung the best return had not grown" if halted else ""
+    return f"{before}{why}; none of the {attempts} attempts of the last evaluation is a witness"
 
 
 def trivial_reason(steps: int) -> str:

@@ -89,7 +89,7 @@ def train_levels(
     tell = lambda env_steps, through, solved: report(env_steps, known_before + through, solved)
     mine = {place: begun[level_id] for place, level_id in enumerate(level_ids[left].tolist()) if level_id in begun}
     trained, spent = train(take(levels, left), level_ids[left], updates, config, stopping, rules, tell, mine, keep)
-    judged, witness = judge(take(levels, left), trained, config, rules, failed[left])
+    judged, witness = judge(take(levels, left), trained, updates, config, rules, failed[left])
     verdicts = {int(i): verdict for i, verdict in zip(left, judged, strict=True)}
     known = [verdict or verdicts[i] for i, verdict in enumerate(before)]
     actions = np.zeros((RECORD_STEPS, ACTIONS, len(level_ids)), np.int32)  # doing nothing, where none are found

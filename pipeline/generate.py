@@ -49,7 +49,9 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
                     f"Stopped: {board.tally.done} of {len(wanted)} levels are committed; the same command goes on."
                 )
                 raise
-            manifest = read_manifest(split, ["label"])
+            manifest = read_manifest(split, ["label", "env_steps", "steps_to_first_success"])
+            if board.tally.env_steps:
+                print(_spent(manifest, wanted - done, board.tally))
         else:
             print(f"Nothing to do: all {len(wanted)} levels are there.")
         _closing(split, manifest, wanted, queue)
@@ -88,6 +90,23 @@ def _labels(manifest: Manifest, wanted: Collection[int]) -> Counter[str]:
 def _opening(job: JobConfig, split: Path, levels: int, done: int) -> str:
     there = f", {done} are there already" if done else ""
     return f"{levels} levels of size {job.size}, {job.budget} env steps each, into {split}{there}"
+
+
+def _spent(manifest: Manifest, made: Collection[int], tally: Tally) -> str:
+    """What this run's env steps were for."""
+    rows = manifest.table.filter(np.isin(manifest.level_ids, list(made)))
+    steps, first, label = (rows.column(name).to_numpy() for name in ("env_steps", "steps_to_first_success", "label"))
+    total = tally.env_steps + tally.evaluated + tally.idle
+    after = np.nansum(np.where(label == "solved", steps - first.astype(float), 0.0))
+    shares = {
+        "after a level's first success": after / total,
+        "of levels that stayed unsolved": steps[label == "unsolved"].sum() / total,
+        "of evaluations": tally.evaluated / total,
+        "in empty slots": tally.idle / total,
+    }
+    told = ", ".join(f"{share:.0%} {name}" for name, share in shares.items())
+    nothing = (after + tally.idle) / total
+    return f"{total:,} env steps: {told}. Decided nothing (after the first success, or empty): {nothing:.0%}."
 
 
 def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: Queue) -> None:

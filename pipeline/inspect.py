@@ -66,7 +66,9 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
         "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
         "duplicates": duplicates.within(levels, shown),
         "against": {str(other): duplicates.between(levels, duplicates.compared_in(other), shown) for other in against},
-        "env_steps": sum(chosen.column("env_steps").to_pylist()),
+        "env_steps": total(chosen, "env_steps"),
+        "env_steps_after_success": total(solved, "env_steps - coalesce(steps_to_first_success, env_steps)"),
+        "env_steps_unsolved": total(select(chosen, "label = 'unsolved'"), "env_steps"),
         "split_bytes": stored,  # of all the split's shards, whatever the condition
         "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
         "rows": [_plain(row) for row in chosen.slice(0, shown).to_pylist()],
@@ -96,6 +98,15 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
             raise UserError(
                 f"Cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
             ) from None
+
+
+def total(table: pa.Table, expression: str) -> int:
+    """Sum of an SQL expression over the rows."""
+    with duckdb.connect() as connection:
+        connection.register("manifest", table)
+        row = connection.sql(f"SELECT coalesce(sum({expression}), 0) FROM manifest").fetchone()
+    assert row is not None
+    return int(row[0])
 
 
 def _counts(table: pa.Table, column: str) -> dict[str, int]:
@@ -135,7 +146,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         "training steps to first success": _told(facts["steps_to_first_success"]),
         "duplicates": duplicates.told(facts["duplicates"]),
         **{f"duplicates in {other}": duplicates.told(found) for other, found in facts["against"].items()},
-        "training env steps": f"{facts['env_steps']:,}",
+        "training env steps": _steps_told(facts),
         "shards": f"{facts['split_bytes']:,} bytes",
         "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
     }
@@ -148,6 +159,13 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     if facts["rows"]:
         console.print()
         console.print(table)
+
+
+def _steps_told(facts: dict[str, Any]) -> str:
+    steps, after, unsolved = (facts[f"env_steps{of}"] for of in ("", "_after_success", "_unsolved"))
+    if not steps:
+        return "0"
+    return f"{steps:,} ({after / steps:.0%} after a first success, {unsolved / steps:.0%} of levels unsolved)"
 
 
 def _told(quantiles: dict[str, float] | None) -> str | None:

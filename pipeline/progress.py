@@ -23,7 +23,9 @@ class Tally:
     done: int  # committed, those of earlier runs included
     solved: int
     running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
-    env_steps: int = 0  # of this run's committed units
+    env_steps: int = 0  # of this run's committed units, of training
+    evaluated: int = 0  # env steps of their evaluations
+    idle: int = 0  # env steps in their slots without a level
     history: deque[tuple[float, int]] = field(default_factory=deque)  # time, env steps of this run
 
     def __post_init__(self) -> None:
@@ -40,6 +42,8 @@ class Tally:
             self.done += summary.levels
             self.solved += summary.solved
             self.env_steps += summary.env_steps
+            self.evaluated += summary.evaluated
+            self.idle += summary.idle
 
     def tick(self, now: float) -> None:
         """Note where the job is at time `now`, s. The clock starts with the first env step: compiling is no pace."""

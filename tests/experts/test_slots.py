@@ -105,6 +105,9 @@ def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) ->
     for i in never:
         assert len(halved[i].curve) in (4, 8)  # at the first rung there is nothing to compare with
     assert spent.trained == sum(len(of.curve) for of in halved) * CONFIG.steps_per_update
+    verdicts = train_levels(levels, IDS, UPDATES * 512, CONFIG, stopping).verdicts
+    reasons = {i: verdict.label_reason for i, verdict in enumerate(verdicts) if verdict.label is Label.UNSOLVED}
+    assert all("at a rung the best return had not grown" in reasons[i] for i in never)
 
 
 def test_a_success_of_training_is_a_witness_if_wanted(levels: Level) -> None:
