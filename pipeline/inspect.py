@@ -104,9 +104,8 @@ def total(table: pa.Table, expression: str) -> int:
     """Sum of an SQL expression over the rows."""
     with duckdb.connect() as connection:
         connection.register("manifest", table)
-        row = connection.sql(f"SELECT coalesce(sum({expression}), 0) FROM manifest").fetchone()
-    assert row is not None
-    return int(row[0])
+        rows = connection.sql(f"SELECT coalesce(sum({expression}), 0) AS sum FROM manifest").to_arrow_table()
+    return int(rows.column("sum")[0].as_py())
 
 
 def _counts(table: pa.Table, column: str) -> dict[str, int]:

@@ -38,8 +38,9 @@ def main() -> None:
     import jax
 
     from experts.config import ExpertConfig, Rule, StopConfig
-    from experts.slots import advance, empty_slots
+    from experts.slots import Queue, Training, advance, empty_slots
     from experts.train import queue_of, slot_count
+    from experts.witness import take
     from levelgen.task import TaskParams
     from pipeline.bench.worlds import load_levels
 
@@ -52,25 +53,32 @@ def main() -> None:
     slots = min(slot_count(config), given.count)
     batches = [np.minimum(np.arange(i, i + slots), given.count - 1) for i in range(0, given.count, slots)]
 
-    def go(updates: int, batch: np.ndarray):
-        queue = queue_of(jax.tree.map(lambda x: x[..., batch], levels), ids[batch], NEVER_ENDING, config)
-        now, goals = empty_slots(slots, queue, config), np.zeros(len(batch))
+    def train(updates: int, batches: list[np.ndarray]) -> list[tuple[Training, float]]:
+        """Fresh experts, a batch of them after another: what they have become, and their goals."""
+        everyone = queue_of(levels, ids, NEVER_ENDING, config)
+        return [train_batch(of_batch(everyone, batch), updates) for batch in batches]
+
+    def of_batch(queue: Queue, batch: np.ndarray) -> Queue:
+        begun = jax.tree.map(lambda x: x[batch], queue.begun)
+        count = jax.numpy.int32(len(batch))
+        return Queue(take(queue.levels, batch), queue.level_ids[batch], count, queue.updates, begun)
+
+    def train_batch(queue: Queue, updates: int) -> tuple[Training, float]:
+        now, goals, ended = empty_slots(slots, queue, config), 0.0, np.zeros(slots)
         for _ in range(updates):
-            before = np.asarray(now.slot.training.progress.episodes)
             now, seen = advance(now, queue, config, StopConfig(rule=Rule.BUDGET), rules)
-            ended = np.asarray(now.slot.training.progress.episodes) - before
-            goals += np.nan_to_num(np.asarray(seen.share)) * ended
+            before, ended = ended, np.asarray(now.slot.training.progress.episodes)
+            goals += float((np.nan_to_num(np.asarray(seen.share)) * (ended - before)).sum())
         return now.slot.training, goals
 
-    cold, _ = timed(lambda: go(1, batches[0]))
-    warm, _ = timed(lambda: go(1, batches[0]))
+    cold, _ = timed(lambda: train(1, batches[:1]))
+    warm, _ = timed(lambda: train(1, batches[:1]))
 
     def run() -> dict:
-        seconds, out = timed(lambda: [go(given.updates, batch) for batch in batches])
+        seconds, out = timed(lambda: train(given.updates, batches))
         finite = all(np.isfinite(np.asarray(x)).all() for training, _ in out for x in jax.tree.leaves(training.expert))
         episodes = sum(float(np.asarray(training.progress.episodes).sum()) for training, _ in out)
-        goals = sum(float(goals.sum()) for _, goals in out)
-        return {"seconds": seconds, "done": episodes, "goal": goals, "finite": bool(finite)}
+        return {"seconds": seconds, "done": episodes, "goal": sum(goals for _, goals in out), "finite": bool(finite)}
 
     serve({"compile_seconds": cold - warm}, run)
 

@@ -1,0 +1,96 @@
+"""Where training's time goes: rollout and update of one core alone, and the program that does both in slots.
+
+python -m benchmarks.training [SIZE ...]
+"""
+
+import os
+import sys
+import time
+from functools import partial
+
+os.environ.update(dict.fromkeys(("NPROC", "OMP_NUM_THREADS"), "1"))
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experts import ppo
+from experts.config import ExpertConfig, Rule, StopConfig
+from experts.ppo import Batch, Seen
+from experts.rollout import Manner, repeat, rollout, start
+from experts.slots import advance, empty_slots, network_of
+from experts.train import queue_of, slot_count
+from levelgen.actions import CHOICES, action_mask
+from levelgen.level import SIZES
+from levelgen.observe import level_features
+from levelgen.sampler import sample_levels
+from levelgen.task import DEFAULT_RULES
+
+REPEATS = 30
+ENDLESS = 10**6  # updates
+
+
+def main() -> None:
+    config = ExpertConfig()
+    print("env steps/s of one core\n\n| size | rollout | update | both, in slots |\n|---|---|---|---|")
+    for size in sys.argv[1:] or SIZES:
+        experts = slot_count(config)
+        steps = experts * config.steps_per_update
+        levels = jax.device_get(sample_levels(jnp.arange(experts), SIZES[size]))
+        rates = [f"{steps / seconds(call):,.0f}" for call in calls(levels, config)]
+        print("|", " | ".join((size, *rates)), "|", flush=True)
+
+
+def calls(levels, config: ExpertConfig):
+    """A rollout, an update, and both: functions without arguments, one after another."""
+    count = levels.role.shape[-1]
+    queue = queue_of(levels, np.arange(count), ENDLESS, config)
+    slots = empty_slots(count, queue, config)
+    stopping = StopConfig(rule=Rule.BUDGET)
+    slots, _ = advance(slots, queue, config, stopping, DEFAULT_RULES)
+    experts, levels = slots.slot.training.expert, jax.tree.map(jnp.asarray, levels)
+    experts = jax.tree.map(jnp.copy, experts)  # `advance` uses its slots up
+    lanes, network = config.environments * count, network_of(levels, config)
+    no = jnp.zeros(lanes, bool)
+    manner = Manner(no, jnp.zeros(lanes), no, jnp.zeros((256, len(CHOICES), count), jnp.int8))
+    keys, acting = jax.random.split(jax.random.key(0), count), start(repeat(levels, config.environments))
+    ours = config.horizon, DEFAULT_RULES
+    act = jax.jit(lambda params, acting: rollout(network, params, levels, acting, keys, manner, *ours))
+    yield partial(act, experts.params, acting)
+
+    _, seen, last_value = act(experts.params, acting)
+    advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
+    batch = Batch(seen.moving, seen.action, seen.log_probability, seen.value, advantage)
+    samples = jax.vmap(ppo.as_samples, in_axes=-2)(batch)
+    constant = Seen(level_features(levels).T, action_mask(levels).T)
+
+    @jax.jit
+    def update(experts):
+        one = lambda given: ppo.update(given[0], given[1], network, given[2], given[3], config)
+        return jax.lax.map(one, (experts, keys, constant, samples))
+
+    yield partial(update, experts)
+
+    def both():
+        nonlocal slots
+        slots, report = advance(slots, queue, config, stopping, DEFAULT_RULES)
+        return report
+
+    yield both
+
+
+def seconds(call) -> float:
+    """Median of REPEATS calls."""
+    jax.block_until_ready(call())
+    taken = []
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        jax.block_until_ready(call())
+        taken.append(time.perf_counter() - begin)
+    return float(np.median(taken))
+
+
+if __name__ == "__main__":
+    main()
