@@ -178,12 +178,13 @@ def queue_of(
     places = np.minimum(np.arange(max(BLOCK, 1 << (count - 1).bit_length())), count - 1)
     levels, ids = take(levels, places), np.asarray(level_ids, np.int32)[places]
     blocks = [np.arange(first, first + BLOCK) for first in range(0, len(places), BLOCK)]
-    fresh = [jax.device_get(begin(take(levels, block), ids[block], config)) for block in blocks]
-    experts = jax.tree.map(lambda *parts: np.concatenate(parts), *fresh)
-    for place, expert in begun.items():
-        jax.tree.map(partial(_put, place), experts, expert.begun)
-    levels, ids, experts = jax.device_put((levels, ids, experts))
-    return Queue(levels, ids, jnp.int32(count), jnp.int32(updates), experts)
+    fresh = [begin(take(levels, block), ids[block], config) for block in blocks]
+    experts = jax.tree.map(lambda *parts: jnp.concatenate(parts), *fresh) if len(fresh) > 1 else fresh[0]
+    if begun:
+        experts = jax.tree.map(np.array, experts)
+        for place, expert in begun.items():
+            jax.tree.map(partial(_put, place), experts, expert.begun)
+    return jax.device_put(Queue(levels, ids, np.int32(count), np.int32(updates), experts))
 
 
 def _put(place: int, rows: np.ndarray, row: np.ndarray) -> None:

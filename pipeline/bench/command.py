@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--levels", type=int, default=32, help="levels, one expert each (default: 32)")
     sub.add_argument("--environments", type=int, default=32, help="lanes of an expert (default: 32)")
     sub.add_argument("--horizon", type=int, default=64, help="env steps in each lane between updates (default: 64)")
-    sub.add_argument("--updates", type=int, default=2, help="updates of a run (default: 2)")
+    sub.add_argument("--updates", type=int, default=4, help="updates of a run (default: 4)")
 
     sub = bench(
         "parity", parity, "how far the physics is from the reference's: one step from many states, and episodes"

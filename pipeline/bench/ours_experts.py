@@ -55,13 +55,12 @@ def main() -> None:
 
     def train(updates: int, batches: list[np.ndarray]) -> list[tuple[Training, float]]:
         """Fresh experts, a batch of them after another: what they have become, and their goals."""
-        everyone = queue_of(levels, ids, NEVER_ENDING, config)
+        everyone = jax.device_get(queue_of(levels, ids, NEVER_ENDING, config))
         return [train_batch(of_batch(everyone, batch), updates) for batch in batches]
 
     def of_batch(queue: Queue, batch: np.ndarray) -> Queue:
-        begun = jax.tree.map(lambda x: x[batch], queue.begun)
-        count = jax.numpy.int32(len(batch))
-        return Queue(take(queue.levels, batch), queue.level_ids[batch], count, queue.updates, begun)
+        begun, count = jax.tree.map(lambda x: x[batch], queue.begun), np.int32(len(batch))
+        return jax.device_put(Queue(take(queue.levels, batch), queue.level_ids[batch], count, queue.updates, begun))
 
     def train_batch(queue: Queue, updates: int) -> tuple[Training, float]:
         now, goals, ended = empty_slots(slots, queue, config), 0.0, np.zeros(slots)
