@@ -6,6 +6,13 @@ from enum import StrEnum
 RECORD_STEPS = 256  # env steps of a record
 
 
+class Network(StrEnum):
+    """What an expert sees, and through which network."""
+
+    FLAT = "flat"  # all features side by side
+    ENTITY = "entity"  # a set of things; their order does not matter
+
+
 class Rule(StrEnum):
     """When a level leaves its slot."""
 
@@ -26,8 +33,10 @@ class ExpertConfig:
     """Hyperparameters of one expert (hashable: pass as a static argument)."""
 
     # network
+    network: Network = Network.FLAT
     width: int = 64  # units of a hidden layer
     depth: int = 2  # hidden layers of the policy and of the value function, which share none
+    encoding: int = 16  # units of the first hidden layer of an entity network, of each kind of thing
     # experience
     environments: int = 32  # lanes an expert acts in
     horizon: int = 32  # env steps in each lane between updates
@@ -56,7 +65,7 @@ class ExpertConfig:
     slots: int = 0  # experts that train side by side in one program; 0: as many as suit the device
 
     def __post_init__(self) -> None:
-        at_least_one = ("width", "depth", "environments", "horizon", "epochs", "minibatches", "attempts")
+        at_least_one = ("width", "depth", "encoding", "environments", "horizon", "epochs", "minibatches", "attempts")
         for name in at_least_one:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")

@@ -1,119 +1,50 @@
-"""An expert's networks: what to do (multi-discrete logits) and what to expect (value), over the symbolic-flat view.
+"""An expert's policy: what to do (multi-discrete logits) and what to expect (value), from what it sees of a state."""
 
-Lanes last, as in the engine: a layer is `kernel @ x`, and everything between matrix products is a dense loop over
-lanes. Most features are constant within a level, so the first layer folds them into its bias once, and multiplies
-only those that move. That is the same function of the whole observation, at a sixth of its cost for size s.
-"""
+from typing import Any
 
-from collections.abc import Sequence
-
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax.typing import VariableDict as Params
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
+from experts.config import ExpertConfig, Network
+from experts.networks.entity import EntityNetwork
+from experts.networks.flat import FlatNetwork
 from levelgen.actions import CHOICES
 from levelgen.observe import dynamic_features
 from physics.types import Size
-from physics.vector import rows
 
-LOGITS = sum(CHOICES)
+ActorCritic = FlatNetwork | EntityNetwork
+Constant = Any  # what is constant within one level, as the network's `constant` lays it out
 FIRSTS = np.cumsum([0, *CHOICES[:-1]]).tolist()  # of each entry's logits
-HIDDEN_GAIN, POLICY_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0  # of orthogonal initial kernels
 
 
-def orthogonal(gain: float) -> nn.initializers.Initializer:
-    """Kernels with orthogonal rows (or columns, if these are fewer) of length `gain`, evenly distributed.
-
-    Gram-Schmidt, twice for accuracy, on a Gaussian matrix. Flax's own does a QR factorisation, and several of these
-    side by side can deadlock the thread pool of jaxlib 0.10's CPU backend.
-    """
-
-    def initialise(key, shape, dtype=jnp.float32):
-        units, inputs = shape
-        if units > inputs:
-            return initialise(key, (inputs, units), dtype).T
-
-        def add_row(k, kernel):
-            earlier = jnp.where(jnp.arange(units)[:, None] < k, kernel, 0.0)
-            row = kernel[k]
-            for _ in range(2):
-                row = row - earlier.T @ (earlier @ row)
-            return kernel.at[k].set(row / jnp.linalg.norm(row))
-
-        return gain * jax.lax.fori_loop(0, units, add_row, jax.random.normal(key, shape, dtype))
-
-    return initialise
+def network_of(size: Size, config: ExpertConfig) -> ActorCritic:
+    """The network that a configuration asks for."""
+    match config.network:
+        case Network.FLAT:
+            return FlatNetwork(size, config.width, config.depth)
+        case Network.ENTITY:
+            return EntityNetwork(size, config.width, config.depth, config.encoding)
 
 
-class Dense(nn.Module):
-    """A layer on columns."""
-
-    units: int
-    gain: float
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "input lane"]) -> Float[Array, "unit lane"]:
-        kernel = self.param("kernel", orthogonal(self.gain), (self.units, x.shape[0]))
-        bias = self.param("bias", nn.initializers.zeros, (self.units,))
-        return kernel @ x + bias[:, None]
-
-
-class FirstDense(nn.Module):
-    """A layer on the whole observation, given as its constant part (0 where it moves) and its moving rows."""
-
-    units: int
-    gain: float
-    moving_rows: Sequence[int]
-
-    @nn.compact
-    def __call__(
-        self, constant: Float[Array, " feature"], moving: Float[Array, "dynamic lane"]
-    ) -> Float[Array, "unit lane"]:
-        kernel = self.param("kernel", orthogonal(self.gain), (self.units, constant.shape[0]))
-        bias = self.param("bias", nn.initializers.zeros, (self.units,))
-        columns = rows(kernel.T, self.moving_rows)
-        return columns.T @ moving + (bias + kernel @ constant)[:, None]
-
-
-class Trunk(nn.Module):
-    width: int
-    depth: int
-    outputs: int
-    gain: float
-    moving_rows: Sequence[int]
-
-    @nn.compact
-    def __call__(self, constant: Float[Array, " feature"], moving: Float[Array, "dynamic lane"]) -> Array:
-        x = nn.tanh(FirstDense(self.width, HIDDEN_GAIN, self.moving_rows)(constant, moving))
-        for _ in range(self.depth - 1):
-            x = nn.tanh(Dense(self.width, HIDDEN_GAIN)(x))
-        return Dense(self.outputs, self.gain)(x)
-
-
-class ActorCritic(nn.Module):
-    """Separate networks for policy and value of one level."""
-
-    size: Size
-    width: int
-    depth: int
-
-    @nn.compact
-    def __call__(
-        self, constant: Float[Array, " feature"], moving: Float[Array, "dynamic lane"]
-    ) -> tuple[Float[Array, "logit lane"], Float[Array, " lane"]]:
-        moving_rows = tuple(dynamic_features(self.size).tolist())
-        logits = Trunk(self.width, self.depth, LOGITS, POLICY_GAIN, moving_rows, name="policy")(constant, moving)
-        value = Trunk(self.width, self.depth, 1, VALUE_GAIN, moving_rows, name="value")(constant, moving)
-        return logits, value[0]
+def initial(key: Key[Array, ""], network: ActorCritic, constant: Constant) -> Params:
+    """Parameters of an expert that has seen nothing; `constant` gives shapes only."""
+    return network.init(key, constant, jnp.zeros((len(dynamic_features(network.size)), 1)))
 
 
 def forward(
-    network: ActorCritic, params: Params, constant: Float[Array, " feature"], moving: Float[Array, "dynamic lane"]
+    network: ActorCritic, params: Params, constant: Constant, moving: Float[Array, "dynamic lane"]
 ) -> tuple[Float[Array, "logit lane"], Float[Array, " lane"]]:
-    """Logits and value of one expert."""
+    """Logits and value of one expert.
+
+    Args:
+        network: its shape.
+        params: its parameters.
+        constant: of its level.
+        moving: the rows that change, `levelgen.observe.state_features`.
+    """
     return network.apply(params, constant, moving)  # type: ignore[return-value]
 
 

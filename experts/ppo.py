@@ -11,7 +11,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts.config import ExpertConfig
-from experts.policy import ActorCritic, Params, entropy, forward, log_probability
+from experts.policy import ActorCritic, Constant, Params, entropy, forward, initial, log_probability
 from levelgen.actions import CHOICES
 
 ADVANTAGE_EPSILON = 1e-8
@@ -27,7 +27,7 @@ class Expert(NamedTuple):
 class Seen(NamedTuple):
     """What is constant within a level."""
 
-    constant: Float[Array, " feature"]  # the observation's constant rows, see levelgen.observe
+    constant: Constant  # of what the network sees
     live: Bool[Array, "6"]  # entries of an action that something obeys
 
 
@@ -48,9 +48,9 @@ def optimiser(config: ExpertConfig) -> optax.GradientTransformation:
     )
 
 
-def init(key: Key[Array, ""], network: ActorCritic, features: int, dynamic: int, config: ExpertConfig) -> Expert:
+def init(key: Key[Array, ""], network: ActorCritic, constant: Constant, config: ExpertConfig) -> Expert:
     """An expert that has seen nothing."""
-    params = network.init(key, jnp.zeros(features), jnp.zeros((dynamic, 1)))
+    params = initial(key, network, constant)
     return Expert(params, optimiser(config).init(params))
 
 

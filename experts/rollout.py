@@ -14,7 +14,7 @@ from experts.policy import ActorCritic, forward, log_probability, most_probable,
 from levelgen import task
 from levelgen.actions import CHOICES, action_mask
 from levelgen.level import Level
-from levelgen.observe import level_features, state_features
+from levelgen.observe import state_features
 from levelgen.task import TaskParams, TaskState
 
 T = TypeVar("T")
@@ -88,10 +88,10 @@ def rollout(
     level_count = keys.shape[0]
     environments = len(manner.greedy) // level_count
     lanes = repeat(levels, environments)
-    constant, live = level_features(levels), action_mask(lanes)
+    constant, live = network.constant(levels), action_mask(lanes)
     per_level = lambda x: x.reshape(*x.shape[:-1], level_count, environments)
     flat = lambda x: x.reshape(*x.shape[:-2], -1)
-    each = jax.vmap(partial(forward, network), in_axes=(0, 1, 1), out_axes=(-2, 0))
+    each = jax.vmap(partial(forward, network), in_axes=(0, -1, 1), out_axes=(-2, 0))
 
     def look(world: TaskState):
         moving = per_level(state_features(lanes, world.state))

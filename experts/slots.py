@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts import ppo, progress, stop
 from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
-from experts.policy import ActorCritic
+from experts.policy import ActorCritic, Constant, network_of
 from experts.ppo import Batch, Expert, Seen
 from experts.progress import Progress
 from experts.rollout import Acting, Experience, Manner, repeat, rollout, start
@@ -28,7 +28,6 @@ from experts.success import Success, find, no_success, remember
 from levelgen.actions import CHOICES, action_mask
 from levelgen.identity import Stream, key_for
 from levelgen.level import Level
-from levelgen.observe import dynamic_features, feature_count, level_features
 from levelgen.task import TaskParams
 
 STICKINESS = 0.25  # of sticky attempts (Machado et al. 2018, arXiv:1709.06009)
@@ -108,10 +107,6 @@ class Report(NamedTuple):
     left: Bool[Array, " slot"]
 
 
-def network_of(levels: Level, config: ExpertConfig) -> ActorCritic:
-    return ActorCritic(levels.size, config.width, config.depth)
-
-
 def over_slots(function: Callable, *slots: Any) -> Any:
     """One slot after another on a CPU: its minibatch stays in a core's cache, and `cond` skips what it can."""
     if jax.default_backend() == "cpu":
@@ -122,15 +117,16 @@ def over_slots(function: Callable, *slots: Any) -> Any:
 @partial(jax.jit, static_argnames="config")
 def begin(levels: Level, level_ids: Int[Array, " level"], config: ExpertConfig) -> Begun:
     """Experts that have seen nothing, level axis first."""
-    size, network, lanes = levels.size, network_of(levels, config), config.environments
+    network, lanes = network_of(levels.size, config), config.environments
 
-    def training(level_id) -> Training:
+    def training(level_id, constant: Constant) -> Training:
         key = jax.random.fold_in(key_for(level_id, Stream.EXPERT), 0)
-        expert = ppo.init(key, network, feature_count(size), len(dynamic_features(size)), config)
+        expert = ppo.init(key, network, constant, config)
         recent = jnp.zeros((RECORD_STEPS, len(CHOICES), lanes), jnp.int8)
         return Training(expert, progress.start(lanes), stop.begin(), no_success(), recent)
 
-    return Begun(jax.vmap(training)(level_ids), _by_slot(start(repeat(levels, lanes)), lanes))
+    experts = jax.vmap(training, in_axes=(0, -1))(level_ids, network.constant(levels))
+    return Begun(experts, _by_slot(start(repeat(levels, lanes)), lanes))
 
 
 @partial(jax.jit, static_argnames=("count", "config"))
@@ -175,12 +171,12 @@ def advance(
     trial = _where(fresh, _moved_start(lanes, keys, config), slots.trial)
     acting = _where(trains, slots.acting, trial)
 
-    network = network_of(levels, config)
+    network = network_of(levels.size, config)
     manner = _manner(slot, evaluating, config)
     acting, experience, last_value = rollout(
         network, slot.training.expert.params, levels, acting, keys, manner, config.horizon, rules
     )
-    now = _split(levels, keys, experience, last_value, manner, config)
+    now = _split(network, levels, keys, experience, last_value, manner, config)
     slot, share, mode = over_slots(partial(_follow, network=network, config=config, stopping=stopping), slot, now)
     left = (slot.mode == Mode.EMPTY) & (mode == Mode.EVALUATE)
     ended = (mode == Mode.EVALUATE) & (slot.trial.part == config.record_rollouts)
@@ -226,6 +222,7 @@ class _Now(NamedTuple):
 
 
 def _split(
+    network: ActorCritic,
     levels: Level,
     keys: Key[Array, " slot"],
     experience: Experience,
@@ -240,7 +237,7 @@ def _split(
     samples = jax.vmap(ppo.as_samples, in_axes=-2)(batch)
     by_slot = lambda x: jnp.moveaxis(x, -2, 0)
     return _Now(
-        Seen(level_features(levels).T, action_mask(levels).T),
+        jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), Seen(network.constant(levels), action_mask(levels))),
         keys,
         samples,
         by_slot(seen.action.astype(jnp.int8)),

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from experts import ppo
-from experts.config import ExpertConfig
-from experts.policy import ActorCritic, forward, log_probability, sample
+from experts.config import ExpertConfig, Network
+from experts.policy import forward, log_probability, network_of, sample
 from experts.ppo import Batch, Seen
 from levelgen.actions import CHOICES
 from levelgen.level import SIZES
-from levelgen.observe import dynamic_features, feature_count
+from levelgen.observe import dynamic_features
+from levelgen.sampler import sample_levels
 
 SIZE = SIZES["s"]
-FEATURES, DYNAMIC = feature_count(SIZE), len(dynamic_features(SIZE))
+DYNAMIC = len(dynamic_features(SIZE))
 
 
 def test_advantages() -> None:
@@ -43,12 +44,14 @@ def test_samples_keep_every_number_at_its_place() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_learns_a_bandit(seed: int) -> None:
+@pytest.mark.parametrize("kind", Network)
+def test_learns_a_bandit(kind: Network, seed: int) -> None:
     """One action entry pays when it is 2: after a few updates it is chosen nearly always."""
-    config = ExpertConfig(environments=32, horizon=8, learning_rate=3e-3)
-    network, samples = ActorCritic(SIZE, 16, 2), config.steps_per_update
-    expert = ppo.init(jax.random.key(seed), network, FEATURES, DYNAMIC, config)
-    seen, moving = Seen(jnp.zeros(FEATURES), jnp.ones(len(CHOICES), bool)), jnp.ones((DYNAMIC, samples))
+    config = ExpertConfig(network=kind, width=16, encoding=16, environments=32, horizon=8, learning_rate=3e-3)
+    network, samples = network_of(SIZE, config), config.steps_per_update
+    constant = jax.tree.map(lambda x: x[..., 0], network.constant(sample_levels(jnp.array([seed]), SIZE)))
+    expert = ppo.init(jax.random.key(seed), network, constant, config)
+    seen, moving = Seen(constant, jnp.ones(len(CHOICES), bool)), jnp.ones((DYNAMIC, samples))
 
     @jax.jit
     def learn(expert, key):

@@ -1,0 +1,113 @@
+"""What networks cost: multiply-adds of one env step, and env steps/s of experts in training.
+
+python -m benchmarks.networks [--write docs/experts.md]
+
+The transformer is counted, not built: tokens are the floor, movable polygons, circles, joints and thrusters; policy
+and value function share none, as in the others.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from benchmarks.document import between_marks
+from experts.config import ExpertConfig, Network, Rule, StopConfig
+from experts.networks.entity import KINDS
+from experts.networks.layers import LOGITS
+from experts.slots import advance, empty_slots
+from experts.train import queue_of
+from levelgen.level import SIZES
+from levelgen.observe import DYNAMIC_ROWS
+from levelgen.sampler import sample_levels
+from levelgen.task import DEFAULT_RULES
+from physics.types import FIXED_POLYGONS, Size
+from pipeline.runtime import own_cores, prepare_jax
+
+SLOTS, UPDATES, REPEATS = 4, 5, 9  # REPEATS in turns, so that medians compare
+NEVER_ENDING = 10**6  # updates
+LAYERS, MODEL = 2, 64  # of the transformer; heads change nothing here
+FEED_FORWARD = 4 * MODEL
+CONFIGS = {kind.value: ExpertConfig(network=kind, slots=SLOTS) for kind in Network}
+FLAT = CONFIGS["flat"]
+STEPS_OF_UPDATES = 3 * FLAT.epochs  # forward passes' worth per env step: a backward pass takes about two
+
+
+def multiply_adds(name: str, size: Size) -> int:
+    """Of one forward pass of one lane: policy and value function, what is folded once per level left out."""
+    moving = len(DYNAMIC_ROWS)
+    things = (size.polygons - FIXED_POLYGONS, size.circles, size.joints, size.thrusters)
+    moving_rows = sum(n * len(kind.moving_rows) for n, kind in zip(things, KINDS, strict=True))
+    if name == "transformer":
+        tokens = 1 + sum(things)
+        projections = 4 * MODEL * MODEL  # queries, keys, values, outputs
+        layer = tokens * (projections + 2 * tokens * MODEL + 2 * MODEL * FEED_FORWARD)
+        trunk = moving_rows * MODEL + LAYERS * layer
+        last = MODEL
+    elif name == "entity":
+        config = CONFIGS[name]
+        sums = sum(things) * config.encoding
+        kinds = sum(n > 0 for n in (1, *things[1:]))
+        trunk = moving_rows * config.encoding + sums + kinds * config.encoding * config.width
+        trunk, last = trunk + (config.depth - 2) * config.width**2, config.width
+    else:
+        config = CONFIGS[name]
+        trunk = (size.bodies - FIXED_POLYGONS) * moving * config.width + (config.depth - 1) * config.width**2
+        last = config.width
+    ends = (2 * size.joints + size.thrusters) * (size.bodies - FIXED_POLYGONS) * moving if name != "flat" else 0
+    return 2 * trunk + last * (LOGITS + 1) + ends
+
+
+def ready(size: Size, config: ExpertConfig):
+    """A function that trains on for some updates, after a first one."""
+    ids, rules = np.arange(16), DEFAULT_RULES
+    queue = queue_of(jax.device_get(sample_levels(ids, size)), ids, NEVER_ENDING, config)
+    slots = empty_slots(SLOTS, queue, config)
+
+    def train() -> None:
+        nonlocal slots
+        for _ in range(UPDATES):
+            slots, _ = advance(slots, queue, config, StopConfig(rule=Rule.BUDGET), rules)
+        jax.block_until_ready(slots)
+
+    train()
+    return train
+
+
+def rates(size: Size) -> dict[str, float]:
+    """Env steps/s of training in one core, medians, in turns."""
+    contestants = {name: ready(size, config) for name, config in CONFIGS.items()}
+    seconds = {name: [] for name in contestants}
+    for _ in range(REPEATS):
+        for name, train in contestants.items():
+            start = time.process_time()
+            train()
+            seconds[name].append(time.process_time() - start)
+    return {name: SLOTS * UPDATES * CONFIGS[name].steps_per_update / np.median(s) for name, s in seconds.items()}
+
+
+def tables() -> str:
+    counts = ["| size | flat | entity | transformer | with its updates |", "|---|---|---|---|---|"]
+    speeds = ["| size | flat | entity |", "|---|---|---|"]
+    for name, size in SIZES.items():
+        adds = [multiply_adds(network, size) for network in ("flat", "entity", "transformer")]
+        counts.append(f"| {name} | {' | '.join(f'{n:,}' for n in adds)} | {(1 + STEPS_OF_UPDATES) * adds[-1]:,} |")
+        speeds.append(f"| {name} | {' | '.join(f'{rate:,.0f}' for rate in rates(size).values())} |")
+    return "\n".join(("Multiply-adds:", "", *counts, "", "Env steps per second of a core, training:", "", *speeds))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--write", type=Path, help="document whose tables to renew")
+    given = parser.parse_args()
+    prepare_jax(min(own_cores()))
+    made = tables()
+    print(made)
+    if given.write:
+        given.write.write_text(between_marks(given.write.read_text(), "networks", made))
+
+
+if __name__ == "__main__":
+    main()

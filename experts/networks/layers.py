@@ -1,0 +1,52 @@
+"""Layers on columns, and how their kernels start.
+
+Lanes last, as in the engine: a layer is `kernel @ x`, and everything between matrix products is a dense loop over
+lanes.
+"""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from levelgen.actions import CHOICES
+
+LOGITS = sum(CHOICES)
+HIDDEN_GAIN, POLICY_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0  # of orthogonal initial kernels
+
+
+def orthogonal(gain: float) -> nn.initializers.Initializer:
+    """Kernels with orthogonal rows (or columns, if these are fewer) of length `gain`, evenly distributed.
+
+    Gram-Schmidt, twice for accuracy, on a Gaussian matrix. Flax's own does a QR factorisation, and several of these
+    side by side can deadlock the thread pool of jaxlib 0.10's CPU backend.
+    """
+
+    def initialise(key, shape, dtype=jnp.float32):
+        units, inputs = shape
+        if units > inputs:
+            return initialise(key, (inputs, units), dtype).T
+
+        def add_row(k, kernel):
+            earlier = jnp.where(jnp.arange(units)[:, None] < k, kernel, 0.0)
+            row = kernel[k]
+            for _ in range(2):
+                row = row - earlier.T @ (earlier @ row)
+            return kernel.at[k].set(row / jnp.linalg.norm(row))
+
+        return gain * jax.lax.fori_loop(0, units, add_row, jax.random.normal(key, shape, dtype))
+
+    return initialise
+
+
+class Dense(nn.Module):
+    """A layer on columns."""
+
+    units: int
+    gain: float
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "input lane"]) -> Float[Array, "unit lane"]:
+        kernel = self.param("kernel", orthogonal(self.gain), (self.units, x.shape[0]))
+        bias = self.param("bias", nn.initializers.zeros, (self.units,))
+        return kernel @ x + bias[:, None]

@@ -1,0 +1,125 @@
+"""The entity network against the plain formula on unfolded entities, and what the order of things does: nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experts.networks.entity import EntityNetwork
+from experts.policy import Params, forward, initial
+from levelgen.level import SIZES, Level
+from levelgen.observe import BODY_ROWS, LIMIT, UNSEEN_WALLS, state_features
+from levelgen.observe_entities import EntityObservation, entities
+from levelgen.sampler import sample_levels
+from levelgen.shuffle import OrderDraws, places, shuffle
+from physics.types import FIXED_POLYGONS, State
+
+LEVELS = 6
+FROM_TANH = 1e-5  # float32, sums of a few hundred terms
+
+
+def network_of(name: str) -> tuple[EntityNetwork, Params]:
+    network = EntityNetwork(SIZES[name], width=8, depth=2, encoding=12)
+    constant = jax.tree.map(lambda x: x[..., 0], network.constant(sample_levels(jnp.arange(1), network.size)))
+    params = initial(jax.random.key(0), network, constant)
+    return network, jax.tree.map(lambda x: x + 0.1, params)  # biases count too
+
+
+def moved(state: State, rng: np.random.Generator) -> State:
+    """Movable bodies somewhere else, at other speeds."""
+
+    def change(x):
+        shift = rng.normal(size=x.shape).astype(np.float32)
+        shift[:FIXED_POLYGONS] = 0
+        return x + shift
+
+    fields = ("position", "rotation", "velocity", "angular_velocity")
+    return jax.tree.map(jnp.asarray, State(**vars(state) | {name: change(getattr(state, name)) for name in fields}))
+
+
+def outputs(network: EntityNetwork, params: Params, level: Level, state: State) -> np.ndarray:
+    """(logits and value, lane): every lane is a level of its own."""
+
+    def one(constant, moving):
+        logits, value = forward(network, params, constant, moving[:, None])
+        return jnp.concatenate([logits[:, 0], value])
+
+    return np.asarray(jax.vmap(one, in_axes=-1, out_axes=-1)(network.constant(level), state_features(level, state)))
+
+
+def plain(params: Params, seen: EntityObservation, lane: int) -> np.ndarray:
+    """The same, of one lane: every thing's whole row through its encoder, the mean of the active ones, two layers."""
+    of = lambda x: np.clip(np.asarray(x, np.float64)[..., lane], -LIMIT, LIMIT)
+    polygons, circles, joints, thrusters = map(of, (seen.polygons, seen.circles, seen.joints, seen.thrusters))
+    bodies, gravity = np.concatenate([polygons[:, :BODY_ROWS], circles[:, :BODY_ROWS]]), polygons[0, -1:]
+    from_b = len(joints) // 2  # the first half of the joints is seen from body b
+    at = np.asarray(seen.joint_indexes)[:from_b, :, lane], np.asarray(seen.thruster_indexes)[:, lane]
+    rows_of_joints = [[*row, *bodies[b], *bodies[a], *gravity] for row, (b, a) in zip(joints, at[0], strict=False)]
+    rows_of_thrusters = [[*row, *bodies[k], *gravity] for row, k in zip(thrusters, at[1], strict=True)]
+    tables = {
+        "polygons": (np.delete(polygons, UNSEEN_WALLS, 0), np.delete(seen.polygon_mask[:, lane], UNSEEN_WALLS)),
+        "circles": (circles, seen.circle_mask[:, lane]),
+        "joints": (rows_of_joints, seen.joint_mask[:from_b, lane]),
+        "thrusters": (rows_of_thrusters, seen.thruster_mask[:, lane]),
+    }
+    results = []
+    for name in ("policy", "value"):
+        p = jax.tree.map(np.asarray, params["params"][name])
+        means = []
+        for kind, (table, active) in tables.items():
+            encoded = np.tanh(np.asarray(table) @ p[kind]["kernel"].T + p[kind]["bias"])[np.asarray(active, bool)]
+            means.append(encoded.mean(0) if len(encoded) else np.zeros(encoded.shape[1]))
+        x = np.tanh(p["Dense_0"]["kernel"] @ np.concatenate(means) + p["Dense_0"]["bias"])
+        results.append(p["Dense_1"]["kernel"] @ x + p["Dense_1"]["bias"])
+    return np.concatenate(results)
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_is_the_plain_formula_on_entities(name: str) -> None:
+    network, params = network_of(name)
+    level = sample_levels(jnp.arange(LEVELS), network.size)
+    state = moved(level.state, np.random.default_rng(0))
+    ours, seen = outputs(network, params, level, state), entities(level, state)
+    for lane in range(LEVELS):
+        np.testing.assert_allclose(ours[:, lane], plain(params, seen, lane), atol=FROM_TANH)
+    assert np.ptp(ours, axis=1).min() > 1e-3  # levels differ
+
+
+@pytest.mark.parametrize("name", SIZES)
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**31 - 1))
+def test_the_order_of_things_does_not_matter(name: str, seed: int) -> None:
+    network, params = network_of(name)
+    level = sample_levels(jnp.arange(LEVELS), network.size)
+    draws = jax.random.uniform(jax.random.key(seed), (places(network.size), LEVELS))
+    other = shuffle(level, OrderDraws(draws))
+    ours, others = (outputs(network, params, x, x.state) for x in (level, other))
+    np.testing.assert_allclose(ours, others, atol=FROM_TANH)
+
+
+def test_a_size_may_lack_kinds() -> None:
+    """No circles and no thrusters: their encoders have no parameters."""
+    size = SIZES["s"]._replace(circles=0, thrusters=0, polygons=7)
+    level = sample_levels(jnp.arange(2), size)
+    network = EntityNetwork(size, width=8, depth=1, encoding=4)
+    constant = network.constant(level)
+    params = initial(jax.random.key(0), network, jax.tree.map(lambda x: x[..., 0], constant))
+    assert set(params["params"]["policy"]) == {"polygons", "joints", "Dense_0"}
+    assert np.isfinite(outputs(network, params, level, level.state)).all()
+
+
+def test_gradient_reaches_every_parameter() -> None:
+    network, params = network_of("m")
+    size, rng = network.size, np.random.default_rng(0)
+    constant = network.constant(sample_levels(jnp.arange(1), size))
+    constant = jax.tree.map(lambda x: rng.uniform(0.1, 0.3, x.shape[:-1]).astype(np.float32), constant)
+    moving = rng.uniform(0.1, 0.3, (7 * (size.bodies - FIXED_POLYGONS), 3)).astype(np.float32)
+
+    def loss(params: Params):
+        logits, value = forward(network, params, constant, moving)
+        return jnp.square(logits).sum() + value.sum()
+
+    for path, gradient in jax.tree_util.tree_leaves_with_path(jax.grad(loss)(params)):
+        assert (np.abs(gradient) > 0).all(), jax.tree_util.keystr(path)

@@ -1,0 +1,34 @@
+"""Either network, in the slots: it learns, and what comes of a level does not depend on its slot."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from experts.config import Network
+from experts.judge import Trained, witness_of
+from experts.train import train
+from experts.witness import take
+from levelgen.level import SIZES
+from levelgen.sampler import sample_levels
+from levelgen.task import DEFAULT_RULES
+from tests.experts.test_slots import CONFIG, SOLVED, UPDATES, same
+
+IDS = np.array([0, 2, 6, 7])
+
+
+def trained(network: Network, at: list[int]) -> list[Trained]:
+    levels = jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
+    config = replace(CONFIG, network=network, encoding=16)
+    return train(take(levels, np.array(at)), IDS[at], UPDATES, config, SOLVED, DEFAULT_RULES)[0]
+
+
+@pytest.mark.parametrize("network", Network)
+def test_learns_real_levels_in_any_slot(network: Network) -> None:
+    every = trained(network, [0, 1, 2, 3])
+    solved = [witness_of(of.evaluations, CONFIG) is not None for of in every]
+    assert sum(solved) >= 3
+    assert min(len(of.curve) for of in every) < UPDATES
+    for i, of in zip([2, 0, 1], trained(network, [2, 0, 1]), strict=True):
+        same(of, every[i])
