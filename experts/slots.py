@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts import ppo, progress, stop
@@ -92,8 +93,8 @@ class Queue(NamedTuple):
 
     levels: Level  # [..., level]
     level_ids: Int[Array, " level"]
-    count: Int[Array, ""]  # the rest fills up
-    updates: Int[Array, ""]  # that an expert may use
+    count: ArrayLike  # the rest fills up
+    updates: ArrayLike  # that an expert may use
     begun: Begun  # where their experts go on, level axis first
 
 

@@ -184,7 +184,7 @@ def queue_of(
         experts = jax.tree.map(np.array, experts)
         for place, expert in begun.items():
             jax.tree.map(partial(_put, place), experts, expert.begun)
-    return jax.device_put(Queue(levels, ids, np.int32(count), np.int32(updates), experts))
+    return jax.device_put(Queue(levels, jnp.asarray(ids), np.int32(count), np.int32(updates), experts))
 
 
 def _put(place: int, rows: np.ndarray, row: np.ndarray) -> None:
