@@ -10,17 +10,23 @@ from jaxtyping import Array, Bool, Float
 
 from levelgen.level import Level, Role
 from physics.pairs import Pairs, pairs_of
+from physics.trigonometry import cos_sin
 from physics.types import MAX_VERTICES, Model, Params, State
 from physics.vector import Vec, rows, vec
 
-# The speed of arms was measured for arms like these
-MAX_LENGTH = 1.0  # m, from the joint to the arm's centre
+# How far arms fly was measured for arms like these
+MAX_LENGTH = 1.0  # m, from the joint to the arm's centre; nor is the joint outside of a disc around the arm
 MAX_MOTOR = 3.0  # of Params.motor_speed and of Params.motor_power
 MAX_PUSH = 4.0  # of Params.thruster_power, for each kg: all thrusters of an arm together
 MAX_GRAVITY = 10.0  # m/s^2
+MAX_TURN = 6.3  # rad that a fixed joint or a limit is off at the start
+MIN_RADIUS = 0.05  # m; joints of bodies of a few millimetres break
 SPREAD = (1.0, 8.0)  # mass x (squared distance of the farthest corner) / inertia, lowest and highest
 MAX_GAP = 0.01  # m, between the ends of the joint at the start
-MARGIN = 0.5  # m; the centre of such an arm never comes farther from its pivot than its length and this
+# The centre of such an arm never comes farther from its pivot than its length, SWING times that, and MARGIN. Turning
+# at 50 rad/s, the most that is kept from step to step, takes it 0.3 lengths off in 1/60 s; a step's own pushes add.
+SWING = 0.75
+MARGIN = 0.25  # m
 
 Ends = Bool[Array, "joint body lane"]
 
@@ -84,12 +90,14 @@ def find_arms(level: Level, params: Params) -> Arms:
     of_arm = lambda on_a, on_b: Vec(pick(on_a.x, on_b.x), pick(on_a.y, on_b.y))
     tip, pivot = of_arm(point_a, point_b), of_arm(point_b, point_a)
     length, radius = (tip - vec(level.state.position)).norm(), radii(model)
-    usual = one_joint & ((tip - pivot).norm() <= MAX_GAP) & (length <= MAX_LENGTH) & as_measured(level, a | b, radius)
-    reach = length + radius + MARGIN
+    near = (length <= MAX_LENGTH) & (length <= radius + MAX_GAP) & ((tip - pivot).norm() <= MAX_GAP)
+    usual = one_joint & near & as_measured(level, a, b, radius)
+    reach = (1 + SWING) * length + radius + MARGIN
 
     held = ((arm_a[:, :, None] & b[:, None]) | (arm_b[:, :, None] & a[:, None])).any(0)  # [arm, base, lane]
     clear = still_distance(level, pivot) > reach[:, None]
-    alone = (clear | ~base[None] | (held & ~model.collides)).all(1)
+    collides = model.collides | model.collides.swapaxes(0, 1)
+    alone = (clear | ~base[None] | (held & ~collides)).all(1)
     between = (pivot.map(lambda x: x[:, None]) - pivot.map(lambda x: x[None])).norm()
     same = jnp.eye(len(body), dtype=bool)[..., None]
     apart = (between > reach[:, None] + reach[None]) | ~(body[:, None] & body[None]) | same
@@ -107,26 +115,37 @@ def joint_point(state: State, end: Ends, anchor: Float[Array, "joint 2 lane"]) -
     """Where a joint holds its bodies `end`, [joint, lane], m."""
     pick = lambda x: jnp.where(end, x, 0.0).sum(1)
     angle, centre = pick(state.rotation), vec(state.position).map(pick)
-    return vec(anchor).rotate(jnp.cos(angle), jnp.sin(angle)) + centre
+    return vec(anchor).rotate(*cos_sin(angle)) + centre
 
 
 def radii(model: Model) -> Float[Array, "body lane"]:
     """Distance of each body's farthest point from its centre, m."""
-    used = jnp.arange(MAX_VERTICES)[:, None] < model.n_vertices[:, None]
+    used = (jnp.arange(MAX_VERTICES)[:, None] < 3) | (model.n_vertices[:, None] != 3)  # as `physics.manifold` has it
     return jnp.concatenate([jnp.where(used, vec(model.vertices).norm(), 0.0).max(1), model.radius])
 
 
-def as_measured(level: Level, joined: Ends, radius: Float[Array, "body lane"]) -> Bool[Array, "body lane"]:
-    """Whether a body, as an arm, is like those whose speed was measured: at rest, of no goal, no stronger."""
+def as_measured(level: Level, a: Ends, b: Ends, radius: Float[Array, "body lane"]) -> Bool[Array, "body lane"]:
+    """Whether a body, as an arm, is like those that were measured: at rest, of no goal, no stronger."""
     model, state = level.model, level.state
     rests = (state.velocity == 0).all(1) & (state.angular_velocity == 0)
     spread = jnp.square(radius) * model.inverse_inertia / jnp.where(model.inverse_mass == 0, 1.0, model.inverse_mass)
-    solid = (model.inverse_mass > 0) & (spread >= SPREAD[0]) & (spread <= SPREAD[1])
-    power = jnp.where(carried(level), jnp.abs(model.thruster_power)[:, None], 0.0).sum(0) * model.inverse_mass
+    solid = (radius >= MIN_RADIUS) & (model.inverse_mass > 0) & (spread >= SPREAD[0]) & (spread <= SPREAD[1])
+    pushes = carried(level)
+    power = jnp.where(pushes, jnp.abs(model.thruster_power)[:, None], 0.0).sum(0) * model.inverse_mass
+    outside = (pushes & (vec(model.thruster_position).norm()[:, None] > radius + MAX_GAP)).any(0)
     remembers = (level.state.joint_impulse != 0).any(1) | (level.state.joint_angular_impulse != 0)
     strong = jnp.maximum(jnp.abs(model.motor_speed), jnp.abs(model.motor_power)) > MAX_MOTOR
-    odd = (joined & (remembers | (model.motor_on & strong))[:, None]).any(0)
-    return rests & solid & (power <= MAX_PUSH) & ~odd & (level.role == Role.PLAIN)
+    turned = jnp.abs(turn(level, a, b)) > MAX_TURN
+    odd = ((a | b) & (remembers | turned | (model.motor_on & strong))[:, None]).any(0)
+    return rests & solid & (power <= MAX_PUSH) & ~outside & ~odd & (level.role == Role.PLAIN)
+
+
+def turn(level: Level, a: Ends, b: Ends) -> Float[Array, "joint lane"]:
+    """How far each joint that holds is from an angle that it may have, rad, as `physics.joint` has it."""
+    model, of = level.model, lambda end: jnp.where(end, level.state.rotation, 0.0).sum(1)
+    angle = of(b) - of(a) - model.joint_rotation
+    beyond = angle - jnp.clip(angle, model.joint_min, model.joint_max)
+    return jnp.where(model.joint_fixed, angle, jnp.where(model.joint_limited, beyond, 0.0))
 
 
 def as_published(level: Level, params: Params) -> Bool[Array, " lane"]:
@@ -139,7 +158,7 @@ def as_published(level: Level, params: Params) -> Bool[Array, " lane"]:
 def still_distance(level: Level, point: Vec) -> Float[Array, "body body lane"]:
     """[i, j]: a distance that point i has at least from body j, as body j starts, m; negative inside."""
     model, state, polygons = level.model, level.state, level.size.polygons
-    cos, sin = jnp.cos(state.rotation), jnp.sin(state.rotation)
+    cos, sin = cos_sin(state.rotation)
     centre = vec(state.position)
     offset = Vec(*(p[:, None] - c[None] for p, c in zip(point, centre, strict=True)))  # [i, j, lane]
     local = offset.map(lambda x: x[:, :polygons]).unrotate(cos[:polygons], sin[:polygons])
@@ -149,8 +168,9 @@ def still_distance(level: Level, point: Vec) -> Float[Array, "body body lane"]:
     edge = corners.map(lambda x: jnp.roll(x, -1, 1)) - corners
     length = edge.norm()
     outward = Vec(-edge.y, edge.x).scale(1 / jnp.where(length == 0, 1.0, length))
-    from_face = Vec(*(p[:, :, None] - c[None] for p, c in zip(local, corners, strict=True))).dot(outward)
-    from_face = jnp.where(length > 0, from_face, -jnp.inf)  # [i, j, face, lane]
+    support = outward.map(lambda x: x[:, :, None]).dot(corners.map(lambda x: x[:, None])).max(2)  # [j, face, lane]
+    from_face = local.map(lambda x: x[:, :, None]).dot(outward) - support  # [i, j, face, lane]
+    from_face = jnp.where(length > 0, from_face, -jnp.inf)
     from_circle = offset.map(lambda x: x[:, polygons:]).norm() - model.radius
     return jnp.concatenate([from_face.max(2), from_circle], 1)
 

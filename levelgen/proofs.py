@@ -4,7 +4,7 @@ A level is proved unsolvable where doing nothing does not reach the goal, and no
 docs/labels.md gives the arguments; every doubt leaves a level unproved.
 """
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from enum import IntEnum
 from functools import partial
 from typing import NamedTuple
@@ -19,6 +19,8 @@ from levelgen.task import TaskParams, TaskState, advance_seen, has_nan, has_role
 from physics.pairs import PairKind, pairs_of
 from physics.types import Model, Params
 from physics.vector import rows
+
+LARGEST = 1e9  # of any quantity: what is multiplied by zero has to be a number, and so do products of two of them
 
 
 class Proof(IntEnum):
@@ -58,7 +60,7 @@ def examine(level: Level, rules: TaskParams, env_steps: int) -> Facts:
         [int(kind) for kind in (Proof.NOTHING_ACTS, Proof.GOAL_STANDS, Proof.OUT_OF_REACH)],
         int(Proof.NONE),
     )
-    sound = finite(level) & (idle.fails | idle.lasts)
+    sound = moderate(level, rules.physics) & (idle.fails | idle.lasts)
     return Facts(idle.reaches, idle.fails, jnp.where(sound, proof, int(Proof.NONE)))
 
 
@@ -87,10 +89,11 @@ def stay_idle(level: Level, arms: Arms, rules: TaskParams, env_steps: int) -> Id
     return jax.lax.scan(act, start, length=env_steps * skip)[0][1]
 
 
-def finite(level: Level) -> Bool[Array, " lane"]:
-    """Whether every number of a level is one."""
+def moderate(level: Level, params: Params) -> Bool[Array, " lane"]:
+    """Whether every number of a level and of the engine is one, and no larger than LARGEST."""
     floats = [x for x in jax.tree.leaves((level.model, level.state)) if x.dtype == jnp.float32]
-    return jnp.stack([jnp.isfinite(x).all(tuple(range(x.ndim - 1))) for x in floats]).all(0)
+    small = [(jnp.abs(x) <= LARGEST).all(tuple(range(x.ndim - 1))) for x in floats]
+    return jnp.stack(small).all(0) & all(abs(x) <= LARGEST for x in astuple(params))
 
 
 def goal_stands(level: Level, params: Params) -> Bool[Array, " lane"]:
