@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from physics.body import Bodies
 from physics.joint import Joints
-from physics.lanes import Ref, anywhere, each, pick, spread, when
+from physics.lanes import NOBODY, Ref, anywhere, each, pick, spread, when
 from physics.trigonometry import cos_sin, tanh
 from physics.types import FIXED_POLYGONS, Model, Params, State
 from physics.vector import Vec
@@ -35,8 +35,9 @@ def drive_motors(model: Model, bodies: Bodies, joints: Joints, control: Ref, par
         beyond = angle - jnp.clip(angle, model.joint_min[j] + zone, model.joint_max[j] - zone)
         towards_limit = model.joint_limited[j] & (beyond != 0) & (jnp.sign(beyond) == jnp.sign(control[j]))
         power = power * jnp.where(towards_limit, jnp.maximum(0.0, 1 - jnp.abs(beyond) / zone), 1.0)
-        turn = jnp.where(runs, power * tanh(excess * params.motor_decay), 0.0)
+        turn = power * tanh(excess * params.motor_decay)
         none = jnp.zeros_like(turn)
+        a, b = (jnp.where(runs, body, NOBODY) for body in (a, b))
         spread(
             bodies.push, (a, jnp.stack([none, none, turn])), (b, jnp.stack([none, none, -turn])), first=FIXED_POLYGONS
         )
@@ -57,6 +58,7 @@ def fire_thrusters(model: Model, before: State, bodies: Bodies, control: Ref, pa
         cos, sin, rotation = turn
         arm = Vec(*model.thruster_position[t]).rotate(cos, sin)
         push = Vec(*cos_sin(model.thruster_rotation[t] + rotation)).scale(force)
+        body = jnp.where(force != 0, body, NOBODY)
         spread(bodies.push, (body, jnp.stack([push.x, push.y, arm.cross(push)])), first=FIXED_POLYGONS)
 
     each(model.thruster_active.shape[0], one)

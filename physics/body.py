@@ -62,7 +62,8 @@ def integrate(before: State, after: State, bodies: Bodies, params: Params) -> No
         return jnp.clip(x, -most, most)
 
     def write(i):
-        x, y, v_x, v_y, w = bodies.motion[i]
+        # -0 becomes 0: a push of nothing, because of another lane, would make it so
+        x, y, v_x, v_y, w = (jnp.where(row == 0, 0.0, row) for row in bodies.motion[i])
         after.position[i, 0] = clip(x + v_x * params.dt, params.max_position)
         after.position[i, 1] = clip(y + v_y * params.dt, params.max_position)
         after.rotation[i] = before.rotation[i] + w * params.dt

@@ -137,7 +137,7 @@ def prepare(
         to.counts[group] += 1
         normal, point = _geometry(to, c)
         arm = _arms(bodies.motion[a], bodies.motion[b], normal, point)
-        _push(bodies, a, b, normal, arm, impulse[0], impulse[1])
+        _push(bodies, a, b, acts, normal, arm, impulse[0], impulse[1])
 
     when(anywhere(acts), constrain)
 
@@ -188,9 +188,8 @@ def solve(model: Model, bodies: Bodies, to: Constraints, table: Table) -> None:
             _solve_one(bodies, to, c, table.a[c], table.b[c], to.batch[c] == table.turn[s], table.kept[c])
 
         def yield_both(k):
-            c = to.listed[k]
-            yield_one(model, bodies, table.a[c])
-            yield_one(model, bodies, table.b[c])
+            for body in (table.a[to.listed[k]], table.b[to.listed[k]]):
+                when(body >= FIXED_POLYGONS, functools.partial(yield_one, model, bodies, body))
 
         first, end = to.ends[s], to.ends[s + 1]
         each(end, one, first=first)
@@ -244,12 +243,12 @@ def _solve_one(bodies: Bodies, to: Constraints, c, a, b, mine: Bool[Array, " lan
     to.impulse[c] = jnp.stack(
         [jnp.where(mine, normal * kept, before_normal), jnp.where(mine, tangent * kept, before_tangent)]
     )
-    change = lambda now, before: jnp.where(mine, now - before, 0.0)
-    _push(bodies, a, b, n, arm, change(normal, before_normal), change(tangent, before_tangent))
+    _push(bodies, a, b, mine, n, arm, normal - before_normal, tangent - before_tangent)
 
 
-def _push(bodies: Bodies, a, b, n: Vec, arm: Arms, normal: Array, tangent: Array) -> None:
-    """Push both bodies of a contact apart."""
-    force = Vec(normal * n.x + tangent * n.y, normal * n.y - tangent * n.x)
-    bodies.push[a] += jnp.stack([-force.x, -force.y, tangent * arm.dot_a - normal * arm.cross_a])
-    bodies.push[b] += jnp.stack([force.x, force.y, normal * arm.cross_b - tangent * arm.dot_b])
+def _push(bodies: Bodies, a, b, mine: Array, n: Vec, arm: Arms, normal: Array, tangent: Array) -> None:
+    """Push both bodies of a contact apart, in the lanes that it is `mine` in."""
+    only = lambda x: jnp.where(mine, x, 0.0)
+    x, y = only(normal * n.x + tangent * n.y), only(normal * n.y - tangent * n.x)
+    bodies.push[a] += jnp.stack([-x, -y, only(tangent * arm.dot_a - normal * arm.cross_a)])
+    bodies.push[b] += jnp.stack([x, y, only(normal * arm.cross_b - tangent * arm.dot_b)])

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from physics.body import Bodies, place, velocity
-from physics.lanes import Ref, anywhere, each, pick, spread, when
+from physics.lanes import NOBODY, Ref, anywhere, each, pick, spread, when
 from physics.types import FIXED_POLYGONS, Model, Params, State
 from physics.vector import Vec, nonzero, spin
 
@@ -74,7 +74,8 @@ def warm_start(model: Model, bodies: Bodies, to: Joints) -> None:
         a_x, a_y, b_x, b_y = to.arms[j]
         on_a = jnp.stack([x, y, Vec(a_x, a_y).cross(Vec(x, y)) + turn])
         on_b = jnp.stack([-x, -y, -(Vec(b_x, b_y).cross(Vec(x, y)) + turn)])
-        spread(bodies.push, (model.joint_a[j], on_a), (model.joint_b[j], on_b), first=FIXED_POLYGONS)
+        a, b = (jnp.where(to.acts[j], body[j], NOBODY) for body in (model.joint_a, model.joint_b))
+        spread(bodies.push, (a, on_a), (b, on_b), first=FIXED_POLYGONS)
 
     each(to.acts.shape[0], lambda j: when(anywhere(to.acts[j]), lambda: one(j)))
 
@@ -122,6 +123,7 @@ def _solve_one(model: Model, bodies: Bodies, to: Joints, j, params: Params) -> N
     closer = gap.scale(params.joint_bias_position / nonzero(mass_a + mass_b))
     on_a = jnp.stack([*closer.scale(mass_a), *pull.scale(mass_a), turn_a])
     on_b = jnp.stack([*closer.scale(-mass_b), *pull.scale(-mass_b), turn_b])
+    a, b = (jnp.where(to.acts[j], body, NOBODY) for body in (a, b))
     spread(bodies.motion, (a, on_a), (b, on_b), first=FIXED_POLYGONS)
     x, y, angular = to.impulse[j]
     to.impulse[j] = jnp.stack([x + pull.x, y + pull.y, jnp.where(fixed, angular + twist, 0.0)])

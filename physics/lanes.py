@@ -3,6 +3,10 @@
 A reference reads and writes rows: `ref[i]` is a row of lanes, i a number that may be known only at run time. What
 differs between lanes is computed in all of them and selected; what no lane needs is skipped. The same source becomes
 machine code (`physics.codegen`), a Pallas kernel, or plain XLA operations on all lanes at once.
+
+Whether something is skipped depends on the other lanes, so computing it must change nothing in a lane that does not
+need it. Select what is added there, for 0 times infinity is not 0; let a lane's own condition decide, not a guess that
+the computation would find nothing; and let no result show the sign of a zero, for -0 + 0 is 0.
 """
 
 import functools
@@ -14,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 LANES = 16  # of a block: as many float32 as the widest vector register holds
+NOBODY = -1  # instead of a body's number
 
 Ref = Any  # a reference to an array, `jax.Ref`
 Scalar = Int[Array, ""] | int
@@ -57,7 +62,8 @@ def pick(
 
 
 def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]], first: int = 0) -> None:
-    """ref[number[lane], ..., lane] += change, for each (number, change); numbers below `first` are left alone."""
+    """ref[number[lane], ..., lane] += change, for each (number, change); numbers below `first`, NOBODY
+    among them, are left alone."""
 
     def add(i):
         here = [number == i for number, _ in changes]

@@ -101,13 +101,13 @@ def find_contacts(model: Model, bodies: Bodies, polygons: Polygons, table: Table
         a, b = table.a[p], table.b[p]
         mine, other = polygons.box[a], polygons.box[b]
         apart = (mine[:2] > other[2:] + MARGIN) | (other[:2] > mine[2:] + MARGIN)
-        may = may_touch(model, a, b)
+        may = may_touch(model, a, b) & ~apart.any(0)
 
         def narrow():
             contacts = _polygon_polygon(_outline(bodies, polygons, a), _outline(bodies, polygons, b))
             found(0, [p, n + p], [c._replace(active=c.active & may) for c in contacts])
 
-        when(anywhere(may & ~apart.any(0)), narrow)
+        when(anywhere(may), narrow)
 
     def circle_polygon(c):
         a, b = table.a[c], table.b[c]
@@ -115,13 +115,13 @@ def find_contacts(model: Model, bodies: Bodies, polygons: Polygons, table: Table
         reach = radius + MARGIN
         apart = (centre.x < box[0] - reach) | (centre.x > box[2] + reach)
         apart |= (centre.y < box[1] - reach) | (centre.y > box[3] + reach)
-        may = may_touch(model, a, b)
+        may = may_touch(model, a, b) & ~apart
 
         def narrow():
             contact = _circle_polygon(bodies, polygons, centre, radius, b)
             found(1, [c], [contact._replace(active=contact.active & may)])
 
-        when(anywhere(may & ~apart), narrow)
+        when(anywhere(may), narrow)
 
     def circle_circle(c):
         a, b = table.a[c], table.b[c]

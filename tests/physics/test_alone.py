@@ -1,0 +1,85 @@
+"""A lane's world is its own: whatever its neighbours are, it goes on to the same bits, also when it has broken down.
+
+Other lanes decide what a block computes and what it skips (`physics.lanes`).
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from physics.engine import Given
+from physics.lanes import LANES
+from physics.step import as_machine_code, on_all_lanes
+from physics.types import Params, Size
+from tests.physics.kernels import same_bits
+from tests.physics.worlds import scattered
+
+SIZE = Size(polygons=6, circles=3, joints=4, thrusters=2)
+BOUNDS = {"max_position": 1e6, "max_velocity": 1e6, "max_angular_velocity": 1e4}
+RULES = {
+    "usual": Params(),
+    "strong": Params(motor_power=9000, thruster_power=300, joint_stiffness=0.9, max_velocity=1000),
+    "far": Params(motor_power=9000, thruster_power=300, joint_stiffness=0.9, **BOUNDS),
+}
+ODD = np.array([0, -0.0, 1e-40, -1e-40, 1e3, -1e6, 1e12, -1e25, 1e38, -1e38, np.inf, -np.inf, np.nan], np.float32)
+Way = Callable[[Given, Params, bool], Any]
+
+
+def wild(lanes: int, seed: int) -> Given:
+    """Worlds in which some numbers are odd: none in half of the lanes, up to a fifth in others."""
+    random = np.random.default_rng(seed)
+
+    def strew(x):
+        if x.dtype != np.float32:
+            return x
+        share = random.choice([0, 0, 0.02, 0.2], lanes)
+        return np.where(random.random(x.shape) < share, random.choice(ODD, x.shape), x)
+
+    given = Given(*scattered(SIZE, lanes, seed))
+    control = given.motor * random.choice([1, 1, 100, -1e20], lanes).astype(np.float32)
+    return given._replace(before=jax.tree.map(strew, given.before), motor=control, thrust=strew(given.thrust))
+
+
+@functools.cache
+def stepped(way: Way, params: Params) -> Callable[[Given], list[np.ndarray]]:
+    run = jax.jit(lambda given: way(given, params, True))
+    return lambda given: [np.asarray(x) for x in jax.tree.leaves(run(given))]
+
+
+def lanes_of(given: Given, lanes: np.ndarray) -> Given:
+    return jax.tree.map(lambda x: np.asarray(x)[..., lanes], given)
+
+
+@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_in_machine_code_neighbours_change_nothing(rules: str, seed: int) -> None:
+    """Each lane in a block of its own copies, then among others."""
+    step, lanes = stepped(as_machine_code, RULES[rules]), 2048
+    given, order = wild(lanes, seed), np.random.default_rng(seed).permutation(lanes)
+    alone = step(lanes_of(given, np.repeat(order, LANES)))
+    same_bits([x[..., ::LANES] for x in alone], step(lanes_of(given, order)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rules", RULES)
+def test_on_all_lanes_neighbours_change_nothing(rules: str) -> None:
+    """The same where all lanes are one block."""
+    step, lanes = stepped(on_all_lanes, RULES[rules]), 64
+    given = wild(lanes, 3)
+    among = step(given)
+    for lane in range(lanes):
+        alone = step(lanes_of(given, np.full(lanes, lane)))
+        same_bits([x[..., lane] for x in alone], [x[..., lane] for x in among])
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_the_worlds_are_wild_and_not_all_broken(rules: str) -> None:
+    step = stepped(as_machine_code, RULES[rules])
+    given = wild(2048, 1)
+    after = step(given)
+    fine = np.all([np.isfinite(x).reshape(-1, 2048).all(0) for x in after], 0)
+    assert 0.2 < fine.mean() < 0.9
