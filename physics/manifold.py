@@ -24,7 +24,9 @@ FLIP_BIAS = 0.01  # m; b must separate this much more than a to become the refer
 # by that much, so of equally deep corners the one nearer to the face's start is first (docs/physics.md, "Ties")
 TILT = 4.371139e-8
 FAR = 1e30  # m; stands for a vertex or edge that does not exist
-MARGIN = 0.01  # m; bodies whose boxes are farther apart cannot touch, whatever the rounding
+# m; bodies whose boxes are farther apart do not touch: convex clockwise polygons could not, whatever the rounding, and
+# of others the axes may find a contact at a distance, which is then none
+MARGIN = 0.01
 
 # found(kind, contact numbers, contacts): what to do with the contacts of a pair
 Found = Callable[[int, list, list[Contact]], None]

@@ -47,6 +47,9 @@ class Sample:
 ACTS, STANDS, REACH = Proof.NOTHING_ACTS, Proof.GOAL_STANDS, Proof.OUT_OF_REACH
 # a step and a time limit of their own, no dense reward, and the padding defect mended
 OTHER_RULES = TaskParams(frame_skip=3, max_timesteps=96, dense_reward_scale=0, physics=Params(faithful_padding=False))
+# worlds that break down: the auto motors tear joints, bodies leave the room
+STRONG = Params(motor_power=9000, thruster_power=300, joint_stiffness=0.9, max_velocity=1000)
+STRONG_RULES = TaskParams(physics=STRONG)
 SAMPLES = {
     "s": Sample("s", 2048, frozenset({ACTS})),
     "m": Sample("m", 2048, frozenset({ACTS, REACH})),
@@ -57,6 +60,7 @@ SAMPLES = {
     "m mutated": Sample("m", 4096, frozenset({ACTS, STANDS, REACH}), ARMS, mutated=True),
     "l mutated": Sample("l", 1024, frozenset({ACTS, STANDS}), ARMS, mutated=True),
     "m mutated, other rules": Sample("m", 2048, frozenset({ACTS, STANDS, REACH}), ARMS, True, OTHER_RULES),
+    "m mutated, strong": Sample("m", 2048, frozenset({ACTS, STANDS}), ARMS, True, STRONG_RULES),
 }
 
 
@@ -84,19 +88,23 @@ def changed(level: Level, **model: Any) -> Level:
 
 
 @functools.partial(jax.jit, static_argnames=("rules", "steps"))
-def play(level: Level, key, sticky, rules: TaskParams = DEFAULT_RULES, steps: int = ENV_STEPS):
-    """(done, goal, reward), each [step, lane]: random actions that stay as they are with chance `sticky` [lane]."""
+def play(level: Level, key, sticky, rules: TaskParams = DEFAULT_RULES, steps: int = ENV_STEPS, choices=CHOICES):
+    """(done, goal, reward), each [step, lane]: random actions that stay as they are with chance `sticky` [lane].
+
+    `choices` [action] is how many of each there are; with one, it does nothing.
+    """
+    choices = jnp.asarray(choices)[:, None]
     lanes = level.role.shape[-1]
 
     def act(carry, key):
         now, action = carry
         fresh, stays = jax.random.split(key)
-        drawn = jax.random.randint(fresh, action.shape, 0, jnp.array(CHOICES)[:, None])
+        drawn = jax.random.randint(fresh, action.shape, 0, choices)
         action = jnp.where(jax.random.uniform(stays, action.shape) < sticky, action, drawn)
         now, outcome = task.step(level, now, action, rules)
         return (now, action), (outcome.done, outcome.goal, outcome.reward)
 
-    first = jax.random.randint(key, (len(CHOICES), lanes), 0, jnp.array(CHOICES)[:, None])
+    first = jax.random.randint(key, (len(choices), lanes), 0, choices)
     return jax.lax.scan(act, (task.reset(level), first), jax.random.split(key, steps))[1]
 
 
@@ -113,7 +121,7 @@ def test_no_action_sequence_changes_what_is_proved(name: str) -> None:
     proved = np.flatnonzero(known.proof != Proof.NONE)
     assert SAMPLES[name].proofs <= {Proof(p) for p in known.proof[proved]}
     idle_done, _, idle_reward = idle(name)
-    plays = -(-max(len(proved), 4 * LANES) // LANES)
+    plays = -(-max(len(proved), 2 * LANES) // LANES)
     for k, at in enumerate(np.resize(proved, plays * LANES).reshape(plays, LANES)):
         done, goal, reward = play(take(level, at), jax.random.key(k), stickiness(k), rules)
         assert not np.asarray(goal).any()
@@ -122,21 +130,15 @@ def test_no_action_sequence_changes_what_is_proved(name: str) -> None:
         np.testing.assert_array_equal(np.asarray(reward)[:, alike], idle_reward[:, at[alike]])
 
 
-@functools.partial(jax.jit, static_argnames="rules")
-def stay(level: Level, rules: TaskParams):
-    nothing = jnp.zeros((len(CHOICES), LANES), jnp.int32)
-    return jax.lax.scan(lambda now, _: task.step(level, now, nothing, rules), task.reset(level), length=ENV_STEPS)[1]
-
-
 @functools.cache
 def idle(name: str) -> tuple[np.ndarray, ...]:
     """(done, goal, reward) of doing nothing."""
-    level = sampled(name)
+    level, rules, nothing = sampled(name), SAMPLES[name].rules, np.ones_like(CHOICES)
     parts = []
     for start in range(0, level.role.shape[-1], LANES):
-        parts.append(jax.device_get(stay(take(level, np.arange(start, start + LANES)), SAMPLES[name].rules)))
-    reward, done, goal = (np.concatenate(x, -1) for x in zip(*parts, strict=True))
-    return done, goal, reward
+        lanes = take(level, np.arange(start, start + LANES))
+        parts.append(jax.device_get(play(lanes, jax.random.key(0), stickiness(), rules, choices=nothing)))
+    return tuple(np.concatenate(x, -1) for x in zip(*parts, strict=True))
 
 
 @pytest.mark.slow
@@ -310,7 +312,7 @@ def test_an_arm_that_shares_solver_batches_with_others_is_not_out_of_reach() -> 
     few, many = world(**ARM), world(**ARM)
     assert proof(few) is Proof.OUT_OF_REACH
     assert not np.asarray(arms_of(few, Params()).mixing).any()
-    wide = wider(many, polygons=12, circles=4)
+    wide = wider(many, polygons=8, circles=2)
     assert np.asarray(driven(wide)).sum() == 1
     assert np.asarray(arms_of(wide, Params()).mixing).any()
     assert proof(wide) is Proof.NONE

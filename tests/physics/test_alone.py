@@ -3,6 +3,7 @@
 Other lanes decide what a block computes and what it skips (`physics.lanes`).
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -26,11 +27,13 @@ RULES = {
     "far": Params(motor_power=9000, thruster_power=300, joint_stiffness=0.9, **BOUNDS),
 }
 ODD = np.array([0, -0.0, 1e-40, -1e-40, 1e3, -1e6, 1e12, -1e25, 1e38, -1e38, np.inf, -np.inf, np.nan], np.float32)
+LOPSIDED = np.array([(2, 1), (1, 1), (1, 1), (1, 1)], np.float32)[:, :, None]
 Way = Callable[[Given, Params, bool], Any]
 
 
 def wild(lanes: int, seed: int) -> Given:
-    """Worlds in which some numbers are odd: none in half of the lanes, up to a fifth in others."""
+    """Worlds in which some numbers are odd: none in half of the lanes, up to a fifth in others; in some the polygons
+    are lopsided and have their corners the wrong way round, so that they touch at a distance."""
     random = np.random.default_rng(seed)
 
     def strew(x):
@@ -40,8 +43,12 @@ def wild(lanes: int, seed: int) -> Given:
         return np.where(random.random(x.shape) < share, random.choice(ODD, x.shape), x)
 
     given = Given(*scattered(SIZE, lanes, seed))
+    corners = np.where(random.random(lanes) < 0.3, given.model.vertices[:, ::-1] * LOPSIDED, given.model.vertices)
+    model = dataclasses.replace(given.model, vertices=corners)
     control = given.motor * random.choice([1, 1, 100, -1e20], lanes).astype(np.float32)
-    return given._replace(before=jax.tree.map(strew, given.before), motor=control, thrust=strew(given.thrust))
+    return given._replace(
+        model=model, before=jax.tree.map(strew, given.before), motor=control, thrust=strew(given.thrust)
+    )
 
 
 @functools.cache
