@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from levelgen.level import SIZES, Level, Role
@@ -17,7 +18,7 @@ CHANCE = 0.15  # of each change
 def mutants(size: str, count: int, distribution: Distribution, seed: int = 0) -> Level:
     """Levels of a distribution with some things changed: what moves, acts, touches, and where all of it starts."""
     random = np.random.default_rng(seed)
-    level = jax.tree.map(np.array, sample_levels(np.arange(count), SIZES[size], distribution))
+    level = jax.tree.map(np.array, sample_levels(jnp.arange(count), SIZES[size], distribution))
     model, state = level.model, level.state
 
     def mutate(values: np.ndarray, new, chance: float = CHANCE) -> None:

@@ -69,7 +69,7 @@ def test_continuous_actions_train_without_ado() -> None:
 
 def test_seeds_train_side_by_side() -> None:
     """`vmap` of a whole training run, as people do for error bars: here of one rollout."""
-    env, params = make(sample_levels(np.arange(2), SIZES["s"]), ActionType.DISCRETE)
+    env, params = make(sample_levels(jnp.arange(2), SIZES["s"]), ActionType.DISCRETE)
 
     def rollout(rng):
         _, state = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(rng, 3), params)

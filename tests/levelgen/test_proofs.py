@@ -69,7 +69,7 @@ def sampled(name: str) -> Level:
     of = SAMPLES[name]
     if of.mutated:
         return mutants(of.size, of.count, of.distribution)
-    level = jax.tree.map(np.asarray, sample_levels(np.arange(of.count), SIZES[of.size], of.distribution))
+    level = jax.tree.map(np.asarray, sample_levels(jnp.arange(of.count), SIZES[of.size], of.distribution))
     if name != "m with fixed goals":
         return level
     goals = np.isin(level.role, (Role.GREEN, Role.BLUE))  # by hand: the sampler lets one of them move
@@ -87,13 +87,16 @@ def changed(level: Level, **model: Any) -> Level:
     return dataclasses.replace(level, model=dataclasses.replace(level.model, **values))
 
 
-@functools.partial(jax.jit, static_argnames=("rules", "steps"))
 def play(level: Level, key, sticky, rules: TaskParams = DEFAULT_RULES, steps: int = ENV_STEPS, choices=CHOICES):
     """(done, goal, reward), each [step, lane]: random actions that stay as they are with chance `sticky` [lane].
 
     `choices` [action] is how many of each there are; with one, it does nothing.
     """
-    choices = jnp.asarray(choices)[:, None]
+    return _play(level, key, sticky, np.asarray(choices)[:, None], rules, steps)  # traced: one program serves all
+
+
+@functools.partial(jax.jit, static_argnames=("rules", "steps"))
+def _play(level: Level, key, sticky, choices, rules: TaskParams, steps: int):
     lanes = level.role.shape[-1]
 
     def act(carry, key):

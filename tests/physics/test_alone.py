@@ -20,11 +20,11 @@ from tests.physics.kernels import same_bits
 from tests.physics.worlds import scattered
 
 SIZE = Size(polygons=6, circles=3, joints=4, thrusters=2)
-BOUNDS = {"max_position": 1e6, "max_velocity": 1e6, "max_angular_velocity": 1e4}
+STRONG = Params(motor_power=9000, thruster_power=300, joint_stiffness=0.9, max_velocity=1000)
 RULES = {
     "usual": Params(),
-    "strong": Params(motor_power=9000, thruster_power=300, joint_stiffness=0.9, max_velocity=1000),
-    "far": Params(motor_power=9000, thruster_power=300, joint_stiffness=0.9, **BOUNDS),
+    "strong": STRONG,
+    "far": dataclasses.replace(STRONG, max_position=1e6, max_velocity=1e6, max_angular_velocity=1e4),
 }
 ODD = np.array([0, -0.0, 1e-40, -1e-40, 1e3, -1e6, 1e12, -1e25, 1e38, -1e38, np.inf, -np.inf, np.nan], np.float32)
 LOPSIDED = np.array([(2, 1), (1, 1), (1, 1), (1, 1)], np.float32)[:, :, None]
