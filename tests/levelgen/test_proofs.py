@@ -315,7 +315,7 @@ def test_an_arm_that_shares_solver_batches_with_others_is_not_out_of_reach() -> 
     few, many = world(**ARM), world(**ARM)
     assert proof(few) is Proof.OUT_OF_REACH
     assert not np.asarray(arms_of(few, Params()).mixing).any()
-    wide = wider(many, polygons=8, circles=2)
+    wide = wider(many, polygons=12, circles=4)
     assert np.asarray(driven(wide)).sum() == 1
     assert np.asarray(arms_of(wide, Params()).mixing).any()
     assert proof(wide) is Proof.NONE
