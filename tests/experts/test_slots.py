@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from experts import slots as slots_module
 from experts.config import ExpertConfig, Rule, StopConfig
 from experts.judge import Trained
 from experts.labels import Label, Source
@@ -141,3 +142,21 @@ def test_going_on_equals_having_trained_through(levels: Level, stopping: StopCon
     assert spent.trained == sum(len(through[i].curve) - UPDATES // 3 for i in left) * CONFIG.steps_per_update
     for i, of in zip(left, later, strict=True):
         same(of, through[i])
+
+
+def test_all_slots_at_once_as_on_an_accelerator(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same course and nearly the same numbers: sums are taken in another order."""
+    queue = queue_of(levels, IDS, 3, CONFIG)
+
+    def go(advance) -> list:
+        slots, seen = empty_slots(2, queue, CONFIG), []
+        for _ in range(3 + CONFIG.record_rollouts + 2):  # an update of the second levels is among them
+            slots, report = advance(slots, queue, CONFIG, WHOLE, DEFAULT_RULES)
+            seen.append(report)
+        return [jax.device_get(seen), jax.device_get(slots.slot.training)]
+
+    one_by_one, ours = go(advance)
+    monkeypatch.setattr(slots_module, "over_slots", lambda function, *slots: jax.vmap(function)(*slots))
+    together, theirs = go(jax.jit(advance.__wrapped__, static_argnums=(2, 3, 4)))
+    same([(r.place, r.mode, r.left) for r in one_by_one], [(r.place, r.mode, r.left) for r in together])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), ours.expert.params, theirs.expert.params)

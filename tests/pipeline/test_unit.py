@@ -89,7 +89,9 @@ def test_a_unit_is_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
     summary = run_unit(job, tmp_path, UNIT, lambda steps, solved: seen.append((steps, solved)))
     manifest = read_manifest(tmp_path)
     assert manifest.level_ids.tolist() == list(UNIT.level_ids)
-    assert summary == Summary(4, manifest.labels.tolist().count("solved"), sum(manifest.table["env_steps"].to_pylist()))
+    solved, trained = manifest.labels.tolist().count("solved"), sum(manifest.table["env_steps"].to_pylist())
+    assert summary == Summary(4, solved, trained, summary.evaluated, summary.idle)
+    assert summary.evaluated >= 256
     assert seen == sorted(seen)
     for row in manifest.table.to_pylist():
         assert (row["label"] in WITNESSED) == (row["shard"] is not None)
@@ -100,7 +102,7 @@ def test_a_unit_is_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
 def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: JobConfig, result: UnitResult) -> None:
     commit(job, tmp_path, UNIT, result)
     first = read_manifest(tmp_path)
-    run_unit(job, tmp_path, UNIT, lambda steps, solved: None)
+    run_unit(job, tmp_path, UNIT, lambda steps, levels, solved: None)
     second = read_manifest(tmp_path)
     assert repr(first.table.drop(["shard"]).to_pylist()) == repr(second.table.drop(["shard"]).to_pylist())
     (old,), (new,) = first.shards, second.shards
@@ -130,7 +132,7 @@ def test_a_unit_without_solved_levels_has_no_shard(tmp_path: Path, job: JobConfi
 
 def test_a_failed_attempt_is_a_value(tmp_path: Path) -> None:
     broken = made_job("data", "budget=5k", "task.max_timesteps=3000000000")  # no 32-bit counter reaches it
-    outcome = attempt(broken, tmp_path, UNIT, lambda steps, solved: None)
+    outcome = attempt(broken, tmp_path, UNIT, lambda steps, levels, solved: None)
     assert outcome.summary is None
     assert "Traceback" in outcome.reason
     assert not list(tmp_path.rglob("*.parquet"))
