@@ -50,11 +50,11 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
                 )
                 raise
             manifest = read_manifest(split, ["label", "env_steps", "steps_to_first_success"])
-            if board.tally.env_steps:
-                print(_spent(manifest, wanted - done, board.tally))
+            spent = _spent(manifest, wanted - done, board.tally) if board.tally.env_steps else ""
         else:
             print(f"Nothing to do: all {len(wanted)} levels are there.")
-        _closing(split, manifest, wanted, queue)
+            spent = ""
+        _closing(split, manifest, wanted, queue, spent)
     return Exit.QUARANTINED if queue.quarantined else Exit.DONE
 
 
@@ -109,12 +109,14 @@ def _spent(manifest: Manifest, made: Collection[int], tally: Tally) -> str:
     return f"{total:,} env steps: {told}. Decided nothing (after the first success, or empty): {nothing:.0%}."
 
 
-def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: Queue) -> None:
+def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: Queue, spent: str) -> None:
     """Where it is, what came of it, and what to type next. On stdout."""
     labels, folder = _labels(manifest, wanted), shlex.quote(str(split))
     total = sum(labels.values())
     counts = ", ".join(f"{count} {label}" for label, count in labels.most_common())
     print(f"{split}: {total} levels, {counts}." if total else f"{split}: nothing is committed.")
+    if spent:
+        print(spent)
     for unit in queue.quarantined:
         print(f"Given up: levels {unit.text}, for the reason in {quarantine_path(split, unit.name)}")
     if total:

@@ -15,7 +15,7 @@ import pytest
 from pipeline.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import ROOT, TINY, assert_refused, run
 
-COMMANDS = ("generate", "sample", "inspect", "show", "export", "status", "verify", "bench")
+COMMANDS = ("generate", "regenerate", "sample", "inspect", "show", "export", "status", "verify", "bench")
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def test_inspect_takes_a_condition_and_refuses_what_is_none(made: Path) -> None:
     facts = json.loads(run(["inspect", "data/5k/s", "--json", "--where", "level_id >= 2 -- the last two"], made).stdout)
     assert facts["levels"] == 2
     done = run(["inspect", "data/5k/s", "--where", "no_such_column = 1"], made)
-    assert_refused(done, 2, "no_such_column", "columns level_id, size")
+    assert_refused(done, 2, "no_such_column", "columns level_id, content_hash")
     done = run(["inspect", "data/5k/s", "--where", "label IN (SELECT content FROM read_text('/etc/passwd'))"], made)
     assert_refused(done, 2, "Cannot use the condition")
 

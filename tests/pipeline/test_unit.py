@@ -85,8 +85,8 @@ def test_a_trivial_level_whose_witness_does_something_does_not_pass(job: JobConf
 
 
 def test_a_unit_is_committed_with_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
-    seen: list[tuple[int, int]] = []
-    summary = run_unit(job, tmp_path, UNIT, lambda steps, solved: seen.append((steps, solved)))
+    seen: list[tuple[int, float, int]] = []
+    summary = run_unit(job, tmp_path, UNIT, lambda *totals: seen.append(totals))
     manifest = read_manifest(tmp_path)
     assert manifest.level_ids.tolist() == list(UNIT.level_ids)
     solved, trained = manifest.labels.tolist().count("solved"), sum(manifest.table["env_steps"].to_pylist())
