@@ -1,7 +1,7 @@
 """Experts on the disk, so that a larger budget goes on instead of starting again: one Orbax checkpoint per unit."""
 
-import contextlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,7 @@ from experts.slots import begin
 from levelgen.level import size_of
 from levelgen.sampler import sample_levels
 from pipeline.errors import Failure, UserError
-from pipeline.manifest import Manifest, differences, read_manifest, require_manifest, told
-
-SAME_BUT = ("budget",)  # settings that may differ where experts go on
+from pipeline.manifest import differences, read_manifest, require_manifest, told
 
 
 def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
@@ -86,13 +84,12 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     if not job.continue_from:
         return {}
     source = Path(job.continue_from).expanduser()
-    rows = read_manifest(source, ["label", "experts"]).table.to_pylist()
-    goes_on = lambda row: row["label"] == Label.UNSOLVED or job.stop.rule == Rule.BUDGET
-    wanted = set(level_ids)
+    rows = _kept_in(source)
     paths: dict[str, set[int]] = {}
-    for row in rows:
-        if row["level_id"] in wanted and row["experts"] and goes_on(row):
-            paths.setdefault(row["experts"], set()).add(row["level_id"])
+    for level_id in level_ids:
+        label, path = rows.get(level_id, ("", None))
+        if path and (label == Label.UNSOLVED or job.stop.rule == Rule.BUDGET):
+            paths.setdefault(path, set()).add(level_id)
     found: dict[int, Kept] = {}
     for path, ids in paths.items():
         experts = load_experts(source / path, job)
@@ -100,15 +97,23 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     return found
 
 
-def require_same_experts(job: JobConfig) -> Manifest | None:
-    """The split that experts are taken from, if any.
+@cache
+def _kept_in(source: Path) -> dict[int, tuple[str, str | None]]:
+    """Label and checkpoint of every level, read once in a worker: it asks for every unit."""
+    table = read_manifest(source, ["label", "experts"]).table
+    columns = (table.column(name).to_pylist() for name in ("level_id", "label", "experts"))
+    return {level_id: (label, path) for level_id, label, path in zip(*columns, strict=True)}
+
+
+def require_same_experts(job: JobConfig) -> None:
+    """Refuse to take experts from a split whose experts cannot go on with this job.
 
     Raises:
         UserError: it kept no experts, was made with other settings, or with a larger budget.
         Failure: it is damaged.
     """
     if not job.continue_from:
-        return None
+        return
     source = require_manifest(Path(job.continue_from).expanduser())
     if source.table.column("experts").null_count == source.table.num_rows:
         raise UserError(
@@ -116,9 +121,7 @@ def require_same_experts(job: JobConfig) -> Manifest | None:
         )
     config = source.config or {}
     changes = differences(config, job.results)
-    for name in SAME_BUT:
-        with contextlib.suppress(KeyError):
-            del changes[name]
+    changes.pop("budget", None)
     if changes:
         raise UserError(
             f"Experts of {source.split} cannot go on under other settings ({told(changes)}): "
@@ -129,4 +132,3 @@ def require_same_experts(job: JobConfig) -> Manifest | None:
             f"Experts of {source.split} have had {config['budget']:,} env steps: give a larger budget than that, "
             f"not {job.budget}."
         )
-    return source
