@@ -72,7 +72,7 @@ class ExpertConfig:
         for name in ("learning_rate", "adam_epsilon", "max_gradient_norm"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be above 0")
-        for name in ("discount", "gae_lambda", "clip"):
+        for name in ("discount", "gae_lambda", "clip", "persistence"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be between 0 and 1")
         not_negative = ("dense_reward_scale", "value_weight", "entropy_weight", "slots")

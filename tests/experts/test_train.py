@@ -127,6 +127,7 @@ def test_a_budget_below_one_update_is_refused() -> None:
         ({"minibatches": 3}, "must divide"),
         ({"attempts": 64}, "are 80 together"),
         ({"rehearsals": 33}, "rehearsals is 33"),
+        ({"persistence": 1.5}, "persistence is 1.5: it must be between 0 and 1"),
         ({"clip": 2.0}, "clip is 2.0"),
     ],
 )
