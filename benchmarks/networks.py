@@ -14,20 +14,18 @@ import jax
 import numpy as np
 
 from benchmarks.document import between_marks
-from experts.config import ExpertConfig, Network, Rule, StopConfig
+from experts.config import ExpertConfig, Network
 from experts.networks.entity import KINDS
 from experts.networks.layers import LOGITS
-from experts.slots import advance, empty_slots
-from experts.train import queue_of
+from experts.slots import empty_slots
 from levelgen.level import SIZES
 from levelgen.observe import DYNAMIC_ROWS
 from levelgen.sampler import sample_levels
-from levelgen.task import DEFAULT_RULES
 from physics.types import FIXED_POLYGONS, Size
+from pipeline.bench.endless import endless_queue, go_on
 from pipeline.runtime import own_cores, prepare_jax
 
 SLOTS, UPDATES, REPEATS = 4, 5, 9  # REPEATS in turns, so that medians compare
-NEVER_ENDING = 10**6  # updates
 LAYERS, MODEL = 2, 64  # of the transformer; heads change nothing here
 FEED_FORWARD = 4 * MODEL
 CONFIGS = {kind.value: ExpertConfig(network=kind, slots=SLOTS) for kind in Network}
@@ -62,14 +60,13 @@ def multiply_adds(name: str, size: Size) -> int:
 
 def ready(size: Size, config: ExpertConfig):
     """A function that trains on for some updates, after a first one."""
-    ids, rules = np.arange(16), DEFAULT_RULES
-    queue = queue_of(jax.device_get(sample_levels(ids, size)), ids, NEVER_ENDING, config)
+    queue = endless_queue(jax.device_get(sample_levels(np.arange(SLOTS), size)), config)
     slots = empty_slots(SLOTS, queue, config)
 
     def train() -> None:
         nonlocal slots
         for _ in range(UPDATES):
-            slots, _ = advance(slots, queue, config, StopConfig(rule=Rule.BUDGET), rules)
+            slots, _ = go_on(slots, queue, config)
         jax.block_until_ready(slots)
 
     train()

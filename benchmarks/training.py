@@ -17,19 +17,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from experts import ppo
-from experts.config import ExpertConfig, Rule, StopConfig
+from experts.config import ExpertConfig
+from experts.policy import network_of
+from experts.pool import slot_count
 from experts.ppo import Batch, Seen
 from experts.rollout import Manner, repeat, rollout, start
-from experts.slots import advance, empty_slots, network_of
-from experts.train import queue_of, slot_count
+from experts.slots import empty_slots
 from levelgen.actions import CHOICES, action_mask
 from levelgen.level import SIZES
 from levelgen.observe import level_features
 from levelgen.sampler import sample_levels
 from levelgen.task import DEFAULT_RULES
+from pipeline.bench.endless import endless_queue, go_on
 
 REPEATS = 30
-ENDLESS = 10**6  # updates
 
 
 def main() -> None:
@@ -46,10 +47,8 @@ def main() -> None:
 def calls(levels, config: ExpertConfig):
     """A rollout, an update, and both: functions without arguments, one after another."""
     count = levels.role.shape[-1]
-    queue = queue_of(levels, np.arange(count), ENDLESS, config)
-    slots = empty_slots(count, queue, config)
-    stopping = StopConfig(rule=Rule.BUDGET)
-    slots, _ = advance(slots, queue, config, stopping, DEFAULT_RULES)
+    queue = endless_queue(levels, config)
+    slots, _ = go_on(empty_slots(count, queue, config), queue, config)
     experts, levels = slots.slot.training.expert, jax.tree.map(jnp.asarray, levels)
     experts = jax.tree.map(jnp.copy, experts)  # `advance` uses its slots up
     lanes, network = config.environments * count, network_of(levels, config)
@@ -75,7 +74,7 @@ def calls(levels, config: ExpertConfig):
 
     def both():
         nonlocal slots
-        slots, report = advance(slots, queue, config, stopping, DEFAULT_RULES)
+        slots, report = go_on(slots, queue, config)
         return report
 
     yield both

@@ -99,6 +99,10 @@ class ExpertConfig:
         """Environment steps of one expert between updates."""
         return self.environments * self.horizon
 
+    def updates_in(self, env_steps: int) -> int:
+        """How many updates so many env steps are, at least one."""
+        return max(1, env_steps // self.steps_per_update)
+
     @property
     def record_rollouts(self) -> int:
         """Rollouts that a record takes."""

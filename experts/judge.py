@@ -12,10 +12,7 @@ from experts.labels import Label, Source, Verdict, solved_reason, unsolved_reaso
 from experts.progress import NEVER, Progress
 from experts.slots import Begun
 from experts.success import Success
-from experts.witness import replay, steps_to_goal, succeeds
-from levelgen.actions import CHOICES
-from levelgen.level import Level
-from levelgen.task import TaskParams
+from experts.witness import Record, steps_to_goal, succeeds
 
 
 class Evaluation(NamedTuple):
@@ -52,33 +49,25 @@ class Witness(NamedTuple):
 
 
 def judge(
-    levels: Level,
     trained: Sequence[Trained],
+    witnesses: Sequence[Witness | None],
+    record: Record,
     updates: int,
     config: ExpertConfig,
-    rules: TaskParams,
     failed_by_noop: Bool[np.ndarray, " level"],
-) -> tuple[list[Verdict], Int[np.ndarray, "256 6 level"]]:
-    """Verdicts, and the witnesses' actions (0 where there is none). A witness counts only if it replays.
+) -> list[Verdict]:
+    """Verdicts. A witness counts only if its record, by replay, shows what the evaluation showed.
 
     `updates` are those that the budget paid for.
     """
-    if not trained:
-        return [], np.zeros((RECORD_STEPS, len(CHOICES), 0), np.int32)
-    best = [witness_of(of.evaluations, config) for of in trained]
-    actions = np.zeros((RECORD_STEPS, len(CHOICES), len(trained)), np.int32)
-    for i, witness in enumerate(best):
-        if witness is not None:
-            actions[..., i] = witness.action
-    record = replay(levels, actions, rules)
     replays, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
     verdicts = []
-    for i, (of, witness) in enumerate(zip(trained, best, strict=True)):
+    for i, (of, witness) in enumerate(zip(trained, witnesses, strict=True)):
         if witness is not None and not (replays[i] and steps[i] == witness.steps):
-            witness, actions[..., i] = None, 0
+            witness = None
         episodes, halted = int(record.done[:, i].sum()), len(of.curve) < updates
         verdicts.append(verdict_of(of, witness, episodes, halted, config, bool(failed_by_noop[i])))
-    return verdicts, actions
+    return verdicts
 
 
 def witness_of(evaluations: Sequence[Evaluation], config: ExpertConfig) -> Witness | None:

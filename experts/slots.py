@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts import ppo, progress, stop
@@ -64,6 +64,7 @@ class Trial(NamedTuple):
     part: Int[Array, ""]  # rollouts of it that are done
     due: Bool[Array, ""]  # by what training showed
     final: Bool[Array, ""]  # the level leaves afterwards
+    solved: Bool[Array, ""]  # it has ended, and enough attempts succeeded
     action: Int[Array, "time 6 attempt"]
     done: Bool[Array, "time environment"]
     goal: Bool[Array, "time environment"]
@@ -85,17 +86,24 @@ class Slots(NamedTuple):
     slot: Slot
     acting: Acting  # of training; lanes, slot by slot
     trial: Acting  # of evaluation
-    taken: Int[Array, ""]  # levels that have left the queue
+    taken: Int[Array, ""]  # levels that have left the queue, ever
 
 
 class Queue(NamedTuple):
-    """Levels that wait, in order."""
+    """Levels that wait, in order: a ring, in which the level that came as number n has place n modulo capacity.
 
-    levels: Level  # [..., level]
-    level_ids: Int[Array, " level"]
-    count: ArrayLike  # the rest fills up
-    updates: ArrayLike  # that an expert may use
-    begun: Begun  # where their experts go on, level axis first
+    A level keeps its place until it leaves its slot.
+    """
+
+    levels: Level  # [..., place]
+    level_ids: Int[Array, " place"]
+    count: Int[Array, ""] | np.int32  # levels that have come, ever
+    updates: Int[Array, ""] | np.int32  # that an expert may use
+    begun: Begun  # where their experts go on, place first
+
+    @property
+    def capacity(self) -> int:
+        return len(self.level_ids)
 
 
 class Report(NamedTuple):
@@ -106,6 +114,7 @@ class Report(NamedTuple):
     share: Float[Array, " slot"]  # of a trained slot's finished episodes that reached the goal
     evaluated: Bool[Array, " slot"]  # an evaluation ended that solved the level, or after which it left
     left: Bool[Array, " slot"]
+    taken: Int[Array, ""]  # levels that have left the queue, ever
 
 
 def over_slots(function: Callable, *slots: Any) -> Any:
@@ -135,14 +144,9 @@ def empty_slots(count: int, queue: Queue, config: ExpertConfig) -> Slots:
     """Slots without levels."""
     blank = lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype)
     training, acting = jax.tree.map(blank, queue.begun)
-    rows, zeros = config.record_rollouts * config.horizon, jnp.zeros(count, jnp.int32)
-    trial = Trial(
-        zeros,
-        zeros.astype(bool),
-        zeros.astype(bool),
-        jnp.zeros((count, rows, len(CHOICES), config.attempts), jnp.int8),
-        *jnp.zeros((2, count, rows, config.environments), bool),
-    )
+    rows, zeros, no = config.record_rollouts * config.horizon, jnp.zeros(count, jnp.int32), jnp.zeros(count, bool)
+    action = jnp.zeros((count, rows, len(CHOICES), config.attempts), jnp.int8)
+    trial = Trial(zeros, no, no, no, action, *jnp.zeros((2, count, rows, config.environments), bool))
     acting = _lanes(acting)
     return Slots(Slot(zeros, zeros, zeros, training, trial), acting, acting, jnp.int32(0))
 
@@ -180,17 +184,16 @@ def advance(
     now = _split(network, levels, keys, experience, last_value, manner, config)
     slot, share, mode = over_slots(partial(_follow, network=network, config=config, stopping=stopping), slot, now)
     left = (slot.mode == Mode.EMPTY) & (mode == Mode.EVALUATE)
-    ended = (mode == Mode.EVALUATE) & (slot.trial.part == config.record_rollouts)
-    evaluated = ended & (left | stop.solves(slot.trial.done, slot.trial.goal, stopping, config))
+    evaluated = (mode == Mode.EVALUATE) & (left | slot.trial.solved)
     after = Slots(slot, _where(trains, acting, slots.acting), acting, slots.taken)
-    return after, Report(slot.place, mode, share, evaluated, left)
+    return after, Report(slot.place, mode, share, evaluated, left, slots.taken)
 
 
 def refill(slots: Slots, queue: Queue, config: ExpertConfig) -> Slots:
     """Slots that are empty take the next levels of the queue."""
     free = slots.slot.mode == Mode.EMPTY
-    place = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
-    takes = free & (place < queue.count)
+    number = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
+    takes, place = free & (number < queue.count), number % queue.capacity
 
     def fill() -> tuple[Slot, Acting]:
         begun = jax.tree.map(lambda x: x[place], queue.begun)
@@ -284,18 +287,13 @@ def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) 
     """A part of an evaluation; after the last, whether the level leaves."""
     first = slot.trial.part * config.horizon
     put = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, first, 0)
-    trial = Trial(
-        slot.trial.part + 1,
-        slot.trial.due,
-        slot.trial.final,
-        put(slot.trial.action, now.action[..., : config.attempts]),
-        put(slot.trial.done, now.done),
-        put(slot.trial.goal, now.goal),
-    )
-    steps = trial.part * config.horizon
-    hopeless = ~trial.final & stop.fails(trial.done, trial.goal, steps, stopping, config)
-    ended = (trial.part == config.record_rollouts) | hopeless
-    solved = ~hopeless & stop.solves(trial.done, trial.goal, stopping, config)
+    action = put(slot.trial.action, now.action[..., : config.attempts])
+    done, goal = put(slot.trial.done, now.done), put(slot.trial.goal, now.goal)
+    part = slot.trial.part + 1
+    hopeless = ~slot.trial.final & stop.fails(done, goal, part * config.horizon, stopping, config)
+    ended = (part == config.record_rollouts) | hopeless
+    solved = ended & ~hopeless & stop.solves(done, goal, stopping, config)
+    trial = Trial(part, slot.trial.due, slot.trial.final, solved, action, done, goal)
     course, leaves, deadline = stop.after_evaluation(
         slot.training.course, solved, trial.due, trial.final, slot.deadline, config, stopping
     )

@@ -42,7 +42,7 @@ def after_update(
         evaluate = (share >= stopping.share) & (updates >= course.next_evaluation) & ~course.solved
         final |= jnp.bool_(config.exploration) & (progress.first_success != NEVER)
     if stopping.rule == Rule.HALVING:
-        at_rung = is_rung(updates, updates_in(stopping.first_rung, config))
+        at_rung = is_rung(updates, config.updates_in(stopping.first_rung))
         moves = (progress.first_success != NEVER) | (progress.best_return >= rung_return + stopping.gain)
         final |= at_rung & ~moves
         rung_return = jnp.where(at_rung, progress.best_return, rung_return)
@@ -59,10 +59,10 @@ def after_evaluation(
     stopping: StopConfig,
 ) -> tuple[Course, Bool[Array, ""], Int[Array, ""]]:
     """The course, whether the level leaves, and its deadline."""
-    polish = stopping.polish // config.steps_per_update
+    polish = config.updates_in(stopping.polish) if stopping.polish else 0
     leaves = final | solved if not polish else final
     deadline = jnp.where(solved & ~final, jnp.minimum(deadline, course.updates + polish), deadline)
-    wait = updates_in(stopping.wait, config) << jnp.minimum(course.failed, MOST_DOUBLINGS)
+    wait = config.updates_in(stopping.wait) << jnp.minimum(course.failed, MOST_DOUBLINGS)
     tried = course._replace(
         next_evaluation=course.updates + wait,
         failed=course.failed + ~solved,
@@ -106,8 +106,3 @@ def is_rung(updates: Int[Array, ""], first: int) -> Bool[Array, ""]:
     """Whether it is `first` times a power of two."""
     times = updates // first
     return (updates % first == 0) & (times > 0) & ((times & (times - 1)) == 0)
-
-
-def updates_in(env_steps: int, config: ExpertConfig) -> int:
-    """How many updates so many env steps are, at least one."""
-    return max(1, env_steps // config.steps_per_update)

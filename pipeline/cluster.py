@@ -7,8 +7,9 @@ import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 os.environ |= {
@@ -27,87 +28,109 @@ from pipeline.schedule import Outcome, Queue, WorkUnit
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s between looks at the workers
+MOST_UNITS = 64  # in a worker at once
 
 
 class Worker:
-    """An actor that attempts units, one at a time, and tells how far it is meanwhile."""
+    """An actor that attempts units, all in one pool of slots, and tells how far it is meanwhile."""
 
-    def __init__(self, core: int | None) -> None:
+    def __init__(self, job: JobConfig, split: Path, core: int | None) -> None:
         prepare_jax(core)
-        self._progress = 0, 0.0, 0
+        self._job, self._split, self._pool = job, split, None
+        self._totals: dict[str, tuple[int, float, int] | None] = {}  # by unit; None: its levels are not in the pool yet
+        self._making = Lock()
 
-    def attempt(self, job: JobConfig, split: Path, unit: WorkUnit) -> Outcome:
-        from pipeline.unit import attempt  # imports what reads the settings made in __init__
+    def attempt(self, unit: WorkUnit) -> Outcome:
+        from pipeline.unit import attempt, pool_for  # imports what reads the settings made in __init__
 
         def report(env_steps: int, levels: float, solved: int) -> None:
-            self._progress = env_steps, levels, solved
+            self._totals[unit.name] = env_steps, levels, solved
 
-        self._progress = 0, 0.0, 0
-        return attempt(job, split, unit, report)
+        self._totals[unit.name] = None
+        with self._making:
+            if self._pool is None or self._pool.error:
+                self._pool = pool_for(self._job)
+            pool = self._pool
+        return attempt(self._job, self._split, unit, report, pool)
 
-    def progress(self) -> tuple[int, float, int]:
-        """Env steps, levels and solved levels of the unit under way."""
-        return self._progress
+    def progress(self, names: list[str]) -> tuple[dict[str, tuple[int, float, int]], int]:
+        """Of these units under way env steps, levels and solved levels; and how many levels more there is room for."""
+        totals = {name: now for name in names if (now := self._totals.get(name)) is not None}
+        return totals, self._pool.wants if self._pool and len(totals) == len(names) else 0
 
 
 @dataclass
 class Slot:
     """A place for one worker: what it occupies, who is in it and what it does."""
 
+    job: JobConfig
+    split: Path
     core: int | None
     gpus: int
     actor: Any = None
-    unit: WorkUnit | None = None
-    result: Any = None  # reference to the coming Outcome
+    running: dict[Any, WorkUnit] = field(default_factory=dict)  # by reference to the coming Outcome
+    wants: int = 1  # levels it has room for
     look: Any = None  # reference to the coming progress
 
-    def start(self, job: JobConfig, split: Path, unit: WorkUnit) -> None:
+    def take(self, queue: Queue) -> bool:
+        """Start the queue's next unit here, if there is room for it."""
+        if self.running and (self.wants <= 0 or len(self.running) == MOST_UNITS):
+            return False
+        unit = queue.take(alone=not self.running)
+        if unit is None:
+            return False
         if self.actor is None:
-            # two threads: one attempts, the other answers `progress`
-            options = {"num_cpus": 1, "num_gpus": self.gpus, "max_concurrency": 2, "max_restarts": 0}
-            self.actor = ray.remote(Worker).options(**options).remote(self.core)
-        self.unit, self.result, self.look = unit, self.actor.attempt.remote(job, split, unit), None
+            # one thread for each unit, and one that answers `progress`
+            options = {"num_cpus": 1, "num_gpus": self.gpus, "max_concurrency": MOST_UNITS + 1, "max_restarts": 0}
+            self.actor = ray.remote(Worker).options(**options).remote(self.job, self.split, self.core)
+        self.running[self.actor.attempt.remote(unit)] = unit
+        self.wants = 0 if unit in queue.attempts else self.wants - len(unit.level_ids)
+        self.look = None  # the last one did not see this unit
+        return True
 
-    def outcome(self) -> Outcome:
+    def outcome(self, result: Any) -> Outcome:
         """The finished attempt; a worker that died leaves its place to a new one."""
-        unit, self.unit = self.unit, None
-        assert unit is not None
+        unit = self.running.pop(result)
         try:
-            return ray.get(self.result)
+            return ray.get(result)
         except RayError as error:
             self.actor = None
             sentence = str(error).strip().splitlines()[0]
             return Outcome(unit, reason=f"{error}\n\nThe worker died: {sentence}")
 
-    def watch(self, board: Board) -> None:
+    def watch(self, board: Board, queue: Queue) -> None:
         """Fetch the worker's progress when it is there, without waiting."""
-        if self.unit is None:
+        if self.actor is None:
             return
+        units = {unit.name: unit for unit in self.running.values()}
         if self.look is not None:
             if not ray.wait([self.look], timeout=0)[0]:
                 return
             try:
-                board.tally.progress(self.unit, *ray.get(self.look))
-            except RayError:  # its attempt fails, too, and is dealt with there
+                totals, wants = ray.get(self.look)
+            except RayError:  # its attempts fail, too, and are dealt with there
                 return
-        self.look = self.actor.progress.remote()
+            for name in totals.keys() & units.keys():
+                board.tally.progress(units[name], *totals[name])
+            alone = any(unit in queue.attempts for unit in units.values())
+            self.wants = 0 if alone else wants
+        self.look = self.actor.progress.remote(list(units))
 
 
 def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Outcome], None], board: Board) -> None:
     """Work on the queue until it is empty."""
     with connected():
-        slots = _slots()[: job.workers or None]
+        slots = [Slot(job, split.absolute(), *of) for of in _places()[: job.workers or None]]
         while True:
-            for slot in slots:
-                if slot.unit is None and (unit := queue.take()):
-                    slot.start(job, split.absolute(), unit)
-            busy = {slot.result: slot for slot in slots if slot.unit}
+            while sum(slot.take(queue) for slot in slots):
+                pass
+            busy = {result: slot for slot in slots for result in slot.running}
             if not busy:
                 return
             for result in ray.wait(list(busy), num_returns=len(busy), timeout=POLL)[0]:
-                settle(busy[result].outcome())
+                settle(busy[result].outcome(result))
             for slot in slots:
-                slot.watch(board)
+                slot.watch(board, queue)
             board.refresh()
 
 
@@ -130,16 +153,16 @@ def _existing() -> bool:
     return bool(os.environ.get("RAY_ADDRESS"))
 
 
-def _slots() -> list[Slot]:
-    """One place per GPU where JAX can use them, else one per core."""
+def _places() -> list[tuple[int | None, int]]:
+    """Core and GPUs of each worker: one worker per GPU where JAX can use them, else one per core."""
     resources = ray.cluster_resources()
     if gpus := int(resources.get("GPU", 0)):
         probe = ray.remote(num_gpus=1, max_calls=1)(_jax_sees_a_gpu)
         if ray.get(probe.remote()):
-            return [Slot(None, 1) for _ in range(gpus)]
+            return [(None, 1)] * gpus
     if _existing():  # which cores its machines have is theirs to know
-        return [Slot(None, 0) for _ in range(int(resources["CPU"]))]
-    return [Slot(core, 0) for core in own_cores()]
+        return [(None, 0)] * int(resources["CPU"])
+    return [(core, 0) for core in own_cores()]
 
 
 def _jax_sees_a_gpu() -> bool:

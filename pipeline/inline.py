@@ -12,14 +12,14 @@ from pipeline.schedule import Outcome, Queue
 def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Outcome], None], board: Board) -> None:
     """Work on the queue until it is empty."""
     prepare_jax()
-    from pipeline.unit import attempt  # imports what reads the settings just made
+    from pipeline.unit import attempt, pool_for  # imports what reads the settings just made
 
     with interruptible():
-        while unit := queue.take():
+        while unit := queue.take(alone=True):
 
             def report(env_steps: int, levels: float, solved: int, unit=unit) -> None:
                 board.tally.progress(unit, env_steps, levels, solved)
                 board.refresh()
 
             board.refresh()
-            settle(attempt(job, split, unit, report))
+            settle(attempt(job, split, unit, report, pool_for(job)))

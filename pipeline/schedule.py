@@ -70,9 +70,15 @@ class Queue:
     def of(cls, units: Iterable[WorkUnit]) -> "Queue":
         return cls(deque(units))
 
-    def take(self) -> WorkUnit | None:
-        """The next unit to work on; None when no more wait."""
-        return self.waiting.popleft() if self.waiting else None
+    def take(self, alone: bool) -> WorkUnit | None:
+        """The next unit to work on; None when no more wait.
+
+        A unit that has failed goes only to a worker that has no other (`alone`): it must not take others with it.
+        Such units wait behind all that have not failed.
+        """
+        if not self.waiting or (self.waiting[0] in self.attempts and not alone):
+            return None
+        return self.waiting.popleft()
 
     def failed(self, unit: WorkUnit) -> bool:
         """Note a failed attempt; the unit waits again, or True when it is now quarantined."""

@@ -16,7 +16,8 @@ import numpy as np
 from configs.compose import again
 from configs.schema import JobConfig
 from experts.labels import WITNESSED, Label, Verdict
-from experts.train import UnitResult, train_levels
+from experts.pool import Pool
+from experts.train import UnitResult, new_pool, train_in
 from experts.witness import Record, replay, succeeds
 from levelgen.content import content_hashes
 from levelgen.level import Level, size_of
@@ -45,10 +46,10 @@ FATAL = {
 }
 
 
-def attempt(job: JobConfig, split: Path, unit: WorkUnit, report: Report) -> Outcome:
+def attempt(job: JobConfig, split: Path, unit: WorkUnit, report: Report, pool: Pool) -> Outcome:
     """One attempt at a unit, with its failure as a value: exceptions do not travel between processes."""
     try:
-        return Outcome(unit, run_unit(job, split, unit, report))
+        return Outcome(unit, run_unit(job, split, unit, report, pool))
     except OSError as error:
         fatal = FATAL.get(error.errno or 0, "")
         sentence = fatal and f"Cannot write to {split}, {fatal}, then run the same command again."
@@ -57,7 +58,12 @@ def attempt(job: JobConfig, split: Path, unit: WorkUnit, report: Report) -> Outc
         return Outcome(unit, reason=traceback.format_exc())
 
 
-def run_unit(job: JobConfig, split: Path, unit: WorkUnit, report: Report) -> Summary:
+def pool_for(job: JobConfig) -> Pool:
+    """Where a job's experts train, those of several units side by side."""
+    return new_pool(job.env_steps, job.expert, job.stop, job.task)
+
+
+def run_unit(job: JobConfig, split: Path, unit: WorkUnit, report: Report, pool: Pool) -> Summary:
     """Make and commit one unit.
 
     Raises:
@@ -66,17 +72,7 @@ def run_unit(job: JobConfig, split: Path, unit: WorkUnit, report: Report) -> Sum
     """
     ids = np.asarray(unit.level_ids, np.int32)
     levels = sample_levels(jnp.asarray(ids), size_of(job.size), job.distribution)
-    result = train_levels(
-        levels,
-        ids,
-        job.env_steps,
-        job.expert,
-        job.stop,
-        job.task,
-        report,
-        begun=experts_for(job, unit.level_ids),
-        keep=job.keep_experts,
-    )
+    result = train_in(pool, levels, ids, report, experts_for(job, unit.level_ids), job.keep_experts)
     check_witnesses(result, job.task)
     commit(job, split, unit, result)
     labels = [verdict.label for verdict in result.verdicts]

@@ -155,7 +155,7 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
             train_levels(levels, ids, variant.expert.steps_per_update, variant.expert, variant.stop)
             warm = True
         wall, cpu = time.perf_counter(), time.process_time()
-        result = train_levels(levels, ids, header.budget, variant.expert, variant.stop, report=report)
+        result = train_levels(levels, ids, header.budget, variant.expert, variant.stop, tell=report)
         spent = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
         rows = [row_of(int(i), v, spent, len(ids)) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
         solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)

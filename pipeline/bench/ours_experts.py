@@ -7,7 +7,6 @@ import numpy as np
 from pipeline.bench.serve import serve, timed
 from pipeline.runtime import prepare_jax
 
-NEVER_ENDING = 10**6  # updates
 # What the reference's side does; ours may have other defaults.
 REFERENCE = {
     "width": 64,
@@ -37,11 +36,12 @@ def main() -> None:
 
     import jax
 
-    from experts.config import ExpertConfig, Rule, StopConfig
-    from experts.slots import Queue, Training, advance, empty_slots
-    from experts.train import queue_of, slot_count
+    from experts.config import ExpertConfig
+    from experts.pool import slot_count
+    from experts.slots import Queue, Training, empty_slots
     from experts.witness import take
     from levelgen.task import TaskParams
+    from pipeline.bench.endless import endless_queue, go_on
     from pipeline.bench.worlds import load_levels
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
@@ -49,13 +49,12 @@ def main() -> None:
     config = ExpertConfig(**REFERENCE, environments=given.environments, horizon=given.horizon)
     rules = TaskParams(dense_reward_scale=config.dense_reward_scale)
     levels = load_levels(given.levels, given.first, given.count)
-    ids = np.arange(given.first, given.first + given.count, dtype=np.int32)
     slots = min(slot_count(config), given.count)
     batches = [np.minimum(np.arange(i, i + slots), given.count - 1) for i in range(0, given.count, slots)]
 
     def train(updates: int, batches: list[np.ndarray]) -> list[tuple[Training, float]]:
         """Fresh experts, a batch of them after another: what they have become, and their goals."""
-        everyone = jax.device_get(queue_of(levels, ids, NEVER_ENDING, config))
+        everyone = jax.device_get(endless_queue(levels, config))
         return [train_batch(of_batch(everyone, batch), updates) for batch in batches]
 
     def of_batch(queue: Queue, batch: np.ndarray) -> Queue:
@@ -65,7 +64,7 @@ def main() -> None:
     def train_batch(queue: Queue, updates: int) -> tuple[Training, float]:
         now, goals, ended = empty_slots(slots, queue, config), 0.0, np.zeros(slots)
         for _ in range(updates):
-            now, seen = advance(now, queue, config, StopConfig(rule=Rule.BUDGET), rules)
+            now, seen = go_on(now, queue, config, rules)
             before, ended = ended, np.asarray(now.slot.training.progress.episodes)
             goals += float((np.nan_to_num(np.asarray(seen.share)) * (ended - before)).sum())
         return now.slot.training, goals

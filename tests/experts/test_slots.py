@@ -1,6 +1,7 @@
 """Continuous batching on real levels: who leaves when, and that nothing of it shows in a result."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -10,8 +11,10 @@ from experts import slots as slots_module
 from experts.config import ExpertConfig, Rule, StopConfig
 from experts.judge import Trained
 from experts.labels import Label, Source
-from experts.slots import Mode, advance, empty_slots
-from experts.train import queue_of, train, train_levels
+from experts.pool import Pool, Spent
+from experts.queue import empty_queue, enter
+from experts.slots import Mode, Queue, advance, empty_slots
+from experts.train import train_levels
 from experts.witness import take
 from levelgen.level import SIZES, Level
 from levelgen.sampler import sample_levels
@@ -26,6 +29,16 @@ WHOLE = StopConfig(rule=Rule.BUDGET)
 UPDATES = 24  # 12,288 env steps
 
 
+def train(
+    levels: Level, level_ids: np.ndarray, updates: int, config: ExpertConfig, stopping: StopConfig, **how: Any
+) -> tuple[list[Trained], Spent]:
+    return Pool(updates, config, stopping, DEFAULT_RULES).train(levels, level_ids, **how)
+
+
+def queue_of(levels: Level, updates: int) -> Queue:
+    return enter(empty_queue(levels, 16, updates, CONFIG), levels, IDS, CONFIG)
+
+
 @pytest.fixture(scope="module")
 def levels() -> Level:
     return jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
@@ -33,12 +46,12 @@ def levels() -> Level:
 
 @pytest.fixture(scope="module")
 def solved(levels: Level) -> list[Trained]:
-    return train(levels, IDS, UPDATES, CONFIG, SOLVED, DEFAULT_RULES)[0]
+    return train(levels, IDS, UPDATES, CONFIG, SOLVED)[0]
 
 
 @pytest.fixture(scope="module")
 def whole(levels: Level) -> list[Trained]:
-    return train(levels, IDS, UPDATES, CONFIG, WHOLE, DEFAULT_RULES)[0]
+    return train(levels, IDS, UPDATES, CONFIG, WHOLE)[0]
 
 
 def same(a, b) -> None:
@@ -63,14 +76,14 @@ def test_an_evaluation_leaves_no_trace_in_training(solved: list[Trained], whole:
 def test_a_result_depends_neither_on_slot_nor_on_neighbours(
     levels: Level, solved: list[Trained], at: list[int]
 ) -> None:
-    some, _ = train(take(levels, np.array(at)), IDS[at], UPDATES, CONFIG, SOLVED, DEFAULT_RULES)
+    some, _ = train(take(levels, np.array(at)), IDS[at], UPDATES, CONFIG, SOLVED)
     for i, of in zip(at, some, strict=True):
         same(of, solved[i])
 
 
 def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
     """No slot is empty while a level waits, and every level has one place."""
-    queue = queue_of(levels, IDS, 2, CONFIG)
+    queue = queue_of(levels, 2)
     slots = empty_slots(2, queue, CONFIG)
     modes, places = [], []
     for _ in range(400):
@@ -92,15 +105,15 @@ def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
 
 def test_nothing_is_compiled_again(levels: Level) -> None:
     """Another number of levels and another budget use the same program."""
-    train(take(levels, np.arange(3)), IDS[:3], 2, CONFIG, SOLVED, DEFAULT_RULES)
+    train(take(levels, np.arange(3)), IDS[:3], 2, CONFIG, SOLVED)
     before = advance._cache_size()
-    train(levels, IDS, 3, CONFIG, SOLVED, DEFAULT_RULES)
+    train(levels, IDS, 3, CONFIG, SOLVED)
     assert advance._cache_size() == before
 
 
 def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) -> None:
     stopping = StopConfig(rule=Rule.HALVING, successes=4, first_rung=4 * 512, gain=10.0)
-    halved, spent = train(levels, IDS, UPDATES, CONFIG, stopping, DEFAULT_RULES)
+    halved, spent = train(levels, IDS, UPDATES, CONFIG, stopping)
     never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
     assert never
     for i in never:
@@ -123,7 +136,7 @@ def test_a_success_of_training_is_a_witness_if_wanted(levels: Level) -> None:
 
 
 def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[Trained]) -> None:
-    polished, _ = train(levels, IDS, UPDATES, CONFIG, replace(SOLVED, polish=4 * 512), DEFAULT_RULES)
+    polished, _ = train(levels, IDS, UPDATES, CONFIG, replace(SOLVED, polish=4 * 512))
     early = [i for i, of in enumerate(solved) if len(of.curve) < UPDATES - 4]
     assert early
     for i in early:
@@ -134,11 +147,11 @@ def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[T
 
 @pytest.mark.parametrize("stopping", [WHOLE, SOLVED], ids=["budget", "solved"])
 def test_going_on_equals_having_trained_through(levels: Level, stopping: StopConfig) -> None:
-    through, _ = train(levels, IDS, UPDATES, CONFIG, stopping, DEFAULT_RULES)
-    first, _ = train(levels, IDS, UPDATES // 3, CONFIG, stopping, DEFAULT_RULES, keep=True)
+    through, _ = train(levels, IDS, UPDATES, CONFIG, stopping)
+    first, _ = train(levels, IDS, UPDATES // 3, CONFIG, stopping, keep=True)
     left = [i for i, of in enumerate(through) if len(of.curve) > UPDATES // 3]
     kept = {place: first[i].expert for place, i in enumerate(left)}
-    later, spent = train(take(levels, np.array(left)), IDS[left], UPDATES, CONFIG, stopping, DEFAULT_RULES, begun=kept)  # type: ignore[arg-type]
+    later, spent = train(take(levels, np.array(left)), IDS[left], UPDATES, CONFIG, stopping, begun=kept)  # type: ignore[arg-type]
     assert spent.trained == sum(len(through[i].curve) - UPDATES // 3 for i in left) * CONFIG.steps_per_update
     for i, of in zip(left, later, strict=True):
         same(of, through[i])
@@ -146,7 +159,7 @@ def test_going_on_equals_having_trained_through(levels: Level, stopping: StopCon
 
 def test_all_slots_at_once_as_on_an_accelerator(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same course and nearly the same numbers: sums are taken in another order."""
-    queue = queue_of(levels, IDS, 3, CONFIG)
+    queue = queue_of(levels, 3)
 
     def go(advance) -> list:
         slots, seen = empty_slots(2, queue, CONFIG), []

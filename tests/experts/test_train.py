@@ -7,7 +7,7 @@ import pytest
 
 from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.labels import Label
-from experts.train import UnitResult, train_levels, updates_in
+from experts.train import UnitResult, new_pool, train_levels
 from experts.witness import LANES, replay, steps_to_goal, succeeds
 from levelgen.distribution import Distribution
 from levelgen.level import SIZES, Level
@@ -31,7 +31,7 @@ def reports() -> list[tuple[int, float, int]]:
 
 @pytest.fixture(scope="module")
 def result(levels: Level, reports) -> UnitResult:
-    return train_levels(levels, IDS, BUDGET, CONFIG, WHOLE, report=lambda *now: reports.append(now))
+    return train_levels(levels, IDS, BUDGET, CONFIG, WHOLE, tell=lambda *now: reports.append(now))
 
 
 def same(a, b) -> None:
@@ -117,7 +117,7 @@ def test_levels_that_all_need_no_expert() -> None:
 
 def test_a_budget_below_one_update_is_refused() -> None:
     with pytest.raises(ValueError, match="too small: one update of an expert takes 1024"):
-        updates_in(1023, CONFIG)
+        new_pool(1023, CONFIG)
 
 
 @pytest.mark.parametrize(

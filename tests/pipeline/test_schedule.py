@@ -36,13 +36,13 @@ def test_names_of_what_is_left_are_new(count: int, unit: int, committed: set[int
 
 def test_a_unit_that_fails_waits_again_behind_the_others_until_it_is_given_up() -> None:
     queue = Queue.of(plan_units(range(4), set(), 2))
-    bad = queue.take()
+    bad = queue.take(alone=True)
     assert bad is not None
     assert not queue.failed(bad)
-    good = queue.take()
+    good = queue.take(alone=True)
     assert good != bad
     for attempt in range(1, ATTEMPTS):
-        assert queue.take() == bad
+        assert queue.take(alone=True) == bad
         assert queue.failed(bad) == (attempt == ATTEMPTS - 1)
     assert queue.quarantined == [bad]
-    assert queue.take() is None
+    assert queue.take(alone=True) is None

@@ -18,7 +18,7 @@ from pipeline.fields import arrays_of, same_bits, tree_of
 from pipeline.manifest import read_manifest
 from pipeline.schedule import Summary, WorkUnit
 from pipeline.shard import Shard
-from pipeline.unit import attempt, check_witnesses, commit, run_unit
+from pipeline.unit import attempt, check_witnesses, commit, pool_for, run_unit
 from tests.pipeline.made import made_job, made_result
 
 UNIT = WorkUnit((0, 1, 2, 3))
@@ -86,7 +86,7 @@ def test_a_trivial_level_whose_witness_does_something_does_not_pass(job: JobConf
 
 def test_a_unit_is_committed_with_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
     seen: list[tuple[int, float, int]] = []
-    summary = run_unit(job, tmp_path, UNIT, lambda *totals: seen.append(totals))
+    summary = run_unit(job, tmp_path, UNIT, lambda *totals: seen.append(totals), pool_for(job))
     manifest = read_manifest(tmp_path)
     assert manifest.level_ids.tolist() == list(UNIT.level_ids)
     solved, trained = manifest.labels.tolist().count("solved"), sum(manifest.table["env_steps"].to_pylist())
@@ -102,7 +102,7 @@ def test_a_unit_is_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
 def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: JobConfig, result: UnitResult) -> None:
     commit(job, tmp_path, UNIT, result)
     first = read_manifest(tmp_path)
-    run_unit(job, tmp_path, UNIT, lambda steps, levels, solved: None)
+    run_unit(job, tmp_path, UNIT, lambda steps, levels, solved: None, pool_for(job))
     second = read_manifest(tmp_path)
     assert repr(first.table.drop(["shard"]).to_pylist()) == repr(second.table.drop(["shard"]).to_pylist())
     (old,), (new,) = first.shards, second.shards
@@ -132,7 +132,7 @@ def test_a_unit_without_solved_levels_has_no_shard(tmp_path: Path, job: JobConfi
 
 def test_a_failed_attempt_is_a_value(tmp_path: Path) -> None:
     broken = made_job("data", "budget=5k", "task.max_timesteps=3000000000")  # no 32-bit counter reaches it
-    outcome = attempt(broken, tmp_path, UNIT, lambda steps, levels, solved: None)
+    outcome = attempt(broken, tmp_path, UNIT, lambda steps, levels, solved: None, pool_for(broken))
     assert outcome.summary is None
     assert "Traceback" in outcome.reason
     assert not list(tmp_path.rglob("*.parquet"))

@@ -8,12 +8,10 @@ import pytest
 
 from experts.config import Network
 from experts.judge import Trained, witness_of
-from experts.train import train
 from experts.witness import take
 from levelgen.level import SIZES
 from levelgen.sampler import sample_levels
-from levelgen.task import DEFAULT_RULES
-from tests.experts.test_slots import CONFIG, SOLVED, UPDATES, same
+from tests.experts.test_slots import CONFIG, SOLVED, UPDATES, same, train
 
 IDS = np.array([0, 2, 6, 7])
 
@@ -21,7 +19,7 @@ IDS = np.array([0, 2, 6, 7])
 def trained(network: Network, at: list[int]) -> list[Trained]:
     levels = jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
     config = replace(CONFIG, network=network, encoding=16)
-    return train(take(levels, np.array(at)), IDS[at], UPDATES, config, SOLVED, DEFAULT_RULES)[0]
+    return train(take(levels, np.array(at)), IDS[at], UPDATES, config, SOLVED)[0]
 
 
 @pytest.mark.parametrize("network", Network)

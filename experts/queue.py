@@ -1,0 +1,74 @@
+"""The queue before the slots: levels enter it in blocks, with experts that have seen nothing or that go on."""
+
+from collections.abc import Mapping
+from functools import partial
+from types import MappingProxyType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from experts.config import ExpertConfig
+from experts.slots import Begun, Queue, begin
+from experts.witness import take
+from levelgen.level import Level
+
+BLOCK = 16  # levels that enter at once
+NO_EXPERTS: Mapping[int, Begun] = MappingProxyType({})
+
+
+def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig) -> Queue:
+    """A queue for levels of the size of these, without any."""
+    one = take(levels, np.zeros(1, int))
+    begun = jax.eval_shape(partial(begin, config=config), one, jnp.zeros(1, jnp.int32))
+    return Queue(
+        jax.tree.map(lambda x: jnp.zeros((*x.shape[:-1], capacity), x.dtype), one),
+        jnp.zeros(capacity, jnp.int32),
+        np.int32(0),
+        np.int32(updates),
+        jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape[1:]), x.dtype), begun),
+    )
+
+
+def next_places(queue: Queue, count: int) -> list[int]:
+    """Places of the next levels that enter."""
+    come = int(queue.count)
+    return [number % queue.capacity for number in range(come, come + count)]
+
+
+def enter(
+    queue: Queue,
+    levels: Level,
+    level_ids: Int[np.ndarray, " level"],
+    config: ExpertConfig,
+    begun: Mapping[int, Begun] = NO_EXPERTS,
+) -> Queue:
+    """The queue (used up) with more levels. `begun` has the experts that go on, by place among these levels."""
+    for first in range(0, len(level_ids), BLOCK):
+        some = range(first, min(first + BLOCK, len(level_ids)))
+        fill = np.minimum(np.arange(first, first + BLOCK), some[-1])
+        block, ids = take(levels, fill), np.asarray(level_ids, np.int32)[fill]
+        experts = begin(block, ids, config)
+        if mine := {i - first: begun[i] for i in some if i in begun}:
+            experts = jax.tree.map(np.array, experts)
+            for i, expert in mine.items():
+                jax.tree.map(partial(_put_row, i), experts, expert)
+        nowhere = [queue.capacity] * (BLOCK - len(some))
+        queue = _put(queue, block, ids, experts, np.array(next_places(queue, len(some)) + nowhere))
+        queue = queue._replace(count=np.int32(int(queue.count) + len(some)))
+    return queue
+
+
+@partial(jax.jit, donate_argnames="queue")
+def _put(queue: Queue, levels: Level, level_ids: Int[Array, "16"], experts: Begun, places: Int[Array, "16"]) -> Queue:
+    put = lambda old, new: old.at[places].set(new, mode="drop")
+    return queue._replace(
+        levels=jax.tree.map(lambda old, new: old.at[..., places].set(new, mode="drop"), queue.levels, levels),
+        level_ids=put(queue.level_ids, level_ids),
+        begun=jax.tree.map(put, queue.begun, experts),
+    )
+
+
+def _put_row(row: int, rows: np.ndarray, new: np.ndarray) -> None:
+    rows[row] = new
