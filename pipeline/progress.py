@@ -5,9 +5,10 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from pipeline.schedule import Summary, WorkUnit
 
@@ -90,46 +91,55 @@ class Tally:
         )
 
 
-class Board:
-    """Shows a Tally."""
+class Display:
+    """A bar on a terminal, plain lines now and then elsewhere."""
 
-    def __init__(self, tally: Tally, console: Console) -> None:
-        self.tally, self._console, self._lines_at = tally, console, 0.0
+    def __init__(self, console: Console, *columns: ProgressColumn) -> None:
+        self._console, self._line_at = console, 0.0
         self._bar = Progress(
-            BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console
+            BarColumn(), *columns, TextColumn("{task.description}"), TimeElapsedColumn(), console=console
         )
-        self._task = self._bar.add_task("starting", total=1.0)
+        self._task = self._bar.add_task("starting", total=1)
 
     @contextmanager
-    def shown(self) -> Iterator["Board"]:
+    def shown(self) -> Iterator[Self]:
         if not self._console.is_terminal:
             yield self
             return
         with self._bar:
             yield self
 
-    def refresh(self) -> None:
-        """Draw anew; cheap enough to call often."""
+    def draw(self, completed: float, total: float, text: str, line: str, at_once: bool = False) -> None:
+        """Bring the bar up to date, or say `line`, if none was said lately or `at_once`."""
         now = time.monotonic()
-        self.tally.tick(now)
         if self._console.is_terminal:
-            self._bar.update(self._task, completed=self.tally.share, description=self.tally.text(now))
-        elif now - self._lines_at > LINE_EVERY:
-            self._line(now)
-
-    def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
-        self.tally.ended(unit, summary)
-        self.refresh()
-        if summary and not self._console.is_terminal:
-            self._line(time.monotonic())
+            self._bar.update(self._task, completed=completed, total=total, description=text)
+        elif at_once or now - self._line_at > LINE_EVERY:
+            self._line_at = now
+            self.say(line)
 
     def say(self, text: str) -> None:
         """A line that stays."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-    def _line(self, now: float) -> None:
-        self._lines_at = now
-        self.say(self.tally.text(now))
+
+class Board(Display):
+    """Shows a Tally."""
+
+    def __init__(self, tally: Tally, console: Console) -> None:
+        super().__init__(console, TaskProgressColumn())
+        self.tally = tally
+
+    def refresh(self, at_once: bool = False) -> None:
+        """Draw anew; cheap enough to call often."""
+        now = time.monotonic()
+        self.tally.tick(now)
+        text = self.tally.text(now)
+        self.draw(self.tally.share, 1.0, text, text, at_once)
+
+    def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
+        self.tally.ended(unit, summary)
+        self.refresh(at_once=summary is not None)
 
 
 def duration(seconds: float) -> str:

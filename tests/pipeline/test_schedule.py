@@ -46,3 +46,15 @@ def test_a_unit_that_fails_waits_again_behind_the_others_until_it_is_given_up() 
         assert queue.failed(bad) == (attempt == ATTEMPTS - 1)
     assert queue.quarantined == [bad]
     assert queue.take(alone=True) is None
+
+
+def test_a_unit_that_has_failed_goes_to_a_worker_that_has_no_other() -> None:
+    queue = Queue.of(plan_units(range(3), set(), 1))
+    bad = queue.take(alone=False)
+    assert bad is not None
+    queue.failed(bad)
+    fresh = [queue.take(alone=False), queue.take(alone=False)]
+    assert bad not in fresh
+    assert None not in fresh
+    assert queue.take(alone=False) is None
+    assert queue.take(alone=True) == bad
