@@ -3,14 +3,11 @@
 python -m benchmarks.training [SIZE ...]
 """
 
-import os
 import sys
 import time
+from collections.abc import Callable, Iterator
 from functools import partial
-
-os.environ.update(dict.fromkeys(("NPROC", "OMP_NUM_THREADS"), "1"))
-if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,16 +21,17 @@ from experts.ppo import Batch, Seen
 from experts.rollout import Manner, repeat, rollout, start
 from experts.slots import empty_slots
 from levelgen.actions import CHOICES, action_mask
-from levelgen.level import SIZES
-from levelgen.observe import level_features
+from levelgen.level import SIZES, Level
 from levelgen.sampler import sample_levels
 from levelgen.task import DEFAULT_RULES
 from pipeline.bench.endless import endless_queue, go_on
+from pipeline.runtime import own_cores, prepare_jax
 
 REPEATS = 30
 
 
 def main() -> None:
+    prepare_jax(min(own_cores()))
     config = ExpertConfig()
     print("env steps/s of one core\n\n| size | rollout | update | both, in slots |\n|---|---|---|---|")
     for size in sys.argv[1:] or SIZES:
@@ -44,14 +42,14 @@ def main() -> None:
         print("|", " | ".join((size, *rates)), "|", flush=True)
 
 
-def calls(levels, config: ExpertConfig):
+def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
     """A rollout, an update, and both: functions without arguments, one after another."""
     count = levels.role.shape[-1]
     queue = endless_queue(levels, config)
     slots, _ = go_on(empty_slots(count, queue, config), queue, config)
     experts, levels = slots.slot.training.expert, jax.tree.map(jnp.asarray, levels)
     experts = jax.tree.map(jnp.copy, experts)  # `advance` uses its slots up
-    lanes, network = config.environments * count, network_of(levels, config)
+    lanes, network = config.environments * count, network_of(levels.size, config)
     no = jnp.zeros(lanes, bool)
     manner = Manner(no, jnp.zeros(lanes), no, jnp.zeros((256, len(CHOICES), count), jnp.int8))
     keys, acting = jax.random.split(jax.random.key(0), count), start(repeat(levels, config.environments))
@@ -63,7 +61,8 @@ def calls(levels, config: ExpertConfig):
     advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
     batch = Batch(seen.moving, seen.action, seen.log_probability, seen.value, advantage)
     samples = jax.vmap(ppo.as_samples, in_axes=-2)(batch)
-    constant = Seen(level_features(levels).T, action_mask(levels).T)
+    seen_once = Seen(network.constant(levels), action_mask(levels))
+    constant = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), seen_once)
 
     @jax.jit
     def update(experts):
@@ -72,7 +71,7 @@ def calls(levels, config: ExpertConfig):
 
     yield partial(update, experts)
 
-    def both():
+    def both() -> Any:
         nonlocal slots
         slots, report = go_on(slots, queue, config)
         return report
@@ -80,7 +79,7 @@ def calls(levels, config: ExpertConfig):
     yield both
 
 
-def seconds(call) -> float:
+def seconds(call: Callable[[], Any]) -> float:
     """Median of REPEATS calls."""
     jax.block_until_ready(call())
     taken = []

@@ -68,6 +68,7 @@ def test_what_follows_from_an_evaluation() -> None:
     assert bool(decide(False, True, SOLVED)[1])
     polished, leaves, deadline = decide(True, False, replace(SOLVED, polish=5 * 1024))
     assert (bool(polished.solved), bool(leaves), int(deadline)) == (True, False, 15)
+    assert int(decide(True, False, replace(SOLVED, polish=1))[2]) == 11, "less than an update is an update"
 
 
 def test_a_last_evaluation_leaves_no_trace_in_what_goes_on() -> None:
