@@ -89,13 +89,12 @@ def train(
     import jax.numpy as jnp
 
     from experts.before import decide
-    from experts.train import updates_in
     from experts.witness import take
     from levelgen.level import size_of
     from levelgen.sampler import sample_levels
     from levelgen.task import DEFAULT_RULES
 
-    ids, updates = np.asarray(unit.level_ids, np.int32), updates_in(header.budget, config)
+    ids, updates = np.asarray(unit.level_ids, np.int32), config.updates_in(header.budget)
     levels = sample_levels(jnp.asarray(ids), size_of(header.size))
     before, failed = decide(levels, DEFAULT_RULES)
     left = np.array([i for i, verdict in enumerate(before) if verdict is None], int)
