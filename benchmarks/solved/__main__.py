@@ -5,6 +5,7 @@
     python -m benchmarks.solved plot FILES... --out docs/unsolved-by-budget.svg [--write docs/experts.md]
 
 `run` appends a line per level to a file and skips the levels that are there: run it again to go on, or for more levels.
+The variant `original` runs in the reference's own environment, made on first use as for `levelproof bench`.
 Levels below 1,000,000 are for tuning, those above for reports.
 """
 
@@ -13,8 +14,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.document import between_marks
-from benchmarks.solved import plot, tables
-from benchmarks.solved.measure import measure
+from benchmarks.solved import measure, original, plot, tables
 from benchmarks.solved.results import Header, count, read_all
 from benchmarks.solved.variants import VARIANTS
 from configs.convert import ConfigError, plain
@@ -77,7 +77,8 @@ def run(given: argparse.Namespace) -> None:
     settings = {"expert": plain(variant.expert), "stop": plain(variant.stop)}
     header = Header(given.variant, given.size, budget, settings)
     out = given.out or RESULTS / f"{given.size}-{count(budget)}-{given.variant}.jsonl"
-    measure(header, variant, range(given.first, given.first + levels), out, given.jobs)
+    worker = original.work if variant.original else measure.work
+    measure.measure(header, variant, range(given.first, given.first + levels), out, given.jobs, worker)
 
 
 def table(given: argparse.Namespace) -> None:

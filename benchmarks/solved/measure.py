@@ -6,6 +6,7 @@ import multiprocessing
 import queue
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from rich.console import Console
 from benchmarks.solved.results import Header, header_of, read
 from benchmarks.solved.variants import Variant
 from experts.labels import Label, Verdict
-from pipeline.errors import Failure, UserError
+from pipeline.errors import Failure, LevelproofError, UserError
 from pipeline.progress import Board, Tally
 from pipeline.runtime import interruptible, own_cores, prepare_jax
 from pipeline.schedule import Summary, WorkUnit, plan_units
@@ -45,15 +46,24 @@ class Trained:
     unit: WorkUnit
     rows: list[dict[str, Any]]
     summary: Summary
+    versions: dict[str, Any]
     device: str
 
 
-def measure(header: Header, variant: Variant, wanted: range, out: Path, jobs: int) -> None:
+def measure(header: Header, variant: Variant, wanted: range, out: Path, jobs: int, worker: Callable[..., None]) -> None:
     """Train the wanted levels that are not in the file; append each unit when it is done.
+
+    Args:
+        header: of the file.
+        variant: how to train.
+        wanted: level ids.
+        out: the file.
+        jobs: processes; 0: one per core.
+        worker: what each does, as `work`.
 
     Raises:
         UserError: the file is of another benchmark, or there are not as many cores as jobs.
-        Failure: a process died.
+        LevelproofError: what a process tells, or that it died.
     """
     there = rows_there(out, header)
     units = plan_units(wanted, there, UNIT)
@@ -66,7 +76,7 @@ def measure(header: Header, variant: Variant, wanted: range, out: Path, jobs: in
     context = multiprocessing.get_context("spawn")
     tasks, told = context.Queue(), context.Queue()
     processes = [
-        context.Process(target=work, args=(core, header, variant, tasks, told), daemon=True)
+        context.Process(target=worker, args=(core, header, variant, tasks, told), daemon=True)
         for core in cores[: min(jobs or len(cores), len(units))]
     ]
     for task in (*units, *[None] * len(processes)):
@@ -86,7 +96,7 @@ def follow(units: int, told: Any, processes: list, board: Board, header: Header,
     """Write and show what the processes tell, until all units are done.
 
     Raises:
-        Failure: a process died.
+        LevelproofError: what a process tells, or that it died.
     """
     while units:
         board.refresh()
@@ -96,6 +106,8 @@ def follow(units: int, told: Any, processes: list, board: Board, header: Header,
             if any(process.exitcode for process in processes):
                 raise Failure(f"A process died; run the same command again to go on with {out}.") from None
             continue
+        if isinstance(now, LevelproofError):
+            raise now
         if isinstance(now, Trained):
             append(out, now, header)
             board.ended(now.unit, now.summary)
@@ -106,7 +118,7 @@ def follow(units: int, told: Any, processes: list, board: Board, header: Header,
 
 def append(out: Path, trained: Trained, header: Header) -> None:
     """A unit's lines, after the header in a new file."""
-    lines = trained.rows if out.exists() else [header_of(header, versions(), trained.device), *trained.rows]
+    lines = trained.rows if out.exists() else [header_of(header, trained.versions, trained.device), *trained.rows]
     out.parent.mkdir(parents=True, exist_ok=True)
     with out.open("a") as file:
         file.write("".join(json.dumps(line) + "\n" for line in lines))
@@ -159,7 +171,7 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
         spent = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
         rows = [row_of(int(i), v, spent, len(ids)) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
         solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
-        told.put(Trained(unit, rows, Summary(len(ids), solved, *result.spent), device()))
+        told.put(Trained(unit, rows, Summary(len(ids), solved, *result.spent), versions(), device()))
 
 
 def row_of(level_id: int, verdict: Verdict, spent: dict[str, float], levels: int) -> dict[str, Any]:

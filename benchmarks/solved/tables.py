@@ -65,17 +65,16 @@ def line(results: Results) -> list[str]:
 
 
 def paired(group: Sequence[Results]) -> list[list[str]]:
-    """A row for each variant and the one it is compared with, where both are there."""
+    """A row for each variant and each one it is compared with, where both are there."""
     by_name, lines = {each.header.variant: each for each in group}, []
     for name, one in by_name.items():
-        other = by_name.get(VARIANTS[name].against) if name in VARIANTS else None
-        if not other:
-            continue
-        against = f"`{other.header.variant}`"
-        lines.append([f"`{name}`", against, *discordant(one, other, one.solved())])
+        against = VARIANTS[name].against if name in VARIANTS else ()
+        others = [by_name[other] for other in against if other in by_name]
+        solved = {f"`{name}`": one.solved()}
         if name == QUARTER and one.header.stops_early:
-            early = one.solved(one.header.budget / 4)
-            lines.append([f"`{name}`, a quarter of the budget", against, *discordant(one, other, early)])
+            solved[f"`{name}`, a quarter of the budget"] = one.solved(one.header.budget / 4)
+        for text, levels in solved.items():
+            lines += [[text, f"`{other.header.variant}`", *discordant(one, other, levels)] for other in others]
     return lines
 
 

@@ -1,4 +1,4 @@
-"""What is compared: the reference's PPO, our defaults, and our defaults with one thing changed."""
+"""What is compared: the reference's PPO, there and here, our defaults, and our defaults with one thing changed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -36,7 +36,8 @@ class Variant:
     text: str  # what it is, in a line
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     stop: StopConfig = field(default_factory=StopConfig)
-    against: str = "ours"  # the variant it is compared with, level by level
+    against: tuple[str, ...] = ("ours",)  # variants it is compared with, level by level
+    original: bool = False  # trained and evaluated by the reference's side, in its own environment
 
 
 def expert(text: str, **changed: Any) -> Variant:
@@ -49,9 +50,16 @@ def stop(text: str, **changed: Any) -> Variant:
 
 WHOLE = StopConfig(rule=Rule.BUDGET)
 VARIANTS: Mapping[str, Variant] = {
-    "reference": Variant("the reference's hyperparameters, the whole budget for every level", REFERENCE, WHOLE, ""),
-    "ours": Variant("the defaults", against="reference"),
-    "ours_budget": Variant("the defaults, the whole budget for every level", stop=WHOLE, against="reference"),
+    "original": Variant(
+        "the reference's PPO in the reference's own environment and physics, the whole budget for every level",
+        replace(REFERENCE, sticky_attempts=0, moved_attempts=0),
+        WHOLE,
+        ("reference",),
+        original=True,
+    ),
+    "reference": Variant("the reference's hyperparameters, the whole budget for every level", REFERENCE, WHOLE, ()),
+    "ours": Variant("the defaults", against=("reference", "original")),
+    "ours_budget": Variant("the defaults, the whole budget for every level", stop=WHOLE, against=("reference",)),
     "no_rehearsals": expert("no lanes repeat the first success", rehearsals=0),
     "no_persistence": expert("no lanes repeat their last action", persistence=0.0),
     "horizon_64": expert("64 env steps between updates", horizon=64),

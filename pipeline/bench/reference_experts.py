@@ -2,14 +2,16 @@
 """The reference's side of `levelproof bench experts`, inside its own environment.
 
 The PPO that its users would write today: one agent per level, in the manner of PureJaxRL, vmapped over levels, with
-our experts' network and hyperparameters. One run trains fresh experts for a number of updates.
+our experts' network and hyperparameters. One run trains fresh experts for a number of updates. What these experts
+solve is measured by reference_solved.py, with the same programs.
 """
 
 import argparse
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from reference_world import load_levels, stay_on
+from reference_world import load_levels, static_of, stay_on
 from serve import serve, timed
 
 CHOICES = (3, 3, 3, 3, 2, 2)
@@ -37,7 +39,7 @@ def main() -> None:
     import jax
 
     levels = load_levels(given.levels, given.size, given.first, given.count)
-    start, update = programs(given.size, given.environments, given.horizon)
+    start, update, _ = programs(given.size, given.environments, given.horizon)
     keys = jax.random.split(jax.random.PRNGKey(given.first), given.count)
 
     def compile_both():
@@ -84,18 +86,27 @@ class Sample(NamedTuple):
     done: Any
 
 
-def programs(size: str, environments: int, horizon: int):
-    """(key, level) -> Learner, and (Learner, level) -> (Learner, (episodes ended, goals reached)), for one level."""
+class Programs(NamedTuple):
+    """Of one level and its expert."""
+
+    start: Callable  # (key, level) -> Learner
+    update: Callable  # (Learner, level) -> (Learner, (ended, reached the goal)), flags [horizon, environment]
+    # (Learner, level, key, attempts, steps) -> (actions [step, attempt, 6], ended, reached the goal)
+    evaluate: Callable
+
+
+def programs(size: str, environments: int, horizon: int) -> Programs:
+    """To be vmapped over levels."""
     import flax.linen as nn
     import jax
     import jax.numpy as jnp
     import optax
-    from kinetix.environment import EnvParams, static_env_params_from_size
+    from kinetix.environment import EnvParams
     from kinetix.environment.env import make_kinetix_env
     from kinetix.environment.spaces import ActionType, ObservationType
 
     rules = EnvParams().replace(dense_reward_scale=DENSE_REWARD)
-    static = static_env_params_from_size(size)
+    static = static_of(size)
     env = make_kinetix_env(ActionType.MULTI_DISCRETE, ObservationType.SYMBOLIC_FLAT, None, rules, static)
     ends = np.cumsum(CHOICES)[:-1].tolist()
 
@@ -117,10 +128,16 @@ def programs(size: str, environments: int, horizon: int):
         each = [jnp.take_along_axis(part, action[..., i : i + 1], -1)[..., 0] for i, part in enumerate(parts)]
         return sum(each)
 
+    def draw(key, parts):
+        draws = zip(jax.random.split(key, len(CHOICES)), parts, strict=True)
+        return jnp.stack([jax.random.categorical(k, part) for k, part in draws], -1)
+
+    reset_all = jax.vmap(env.reset, in_axes=(0, None, None))
+    step_all = jax.vmap(env.step, in_axes=(0, 0, 0, None, None))
+
     def start(key, level):
         of_network, of_worlds, kept = jax.random.split(key, 3)
-        reset = jax.vmap(env.reset, in_axes=(0, None, None))
-        observation, worlds = reset(jax.random.split(of_worlds, environments), rules, level)
+        observation, worlds = reset_all(jax.random.split(of_worlds, environments), rules, level)
         params = network.init(of_network, observation)
         return Learner(params, optimiser.init(params), worlds, observation, kept)
 
@@ -129,17 +146,15 @@ def programs(size: str, environments: int, horizon: int):
             worlds, observation = carry
             of_action, of_world = jax.random.split(key)
             parts, value = network.apply(learner.params, observation)
-            draws = zip(jax.random.split(of_action, len(CHOICES)), parts, strict=True)
-            action = jnp.stack([jax.random.categorical(k, part) for k, part in draws], -1)
-            step = jax.vmap(env.step, in_axes=(0, 0, 0, None, None))
-            after = step(jax.random.split(of_world, environments), worlds, action, rules, level)
+            action = draw(of_action, parts)
+            after = step_all(jax.random.split(of_world, environments), worlds, action, rules, level)
             seen, worlds, reward, done, info = after
             sample = Sample(observation, action, log_chance(parts, action), value, reward, done)
             return (worlds, seen), (sample, (done & info["GoalR"]))
 
         keys = jax.random.split(key, horizon)
         (worlds, observation), (samples, goals) = jax.lax.scan(act, (learner.worlds, learner.observation), keys)
-        return learner._replace(worlds=worlds, observation=observation), samples, goals.sum()
+        return learner._replace(worlds=worlds, observation=observation), samples, goals
 
     def advantages(samples, last_value):
         def back(carry, now):
@@ -181,9 +196,23 @@ def programs(size: str, environments: int, horizon: int):
 
         carry = (learner.params, learner.optimiser)
         (params, state), _ = jax.lax.scan(epoch, carry, jax.random.split(of_epochs, EPOCHS))
-        return learner._replace(params=params, optimiser=state, key=key), (samples.done.sum(), goals)
+        return learner._replace(params=params, optimiser=state, key=key), (samples.done, goals)
 
-    return start, update
+    def evaluate(learner, level, key, attempts, steps):
+        def act(carry, key):
+            worlds, observation = carry
+            of_action, of_world = jax.random.split(key)
+            parts, _ = network.apply(learner.params, observation)
+            action = draw(of_action, parts).at[0].set(jnp.stack([part[0].argmax() for part in parts]))
+            after = step_all(jax.random.split(of_world, attempts), worlds, action, rules, level)
+            seen, worlds, _, done, info = after
+            return (worlds, seen), (action, done, done & info["GoalR"])
+
+        of_worlds, of_steps = jax.random.split(key)
+        observation, worlds = reset_all(jax.random.split(of_worlds, attempts), rules, level)
+        return jax.lax.scan(act, (worlds, observation), jax.random.split(of_steps, steps))[1]
+
+    return Programs(start, update, evaluate)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The benchmark of solved levels: statistics, files that go on, tables and plots of made-up files, and a real run."""
 
+import importlib
 import json
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -7,16 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from scipy.stats import binomtest
 
 from benchmarks.solved import __main__ as command
-from benchmarks.solved import plot, tables
-from benchmarks.solved.measure import measure, rows_there
+from benchmarks.solved import original, plot, tables
+from benchmarks.solved.measure import measure, rows_there, work
 from benchmarks.solved.results import Header, count, header_of, mcnemar, read, read_all, share, wilson
-from benchmarks.solved.variants import VARIANTS, Variant
+from benchmarks.solved.variants import REFERENCE, VARIANTS, Variant
 from configs.convert import plain
-from experts.config import ExpertConfig, Rule, StopConfig
+from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from experts.labels import Label, Source
+from levelgen.actions import CHOICES
+from pipeline.bench import oracle
 from pipeline.errors import UserError
 
 SMALL = ExpertConfig(
@@ -105,13 +110,37 @@ def test_an_ablation_changes_one_thing() -> None:
     for name, variant in VARIANTS.items():
         settings = plain(variant.expert) | plain(variant.stop)
         changed = {key for key, value in settings.items() if value != default[key]}
-        if name not in ("reference", "ours"):
+        if name not in ("original", "reference", "ours"):
             assert len(changed) == 1, f"{name} changes {changed}"
-            assert variant.against in VARIANTS
+        assert set(variant.against) <= set(VARIANTS) - {name}
     assert VARIANTS["ours"].expert == ExpertConfig()
     reference = VARIANTS["reference"]
     assert (reference.expert.horizon, reference.expert.learning_rate, reference.expert.rehearsals) == (64, 3e-4, 0)
     assert reference.stop.rule == Rule.BUDGET
+
+
+def test_the_reference_has_the_hyperparameters_of_its_users(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(oracle.HERE)
+    theirs = importlib.import_module("reference_experts")
+    names = {
+        "WIDTH": "width",
+        "EPOCHS": "epochs",
+        "MINIBATCHES": "minibatches",
+        "RATE": "learning_rate",
+        "ADAM_EPSILON": "adam_epsilon",
+        "MAX_NORM": "max_gradient_norm",
+        "DISCOUNT": "discount",
+        "LAMBDA": "gae_lambda",
+        "CLIP": "clip",
+        "VALUE_WEIGHT": "value_weight",
+        "ENTROPY_WEIGHT": "entropy_weight",
+        "DENSE_REWARD": "dense_reward_scale",
+    }
+    assert {name: getattr(theirs, name) for name in names} == {name: getattr(REFERENCE, x) for name, x in names.items()}
+    assert theirs.CHOICES == CHOICES
+    there, here = VARIANTS["original"], VARIANTS["reference"]
+    assert replace(there.expert, sticky_attempts=8, moved_attempts=8) == here.expert
+    assert there.stop == here.stop
 
 
 def test_table(ours: Path, reference: Path) -> None:
@@ -126,6 +155,16 @@ def test_table(ours: Path, reference: Path) -> None:
     assert cells(paired, "`ours`, a quarter of the budget")[1:] == ["`reference`", "9", "3", "3", "1"]
     assert f"- `ours`: {VARIANTS['ours'].text}" in text
     assert text.index("| `reference` |") < text.index("| `ours` |")
+
+
+def test_a_variant_is_compared_with_several(tmp_path: Path, ours: Path, reference: Path) -> None:
+    rows = [row(FIRST + 1, "solved", 63_488, 5), row(FIRST + 9, "unsolved", 63_488)]
+    there = made_up(tmp_path / "original.jsonl", header("original"), rows)
+    paired = tables.tables(read_all([ours, reference, there])).split("Level by level:")[1]
+    assert cells(paired, "`original` | `reference`")[2:] == ["2", "1", "0", "1"]
+    assert cells(paired, "`ours` | `original`")[2:] == ["2", "0", "0", "1"]
+    assert cells(paired, "`ours` | `reference`")[2:] == ["9", "4", "1", "0.38"]
+    assert cells(paired, "`ours`, a quarter of the budget | `original`")[2:] == ["2", "0", "0", "1"]
 
 
 def test_pairs_are_of_the_levels_that_both_tried(tmp_path: Path, ours: Path) -> None:
@@ -221,9 +260,9 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
     variant = Variant("small", SMALL)
     of = Header("small", "s", 4_096, {"expert": plain(variant.expert), "stop": plain(variant.stop)})
     out = tmp_path / "folder" / "small.jsonl"
-    measure(of, variant, range(FIRST, FIRST + 2), out, 1)
+    measure(of, variant, range(FIRST, FIRST + 2), out, 1, work)
     before = out.read_text()
-    measure(of, variant, range(FIRST, FIRST + 4), out, 1)
+    measure(of, variant, range(FIRST, FIRST + 4), out, 1, work)
     assert out.read_text().startswith(before)
     results = read(out)
     assert results.header == of
@@ -233,5 +272,90 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
         assert row["env_steps"] <= 4_096
         assert min(row["cpu_s"], row["wall_s"]) > 0
     assert results.trained, "some of these levels should get an expert"
-    measure(of, variant, range(FIRST, FIRST + 4), out, 1)  # nothing left to do
+    measure(of, variant, range(FIRST, FIRST + 4), out, 1, work)  # nothing left to do
     assert read(out) == results
+
+
+def shown(ends: dict[int, list[tuple[int, bool]]], first_goal: tuple[int, int] | None) -> dict[str, np.ndarray]:
+    """What the reference's process writes of a level: the episodes' ends of each attempt, a success of training."""
+    config = VARIANTS["original"].expert
+    training = np.zeros((2, 2 * config.horizon, config.environments), bool)
+    if first_goal is not None:
+        training[:, *first_goal] = True
+        training[:, first_goal[0] + 3, 0] = True
+    flags = np.zeros((2, RECORD_STEPS, config.attempts), bool)
+    for attempt, episodes in ends.items():
+        for step, goal in episodes:
+            flags[:, step, attempt] = True, goal
+    action = np.zeros((RECORD_STEPS, config.attempts, len(CHOICES)), np.int32)
+    return dict(
+        zip(("trained_done", "trained_goal", "done", "goal", "action"), (*training, *flags, action), strict=True)
+    )
+
+
+def test_the_reference_is_judged_as_we_are() -> None:
+    """An attempt succeeds when an episode ended and all that ended reached the goal; the first one is the witness."""
+    config = VARIANTS["original"].expert
+    ends = {0: [(9, True), (19, False)], 3: [(29, True), (49, True)], 5: [(4, True)], 6: [(255, False)]}
+    verdict = original.judged(shown(ends, (66, 5)), config, False)
+    assert (verdict.label, verdict.witness, verdict.steps_to_goal) == (Label.SOLVED, Source.SAMPLED, 30)
+    assert verdict.success_rate == 3 / 4
+    assert not verdict.most_probable_succeeds
+    assert "all 2 of its finished episodes" in verdict.label_reason
+    assert verdict.steps_to_first_success == 67 * config.environments
+    assert (verdict.env_steps, verdict.episodes) == (2 * config.steps_per_update, 2)
+    assert np.isnan(verdict.sticky_success_rate)
+
+
+def test_a_level_without_a_good_attempt_is_unsolved() -> None:
+    config = VARIANTS["original"].expert
+    verdict = original.judged(shown({0: [(9, True), (19, False)]}, None), config, False)
+    assert (verdict.label, verdict.witness, verdict.steps_to_goal) == (Label.UNSOLVED, None, None)
+    assert np.isnan(verdict.success_rate), "no sampled attempt had an episode that ended"
+    assert verdict.steps_to_first_success is None
+    assert original.judged(shown({2: [(0, True)]}, None), config, False).label is Label.SOLVED
+
+
+def test_without_the_reference_there_is_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
+    out = tmp_path / "original.jsonl"
+    words = ["run", "--variant", "original", "--levels", "2", "--jobs", "1", "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", ["solved", *words])
+    assert command.main() == 1
+    assert "Cannot ask the reference for its version" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_the_original_runs(tmp_path: Path, reference: Path) -> None:
+    """Two updates of a level that gets an expert; its neighbour needs none."""
+    variant = VARIANTS["original"]
+    of = Header("original", "s", 2 * 2_048, {"expert": plain(variant.expert), "stop": plain(variant.stop)})
+    out = tmp_path / "original.jsonl"
+    wanted = range(FIRST + 9, FIRST + 11)
+    measure(of, variant, wanted, out, 1, original.work)
+    head = json.loads(out.read_text().splitlines()[0])
+    assert head["versions"]["reference"]["kinetix-env"] == "3.0.2"
+    results, ours = read(out), read(command.RESULTS / "s-64k-reference.jsonl")
+    assert list(results.rows) == list(wanted)
+    assert results.trained.keys() == ours.trained.keys() & set(wanted)
+    assert 0 < len(results.trained) < len(wanted), "one of these levels should get an expert, and one none"
+    for level_id, row in results.rows.items():
+        known = ours.rows[level_id]
+        assert list(row) == list(known), "the same fields in the same order"
+        if level_id not in results.trained:
+            spent = {"cpu_s": 0.0, "wall_s": 0.0}
+            assert row == known | spent
+            continue
+        assert row["env_steps"] == 2 * 2_048
+        assert (row["label"] == "solved") == (row["witness"] is not None) == (row["steps_to_goal"] is not None)
+        assert (row["steps_to_goal"] or 1) <= RECORD_STEPS
+        assert (row["steps_to_first_success"] or 1) <= row["env_steps"]
+        assert row["witness"] != "most probable" or row["most_probable_succeeds"]
+        assert row["sticky_success_rate"] is row["moved_success_rate"] is None
+        assert min(row["cpu_s"], row["wall_s"]) > 0
+    before = out.read_text()
+    measure(of, variant, wanted, out, 1, original.work)  # nothing left to do
+    assert out.read_text() == before

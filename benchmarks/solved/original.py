@@ -1,0 +1,176 @@
+"""The variant `original`: our levels in the reference's own environment, trained by its users' PPO.
+
+A process of the reference's Python (pipeline/bench/reference_solved.py) trains and evaluates; what an evaluation says
+of a level is judged here, as for every variant. Witnesses are not replayed: they hold in the reference's physics.
+"""
+
+import json
+import signal
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from benchmarks.solved.measure import Progress, Trained, row_of
+from benchmarks.solved.results import Header
+from benchmarks.solved.variants import Variant
+from experts.config import RECORD_STEPS, ExpertConfig
+from experts.labels import Label, Verdict
+from levelgen.level import Level
+from pipeline.bench import oracle
+from pipeline.bench.contest import Process
+from pipeline.errors import LevelproofError
+from pipeline.runtime import cache_folder, prepare_jax
+from pipeline.schedule import Summary, WorkUnit
+from pipeline.stack import device, versions
+
+WIDTH = 8  # levels that the reference trains side by side; empty places of a last batch are not charged
+NOTHING_SPENT = {"cpu_s": 0.0, "wall_s": 0.0}
+
+
+def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> None:
+    """One process, as `measure.work`; the reference's shares its core."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the first process ends the others
+    prepare_jax(core)
+    try:
+        python = oracle.oracle_python()
+        made_with = {**versions(), "reference": oracle.versions(python)}
+        with started(python, core, header, variant.expert) as reference:
+            while (unit := tasks.get()) is not None:
+                rows, summary = train(reference, header, variant.expert, unit, told.put)
+                told.put(Trained(unit, rows, summary, made_with, device()))
+    except LevelproofError as error:
+        told.put(error)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The reference's process, and the folder of arrays that go there and back."""
+
+    process: Process
+    folder: Path
+
+    def ask(self, **request: str) -> dict[str, Any]:
+        self.process.go(json.dumps(request))
+        return self.process.answer()
+
+
+@contextmanager
+def started(python: Path, core: int, header: Header, config: ExpertConfig) -> Iterator[Reference]:
+    """The process lives as long as the context.
+
+    Raises:
+        Failure: it ends early.
+    """
+    words = ["--size", header.size, "--width", WIDTH, "--core", core, "--cache", cache_folder() / "reference-jax"]
+    words += ["--environments", config.environments, "--horizon", config.horizon]
+    words += ["--attempts", config.attempts, "--steps", RECORD_STEPS]
+    command = [str(word) for word in (python, oracle.HERE / "reference_solved.py", *words)]
+    with ExitStack() as stack, tempfile.TemporaryFile("w+") as errors, tempfile.TemporaryDirectory() as folder:
+        process = Process(command, oracle.environment(), stack, errors)
+        process.wake()
+        process.answer()
+        yield Reference(process, Path(folder))
+
+
+def train(
+    reference: Reference, header: Header, config: ExpertConfig, unit: WorkUnit, tell: Callable[[Progress], None]
+) -> tuple[list[dict[str, Any]], Summary]:
+    """Lines of a unit's levels. Those that need no expert are decided here, and cost nothing.
+
+    Raises:
+        Failure: the reference's process ended.
+    """
+    import jax.numpy as jnp
+
+    from experts.before import decide
+    from experts.witness import take
+    from levelgen.level import size_of
+    from levelgen.sampler import sample_levels
+    from levelgen.task import DEFAULT_RULES
+
+    ids, updates = np.asarray(unit.level_ids, np.int32), config.updates_in(header.budget)
+    levels = sample_levels(jnp.asarray(ids), size_of(header.size))
+    before, failed = decide(levels, DEFAULT_RULES)
+    left = np.array([i for i, verdict in enumerate(before) if verdict is None], int)
+    rows = [row_of(int(i), verdict, NOTHING_SPENT, 1) for i, verdict in zip(ids, before, strict=True) if verdict]
+    known_before, solved = len(rows), 0
+    for first in range(0, len(left), WIDTH):
+        batch = left[first : first + WIDTH]
+
+        def report(share: float, first: int = first, count: int = len(batch), solved: int = solved) -> None:
+            through = first + share * count
+            steps = round(through * updates) * config.steps_per_update
+            tell(Progress(unit, (steps, known_before + through, solved)))
+
+        seconds, seen = train_batch(reference, take(levels, batch), ids[batch], updates, report)
+        verdicts = [judged(of, config, bool(failed[i])) for i, of in zip(batch, seen, strict=True)]
+        rows += [row_of(int(ids[i]), verdict, seconds, WIDTH) for i, verdict in zip(batch, verdicts, strict=True)]
+        solved += sum(verdict.label is Label.SOLVED for verdict in verdicts)
+    steps, evaluated = updates * config.steps_per_update, config.attempts * RECORD_STEPS
+    summary = Summary(len(ids), solved, len(left) * steps, len(left) * evaluated, 0)
+    return sorted(rows, key=lambda row: row["level_id"]), summary
+
+
+def train_batch(
+    reference: Reference,
+    levels: Level,
+    level_ids: Int[np.ndarray, " level"],
+    updates: int,
+    report: Callable[[float], None],
+) -> tuple[dict[str, float], list[dict[str, np.ndarray]]]:
+    """Seconds of the batch, and what the reference's process shows of each level (see `judged`).
+
+    Raises:
+        Failure: it ended.
+    """
+    from levelgen.kinetix import state_to_kinetix
+    from levelgen.task import NO_DISTANCE
+
+    worlds, out, count = reference.folder / "levels.npz", reference.folder / "out.npz", len(level_ids)
+    start = levels.state, np.zeros(count, np.int32), np.full(count, NO_DISTANCE, np.float32)
+    np.savez(worlds, level_id=level_ids, **state_to_kinetix(levels, *start))
+    reference.ask(do="begin", levels=str(worlds))
+    for update in range(updates):
+        reference.ask(do="update")
+        report((update + 1) / updates)
+    seconds = reference.ask(do="evaluate", out=str(out))
+    with np.load(out) as file:
+        seen = {name: file[name] for name in file.files}
+    return seconds, [{name: x[i] for name, x in seen.items()} for i in range(count)]
+
+
+def judged(seen: dict[str, np.ndarray], config: ExpertConfig, failed_by_noop: bool) -> Verdict:
+    """The verdict on a level, by the rules for our own experts.
+
+    Args:
+        seen: what the reference's process wrote of it: of training `trained_done` and `trained_goal` (env step,
+            environment), of the evaluation `action` (step, attempt, 6), `done` and `goal` (step, attempt).
+        config: of its expert.
+        failed_by_noop: whether doing nothing lets green touch red.
+    """
+    from experts import judge, progress
+    from experts.success import no_success
+    from experts.witness import succeeds
+
+    done, goal = seen["trained_done"], seen["trained_goal"]
+    unknown = np.zeros(config.environments, np.float32), np.float32(np.nan)  # returns
+    totals = progress.Progress(*unknown, done.sum(), np.int64(done.size), first_success(goal))
+    evaluation = judge.Evaluation(np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, no_success())
+    witness = judge.witness_of([evaluation], config)
+    of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))
+    episodes = int(seen["done"][:, of_witness].sum())
+    return judge.verdict_of(judge.Trained([], [evaluation]), witness, episodes, False, config, failed_by_noop)
+
+
+def first_success(goal: Bool[np.ndarray, "step environment"]) -> int:
+    """Env steps of training until then, those of all environments."""
+    from experts.progress import NEVER
+
+    reached = goal.any(1)
+    return int((np.argmax(reached) + 1) * goal.shape[1]) if reached.any() else NEVER

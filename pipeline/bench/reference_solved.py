@@ -1,0 +1,97 @@
+# pyright: reportMissingImports=false
+"""The reference's side of `python -m benchmarks.solved run --variant original`, inside its own environment.
+
+Trains and evaluates the experts of reference_experts.py. Answers requests (see serve.py):
+    begin     fresh experts for the levels of the file `levels`, with their `level_id`
+    update    one update of all of them
+    evaluate  writes to the file `out` what training and then an evaluation showed, level axis first, and answers with
+              the seconds since `begin`
+"""
+
+import argparse
+import time
+
+import numpy as np
+from reference_experts import programs
+from reference_world import load_levels, stay_on
+from serve import answer
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--size", required=True)
+    parser.add_argument("--width", type=int, required=True, help="levels side by side; a file may have fewer")
+    parser.add_argument("--environments", type=int, required=True)
+    parser.add_argument("--horizon", type=int, required=True)
+    parser.add_argument("--attempts", type=int, required=True, help="of an evaluation")
+    parser.add_argument("--steps", type=int, required=True, help="env steps of an attempt")
+    parser.add_argument("--cache", required=True, help="folder for compiled code")
+    parser.add_argument("--core", type=int)
+    given = parser.parse_args()
+    stay_on(given.core)
+
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", given.cache)
+    answer({}, Batch(given).answer)
+
+
+class Batch:
+    """Levels and their experts, side by side."""
+
+    def __init__(self, given: argparse.Namespace) -> None:
+        import jax
+
+        def evaluate(learner, level, key):
+            return of_one.evaluate(learner, level, key, given.attempts, given.steps)
+
+        of_one = programs(given.size, given.environments, given.horizon)
+        self.given, self.compiled = given, False
+        self.start_all, self.update_all, self.evaluate_all = (
+            jax.jit(jax.vmap(program)) for program in (of_one.start, of_one.update, evaluate)
+        )
+
+    def answer(self, request: dict) -> dict:
+        if not self.compiled:  # which is not measured
+            self.begin(request["levels"])
+            self.update()
+            self.results()
+            self.compiled = True
+        match request["do"]:
+            case "begin":
+                self.begin(request["levels"])
+            case "update":
+                self.update()
+            case "evaluate":
+                np.savez(request["out"], **self.results())  # pyright: ignore[reportArgumentType]
+                wall, cpu = self.since
+                return {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
+        return {}
+
+    def begin(self, path: str) -> None:
+        import jax
+
+        self.since = time.perf_counter(), time.process_time()
+        with np.load(path) as file:
+            ids = file["level_id"]
+        self.count = len(ids)
+        self.levels = load_levels(path, self.given.size, 0, self.given.width)
+        seeds = np.resize(ids, self.given.width).astype(np.uint32)
+        keys = jax.vmap(lambda seed: jax.random.split(jax.random.PRNGKey(seed)))(seeds)
+        self.of_evaluation = keys[:, 1]
+        self.learner, self.seen = self.start_all(keys[:, 0], self.levels), []
+
+    def update(self) -> None:
+        self.learner, flags = self.update_all(self.learner, self.levels)
+        self.seen.append([np.asarray(x) for x in flags])
+
+    def results(self) -> dict[str, np.ndarray]:
+        """Flags of training (level, env step, environment); actions and flags of evaluation (level, step, attempt)."""
+        trained = (np.concatenate(x, 1) for x in zip(*self.seen, strict=True))
+        evaluated = (np.asarray(x) for x in self.evaluate_all(self.learner, self.levels, self.of_evaluation))
+        names = ("trained_done", "trained_goal", "action", "done", "goal")
+        return {name: x[: self.count] for name, x in zip(names, (*trained, *evaluated), strict=True)}
+
+
+if __name__ == "__main__":
+    main()
