@@ -4,45 +4,61 @@ Most features are constant within a level, so the first layer folds them into it
 that move. That is the same function of the whole observation, at a sixth of its cost for size s.
 """
 
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import flax.linen as nn
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
 from levelgen.level import Level
-from levelgen.observe import dynamic_features, level_features
+from levelgen.observe import dynamic_features, feature_count, level_features
 from physics.types import Size
 from physics.vector import rows
 
 
-class FirstDense(nn.Module):
-    """A layer on the whole observation, given as its constant part (0 where it moves) and its moving rows."""
+class Kernel(NamedTuple):
+    """Of a first layer, in two: taking columns out of one would cost more than all products, backwards even more."""
 
+    moving: Float[Array, "unit dynamic"]
+    constant: Float[Array, "unit resting"]
+
+
+def resting_features(size: Size) -> Int[np.ndarray, " resting"]:
+    """Rows of the observation that cannot change within a level, ascending."""
+    return np.setdiff1d(np.arange(feature_count(size)), dynamic_features(size))
+
+
+class FirstDense(nn.Module):
+    """A layer on the whole observation, given as its constant and its moving rows."""
+
+    size: Size
     units: int
     gain: float
-    moving_rows: Sequence[int]
 
     @nn.compact
     def __call__(
-        self, constant: Float[Array, " feature"], moving: Float[Array, "dynamic lane"]
+        self, constant: Float[Array, " resting"], moving: Float[Array, "dynamic lane"]
     ) -> Float[Array, "unit lane"]:
-        kernel = self.param("kernel", orthogonal(self.gain), (self.units, constant.shape[0]))
+        def initial(key: Array) -> Kernel:
+            whole = orthogonal(self.gain)(key, (self.units, feature_count(self.size)))
+            return Kernel(whole[:, dynamic_features(self.size)], whole[:, resting_features(self.size)])
+
+        kernel = self.param("kernel", initial)
         bias = self.param("bias", nn.initializers.zeros, (self.units,))
-        columns = rows(kernel.T, self.moving_rows)
-        return columns.T @ moving + (bias + kernel @ constant)[:, None]
+        return kernel.moving @ moving + (bias + kernel.constant @ constant)[:, None]
 
 
 class Trunk(nn.Module):
+    size: Size
     width: int
     depth: int
     outputs: int
     gain: float
-    moving_rows: Sequence[int]
 
     @nn.compact
-    def __call__(self, constant: Float[Array, " feature"], moving: Float[Array, "dynamic lane"]) -> Array:
-        x = nn.tanh(FirstDense(self.width, HIDDEN_GAIN, self.moving_rows)(constant, moving))
+    def __call__(self, constant: Float[Array, " resting"], moving: Float[Array, "dynamic lane"]) -> Array:
+        x = nn.tanh(FirstDense(self.size, self.width, HIDDEN_GAIN)(constant, moving))
         for _ in range(self.depth - 1):
             x = nn.tanh(Dense(self.width, HIDDEN_GAIN)(x))
         return Dense(self.outputs, self.gain)(x)
@@ -56,15 +72,14 @@ class FlatNetwork(nn.Module):
     depth: int  # hidden layers
 
     @staticmethod
-    def constant(levels: Level) -> Float[Array, "feature level"]:
-        """What is constant within each level; zeros where it moves."""
-        return level_features(levels)
+    def constant(levels: Level) -> Float[Array, "resting level"]:
+        """What is constant within each level."""
+        return rows(level_features(levels), resting_features(levels.size).tolist())
 
     @nn.compact
     def __call__(
-        self, constant: Float[Array, " feature"], moving: Float[Array, "dynamic lane"]
+        self, constant: Float[Array, " resting"], moving: Float[Array, "dynamic lane"]
     ) -> tuple[Float[Array, "logit lane"], Float[Array, " lane"]]:
-        moving_rows = tuple(dynamic_features(self.size).tolist())
-        logits = Trunk(self.width, self.depth, LOGITS, POLICY_GAIN, moving_rows, name="policy")(constant, moving)
-        value = Trunk(self.width, self.depth, 1, VALUE_GAIN, moving_rows, name="value")(constant, moving)
-        return logits, value[0]
+        trunk = lambda outputs, gain, name: Trunk(self.size, self.width, self.depth, outputs, gain, name=name)
+        logits = trunk(LOGITS, POLICY_GAIN, "policy")(constant, moving)
+        return logits, trunk(1, VALUE_GAIN, "value")(constant, moving)[0]

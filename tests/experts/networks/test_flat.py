@@ -5,47 +5,61 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.networks.flat import FlatNetwork
+from experts.networks.flat import FlatNetwork, resting_features
 from experts.policy import Params, forward, initial
 from levelgen.level import SIZES
-from levelgen.observe import dynamic_features, feature_count
+from levelgen.observe import dynamic_features, feature_count, level_features
+from levelgen.sampler import sample_levels
 
 SIZE = SIZES["s"]
+MOVING, STILL = dynamic_features(SIZE), resting_features(SIZE)
 
 
 @pytest.fixture(scope="module")
 def network() -> tuple[FlatNetwork, Params]:
     network = FlatNetwork(SIZE, width=8, depth=2)
-    params = initial(jax.random.key(0), network, jnp.zeros(feature_count(SIZE)))
+    params = initial(jax.random.key(0), network, jnp.zeros(len(STILL)))
     return network, jax.tree.map(lambda x: x + 0.1, params)  # biases count too
+
+
+def whole_kernel(layer: dict) -> np.ndarray:
+    kernel = np.empty((8, feature_count(SIZE)), np.float32)
+    kernel[:, MOVING], kernel[:, STILL] = layer["kernel"].moving, layer["kernel"].constant
+    return kernel
 
 
 def test_folding_constant_features_is_the_network_of_the_whole_observation(network) -> None:
     net, params = network
     rng, lanes = np.random.default_rng(0), 5
     whole = rng.normal(size=(feature_count(SIZE), lanes)).astype(np.float32)
-    still = np.setdiff1d(np.arange(len(whole)), dynamic_features(SIZE))
-    whole[still] = whole[still, :1]
-    constant = whole[:, 0].copy()
-    constant[dynamic_features(SIZE)] = 0
+    whole[STILL] = whole[STILL, :1]
 
-    logits, value = forward(net, params, constant, whole[dynamic_features(SIZE)])
+    logits, value = forward(net, params, whole[STILL, 0], whole[MOVING])
 
     def plain(name):
-        x = whole
-        for layer in ("FirstDense_0", "Dense_0"):
-            p = params["params"][name][layer]
-            x = np.tanh(p["kernel"] @ x + p["bias"][:, None])
-        p = params["params"][name]["Dense_1"]
-        return p["kernel"] @ x + p["bias"][:, None]
+        first, second, last = (params["params"][name][layer] for layer in ("FirstDense_0", "Dense_0", "Dense_1"))
+        x = np.tanh(whole_kernel(first) @ whole + first["bias"][:, None])
+        x = np.tanh(second["kernel"] @ x + second["bias"][:, None])
+        return last["kernel"] @ x + last["bias"][:, None]
 
     np.testing.assert_allclose(logits, plain("policy"), atol=1e-5)
     np.testing.assert_allclose(value, plain("value")[0], atol=1e-5)
 
 
+def test_the_first_kernel_starts_with_orthogonal_rows_as_a_whole() -> None:
+    params = initial(jax.random.key(0), FlatNetwork(SIZE, width=8, depth=2), jnp.zeros(len(STILL)))
+    kernel = whole_kernel(params["params"]["policy"]["FirstDense_0"])  # type: ignore[index]
+    np.testing.assert_allclose(kernel @ kernel.T, 2 * np.eye(8), atol=1e-5)
+
+
+def test_what_is_constant_of_a_level() -> None:
+    levels = sample_levels(np.arange(3), SIZE)
+    np.testing.assert_array_equal(FlatNetwork.constant(levels), np.asarray(level_features(levels))[STILL])
+    assert not np.asarray(level_features(levels))[MOVING].any()
+
+
 def test_gradient_reaches_kernels_of_constant_features(network) -> None:
     net, params = network
-    constant = jnp.full(feature_count(SIZE), 0.01).at[dynamic_features(SIZE)].set(0)
-    loss = lambda p: forward(net, p, constant, jnp.full((len(dynamic_features(SIZE)), 3), 0.01))[1].sum()
-    kernel = jax.grad(loss)(params)["params"]["value"]["FirstDense_0"]["kernel"]
+    loss = lambda p: forward(net, p, jnp.full(len(STILL), 0.01), jnp.full((len(MOVING), 3), 0.01))[1].sum()
+    kernel = whole_kernel(jax.grad(loss)(params)["params"]["value"]["FirstDense_0"])
     assert (np.abs(kernel) > 0).all()
