@@ -74,7 +74,8 @@ class Slot:
 
     def take(self, queue: Queue) -> bool:
         """Start the queue's next unit here, if there is room for it."""
-        if self.running and (self.wants <= 0 or len(self.running) == MOST_UNITS):
+        died = self.actor is None  # while units run: what is left of them fails in a moment
+        if self.running and (died or self.wants <= 0 or len(self.running) == MOST_UNITS):
             return False
         unit = queue.take(alone=not self.running)
         if unit is None:
