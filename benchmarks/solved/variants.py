@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from experts.config import Choice, ExpertConfig, Rule, StopConfig
+from experts.config import Choice, ExpertConfig, Network, Rule, StopConfig
 
 # Each one is written out: other defaults of ours do not change the reference. Its evaluation is ours, so that both are
 # judged alike.
@@ -72,5 +72,6 @@ VARIANTS: Mapping[str, Variant] = {
     "successes_8": stop("solved when 8 attempts of an evaluation succeed", successes=8),
     "exploration": expert("a success of training is a witness, too", exploration=True),
     "shortest": expert("the shortest success of any attempt is the witness", witness=Choice.SHORTEST),
+    "entity": expert("the network on sets of things", network=Network.ENTITY),
     "halving": stop("a level also leaves at a rung where its learning does not move", rule=Rule.HALVING),
 }
