@@ -32,14 +32,6 @@ class Kept(NamedTuple):
     curve: list[float]  # so far, as in `Trained`
 
 
-class Trained(NamedTuple):
-    """A level that has left its slot."""
-
-    curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
-    evaluations: list[Evaluation]  # those that solved it, and the last
-    expert: Kept | None = None  # if it is kept
-
-
 class Witness(NamedTuple):
     """Actions that reach the goal."""
 
@@ -48,9 +40,17 @@ class Witness(NamedTuple):
     steps: int  # of the first episode
 
 
+class Trained(NamedTuple):
+    """A level that has left its slot."""
+
+    curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
+    evaluations: list[Evaluation]  # those that solved it, and the last
+    expert: Kept | None = None  # if it is kept
+    witness: Witness | None = None  # the best, not yet replayed
+
+
 def judge(
     trained: Sequence[Trained],
-    witnesses: Sequence[Witness | None],
     record: Record,
     updates: int,
     config: ExpertConfig,
@@ -62,9 +62,9 @@ def judge(
     """
     replays, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
     verdicts = []
-    for i, (of, witness) in enumerate(zip(trained, witnesses, strict=True)):
-        if witness is not None and not (replays[i] and steps[i] == witness.steps):
-            witness = None
+    for i, of in enumerate(trained):
+        counts = of.witness is not None and replays[i] and steps[i] == of.witness.steps
+        witness = of.witness if counts else None
         episodes, halted = int(record.done[:, i].sum()), len(of.curve) < updates
         verdicts.append(verdict_of(of, witness, episodes, halted, config, bool(failed_by_noop[i])))
     return verdicts

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Int
 
 from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
-from experts.judge import Evaluation, Kept, Trained, witness_of
+from experts.judge import Evaluation, Kept, Trained, Witness, witness_of
 from experts.queue import BLOCK, empty_queue, enter, next_places
 from experts.slots import Begun, Mode, Queue, Report, Slots, advance, empty_slots
 from experts.witness import take
@@ -54,12 +54,13 @@ class Batch:
         self.curves = [list(begun[i].curve) if i in begun else [] for i in range(count)]
         self.evaluations: list[list[Evaluation]] = [[] for _ in range(count)]
         self.experts: list[Kept | None] = [None] * count
+        self.witnesses: list[Witness | None] = [None] * count
         self.under_way = set(range(count))
         self.solved = 0
         self.rollouts: Counter[int] = Counter()  # by mode
 
     def trained(self) -> list[Trained]:
-        return [Trained(*of) for of in zip(self.curves, self.evaluations, self.experts, strict=True)]
+        return [Trained(*of) for of in zip(self.curves, self.evaluations, self.experts, self.witnesses, strict=True)]
 
     def spent(self, config: ExpertConfig) -> Spent:
         modes = Mode.TRAIN, Mode.EVALUATE, Mode.EMPTY
@@ -187,7 +188,8 @@ class Pool:
         if seen.left[slot]:
             if batch.keep:
                 batch.experts[i] = Kept(expert_of(self._slots, slot, self.config), batch.curves[i])
-            batch.solved += witness_of(batch.evaluations[i], self.config) is not None
+            batch.witnesses[i] = witness_of(batch.evaluations[i], self.config)
+            batch.solved += batch.witnesses[i] is not None
             del self._at[place]
             batch.under_way.remove(i)
 

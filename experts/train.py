@@ -11,7 +11,7 @@ import numpy as np
 
 from experts.before import decide
 from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
-from experts.judge import Kept, judge, witness_of
+from experts.judge import Kept, judge
 from experts.labels import WITNESSED, Label, Verdict
 from experts.pool import NOTHING_BEGUN, Pool, Spent, Tell, quiet
 from experts.witness import Record, replay, take
@@ -92,13 +92,12 @@ def train_in(
     tell_all = lambda env_steps, through, solved: tell(env_steps, known_before + through, solved)
     mine = {place: begun[level_id] for place, level_id in enumerate(level_ids[left].tolist()) if level_id in begun}
     trained, spent = pool.train(take(levels, left), level_ids[left], tell_all, mine, keep)
-    witnesses = [witness_of(of.evaluations, pool.config) for of in trained]
     actions = np.zeros((RECORD_STEPS, ACTIONS, len(level_ids)), np.int32)  # doing nothing, where none are found
-    for i, witness in zip(left, witnesses, strict=True):
-        if witness is not None:
-            actions[..., i] = witness.action
+    for i, of in zip(left, trained, strict=True):
+        if of.witness is not None:
+            actions[..., i] = of.witness.action
     record = replay(levels, actions, pool.rules)
-    judged = judge(trained, witnesses, take(record, left), pool.updates, pool.config, failed[left])
+    judged = judge(trained, take(record, left), pool.updates, pool.config, failed[left])
     verdicts = {int(i): verdict for i, verdict in zip(left, judged, strict=True)}
     known = [verdict or verdicts[i] for i, verdict in enumerate(before)]
     witnessed = np.array([verdict.label in WITNESSED for verdict in known])
