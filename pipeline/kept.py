@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import jax
@@ -18,6 +19,8 @@ from levelgen.level import size_of
 from levelgen.sampler import sample_levels
 from pipeline.errors import Failure, UserError
 from pipeline.manifest import differences, read_manifest, require_manifest, told
+
+ORBAX = Lock()  # it numbers its operations by process: two at once wait for each other's files, for ever
 
 
 def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
@@ -35,7 +38,7 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
         curves[place, : len(row.curve)] = row.curve
     begun = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows))
     tree = {"level_id": np.array(sorted(experts)), "curve": curves, "begun": begun}
-    with ocp.StandardCheckpointer() as checkpointer:
+    with ORBAX, ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path.absolute(), tree)
 
 
@@ -50,7 +53,7 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
     level = sample_levels(jnp.zeros(1, jnp.int32), size_of(job.size), job.distribution)
     like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), job.expert), level)
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
+        with ORBAX, ocp.StandardCheckpointer() as checkpointer:
             found = checkpointer.metadata(path.absolute()).item_metadata.tree
             count, longest = found["curve"].shape
             shaped = {
