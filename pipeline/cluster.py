@@ -5,7 +5,7 @@ Workers write their shards and fragments themselves; only summaries travel. Know
 
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,11 +24,10 @@ from ray.exceptions import RayError
 from configs.schema import JobConfig
 from pipeline.progress import Board
 from pipeline.runtime import interruptible, own_cores, prepare_jax
-from pipeline.schedule import Outcome, Queue, WorkUnit
+from pipeline.schedule import COMPANY, Outcome, Queue, WorkUnit
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s between looks at the workers
-MOST_UNITS = 64  # in a worker at once
 
 
 class Worker:
@@ -75,17 +74,17 @@ class Slot:
     def take(self, queue: Queue) -> bool:
         """Start the queue's next unit here, if there is room for it."""
         died = self.actor is None  # while units run: what is left of them fails in a moment
-        if self.running and (died or self.wants <= 0 or len(self.running) == MOST_UNITS):
+        if self.running and (died or self.wants <= 0):
             return False
-        unit = queue.take(alone=not self.running)
+        unit = queue.take(self.running.values())
         if unit is None:
             return False
         if self.actor is None:
             # one thread for each unit, and one that answers `progress`
-            options = {"num_cpus": 1, "num_gpus": self.gpus, "max_concurrency": MOST_UNITS + 1, "max_restarts": 0}
+            options = {"num_cpus": 1, "num_gpus": self.gpus, "max_concurrency": max(COMPANY) + 1, "max_restarts": 0}
             self.actor = ray.remote(Worker).options(**options).remote(self.job, self.split, self.core)
         self.running[self.actor.attempt.remote(unit)] = unit
-        self.wants = 0 if unit in queue.attempts else self.wants - len(unit.level_ids)
+        self.wants -= len(unit.level_ids)
         self.look = None  # the last one did not see this unit
         return True
 
@@ -99,7 +98,7 @@ class Slot:
             sentence = str(error).strip().splitlines()[0]
             return Outcome(unit, reason=f"{error}\n\nThe worker died: {sentence}")
 
-    def watch(self, board: Board, queue: Queue) -> None:
+    def watch(self, board: Board) -> None:
         """Fetch the worker's progress when it is there, without waiting."""
         if self.actor is None:
             return
@@ -108,17 +107,15 @@ class Slot:
             if not ray.wait([self.look], timeout=0)[0]:
                 return
             try:
-                totals, wants = ray.get(self.look)
+                totals, self.wants = ray.get(self.look)
             except RayError:  # its attempts fail, too, and are dealt with there
                 return
             for name in totals.keys() & units.keys():
                 board.tally.progress(units[name], *totals[name])
-            alone = any(unit in queue.attempts for unit in units.values())
-            self.wants = 0 if alone else wants
         self.look = self.actor.progress.remote(list(units))
 
 
-def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Outcome], None], board: Board) -> None:
+def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Sequence[Outcome]], None], board: Board) -> None:
     """Work on the queue until it is empty."""
     with connected():
         slots = [Slot(job, split.absolute(), *of) for of in _places()[: job.workers or None]]
@@ -128,10 +125,10 @@ def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Outcome], N
             busy = {result: slot for slot in slots for result in slot.running}
             if not busy:
                 return
-            for result in ray.wait(list(busy), num_returns=len(busy), timeout=POLL)[0]:
-                settle(busy[result].outcome(result))
+            ended = ray.wait(list(busy), num_returns=len(busy), timeout=POLL)[0]
+            settle([busy[result].outcome(result) for result in ended])
             for slot in slots:
-                slot.watch(board, queue)
+                slot.watch(board)
             board.refresh()
 
 

@@ -14,7 +14,7 @@ from pipeline.kept import require_same_experts
 from pipeline.layout import quarantine_path
 from pipeline.manifest import Manifest, read_manifest
 from pipeline.progress import Board, Tally
-from pipeline.schedule import ATTEMPTS, Outcome, Queue, plan_units
+from pipeline.schedule import Outcome, Queue, WorkUnit, levels_text, plan_units
 from pipeline.split import note_job, writing
 
 
@@ -59,21 +59,25 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
 
 
 def _work(job: JobConfig, split: Path, queue: Queue, board: Board) -> None:
-    def settle(outcome: Outcome) -> None:
-        """Account for an attempt that ended."""
-        board.ended(outcome.unit, outcome.summary)
-        if outcome.fatal:
-            raise Failure(outcome.fatal)
-        note = quarantine_path(split, outcome.unit.name)
-        if outcome.summary:
-            note.unlink(missing_ok=True)
-            return
-        cause = outcome.reason.strip().splitlines()[-1]
-        last = queue.failed(outcome.unit)
-        board.say(f"Levels {outcome.unit.text} failed ({cause}){': given up.' if last else ': trying again.'}")
-        if last:
-            note.parent.mkdir(exist_ok=True)
-            note.write_text(f"Failed {ATTEMPTS} times, the last time with:\n\n{outcome.reason}\n")
+    def settle(outcomes: Sequence[Outcome]) -> None:
+        """Account for attempts that ended together."""
+        failed: dict[tuple[str, bool], list[WorkUnit]] = {}  # by cause, and whether they are given up
+        for outcome in outcomes:
+            unit = outcome.unit
+            board.ended(unit, outcome.summary)
+            if outcome.fatal:
+                raise Failure(outcome.fatal)
+            note = quarantine_path(split, unit.name)
+            if outcome.summary:
+                note.unlink(missing_ok=True)
+                continue
+            last = queue.failed(unit)
+            failed.setdefault((outcome.reason.strip().splitlines()[-1], last), []).append(unit)
+            if last:
+                note.parent.mkdir(exist_ok=True)
+                note.write_text(f"Failed {queue.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n")
+        for (cause, last), units in failed.items():
+            board.say(f"{levels_text(units).capitalize()} failed ({cause}): {'given up' if last else 'trying again'}.")
 
     if job.executor == "inline":
         from pipeline.inline import run
@@ -118,7 +122,7 @@ def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: Qu
     if spent:
         print(spent)
     for unit in queue.quarantined:
-        print(f"Given up: levels {unit.text}, for the reason in {quarantine_path(split, unit.name)}")
+        print(f"Given up: {levels_text([unit])}, for the reason in {quarantine_path(split, unit.name)}")
     if total:
         print(f"Next:  levelproof inspect {folder}")
     solved = manifest.level_ids[manifest.labels == "solved"]

@@ -1,12 +1,17 @@
 """What is left to do: work units, their attempts and their quarantine. Knows nothing of workers or files."""
 
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from pipeline.layout import unit_name
 
-ATTEMPTS = 3  # at a unit before it is quarantined
+# How many units a worker may have at once, those included that failed as often: a unit that kills its worker takes
+# fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.
+COMPANY = (64, 8, 1)
+TOLD = 4  # runs of levels in a message
 
 
 @dataclass(frozen=True)
@@ -18,11 +23,6 @@ class WorkUnit:
     @property
     def name(self) -> str:
         return unit_name(self.level_ids[0], self.level_ids[-1])
-
-    @property
-    def text(self) -> str:
-        """For people: `16 to 31`."""
-        return f"{self.level_ids[0]} to {self.level_ids[-1]}"
 
 
 def plan_units(wanted: Iterable[int], done: Collection[int], unit: int) -> list[WorkUnit]:
@@ -70,21 +70,36 @@ class Queue:
     def of(cls, units: Iterable[WorkUnit]) -> "Queue":
         return cls(deque(units))
 
-    def take(self, alone: bool) -> WorkUnit | None:
-        """The next unit to work on; None when no more wait.
-
-        A unit that has failed goes only to a worker that has no other (`alone`): it must not take others with it.
-        Such units wait behind all that have not failed.
-        """
-        if not self.waiting or (self.waiting[0] in self.attempts and not alone):
-            return None
-        return self.waiting.popleft()
+    def take(self, running: Collection[WorkUnit] = ()) -> WorkUnit | None:
+        """The next unit for a worker that has these; None when none may join them (see `COMPANY`)."""
+        failures = {self.attempts.get(unit, 0) for unit in running}
+        for unit in self.waiting:
+            others = self.attempts.get(unit, 0)
+            if not failures or (failures == {others} and len(running) < COMPANY[others]):
+                self.waiting.remove(unit)
+                return unit
+        return None
 
     def failed(self, unit: WorkUnit) -> bool:
         """Note a failed attempt; the unit waits again, or True when it is now quarantined."""
         self.attempts[unit] = self.attempts.get(unit, 0) + 1
-        if self.attempts[unit] < ATTEMPTS:
+        if self.attempts[unit] < len(COMPANY):
             self.waiting.append(unit)
             return False
         self.quarantined.append(unit)
         return True
+
+
+def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of each run of consecutive numbers, ascending."""
+    ordered = np.unique(np.asarray(numbers, np.int64))
+    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
+
+
+def levels_text(units: Iterable[WorkUnit]) -> str:
+    """Their levels, for people: `levels 0 to 31, 96 to 127`."""
+    ids = [level_id for unit in units for level_id in unit.level_ids]
+    of = [f"{first} to {last}" if last > first else f"{first}" for first, last in runs(ids)]
+    more = f" and {len(of) - TOLD} more runs of levels" if len(of) > TOLD else ""
+    return f"level{'s' if len(ids) > 1 else ''} {', '.join(of[:TOLD])}{more}"

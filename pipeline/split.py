@@ -8,13 +8,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-
 from configs.schema import JobConfig
 from pipeline.errors import UserError
 from pipeline.layout import EXPERTS, JOB, MANIFEST, SHARDS, split_path
 from pipeline.locks import Locked, nobody_commits, only_writer
 from pipeline.manifest import Manifest, differences, read_manifest, told
+from pipeline.schedule import runs
 
 
 @contextmanager
@@ -81,13 +80,6 @@ def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequen
     temporary = split / f".{JOB}.{os.getpid()}"
     temporary.write_text(json.dumps(note, indent=2) + "\n")
     temporary.replace(split / JOB)
-
-
-def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """First and last of each run of consecutive numbers, ascending."""
-    ordered = np.unique(np.asarray(numbers, np.int64))
-    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
-    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
 
 
 def _make_writable(split: Path) -> None:

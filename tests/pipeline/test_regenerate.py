@@ -12,7 +12,6 @@ from pipeline.errors import Failure, UserError
 from pipeline.kept import load_experts, require_same_experts
 from pipeline.manifest import read_manifest
 from pipeline.regenerate import split_words
-from pipeline.split import runs
 from pipeline.verify import examine
 from tests.pipeline.command import run
 from tests.pipeline.made import made_job
@@ -128,9 +127,3 @@ def test_a_manifest_that_is_not_there_is_named(tmp_path: Path) -> None:
     done = run(["regenerate", "manifest=data/8k/s", "budget=1M"], tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("Error: There is no split at data/8k/s")
-
-
-def test_runs_of_numbers() -> None:
-    assert runs([5, 1, 2, 3, 9, 8, 5]) == [(1, 3), (5, 5), (8, 9)]
-    assert runs([]) == []
-    assert runs(range(64)) == [(0, 63)]
