@@ -1,5 +1,7 @@
 """The entity network against the plain formula on unfolded entities, and what the order of things does: nothing."""
 
+from functools import cache, partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,11 +22,16 @@ LEVELS = 6
 FROM_TANH = 1e-5  # float32, sums of a few hundred terms
 
 
+@cache
 def network_of(name: str) -> tuple[EntityNetwork, Params]:
     network = EntityNetwork(SIZES[name], width=8, depth=2, encoding=12)
-    constant = jax.tree.map(lambda x: x[..., 0], network.constant(sample_levels(jnp.arange(1), network.size)))
-    params = initial(jax.random.key(0), network, constant)
-    return network, jax.tree.map(lambda x: x + 0.1, params)  # biases count too
+    return network, jax.tree.map(lambda x: x + 0.1, first(network))  # biases count too
+
+
+def first(network: EntityNetwork) -> Params:
+    """The parameters with which training starts."""
+    constant = jax.jit(network.constant)(sample_levels(jnp.arange(1), network.size))
+    return jax.jit(initial, static_argnums=1)(jax.random.key(0), network, jax.tree.map(lambda x: x[..., 0], constant))
 
 
 def moved(state: State, rng: np.random.Generator) -> State:
@@ -39,14 +46,15 @@ def moved(state: State, rng: np.random.Generator) -> State:
     return jax.tree.map(jnp.asarray, State(**vars(state) | {name: change(getattr(state, name)) for name in fields}))
 
 
-def outputs(network: EntityNetwork, params: Params, level: Level, state: State) -> np.ndarray:
+@partial(jax.jit, static_argnums=0)
+def outputs(network: EntityNetwork, params: Params, level: Level, state: State) -> jax.Array:
     """(logits and value, lane): every lane is a level of its own."""
 
     def one(constant, moving):
         logits, value = forward(network, params, constant, moving[:, None])
         return jnp.concatenate([logits[:, 0], value])
 
-    return np.asarray(jax.vmap(one, in_axes=-1, out_axes=-1)(network.constant(level), state_features(level, state)))
+    return jax.vmap(one, in_axes=-1, out_axes=-1)(network.constant(level), state_features(level, state))
 
 
 def plain(params: Params, seen: EntityObservation, lane: int) -> np.ndarray:
@@ -79,9 +87,9 @@ def plain(params: Params, seen: EntityObservation, lane: int) -> np.ndarray:
 @pytest.mark.parametrize("name", SIZES)
 def test_is_the_plain_formula_on_entities(name: str) -> None:
     network, params = network_of(name)
-    level = sample_levels(jnp.arange(LEVELS), network.size)
+    level = jax.tree.map(jnp.asarray, sample_levels(jnp.arange(LEVELS), network.size))
     state = moved(level.state, np.random.default_rng(0))
-    ours, seen = outputs(network, params, level, state), entities(level, state)
+    ours, seen = np.asarray(outputs(network, params, level, state)), jax.jit(entities)(level, state)
     for lane in range(LEVELS):
         np.testing.assert_allclose(ours[:, lane], plain(params, seen, lane), atol=FROM_TANH)
     assert np.ptp(ours, axis=1).min() > 1e-3  # levels differ
@@ -94,7 +102,7 @@ def test_the_order_of_things_does_not_matter(name: str, seed: int) -> None:
     network, params = network_of(name)
     level = sample_levels(jnp.arange(LEVELS), network.size)
     draws = jax.random.uniform(jax.random.key(seed), (places(network.size), LEVELS))
-    other = shuffle(level, OrderDraws(draws))
+    other = jax.jit(shuffle)(level, OrderDraws(draws))
     ours, others = (outputs(network, params, x, x.state) for x in (level, other))
     np.testing.assert_allclose(ours, others, atol=FROM_TANH)
 
@@ -104,8 +112,7 @@ def test_a_size_may_lack_kinds() -> None:
     size = SIZES["s"]._replace(circles=0, thrusters=0, polygons=7)
     level = sample_levels(jnp.arange(2), size)
     network = EntityNetwork(size, width=8, depth=1, encoding=4)
-    constant = network.constant(level)
-    params = initial(jax.random.key(0), network, jax.tree.map(lambda x: x[..., 0], constant))
+    params = first(network)
     assert set(params["params"]["policy"]) == {"polygons", "joints", "Dense_0"}
     assert np.isfinite(outputs(network, params, level, level.state)).all()
 
@@ -113,7 +120,7 @@ def test_a_size_may_lack_kinds() -> None:
 def test_gradient_reaches_every_parameter() -> None:
     network, params = network_of("m")
     size, rng = network.size, np.random.default_rng(0)
-    constant = network.constant(sample_levels(jnp.arange(1), size))
+    constant = jax.jit(network.constant)(sample_levels(jnp.arange(1), size))
     constant = jax.tree.map(lambda x: rng.uniform(0.1, 0.3, x.shape[:-1]).astype(np.float32), constant)
     moving = rng.uniform(0.1, 0.3, (7 * (size.bodies - FIXED_POLYGONS), 3)).astype(np.float32)
 
