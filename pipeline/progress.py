@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColum
 from pipeline.schedule import Summary, WorkUnit
 
 LINE_EVERY = 30.0  # s between plain lines
+LINE_AFTER = 2.0  # s between one and the next commit that is told; the last commit always is
 RATE_OVER = 20.0  # s over which env steps/s are averaged
 
 
@@ -85,10 +86,14 @@ class Tally:
 
     def text(self, now: float) -> str:
         left = self.left(now)
-        tail = f"about {duration(left)} left" if left is not None else "compiling" if not self.rate else "..."
-        return (
-            f"{self.trained}/{self.levels} levels · {self.solved_so_far} solved · {self.rate:,.0f} env steps/s · {tail}"
-        )
+        pace = f"{self.rate:,.0f} env steps/s"
+        if self.trained == self.levels:
+            tail = "done" if self.done == self.levels else "writing"
+        elif left is None:
+            tail = f"{pace} · {'...' if self.rate else 'compiling'}"
+        else:
+            tail = f"{pace} · about {duration(left)} left"
+        return f"{self.trained}/{self.levels} levels · {self.solved_so_far} solved · {tail}"
 
 
 class Display:
@@ -109,12 +114,12 @@ class Display:
         with self._bar:
             yield self
 
-    def draw(self, completed: float, total: float, text: str, line: str, at_once: bool = False) -> None:
-        """Bring the bar up to date, or say `line`, if none was said lately or `at_once`."""
+    def draw(self, completed: float, total: float, text: str, line: str, every: float = LINE_EVERY) -> None:
+        """Bring the bar up to date, or say `line`, if none was said in the last `every` seconds."""
         now = time.monotonic()
         if self._console.is_terminal:
             self._bar.update(self._task, completed=completed, total=total, description=text)
-        elif at_once or now - self._line_at > LINE_EVERY:
+        elif now - self._line_at >= every:
             self._line_at = now
             self.say(line)
 
@@ -130,16 +135,17 @@ class Board(Display):
         super().__init__(console, TaskProgressColumn())
         self.tally = tally
 
-    def refresh(self, at_once: bool = False) -> None:
+    def refresh(self, every: float = LINE_EVERY) -> None:
         """Draw anew; cheap enough to call often."""
         now = time.monotonic()
         self.tally.tick(now)
         text = self.tally.text(now)
-        self.draw(self.tally.share, 1.0, text, text, at_once)
+        self.draw(self.tally.share, 1.0, text, text, every)
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
         self.tally.ended(unit, summary)
-        self.refresh(at_once=summary is not None)
+        if summary:
+            self.refresh(0.0 if self.tally.done == self.tally.levels else LINE_AFTER)
 
 
 def duration(seconds: float) -> str:

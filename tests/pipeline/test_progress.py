@@ -61,10 +61,28 @@ def test_lines_where_there_is_no_terminal() -> None:
     with board.shown():
         board.refresh()
         board.refresh()
-        board.ended(UNIT, Summary(16, 5, 16_000, 0, 0))
+        for first in range(0, 64, 4):
+            board.ended(WorkUnit(tuple(range(first, first + 4))), Summary(4, 1, 4_000, 0, 0))
     lines = text.getvalue().splitlines()
-    assert len(lines) == 2  # not one for every refresh
-    assert "16/64 levels · 5 solved" in lines[1]
+    assert len(lines) == 2  # not one for every refresh, nor for every commit where they come fast
+    assert "0/64 levels" in lines[0]
+    assert lines[1] == "64/64 levels · 16 solved · done"
+
+
+def test_commits_are_told_when_the_last_line_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = io.StringIO()
+    board = Board(tally(), Console(file=text))
+    monkeypatch.setattr("pipeline.progress.LINE_AFTER", 0.0)
+    board.refresh()
+    board.ended(UNIT, Summary(16, 5, 16_000, 0, 0))
+    assert "16/64 levels · 5 solved" in text.getvalue().splitlines()[1]
+
+
+def test_what_is_trained_is_still_to_be_written() -> None:
+    now = Tally(levels=16, done=0, solved=0)
+    now.progress(UNIT, 16_000, 16.0, 5)
+    now.tick(1.0)
+    assert now.text(1.0) == "16/16 levels · 5 solved · writing"
 
 
 def test_a_bar_on_a_terminal() -> None:
