@@ -8,6 +8,7 @@ import ctypes
 import hashlib
 import math
 from collections.abc import Sequence
+from threading import Lock
 
 import jax
 from jax.extend import core
@@ -36,6 +37,7 @@ def bytes_of(room: Room) -> int:
 
 
 _engines: dict[str, object] = {}  # machine code must outlive every executable that calls it
+_registering = Lock()  # a name is registered once, whichever thread asks first
 
 
 def compile_kernel(
@@ -55,11 +57,12 @@ def compile_kernel(
     module = _module(jaxpr, arguments, results, scratch)
     text = str(module)
     name = "levelproof_" + hashlib.sha256(text.encode()).hexdigest()[:16]
-    if name not in _engines:
-        engine = _machine_code(text)
-        address = engine.get_function_address("handler")
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.c_void_p(address)), platform="cpu")
-        _engines[name] = engine
+    with _registering:
+        if name not in _engines:
+            engine = _machine_code(text)
+            address = engine.get_function_address("handler")
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.c_void_p(address)), platform="cpu")
+            _engines[name] = engine
     return name
 
 

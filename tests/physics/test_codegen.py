@@ -10,7 +10,9 @@ import json
 import platform
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
 
+from physics.codegen import compile as compile_module
 from physics.lanes import LANES
 from physics.rooms import Room
 from physics.step import step
@@ -462,3 +465,23 @@ class TestStep:
 
 def here(name: str):
     return jax.jit(lambda given: step(*given))(worlds(name))
+
+
+def test_threads_may_compile_the_same_kernel_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the work units of one worker do; XLA takes a name only once."""
+    compiling = compile_module._machine_code
+
+    def slowly(text: str) -> object:
+        time.sleep(1)  # for the other threads to come, too
+        return compiling(text)
+
+    monkeypatch.setattr(compile_module, "_machine_code", slowly)
+    pairs = every_pair(AWKWARD)
+
+    def result(_: int) -> np.ndarray:
+        kernel = table({"and 1234": lambda x, *_: x + 1234}, "float32", "float32")
+        return kernel.as_machine_code(pairs)[0]
+
+    with ThreadPoolExecutor(4) as threads:
+        for made in threads.map(result, range(4)):
+            np.testing.assert_array_equal(made[0], flush(pairs[0]) + np.float32(1234))
