@@ -63,11 +63,15 @@ VARIANTS: Mapping[str, Variant] = {
     "no_rehearsals": expert("no lanes repeat the first success", rehearsals=0),
     "no_persistence": expert("no lanes repeat their last action", persistence=0.0),
     "horizon_64": expert("64 env steps between updates", horizon=64),
+    "horizon_64_8": expert(
+        "64 env steps between updates, in 8 minibatches of the size of ours", horizon=64, minibatches=8
+    ),
     "lr_3e-4": expert("learning rate 3e-4", learning_rate=3e-4),
     "epochs_8": expert("8 epochs", epochs=8),
     "width_32": expert("hidden layers of 32 units", width=32),
     "no_shaping": expert("no reward for coming closer", dense_reward_scale=0.0),
     "no_entropy": expert("no reward for entropy", entropy_weight=0.0),
+    "attempts_16": expert("16 attempts in an evaluation, of which one must succeed", attempts=16),
     "successes_4": stop("solved when 4 attempts of an evaluation succeed", successes=4),
     "successes_8": stop("solved when 8 attempts of an evaluation succeed", successes=8),
     "exploration": expert("a success of training is a witness, too", exploration=True),
