@@ -63,9 +63,6 @@ VARIANTS: Mapping[str, Variant] = {
     "no_rehearsals": expert("no lanes repeat the first success", rehearsals=0),
     "no_persistence": expert("no lanes repeat their last action", persistence=0.0),
     "horizon_64": expert("64 env steps between updates", horizon=64),
-    "horizon_64_8": expert(
-        "64 env steps between updates, in 8 minibatches of the size of ours", horizon=64, minibatches=8
-    ),
     "lr_3e-4": expert("learning rate 3e-4", learning_rate=3e-4),
     "epochs_8": expert("8 epochs", epochs=8),
     "width_32": expert("hidden layers of 32 units", width=32),
