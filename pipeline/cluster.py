@@ -3,10 +3,11 @@
 Workers write their shards and fragments themselves; only summaries travel. Knows nothing of what a unit is made of.
 """
 
+import io
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -19,7 +20,7 @@ os.environ |= {
 }
 
 import ray
-from ray.exceptions import RayError
+from ray.exceptions import ActorDiedError, RayError
 
 from configs.schema import JobConfig
 from pipeline.progress import Board
@@ -95,8 +96,9 @@ class Slot:
             return ray.get(result)
         except RayError as error:
             self.actor = None
-            sentence = str(error).strip().splitlines()[0]
-            return Outcome(unit, reason=f"{error}\n\nThe worker died: {sentence}")
+            told = str(error).strip().splitlines()[0].rstrip(".")
+            why = "; if memory ran out, `dmesg` says so" if isinstance(error, ActorDiedError) else f": {told}"
+            return Outcome(unit, reason=f"{error}\n\nThe worker died{why}")
 
     def watch(self, board: Board) -> None:
         """Fetch the worker's progress when it is there, without waiting."""
@@ -139,12 +141,13 @@ def connected() -> Iterator[None]:
         settings: dict[str, Any] = {}
     else:
         settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE, "num_cpus": len(own_cores())}
-    ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
-    try:
-        with interruptible():  # only now: Ray sets a handler of its own when it starts
-            yield
-    finally:
-        ray.shutdown()
+    with redirect_stdout(io.StringIO()):  # where Ray has a long word of its own to each worker's death
+        ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
+        try:
+            with interruptible():  # only now: Ray sets a handler of its own when it starts
+                yield
+        finally:
+            ray.shutdown()
 
 
 def _existing() -> bool:

@@ -23,6 +23,7 @@ def test_a_level_that_kills_its_worker_takes_no_other_with_it(tmp_path: Path) ->
     done = subprocess.run([*command, *settings], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
+    assert "raylet" not in done.stdout + done.stderr
     split = tmp_path / "data/5k/s"
     assert read_manifest(split).level_ids.tolist() == [i for i in range(LEVELS) if i != DEADLY]
     (note,) = (split / "quarantine").iterdir()
