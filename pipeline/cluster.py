@@ -6,6 +6,9 @@ Workers write their shards and fragments themselves; only summaries travel. Know
 import io
 import logging
 import os
+import re
+import socket
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
@@ -23,12 +26,16 @@ import ray
 from ray.exceptions import ActorDiedError, RayError
 
 from configs.schema import JobConfig
+from pipeline.errors import Failure, UserError
 from pipeline.progress import Board
 from pipeline.runtime import interruptible, own_cores, prepare_jax
 from pipeline.schedule import COMPANY, Outcome, Queue, WorkUnit
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s between looks at the workers
+REACH = 5.0  # s in which a cluster has to answer
+ROOM = 60.0  # s without any worker after which people are told why
+STARTS = 3  # workers in a row that do not start, after which the run stops
 
 
 class Worker:
@@ -68,22 +75,42 @@ class Slot:
     core: int | None
     gpus: int
     actor: Any = None
+    starting: Any = None  # reference to the new worker's first answer
+    failed_starts: int = 0  # in a row
     running: dict[Any, WorkUnit] = field(default_factory=dict)  # by reference to the coming Outcome
     wants: int = 1  # levels it has room for
     look: Any = None  # reference to the coming progress
 
+    def start(self) -> None:
+        """Ask for a worker. It gets no unit before it answers: a cluster may have no room for it now, or ever."""
+        # one thread for each unit, and one that answers `progress`
+        options = {"num_cpus": 1, "num_gpus": self.gpus, "max_concurrency": max(COMPANY) + 1, "max_restarts": 0}
+        self.actor = ray.remote(Worker).options(**options).remote(self.job, self.split, self.core)
+        self.starting, self.look, self.wants = self.actor.progress.remote([]), None, 1
+
+    def started(self) -> None:
+        """The new worker has answered.
+
+        Raises:
+            Failure: it did not start, nor did those before it.
+        """
+        try:
+            ray.get(self.starting)
+        except RayError as error:
+            self.actor, self.failed_starts = None, self.failed_starts + 1
+            if self.failed_starts == STARTS:
+                raise Failure(f"No worker can start ({_told(error)}): executor=inline may tell more.") from error
+        else:
+            self.failed_starts = 0
+        self.starting = None
+
     def take(self, queue: Queue) -> bool:
-        """Start the queue's next unit here, if there is room for it."""
-        died = self.actor is None  # while units run: what is left of them fails in a moment
-        if self.running and (died or self.wants <= 0):
+        """Give the worker the queue's next unit, if it has room for it."""
+        if self.actor is None or self.starting is not None or (self.running and self.wants <= 0):
             return False
         unit = queue.take(self.running.values())
         if unit is None:
             return False
-        if self.actor is None:
-            # one thread for each unit, and one that answers `progress`
-            options = {"num_cpus": 1, "num_gpus": self.gpus, "max_concurrency": max(COMPANY) + 1, "max_restarts": 0}
-            self.actor = ray.remote(Worker).options(**options).remote(self.job, self.split, self.core)
         self.running[self.actor.attempt.remote(unit)] = unit
         self.wants -= len(unit.level_ids)
         self.look = None  # the last one did not see this unit
@@ -96,13 +123,11 @@ class Slot:
             return ray.get(result)
         except RayError as error:
             self.actor = None
-            told = str(error).strip().splitlines()[0].rstrip(".")
-            why = "; if memory ran out, `dmesg` says so" if isinstance(error, ActorDiedError) else f": {told}"
-            return Outcome(unit, reason=f"{error}\n\nThe worker died{why}")
+            return Outcome(unit, reason=f"{error}\n\n{_told(error)}")
 
     def watch(self, board: Board) -> None:
         """Fetch the worker's progress when it is there, without waiting."""
-        if self.actor is None:
+        if self.actor is None or not self.running:
             return
         units = {unit.name: unit for unit in self.running.values()}
         if self.look is not None:
@@ -117,37 +142,98 @@ class Slot:
         self.look = self.actor.progress.remote(list(units))
 
 
+def _told(error: RayError) -> str:
+    """Ray's account of a worker's end, in a sentence without an end."""
+    lines = str(error).strip().splitlines()
+    if isinstance(error, ActorDiedError):
+        return lines[-1] if error.actor_init_failed else "The worker died; if memory ran out, `dmesg` says so"
+    return f"The worker died: {lines[0].rstrip('.')}"
+
+
 def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Sequence[Outcome]], None], board: Board) -> None:
-    """Work on the queue until it is empty."""
+    """Work on the queue until it is empty.
+
+    Raises:
+        UserError: the cluster of RAY_ADDRESS cannot be reached.
+        Failure: no worker can start.
+    """
     with connected():
         slots = [Slot(job, split.absolute(), *of) for of in _places()[: job.workers or None]]
+        notice_at = time.monotonic() + ROOM
         while True:
+            _start_workers(slots, len(queue.waiting))
             while sum(slot.take(queue) for slot in slots):
                 pass
             busy = {result: slot for slot in slots for result in slot.running}
-            if not busy:
+            if not busy and not queue.waiting:
                 return
-            ended = ray.wait(list(busy), num_returns=len(busy), timeout=POLL)[0]
-            settle([busy[result].outcome(result) for result in ended])
+            starting = {slot.starting: slot for slot in slots if slot.starting is not None}
+            both = [*busy, *starting]
+            ended = ray.wait(both, num_returns=len(both), timeout=POLL)[0]
+            for result in starting.keys() & set(ended):
+                starting[result].started()
+            settle([busy[result].outcome(result) for result in ended if result in busy])
             for slot in slots:
                 slot.watch(board)
             board.refresh()
+            if busy:
+                notice_at = time.monotonic() + ROOM
+            elif time.monotonic() > notice_at:
+                board.say("No worker has started yet: `ray status` tells what the cluster has free.")
+                notice_at = float("inf")
+
+
+def _start_workers(slots: Sequence[Slot], waiting: int) -> None:
+    """Where there is none, and more units wait than workers are starting."""
+    starting = sum(slot.starting is not None for slot in slots)
+    free = [slot for slot in slots if slot.actor is None and not slot.running]
+    for slot in free[: max(0, waiting - starting)]:
+        slot.start()
 
 
 @contextmanager
 def connected() -> Iterator[None]:
-    """The cluster of RAY_ADDRESS, or one on this machine that lives as long as this block and this process."""
+    """The cluster of RAY_ADDRESS, or one on this machine that lives as long as this block and this process.
+
+    Raises:
+        UserError: there is none at RAY_ADDRESS.
+    """
     if _existing():
+        _require_reachable(os.environ["RAY_ADDRESS"])
         settings: dict[str, Any] = {}
     else:
         settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE, "num_cpus": len(own_cores())}
     with redirect_stdout(io.StringIO()):  # where Ray has a long word of its own to each worker's death
-        ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
+        try:
+            ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
+        except ConnectionError as error:
+            raise _no_cluster(str(error).strip().splitlines()[0]) from error
         try:
             with interruptible():  # only now: Ray sets a handler of its own when it starts
                 yield
         finally:
             ray.shutdown()
+
+
+def _require_reachable(address: str) -> None:
+    """Ray itself tries for minutes.
+
+    Raises:
+        UserError: nobody listens there.
+    """
+    if place := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
+        try:
+            socket.create_connection((place[1].strip("[]"), int(place[2])), REACH).close()
+        except (OSError, OverflowError) as error:
+            raise _no_cluster(getattr(error, "strerror", None) or str(error)) from error
+
+
+def _no_cluster(reason: str) -> UserError:
+    address = os.environ.get("RAY_ADDRESS", "")
+    return UserError(
+        f"There is no Ray cluster at RAY_ADDRESS={address} ({reason.rstrip('.')}): "
+        "start one with `ray start --head`, correct the address, or unset it to use this machine."
+    )
 
 
 def _existing() -> bool:

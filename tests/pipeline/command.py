@@ -11,10 +11,14 @@ ROOT = Path(__file__).parents[2]
 TINY = ("levels=4", "unit=1", "budget=5k")  # four real units with two updates each
 
 
-def start(arguments: Sequence[str], cwd: Path, **options: Any) -> subprocess.Popen[str]:
-    """Start it in a process group of its own, so that Ctrl-C can be sent as a terminal sends it: to the whole group."""
+def start(arguments: Sequence[str], cwd: Path, address: str = "", **options: Any) -> subprocess.Popen[str]:
+    """Start it in a process group of its own, so that Ctrl-C can be sent as a terminal sends it: to the whole group.
+
+    With an `address`, on the Ray cluster that is there.
+    """
     environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "200"}
     environment.pop("RAY_ADDRESS", None)
+    environment |= {"RAY_ADDRESS": address} if address else {}
     return subprocess.Popen(
         [sys.executable, "-m", "pipeline.cli", *arguments],
         cwd=cwd,

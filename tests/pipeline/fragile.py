@@ -1,9 +1,14 @@
-"""The command `levelproof` with workers that die of a level: `python -m tests.pipeline.fragile LEVEL generate ...`."""
+"""The command `levelproof` with workers that die of a level: `python -m tests.pipeline.fragile LEVEL generate ...`.
+
+Of level -1 they die before they have started.
+"""
 
 import os
 import sys
 import time
+from pathlib import Path
 
+from configs.schema import JobConfig
 from pipeline import cli, cluster
 from pipeline.schedule import Outcome, WorkUnit
 
@@ -14,6 +19,11 @@ class Fragile(cluster.Worker):
     """A worker as it is, but for one level that kills its process, as a fault in native code does."""
 
     deadly = int(sys.argv[1])
+
+    def __init__(self, job: JobConfig, split: Path, core: int | None) -> None:
+        if self.deadly < 0:
+            os._exit(1)
+        super().__init__(job, split, core)
 
     def attempt(self, unit: WorkUnit) -> Outcome:
         if self.deadly in unit.level_ids:
