@@ -35,7 +35,7 @@ OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s between looks at the workers
 REACH = 5.0  # s in which a cluster has to answer
 ROOM = 60.0  # s without any worker after which people are told why
-STARTS = 3  # workers in a row that do not start, after which the run stops
+STARTS = 3  # workers in a row that do not start, after which a place is given up
 
 
 class Worker:
@@ -77,6 +77,7 @@ class Slot:
     actor: Any = None
     starting: Any = None  # reference to the new worker's first answer
     failed_starts: int = 0  # in a row
+    why: str = ""  # of the last of them
     running: dict[Any, WorkUnit] = field(default_factory=dict)  # by reference to the coming Outcome
     wants: int = 1  # levels it has room for
     look: Any = None  # reference to the coming progress
@@ -89,17 +90,11 @@ class Slot:
         self.starting, self.look, self.wants = self.actor.progress.remote([]), None, 1
 
     def started(self) -> None:
-        """The new worker has answered.
-
-        Raises:
-            Failure: it did not start, nor did those before it.
-        """
+        """The new worker has answered, or died."""
         try:
             ray.get(self.starting)
         except RayError as error:
-            self.actor, self.failed_starts = None, self.failed_starts + 1
-            if self.failed_starts == STARTS:
-                raise Failure(f"No worker can start ({_told(error)}): executor=inline may tell more.") from error
+            self.actor, self.failed_starts, self.why = None, self.failed_starts + 1, _told(error)
         else:
             self.failed_starts = 0
         self.starting = None
@@ -172,6 +167,7 @@ def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Sequence[Ou
             ended = ray.wait(both, num_returns=len(both), timeout=POLL)[0]
             for result in starting.keys() & set(ended):
                 starting[result].started()
+            slots = _usable(slots, board)
             settle([busy[result].outcome(result) for result in ended if result in busy])
             for slot in slots:
                 slot.watch(board)
@@ -181,6 +177,21 @@ def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Sequence[Ou
             elif time.monotonic() > notice_at:
                 board.say("No worker has started yet: `ray status` tells what the cluster has free.")
                 notice_at = float("inf")
+
+
+def _usable(slots: list[Slot], board: Board) -> list[Slot]:
+    """Those where workers start.
+
+    Raises:
+        Failure: there are none.
+    """
+    usable = [slot for slot in slots if slot.failed_starts < STARTS]
+    for slot in slots:
+        if not usable:
+            raise Failure(f"No worker can start ({slot.why}): executor=inline may tell more.")
+        if slot not in usable:
+            board.say(f"A worker cannot start ({slot.why}): its place is given up, {len(usable)} left.")
+    return usable
 
 
 def _start_workers(slots: Sequence[Slot], waiting: int) -> None:
