@@ -214,6 +214,7 @@ def connected() -> Iterator[None]:
         settings: dict[str, Any] = {}
     else:
         settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE, "num_cpus": len(own_cores())}
+        settings["address"] = "local"  # not one that somebody has started here and RAY_ADDRESS does not name
     with redirect_stdout(io.StringIO()):  # where Ray has a long word of its own to each worker's death
         try:
             ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.manifest import fragment_paths, read_manifest
 from pipeline.schedule import COMPANY
-from tests.pipeline.command import ROOT, assert_refused, start
+from tests.pipeline.command import ROOT, assert_refused, run, start
 
 LEVELS, DEADLY = 8, 2
 SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k")
@@ -78,5 +78,7 @@ def test_a_cluster_of_two_machines_that_loses_one(tmp_path: Path) -> None:
         assert process.returncode == 0, err
         assert "Traceback" not in err
         assert read_manifest(tmp_path / SPLIT).level_ids.tolist() == list(range(LEVELS))
+        own = run(["generate", "levels=1", "budget=2k", "out=own"], tmp_path)
+        assert own.returncode == 0, own.stderr  # a cluster that RAY_ADDRESS does not name is let be
     finally:
         cluster.shutdown()
