@@ -72,10 +72,11 @@ class Queue:
 
     def take(self, running: Collection[WorkUnit] = ()) -> WorkUnit | None:
         """The next unit for a worker that has these; None when none may join them (see `COMPANY`)."""
-        failures = {self.attempts.get(unit, 0) for unit in running}
+        failures = {self.attempts.get(unit, 0) for unit in running}  # one number at most
+        if failures and len(running) >= COMPANY[max(failures)]:
+            return None  # without a look at all that wait: workers ask several times a second
         for unit in self.waiting:
-            others = self.attempts.get(unit, 0)
-            if not failures or (failures == {others} and len(running) < COMPANY[others]):
+            if not failures or self.attempts.get(unit, 0) in failures:
                 self.waiting.remove(unit)
                 return unit
         return None

@@ -3,24 +3,28 @@
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
+PATIENCE = 240  # s
 TINY = ("levels=4", "unit=1", "budget=5k")  # four real units with two updates each
 
 
-def start(arguments: Sequence[str], cwd: Path, address: str = "", **options: Any) -> subprocess.Popen[str]:
+def start(
+    arguments: Sequence[str], cwd: Path, address: str = "", module: str = "pipeline.cli", **options: Any
+) -> subprocess.Popen[str]:
     """Start it in a process group of its own, so that Ctrl-C can be sent as a terminal sends it: to the whole group.
 
-    With an `address`, on the Ray cluster that is there.
+    With an `address`, on the Ray cluster that is there; `module` is the program, if not the command itself.
     """
     environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "200"}
     environment.pop("RAY_ADDRESS", None)
     environment |= {"RAY_ADDRESS": address} if address else {}
     return subprocess.Popen(
-        [sys.executable, "-m", "pipeline.cli", *arguments],
+        [sys.executable, "-m", module, *arguments],
         cwd=cwd,
         env=environment,
         text=True,
@@ -35,6 +39,15 @@ def run(arguments: Sequence[str], cwd: Path, **options: Any) -> subprocess.Compl
     process = start(arguments, cwd, **options)
     out, err = process.communicate(timeout=300)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    """Wait for the condition while the process runs."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert process.poll() is None, f"it ended early: {process.communicate()}"
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.05)
 
 
 def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:

@@ -1,28 +1,21 @@
 """Workers that die and clusters that shrink, on real Ray: everything that can be done is done."""
 
-import os
 import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from pipeline.manifest import fragment_paths, read_manifest
 from pipeline.schedule import COMPANY
-from tests.pipeline.command import ROOT, assert_refused, run, start
+from tests.pipeline.command import PATIENCE, assert_refused, run, start, until
 
 LEVELS, DEADLY = 8, 2
 SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k")
 SPLIT = Path("data/5k/s")
-PATIENCE = 240  # s
 
 
 def fragile(deadly: int, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tests.pipeline.fragile", str(deadly), *SETTINGS]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    environment.pop("RAY_ADDRESS", None)
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=PATIENCE)
+    return run([str(deadly), *SETTINGS], cwd, module="tests.pipeline.fragile")
 
 
 @pytest.mark.slow
@@ -50,9 +43,7 @@ def test_workers_that_cannot_start_stop_the_run(tmp_path: Path) -> None:
 
 
 def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
-    process = start(SETTINGS, tmp_path, address="127.0.0.1:9")
-    out, err = process.communicate(timeout=PATIENCE)
-    done = subprocess.CompletedProcess(process.args, process.returncode, out, err)
+    done = run(SETTINGS, tmp_path, address="127.0.0.1:9")
     assert_refused(
         done, 2, "There is no Ray cluster at RAY_ADDRESS=127.0.0.1:9 (Connection refused)", "ray start --head"
     )
@@ -68,11 +59,7 @@ def test_a_cluster_of_two_machines_that_loses_one(tmp_path: Path) -> None:
     try:
         second = cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
         process = start(SETTINGS, tmp_path, address=cluster.address)
-        end = time.monotonic() + PATIENCE
-        while not fragment_paths(tmp_path / SPLIT):
-            assert process.poll() is None, process.communicate()
-            assert time.monotonic() < end
-            time.sleep(0.05)
+        until(lambda: fragment_paths(tmp_path / SPLIT), process)
         cluster.remove_node(second, allow_graceful=False)
         _, err = process.communicate(timeout=PATIENCE)
         assert process.returncode == 0, err

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,12 +12,11 @@ import pytest
 from pipeline.fields import same_bits
 from pipeline.manifest import fragment_paths, read_manifest
 from pipeline.shard import Shard
-from tests.pipeline.command import ROOT, run, start
+from tests.pipeline.command import PATIENCE, ROOT, run, start, until
 
 LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
 COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
 SPLIT = Path("data/5k/s")
-PATIENCE = 240  # s
 
 pytestmark = pytest.mark.slow
 
@@ -47,15 +45,6 @@ def assert_same_content(split: Path, other: Path) -> None:
     for level_id, arrays in fields.items():
         assert all(same_bits(values, other_fields[level_id][name]).all() for name, values in arrays.items())
     assert {f"shards/{path.name}" for path in (split / "shards").iterdir()} == read_manifest(split).shards
-
-
-def until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
-    """Wait for the condition while the process runs."""
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert process.poll() is None, f"it ended early: {process.communicate()}"
-        assert time.monotonic() < end, "it took too long"
-        time.sleep(0.05)
 
 
 def descendants(process: subprocess.Popen[str]) -> set[int]:
