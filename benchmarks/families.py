@@ -12,12 +12,12 @@ from benchmarks.document import between_marks
 from configs.compose import compose_job, distributions
 from experts.before import facts_of
 from levelgen.level import SIZES
+from levelgen.pictures.raster import write_png
 from levelgen.proofs import Proof
-from levelgen.render import write_png
-from levelgen.sampler import Distribution, sample_levels
-from levelgen.task import DEFAULT_RULES
+from levelgen.sampling.sampler import Distribution, sample_levels
+from levelgen.task.rules import DEFAULT_RULES
+from pipeline.look.sample import LEVELS, sheet_of
 from pipeline.runtime import prepare_jax
-from pipeline.sample import LEVELS, sheet_of
 
 SHEET_SIZE = "l"
 MARK = "families"

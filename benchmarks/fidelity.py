@@ -24,11 +24,11 @@ from scipy import stats
 
 from benchmarks.document import between_marks
 from experts.before import facts_of
-from levelgen.kinetix import level_from_kinetix, state_to_kinetix
+from levelgen.files.kinetix import level_from_kinetix, state_to_kinetix
 from levelgen.level import SIZES, Level
 from levelgen.proofs import Proof
-from levelgen.sampler import sample_levels
-from levelgen.task import DEFAULT_RULES
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import DEFAULT_RULES
 from pipeline.bench.oracle import environment, oracle_python, tell
 from pipeline.runtime import cache_folder
 from tests.golden.level_statistics import statistics

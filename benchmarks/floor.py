@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from levelgen import task
-from levelgen.actions import controls
 from levelgen.level import SIZES
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task import rules as task
+from levelgen.task.actions import controls
 from physics.codegen.primitives import ELEMENTWISE
 from physics.engine import STAGES, Block, Given, step_block
 from physics.lanes import LANES

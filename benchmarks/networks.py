@@ -19,8 +19,8 @@ from experts.networks.entity import KINDS
 from experts.networks.layers import LOGITS
 from experts.slots import empty_slots
 from levelgen.level import SIZES
-from levelgen.observe import DYNAMIC_ROWS
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.observe.flat import DYNAMIC_ROWS
 from physics.types import FIXED_POLYGONS, Size
 from pipeline.bench.endless import endless_queue, go_on
 from pipeline.runtime import own_cores, prepare_jax

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.scaling import LANES, sticky
-from levelgen import task
 from levelgen.level import SIZES
-from levelgen.observe import level_features, symbolic_flat
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task import rules as task
+from levelgen.task.observe.flat import level_features, symbolic_flat
 
 STEPS = 64
 REPEATS = 60

@@ -22,7 +22,7 @@ OURS = """
 import json, sys, time
 import jax, numpy as np
 from levelgen.level import SIZES
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
 size, levels = SIZES[sys.argv[1]], int(sys.argv[2])
 start = time.perf_counter()
 jax.block_until_ready(sample_levels(np.arange(256), size))

@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from levelgen import task
 from levelgen.level import SIZES, Level
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task import rules as task
 from physics.pairs import pairs_of
 from physics.types import FIXED_POLYGONS, Size
 

@@ -20,10 +20,10 @@ from experts.pool import slot_count
 from experts.ppo import Batch, Seen
 from experts.rollout import Manner, repeat, rollout, start
 from experts.slots import empty_slots
-from levelgen.actions import CHOICES, action_mask
 from levelgen.level import SIZES, Level
-from levelgen.sampler import sample_levels
-from levelgen.task import DEFAULT_RULES
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.actions import CHOICES, action_mask
+from levelgen.task.rules import DEFAULT_RULES
 from pipeline.bench.endless import endless_queue, go_on
 from pipeline.runtime import own_cores, prepare_jax
 

@@ -19,8 +19,8 @@ from omegaconf.errors import OmegaConfBaseException
 from configs.convert import ConfigError, flat, plain, suggestion, typed
 from configs.schema import JobConfig, hash_of
 from experts.config import ExpertConfig, StopConfig
-from levelgen.distribution import Distribution
-from levelgen.task import TaskParams
+from levelgen.sampling.distribution import Distribution
+from levelgen.task.rules import TaskParams
 
 JOB = "generate"
 HYDRA = RLock()  # its state is one for the process, and a worker's units run in threads

@@ -8,11 +8,11 @@ from typing import Any, Literal
 from configs.convert import ConfigError, plain
 from configs.numbers import parse_count
 from experts.config import ExpertConfig, StopConfig
-from levelgen.distribution import CONTROL_WEIGHTS, Distribution
-from levelgen.identity import SAMPLER_VERSION
+from levelgen.identity.keys import SAMPLER_VERSION
 from levelgen.level import SIZES, size_of
-from levelgen.sampler import check_size, controls
-from levelgen.task import TaskParams
+from levelgen.sampling.distribution import CONTROL_WEIGHTS, Distribution
+from levelgen.sampling.sampler import check_size, controls
+from levelgen.task.rules import TaskParams
 
 HASH_DIGITS = 16
 MOST_BODIES = 48  # the most that was tried; compiling takes minutes from there

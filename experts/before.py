@@ -11,7 +11,7 @@ from experts.labels import Label, Verdict, trivial_reason, unsolvable_reason, un
 from experts.witness import blocks, replay, steps_to_goal, succeeds, take
 from levelgen.level import ACTIONS, Level
 from levelgen.proofs import Proof, examine
-from levelgen.task import TaskParams
+from levelgen.task.rules import TaskParams
 
 
 class Known(NamedTuple):

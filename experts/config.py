@@ -40,7 +40,7 @@ class ExpertConfig:
     # experience
     environments: int = 32  # lanes an expert acts in
     horizon: int = 32  # env steps in each lane between updates
-    dense_reward_scale: float = 0.2  # 1/m; shaping while training, see levelgen.task.TaskParams
+    dense_reward_scale: float = 0.2  # 1/m; shaping while training, see levelgen.task.rules.TaskParams
     rehearsals: int = 8  # lanes that repeat the first success of training, once there is one
     persistence: float = 0.9  # chance that these lanes repeat their last action, before
     # PPO (Schulman et al. 2017, arXiv:1707.06347)

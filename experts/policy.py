@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from experts.config import ExpertConfig, Network
 from experts.networks.entity import EntityNetwork
 from experts.networks.flat import FlatNetwork
-from levelgen.actions import CHOICES
-from levelgen.observe import dynamic_features
+from levelgen.task.actions import CHOICES
+from levelgen.task.observe.flat import dynamic_features
 from physics.types import Size
 
 ActorCritic = FlatNetwork | EntityNetwork
@@ -43,7 +43,7 @@ def forward(
         network: its shape.
         params: its parameters.
         constant: of its level.
-        moving: the rows that change, `levelgen.observe.state_features`.
+        moving: the rows that change, `levelgen.task.observe.flat.state_features`.
     """
     return network.apply(params, constant, moving)  # type: ignore[return-value]
 

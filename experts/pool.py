@@ -21,7 +21,7 @@ from experts.queue import BLOCK, empty_queue, enter, next_places
 from experts.slots import Begun, Mode, Queue, Report, Slots, advance, empty_slots
 from experts.witness import take
 from levelgen.level import Level
-from levelgen.task import TaskParams
+from levelgen.task.rules import TaskParams
 
 LANES_IN_CACHE = 128  # their physics and one minibatch fit the cache of a core
 LANES_ON_ACCELERATOR = 32_768

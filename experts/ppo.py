@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts.config import ExpertConfig
 from experts.policy import ActorCritic, Constant, Params, entropy, forward, initial, log_probability
-from levelgen.actions import CHOICES
+from levelgen.task.actions import CHOICES
 
 ADVANTAGE_EPSILON = 1e-8
 

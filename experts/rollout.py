@@ -11,11 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts.policy import ActorCritic, forward, log_probability, most_probable, sample
-from levelgen import task
-from levelgen.actions import CHOICES, action_mask
 from levelgen.level import Level
-from levelgen.observe import state_features
-from levelgen.task import TaskParams, TaskState
+from levelgen.task import rules as task
+from levelgen.task.actions import CHOICES, action_mask
+from levelgen.task.observe.flat import state_features
+from levelgen.task.rules import TaskParams, TaskState
 
 T = TypeVar("T")
 

@@ -26,10 +26,10 @@ from experts.progress import Progress
 from experts.rollout import Acting, Experience, Manner, repeat, rollout, start
 from experts.stop import Course
 from experts.success import Success, find, no_success, remember
-from levelgen.actions import CHOICES, action_mask
-from levelgen.identity import Stream, key_for
+from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
-from levelgen.task import TaskParams
+from levelgen.task.actions import CHOICES, action_mask
+from levelgen.task.rules import TaskParams
 
 STICKINESS = 0.25  # of sticky attempts (Machado et al. 2018, arXiv:1709.06009)
 MOVED = 0.1  # m/s and rad/s, the most by which velocities of moved attempts differ from the level's

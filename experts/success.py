@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from experts.config import RECORD_STEPS
-from levelgen.actions import CHOICES
+from levelgen.task.actions import CHOICES
 
 
 class Success(NamedTuple):

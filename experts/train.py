@@ -16,7 +16,7 @@ from experts.labels import WITNESSED, Label, Verdict
 from experts.pool import NOTHING_BEGUN, Pool, Spent, Tell, quiet
 from experts.witness import Record, replay, take
 from levelgen.level import ACTIONS, Level
-from levelgen.task import DEFAULT_RULES, TaskParams
+from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
 DEFAULT_STOP = StopConfig()
 

@@ -16,9 +16,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen import task
 from levelgen.level import Level
-from levelgen.task import DEFAULT_RULES, TaskParams, TaskState
+from levelgen.task import rules as task
+from levelgen.task.rules import DEFAULT_RULES, TaskParams, TaskState
 from physics.pairs import pairs_of
 from physics.types import Manifold, State
 from physics.vector import select, unvec, vec

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Int
 
 from levelgen.arms import Arms, driven, find_arms, still, within_reach
 from levelgen.level import ACTIONS, Level, Role
-from levelgen.task import TaskParams, TaskState, advance_seen, has_nan, has_roles, reset
+from levelgen.task.rules import TaskParams, TaskState, advance_seen, has_nan, has_roles, reset
 from physics.pairs import PairKind, pairs_of
 from physics.types import Model, Params
 from physics.vector import rows

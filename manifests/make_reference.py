@@ -10,10 +10,10 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from levelgen.level import SIZES
-from levelgen.sampler import sample_levels
-from pipeline.fields import arrays_of
-from pipeline.manifest import read_manifest
+from levelgen.sampling.sampler import sample_levels
 from pipeline.runtime import prepare_jax
+from pipeline.store.fields import arrays_of
+from pipeline.store.manifest import read_manifest
 
 
 def main(split: Path) -> None:

@@ -14,8 +14,8 @@ MAY_IMPORT = {  # our packages only
     "configs": {"physics", "levelgen", "experts"},
     "pipeline": {"physics", "levelgen", "experts", "configs"},
 }
-RAY_IN = {"pipeline/cluster.py"}
-HYDRA_IN = {"configs/compose.py", "pipeline/cli.py"}
+RAY_IN = {"pipeline/jobs/cluster.py"}
+HYDRA_IN = {"configs/compose.py", "pipeline/cli/main.py"}
 LONGEST = 400  # lines of a file
 SOURCES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
 

@@ -10,8 +10,8 @@ import pytest
 from configs.compose import compose_job
 from experts.train import train_levels
 from levelgen.level import SIZES
-from levelgen.sampler import sample_levels
-from pipeline.fields import arrays_of
+from levelgen.sampling.sampler import sample_levels
+from pipeline.store.fields import arrays_of
 
 FOLDER = Path(__file__).parent.parent / "manifests"
 ROWS = pq.read_table(FOLDER / "128k-s.parquet").to_pylist()

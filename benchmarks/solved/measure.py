@@ -17,10 +17,10 @@ from benchmarks.solved.results import Header, header_of, read
 from benchmarks.solved.variants import Variant
 from experts.labels import Label, Verdict
 from pipeline.errors import Failure, LevelproofError, UserError
-from pipeline.progress import Board, Tally
+from pipeline.jobs.progress import Board, Tally
+from pipeline.jobs.schedule import Summary, WorkUnit, plan_units
 from pipeline.runtime import interruptible, own_cores, prepare_jax
-from pipeline.schedule import Summary, WorkUnit, plan_units
-from pipeline.stack import device, versions
+from pipeline.store.provenance import device, versions
 
 UNIT = 32  # levels that a process trains at a time
 POLL = 0.5  # s between looks at the processes
@@ -151,9 +151,9 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
     import numpy as np
 
     from experts.train import train_levels
-    from levelgen.distribution import Distribution
     from levelgen.level import size_of
-    from levelgen.sampler import sample_levels
+    from levelgen.sampling.distribution import Distribution
+    from levelgen.sampling.sampler import sample_levels
 
     warm = False
     while (unit := tasks.get()) is not None:

@@ -25,9 +25,9 @@ from levelgen.level import Level
 from pipeline.bench import oracle
 from pipeline.bench.contest import Process
 from pipeline.errors import LevelproofError
+from pipeline.jobs.schedule import Summary, WorkUnit
 from pipeline.runtime import cache_folder, prepare_jax
-from pipeline.schedule import Summary, WorkUnit
-from pipeline.stack import device, versions
+from pipeline.store.provenance import device, versions
 
 WIDTH = 8  # levels that the reference trains side by side; empty places of a last batch are not charged
 NOTHING_SPENT = {"cpu_s": 0.0, "wall_s": 0.0}
@@ -91,8 +91,8 @@ def train(
     from experts.before import decide
     from experts.witness import take
     from levelgen.level import size_of
-    from levelgen.sampler import sample_levels
-    from levelgen.task import DEFAULT_RULES
+    from levelgen.sampling.sampler import sample_levels
+    from levelgen.task.rules import DEFAULT_RULES
 
     ids, updates = np.asarray(unit.level_ids, np.int32), config.updates_in(header.budget)
     levels = sample_levels(jnp.asarray(ids), size_of(header.size))
@@ -129,8 +129,8 @@ def train_batch(
     Raises:
         Failure: it ended.
     """
-    from levelgen.kinetix import state_to_kinetix
-    from levelgen.task import NO_DISTANCE
+    from levelgen.files.kinetix import state_to_kinetix
+    from levelgen.task.rules import NO_DISTANCE
 
     worlds, out, count = reference.folder / "levels.npz", reference.folder / "out.npz", len(level_ids)
     start = levels.state, np.zeros(count, np.int32), np.full(count, NO_DISTANCE, np.float32)

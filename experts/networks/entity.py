@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 
 from experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
 from levelgen.level import Level
-from levelgen.observe import (
+from levelgen.task.observe.entities import blocks_of
+from levelgen.task.observe.flat import (
     BODY_ROWS,
     CIRCLE_ROWS,
     DYNAMIC_ROWS,
@@ -27,7 +28,6 @@ from levelgen.observe import (
     body_rows,
     level_features,
 )
-from levelgen.observe_entities import blocks_of
 from physics.types import FIXED_POLYGONS, Size
 from physics.vector import rows
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
 from levelgen.level import Level
-from levelgen.observe import dynamic_features, feature_count, level_features
+from levelgen.task.observe.flat import dynamic_features, feature_count, level_features
 from physics.types import Size
 from physics.vector import rows
 

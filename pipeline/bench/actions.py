@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from levelgen.actions import CHOICES
+from levelgen.task.actions import CHOICES
 
 STICKINESS = 0.9  # chance that an action entry stays as it was
 

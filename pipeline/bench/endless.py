@@ -6,7 +6,7 @@ from experts.config import ExpertConfig, Rule, StopConfig
 from experts.queue import empty_queue, enter
 from experts.slots import Queue, Report, Slots, advance
 from levelgen.level import Level
-from levelgen.task import DEFAULT_RULES, TaskParams
+from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
 UPDATES = 10**6  # more than a benchmark waits for
 

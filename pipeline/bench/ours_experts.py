@@ -40,7 +40,7 @@ def main() -> None:
     from experts.pool import slot_count
     from experts.slots import Queue, Training, empty_slots
     from experts.witness import take
-    from levelgen.task import TaskParams
+    from levelgen.task.rules import TaskParams
     from pipeline.bench.endless import endless_queue, go_on
     from pipeline.bench.worlds import load_levels
 

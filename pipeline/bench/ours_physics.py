@@ -21,7 +21,7 @@ def main() -> None:
 
     import jax
 
-    from levelgen import task
+    from levelgen.task import rules as task
     from pipeline.bench.worlds import load_levels
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured

@@ -2,7 +2,7 @@
 """Worlds of the reference, inside its own environment: built from plain arrays, sampled, and written to plain arrays.
 
 Files are .npz with one array per path of the reference's state (`polygon/position`), level axis first, as
-`levelgen.kinetix` reads them. Imports the reference and nothing of ours.
+`levelgen.files.kinetix` reads them. Imports the reference and nothing of ours.
 """
 
 import argparse

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from pipeline.bench.contest import Score
 from pipeline.runtime import own_cores
-from pipeline.stack import device, versions
+from pipeline.store.provenance import device, versions
 
 DIGITS = 3  # decimals of what is printed as JSON
 

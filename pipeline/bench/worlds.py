@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from levelgen.kinetix import level_from_kinetix
+from levelgen.files.kinetix import level_from_kinetix
 from levelgen.level import Level
 
 

@@ -20,7 +20,7 @@ from benchmarks.solved.variants import REFERENCE, VARIANTS, Variant
 from configs.convert import plain
 from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.labels import Label, Source
-from levelgen.actions import CHOICES
+from levelgen.task.actions import CHOICES
 from pipeline.bench import oracle
 from pipeline.errors import UserError
 

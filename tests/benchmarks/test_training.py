@@ -10,7 +10,7 @@ from benchmarks import networks, training
 from experts.config import ExpertConfig, Network
 from experts.slots import Mode
 from levelgen.level import SIZES
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
 
 pytestmark = pytest.mark.slow
 CONFIG = ExpertConfig(

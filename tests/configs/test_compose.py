@@ -15,8 +15,8 @@ from configs.compose import again, compose_job, distributions, identified, listi
 from configs.convert import ConfigError, flat
 from configs.schema import WITHOUT_EFFECT
 from experts.config import ExpertConfig
-from levelgen.distribution import Distribution
-from levelgen.task import TaskParams
+from levelgen.sampling.distribution import Distribution
+from levelgen.task.rules import TaskParams
 
 
 def test_no_overrides_make_the_small_default_dataset() -> None:

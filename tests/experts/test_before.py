@@ -11,8 +11,8 @@ from experts.train import train_levels
 from experts.witness import replay, succeeds, take
 from levelgen.level import SIZES, Level
 from levelgen.proofs import Proof
-from levelgen.sampler import sample_levels
-from levelgen.task import DEFAULT_RULES
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import DEFAULT_RULES
 
 COUNT = 150  # three blocks, the last one not full
 

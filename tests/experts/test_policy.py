@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experts import policy
-from levelgen.actions import CHOICES
+from levelgen.task.actions import CHOICES
 
 ALL = jnp.ones((len(CHOICES), 1), bool)
 

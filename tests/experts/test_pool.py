@@ -14,8 +14,8 @@ from experts.pool import Pool, capacity_of
 from experts.queue import empty_queue, enter, next_places
 from experts.witness import take
 from levelgen.level import SIZES, Level
-from levelgen.sampler import sample_levels
-from levelgen.task import DEFAULT_RULES
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import DEFAULT_RULES
 from tests.experts.test_slots import CONFIG, SOLVED, same
 
 IDS = np.arange(100, 136)

@@ -9,10 +9,10 @@ from experts import ppo
 from experts.config import ExpertConfig, Network
 from experts.policy import forward, log_probability, network_of, sample
 from experts.ppo import Batch, Seen
-from levelgen.actions import CHOICES
 from levelgen.level import SIZES
-from levelgen.observe import dynamic_features
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.actions import CHOICES
+from levelgen.task.observe.flat import dynamic_features
 
 SIZE = SIZES["s"]
 DYNAMIC = len(dynamic_features(SIZE))

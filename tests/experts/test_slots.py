@@ -17,8 +17,8 @@ from experts.slots import Mode, Queue, advance, empty_slots
 from experts.train import train_levels
 from experts.witness import take
 from levelgen.level import SIZES, Level
-from levelgen.sampler import sample_levels
-from levelgen.task import DEFAULT_RULES
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import DEFAULT_RULES
 
 IDS = np.array([0, 2, 3, 4, 6, 7, 9])  # levels that need an expert
 CONFIG = ExpertConfig(

@@ -9,9 +9,9 @@ from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.labels import Label
 from experts.train import UnitResult, new_pool, train_levels
 from experts.witness import LANES, replay, steps_to_goal, succeeds
-from levelgen.distribution import Distribution
 from levelgen.level import SIZES, Level
-from levelgen.sampler import sample_levels
+from levelgen.sampling.distribution import Distribution
+from levelgen.sampling.sampler import sample_levels
 
 IDS = np.array([0, 2, 3, 4, 6, 7])  # levels that need an expert
 CONFIG = ExpertConfig(environments=16, horizon=64, width=32, attempts=4, sticky_attempts=4, moved_attempts=4, slots=4)

@@ -1,6 +1,6 @@
 """Statistics of levels: named samples of numbers, the same for the reference's levels and for ours.
 
-Levels come as plain arrays by the reference's own names, level axis first (`levelgen.kinetix.state_to_kinetix`
+Levels come as plain arrays by the reference's own names, level axis first (`levelgen.files.kinetix.state_to_kinetix`
 gives ours that way). Imports nothing of ours: it runs in the reference's environment too.
 """
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from levelgen.kinetix import level_from_kinetix, state_from_kinetix
+from levelgen.files.kinetix import level_from_kinetix, state_from_kinetix
 from levelgen.level import Level
 from physics.types import State
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from levelgen.level import SIZES, Level, Role
-from levelgen.sampler import Distribution, sample_levels
-from levelgen.shuffle import separate
+from levelgen.sampling.sampler import Distribution, sample_levels
+from levelgen.sampling.shuffle import separate
 from physics.types import FIXED_POLYGONS
 
 SCENERY = slice(FIXED_POLYGONS)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from levelgen.kinetix import Fields, level_from_kinetix
+from levelgen.files.kinetix import Fields, level_from_kinetix
 from levelgen.level import Level
 from pipeline.bench import oracle
 

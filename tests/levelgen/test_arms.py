@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelgen import task
-from levelgen.actions import CHOICES
 from levelgen.arms import MARGIN, MAX_GAP, MAX_LENGTH, MAX_MOTOR, MAX_PUSH, MAX_TURN, SWING, Arms, find_arms, radii
 from levelgen.level import Level
-from levelgen.scenery import empty_level
-from levelgen.shuffle import separate
+from levelgen.sampling.scenery import empty_level
+from levelgen.sampling.shuffle import separate
+from levelgen.task import rules as task
+from levelgen.task.actions import CHOICES
 from physics.types import Params, Size
 from physics.vector import vec
 

@@ -11,16 +11,16 @@ import pytest
 
 from experts.before import Known, facts_of
 from experts.witness import take
-from levelgen import task
-from levelgen.actions import CHOICES
 from levelgen.arms import driven, find_arms
-from levelgen.distribution import Distribution
 from levelgen.level import SIZES, Level, Role
 from levelgen.proofs import Proof
-from levelgen.sampler import sample_levels
-from levelgen.scenery import empty_level
-from levelgen.shuffle import separate
-from levelgen.task import DEFAULT_RULES, TaskParams
+from levelgen.sampling.distribution import Distribution
+from levelgen.sampling.sampler import sample_levels
+from levelgen.sampling.scenery import empty_level
+from levelgen.sampling.shuffle import separate
+from levelgen.task import rules as task
+from levelgen.task.actions import CHOICES
+from levelgen.task.rules import DEFAULT_RULES, TaskParams
 from physics.types import Params, Size
 from tests.levelgen.mutants import mutants
 

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 
 from levelgen.level import MOTOR_BINDINGS, SIZES, THRUSTER_BINDINGS, Level
-from levelgen.sampler import sample_levels
-from levelgen.shuffle import BODY, JOINT, MOTION, THRUSTER
+from levelgen.sampling.sampler import sample_levels
+from levelgen.sampling.shuffle import BODY, JOINT, MOTION, THRUSTER
 from physics.types import FIXED_POLYGONS
 
 COUNT = 256

@@ -9,8 +9,9 @@ import time
 from pathlib import Path
 
 from configs.schema import JobConfig
-from pipeline import cli, cluster
-from pipeline.schedule import Outcome, WorkUnit
+from pipeline.cli import main as cli
+from pipeline.jobs import cluster
+from pipeline.jobs.schedule import Outcome, WorkUnit
 
 MOMENT = 1.0  # s, in which the worker gets other units
 

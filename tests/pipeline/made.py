@@ -17,13 +17,13 @@ from experts.labels import Label, Source, Verdict
 from experts.train import Spent, UnitResult
 from experts.witness import Record, replay, succeeds
 from levelgen.level import ACTIONS, SIZES, Level
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
 from physics.pairs import pairs_of
 from physics.types import MAX_VERTICES, Size
-from pipeline.layout import split_path
-from pipeline.schedule import WorkUnit
-from pipeline.schema import RECORD_STEPS
-from pipeline.unit import commit
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.jobs.unit import commit
+from pipeline.store.layout import split_path
+from pipeline.store.schema import RECORD_STEPS
 
 PLAYED = 64  # levels of `played_split`
 SPENT = Spent(0, 0, 0)

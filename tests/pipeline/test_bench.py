@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from levelgen.actions import CHOICES
+from levelgen.task.actions import CHOICES
 from pipeline.bench import main, oracle
 from pipeline.bench.actions import sticky_actions
 from pipeline.bench.command import OURS, share
@@ -177,7 +177,7 @@ class TestInput:
 def test_a_tiny_bench_for_real(reference, level_file, words) -> None:
     """As a user types it, on one core where the system can, so that the reference has one way to run."""
     pin = f"hasattr(os, 'sched_setaffinity') and os.sched_setaffinity(0, {{{own_cores()[0]}}})"
-    code = f"import os, sys; {pin}; from pipeline.cli import main; sys.exit(main())"
+    code = f"import os, sys; {pin}; from pipeline.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "bench", *words, "--repeats", "2", "--level-file", str(level_file), "--json"]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)

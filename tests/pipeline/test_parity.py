@@ -334,7 +334,7 @@ class TestReport:
 def test_a_small_campaign_for_real(reference, level_file, tmp_path) -> None:
     """As a user types it. Handmade levels, scenes, episodes: all that differs is rounding."""
     words = ["--size", "s", "--states", "120", "--episodes", "12", "--level-file", str(level_file), "--json"]
-    code = "import sys; from pipeline.cli import main; sys.exit(main())"
+    code = "import sys; from pipeline.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "bench", "parity", *words]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
     keep = ["--keep", str(tmp_path / "kept")]

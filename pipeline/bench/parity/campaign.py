@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from levelgen.level import SIZES, Level, Role, name_of, size_of
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
 from pipeline.bench import oracle
 from pipeline.bench.actions import sticky_actions
 from pipeline.bench.parity.engines import Reference

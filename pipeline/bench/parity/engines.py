@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen import task
-from levelgen.actions import controls
-from levelgen.kinetix import MANIFOLDS, level_from_kinetix, state_from_kinetix, state_to_kinetix
+from levelgen.files.kinetix import MANIFOLDS, level_from_kinetix, state_from_kinetix, state_to_kinetix
 from levelgen.level import Level
-from levelgen.task import TaskParams, TaskState
+from levelgen.task import rules as task
+from levelgen.task.actions import controls
+from levelgen.task.rules import TaskParams, TaskState
 from physics.step import step as physics_step
 from physics.types import Manifold, Params, State
 from pipeline.bench import oracle

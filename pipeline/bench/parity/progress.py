@@ -3,7 +3,7 @@
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
-from pipeline.progress import Display
+from pipeline.jobs.progress import Display
 
 
 class Board(Display):

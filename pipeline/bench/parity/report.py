@@ -15,7 +15,7 @@ from pipeline.bench.parity.campaign import SizeReport
 from pipeline.bench.parity.episodes import FIRST_OFF, NOT_EXPLAINED
 from pipeline.bench.parity.onestep import DEFECT_OFF, LIMITS
 from pipeline.errors import Failure
-from pipeline.stack import device, versions
+from pipeline.store.provenance import device, versions
 
 DIGITS = 4  # of a number in JSON
 WIDE = 200  # columns

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from levelgen.level import WORLD_SIDE, Level
-from levelgen.shuffle import separate
+from levelgen.sampling.shuffle import separate
 from physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
 from physics.types import FIXED_POLYGONS, State
 

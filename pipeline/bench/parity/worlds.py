@@ -7,7 +7,7 @@ from typing import TypeVar
 import jax
 import numpy as np
 
-from levelgen.kinetix import state_from_kinetix
+from levelgen.files.kinetix import state_from_kinetix
 from levelgen.level import Level
 from physics.pairs import pairs_of
 from physics.types import Size, State

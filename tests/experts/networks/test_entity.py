@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from experts.networks.entity import EntityNetwork
 from experts.policy import Params, forward, initial
 from levelgen.level import SIZES, Level
-from levelgen.observe import BODY_ROWS, LIMIT, UNSEEN_WALLS, state_features
-from levelgen.observe_entities import EntityObservation, entities
-from levelgen.sampler import sample_levels
-from levelgen.shuffle import OrderDraws, places, shuffle
+from levelgen.sampling.sampler import sample_levels
+from levelgen.sampling.shuffle import OrderDraws, places, shuffle
+from levelgen.task.observe.entities import EntityObservation, entities
+from levelgen.task.observe.flat import BODY_ROWS, LIMIT, UNSEEN_WALLS, state_features
 from physics.types import FIXED_POLYGONS, State
 
 LEVELS = 6

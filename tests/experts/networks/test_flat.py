@@ -8,8 +8,8 @@ import pytest
 from experts.networks.flat import FlatNetwork, resting_features
 from experts.policy import Params, forward, initial
 from levelgen.level import SIZES
-from levelgen.observe import dynamic_features, feature_count, level_features
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.observe.flat import dynamic_features, feature_count, level_features
 
 SIZE = SIZES["s"]
 MOVING, STILL = dynamic_features(SIZE), resting_features(SIZE)

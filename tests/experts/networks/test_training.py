@@ -10,7 +10,7 @@ from experts.config import Network
 from experts.judge import Trained, witness_of
 from experts.witness import take
 from levelgen.level import SIZES
-from levelgen.sampler import sample_levels
+from levelgen.sampling.sampler import sample_levels
 from tests.experts.test_slots import CONFIG, SOLVED, UPDATES, same, train
 
 IDS = np.array([0, 2, 6, 7])

@@ -1,0 +1,1 @@
+"""Levels as the reference has them: its arrays and its level files."""

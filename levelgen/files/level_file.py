@@ -1,0 +1,264 @@
+"""The reference's level files: JSON, read into a level and its rules, and written from them.
+
+As `kinetix.util.saving` 3.0.2 reads and writes them: `env_state` has a list of objects for each kind of thing,
+`env_params` and `static_env_params` have rules, constants and the size. A file may come from anywhere: its length is
+looked at before it is read, every value has a type and bounds, and an error says where it is.
+
+Like the reference, the reader works out anew which bodies may collide. A level starts without contacts, so what a
+file says of contacts is not read; the reference forgets it too when it evaluates on a level.
+"""
+
+import json
+import os
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from levelgen.files.entries import (
+    COUNTS,
+    EXTRA,
+    GRAVITY,
+    NO_CONTACT,
+    PHYSICS,
+    RULES,
+    STATIC_CONSTANTS,
+    STATIC_EXTRA,
+    STEPS,
+    TASK,
+    Entry,
+    LevelFileError,
+    entries_of,
+    item,
+    told,
+)
+from levelgen.files.kinetix import MANIFOLDS, Fields, level_from_kinetix, state_to_kinetix
+from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
+from levelgen.sampling.shuffle import separate
+from levelgen.task.rules import NO_DISTANCE, TaskParams
+from physics.pairs import pairs_of
+from physics.types import FIXED_POLYGONS, Params, Size
+
+MOST_BYTES = 4_000_000  # of a file; the reference's own have at most 52,438
+PATHS = {  # where levelgen.files.kinetix has what a file keeps with a thing
+    ("polygon", "role"): "polygon_shape_roles",
+    ("polygon", "density"): "polygon_densities",
+    ("circle", "role"): "circle_shape_roles",
+    ("circle", "density"): "circle_densities",
+    ("joint", "motor_binding"): "motor_bindings",
+    ("thruster", "thruster_binding"): "thruster_bindings",
+}
+
+
+@dataclass(frozen=True)
+class LevelFile:
+    """What a level file says."""
+
+    level: Level  # one lane, on the host
+    rules: TaskParams
+
+
+def read_level_file(path: Path) -> LevelFile:
+    """The level in a file.
+
+    Raises:
+        LevelFileError: there is no such file, or it has no level that can be used.
+    """
+    try:
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode):  # a pipe or a device may never end
+            raise LevelFileError("it is no ordinary file")
+        if about.st_size > MOST_BYTES:
+            raise LevelFileError(f"it has {about.st_size:,} bytes, and no level needs more than {MOST_BYTES:,}")
+        with path.open("rb") as file:
+            return parse(file.read(MOST_BYTES))
+    except OSError as error:
+        raise LevelFileError(f"Cannot read the level file {path} ({error.strerror or error}).") from None
+    except LevelFileError as error:
+        raise LevelFileError(f"Cannot use the level file {path}: {error}.") from None
+
+
+def write_level_file(file: LevelFile, path: Path) -> None:
+    """Write a level as the reference does.
+
+    Raises:
+        LevelFileError: such a file cannot hold the level.
+        OSError: it cannot be written.
+    """
+    text = json.dumps(to_document(file)) + "\n"
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        unfinished.write_text(text)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def parse(text: bytes) -> LevelFile:
+    """The level in a file's bytes.
+
+    Raises:
+        LevelFileError: there is none that can be used.
+    """
+    try:
+        document = json.loads(text.decode())
+    except UnicodeDecodeError:
+        raise LevelFileError("it is no text") from None
+    except RecursionError:
+        raise LevelFileError("it is nested too deeply") from None
+    except ValueError as error:
+        raise LevelFileError(f"it is not JSON ({error})") from None
+    return from_document(document)
+
+
+def from_document(document: object) -> LevelFile:
+    """The level in what JSON makes of a file.
+
+    Raises:
+        LevelFileError: there is none that can be used.
+    """
+    world, params, static = (item(document, name, "") for name in ("env_state", "env_params", "static_env_params"))
+    for name, needed in STATIC_CONSTANTS.items():
+        value = item(static, name, "static_env_params")
+        if value != needed:
+            raise LevelFileError(f"static_env_params.{name} is {told(value)}, this engine has {told(needed)} only")
+    size = Size(*(entry.read(static, name, "static_env_params") for name, entry in COUNTS.items()))
+    if size.bodies == FIXED_POLYGONS:
+        raise LevelFileError("static_env_params has no place for a body besides the scenery")
+    level = level_from_kinetix(_fields(world, size))
+    _check(level)
+    collides: Any = np.asarray(separate(level.model))
+    return LevelFile(replace(level, model=replace(level.model, collides=collides)), _rules(params, static))
+
+
+def to_document(file: LevelFile) -> dict[str, Any]:
+    """What JSON makes a file of, readable by `from_document` and by the reference.
+
+    Raises:
+        LevelFileError: such a file cannot hold the level.
+    """
+    level, size = file.level, file.level.size
+    if (levels := level.state.rotation.shape[-1]) != 1:
+        raise LevelFileError(f"these are {levels} levels, and a file holds one")
+    if np.any(np.asarray(level.state.contact_active)):
+        raise LevelFileError("the level starts with contacts, and a file's levels start without")
+    if np.any(np.asarray(level.motor_auto) & np.asarray(level.model.joint_active)):
+        raise LevelFileError("the level has a motor that runs by itself, and a file cannot say so")
+    pairs, fields = pairs_of(size), _with_points(level)
+    contacts = (2 * len(pairs.polygon), len(pairs.circle_polygon), len(pairs.circle))
+    document = {
+        "env_state": {
+            **{kind: _things(fields, kind, entries) for kind, entries in entries_of(size).items()},
+            "collision_matrix": _nested(fields["collision_matrix"][0]),
+            **{kind: [NO_CONTACT] * count for kind, count in zip(MANIFOLDS, contacts, strict=True)},
+            "gravity": _nested(fields["gravity"][0]),
+        },
+        "env_params": _params(file.rules),
+        "static_env_params": _static(file.rules, size),
+    }
+    from_document(document)  # nothing is written that cannot be read
+    return document
+
+
+def _fields(world: object, size: Size) -> Fields:
+    """The things of a world as the reference's arrays; no contacts, and no collision matrix yet."""
+    fields = {}
+    for (kind, entries), count in zip(entries_of(size).items(), size, strict=True):
+        things = item(world, kind, "env_state")
+        if not isinstance(things, list) or len(things) != count:
+            found = f"a list of {len(things)}" if isinstance(things, list) else told(things)
+            raise LevelFileError(f"env_state.{kind} is {found}, static_env_params.num_{kind}s says {count}")
+        for name, entry in entries.items():
+            values = [entry.read(thing, name, f"env_state.{kind}[{i}]") for i, thing in enumerate(things)]
+            dtype = {float: np.float32, int: np.int32, bool: np.bool_}[entry.kind]
+            fields[_path(kind, name)] = np.array(values, dtype).reshape(1, count, *entry.shape)
+    pairs = pairs_of(size)
+    shapes = ((len(pairs.polygon), 2), (len(pairs.circle_polygon),), (len(pairs.circle),))
+    for kind, shape in zip(MANIFOLDS, shapes, strict=True):
+        fields[f"{kind}/active"] = np.zeros((1, *shape), bool)
+        fields |= {f"{kind}/acc_impulse_{way}": np.zeros((1, *shape), np.float32) for way in ("normal", "tangent")}
+    return fields | {
+        "gravity": np.array([GRAVITY.read(world, "gravity", "env_state")], np.float32),
+        "collision_matrix": np.zeros((1, size.bodies, size.bodies), bool),
+        "motor_auto": np.zeros((1, size.joints), bool),  # files do not have it
+    }
+
+
+def _check(level: Level) -> None:
+    """What no entry alone can tell.
+
+    Raises:
+        LevelFileError: the engine cannot have this.
+    """
+    model, state, scenery = level.model, level.state, slice(FIXED_POLYGONS)
+    moves = (model.inverse_mass != 0) | (model.inverse_inertia != 0) | (state.angular_velocity != 0)
+    moves |= np.any(np.asarray(state.velocity), 1)
+    _refuse(moves[scenery], "polygon", "is scenery and may move: its inverse masses and velocities have to be 0")
+    flat = model.active[: level.size.polygons] & (model.n_vertices < 3)
+    _refuse(flat, "polygon", "is active and has fewer than 3 vertices")
+    _refuse(model.joint_active & (model.joint_a == model.joint_b), "joint", "joins a body to itself")
+    motors = model.joint_active & (level.motor_binding >= MOTOR_BINDINGS)
+    _refuse(motors, "joint", f"has a motor_binding beyond {MOTOR_BINDINGS - 1}")
+    thrusters = model.thruster_active & (level.thruster_binding >= THRUSTER_BINDINGS)
+    _refuse(thrusters, "thruster", f"has a thruster_binding beyond {THRUSTER_BINDINGS - 1}")
+
+
+def _refuse(bad: Any, kind: str, why: str) -> None:
+    """`bad` things of a kind, (thing, 1)."""
+    if len(found := np.flatnonzero(bad)):
+        raise LevelFileError(f"env_state.{kind}[{found[0]}] {why}")
+
+
+def _rules(params: object, static: object) -> TaskParams:
+    physics = {ours: RULES[ours].read(params, theirs, "env_params") for ours, theirs in PHYSICS.items()}
+    task = {name: entry.read(params, name, "env_params") for name, entry in TASK.items()}
+    frame_skip = STEPS.read(static, "frame_skip", "static_env_params")
+    return TaskParams(frame_skip=frame_skip, physics=Params(**physics), **task)
+
+
+def _params(rules: TaskParams) -> dict[str, Any]:
+    physics = {theirs: getattr(rules.physics, ours) for ours, theirs in PHYSICS.items()}
+    return {**physics, **{name: getattr(rules, name) for name in TASK}, **EXTRA}
+
+
+def _static(rules: TaskParams, size: Size) -> dict[str, Any]:
+    counts = dict(zip(COUNTS, size, strict=True))
+    return {**counts, **STATIC_CONSTANTS, "frame_skip": rules.frame_skip, **STATIC_EXTRA}
+
+
+def _things(fields: Fields, kind: str, entries: Mapping[str, Entry]) -> list[dict[str, Any]]:
+    """All things of a kind as objects."""
+    columns = {name: fields[_path(kind, name)][0] for name in entries}
+    extra = {"highlighted": False} if kind in ("polygon", "circle") else {}  # by the reference's editor
+    count = len(columns["active"])
+    return [{name: _nested(column[i]) for name, column in columns.items()} | extra for i in range(count)]
+
+
+def _path(kind: str, name: str) -> str:
+    return PATHS.get((kind, name), f"{kind}/{name}")
+
+
+def _nested(values: Any) -> Any:
+    """Vectors as a file has them."""
+    values = np.asarray(values)
+    return {str(i): _nested(row) for i, row in enumerate(values)} if values.ndim else values.item()
+
+
+def _with_points(level: Level) -> Fields:
+    """The reference's arrays, with the places of joints and thrusters that its first picture shows."""
+    model = level.model
+    joint_point = _in_world(level, model.joint_a, model.joint_anchor_a)
+    thruster_point = _in_world(level, model.thruster_body, model.thruster_position)
+    start = (np.zeros(1, np.int32), np.full(1, NO_DISTANCE, np.float32))
+    return state_to_kinetix(level, level.state, *start, None, joint_point, thruster_point)
+
+
+def _in_world(level: Level, body: Any, anchor: Any) -> np.ndarray:
+    """Places, m, (thing, 2, 1), of points in the frames of bodies."""
+    body, anchor = np.asarray(body)[:, 0], np.asarray(anchor)
+    position, angle = np.asarray(level.state.position)[body], np.asarray(level.state.rotation)[body]
+    cos, sin, x, y = np.cos(angle), np.sin(angle), anchor[:, 0], anchor[:, 1]
+    return position + np.stack([x * cos - y * sin, x * sin + y * cos], 1)

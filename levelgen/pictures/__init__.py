@@ -1,0 +1,1 @@
+"""Levels as pictures: a scene, drawn in pixels or as SVG."""

@@ -1,0 +1,206 @@
+"""A body that the sampler may add: its random numbers, its shape, its joint, and how it enters a level.
+
+All lanes last; one-hot choices stand for indices. Facts: `kinetix.environment.ued` 3.0.2; numbers are fields of
+`Distribution`.
+"""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from levelgen.level import Level, Role
+from levelgen.sampling.distribution import Distribution
+from levelgen.sampling.draws import at, between, first_free, pick, put
+from physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
+from physics.types import MAX_VERTICES
+from physics.vector import Vec, unvec, vec, where
+
+CORNERS = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)], np.float32)  # of a rectangle, clockwise
+Lane = Float[Array, " lane"]
+Flag = Bool[Array, " lane"]
+
+
+class BodyDraws(NamedTuple):
+    """Random numbers of one proposal, each [lane]."""
+
+    is_polygon: Lane
+    half_x: Lane
+    half_y: Lane
+    long: Lane
+    long_x: Lane
+    radius: Lane
+    rotation: Lane
+    role: Lane
+    # free
+    x: Lane
+    y: Lane
+    opposite: Lane
+    fixed: Lane
+    lowered: Lane
+    # connected
+    target_is_polygon: Lane
+    target: Lane
+    anchor_x: Lane
+    anchor_y: Lane
+    target_anchor_x: Lane
+    target_anchor_y: Lane
+    joint_fixed: Lane
+    motor: Lane
+    motor_binding: Lane
+    motor_speed: Lane
+    motor_power: Lane
+    limited: Lane
+    limit_min: Lane
+    limit_max: Lane
+
+
+class Shape(NamedTuple):
+    """A rectangle or a circle; what the other kind would need is at its minimum."""
+
+    is_polygon: Flag
+    half: Vec  # m, half width and half height
+    radius: Lane  # m
+
+
+class Joint(NamedTuple):
+    """From the proposed body to its target."""
+
+    target: Bool[Array, "body lane"]
+    anchor: Vec  # in the frame of the proposed body
+    target_anchor: Vec
+    fixed: Flag
+    limited: Flag
+    limit_min: Lane
+    limit_max: Lane
+    motor_on: Flag
+    motor_speed: Lane
+    motor_power: Lane
+    motor_binding: Int[Array, " lane"]
+
+
+class Proposal(NamedTuple):
+    """A body to add, with a joint where `joined`; nothing where not `possible`."""
+
+    possible: Flag
+    shape: Shape
+    position: Vec
+    rotation: Lane
+    role: Int[Array, " lane"]
+    fixed: Flag
+    joined: Flag
+    joint: Joint
+    hidden: Flag  # one of the joined bodies may lie within the other whatever the joint's angle
+
+
+def draw_shape(d: BodyDraws, is_polygon: Flag, size: Lane | float, dist: Distribution) -> Shape:
+    """Uniform half sides or radius; one side of some rectangles is longer (util.sample_dimensions)."""
+    longest = size / 2 / math.sqrt(2)
+    half = [
+        jnp.where(is_polygon, between(u, dist.min_half_side, longest), dist.min_half_side) for u in (d.half_x, d.half_y)
+    ]
+    long, long_x = d.long < dist.long_side_chance, d.long_x < 0.5
+    stretch = [jnp.where(long & side, dist.long_side_factor, 1.0) for side in (long_x, ~long_x)]
+    radius = between(d.radius, dist.min_radius, size / 2 * dist.circle_size_factor)
+    return Shape(
+        is_polygon, Vec(half[0] * stretch[0], half[1] * stretch[1]), jnp.where(is_polygon, dist.min_radius, radius)
+    )
+
+
+def corners(half: Vec) -> Float[Array, "vertex 2 lane"]:
+    return jnp.asarray(CORNERS)[:, :, None] * unvec(half)[None]
+
+
+def corners_in_world(p: Proposal) -> Float[Array, "vertex 2 lane"]:
+    """As if the body were a polygon."""
+    return unvec(turned(vec(corners(p.shape.half)), p.rotation) + p.position)
+
+
+def shape_mass(shape: Shape) -> tuple[Lane, Lane]:
+    """kg and kg m^2 at the density of 1 kg/m^2 that all bodies have."""
+    vertices, four = corners(shape.half)[None], jnp.full((1, *shape.radius.shape), MAX_VERTICES)
+    mass = jnp.where(shape.is_polygon, polygon_area(vertices, four)[0], circle_area(shape.radius))
+    inertia = jnp.where(shape.is_polygon, polygon_inertia(vertices, four)[0], circle_inertia(shape.radius))
+    return mass, inertia
+
+
+def draw_role(level: Level, u: Lane, red_allowed: Flag | bool, dist: Distribution) -> Int[Array, " lane"]:
+    """Green and blue come first, then plain, and at most one red (util.get_role)."""
+    there = [(level.model.active & (level.role == role)).any(0) for role in (Role.GREEN, Role.BLUE, Role.RED)]
+    complete = there[0] & there[1]
+    red = jnp.where(complete & ~there[2] & red_allowed, dist.red_weight, 0.0)
+    return pick(jnp.stack([1.0 * complete, 1.0 * ~there[0], 1.0 * ~there[1], red]), u)
+
+
+def insert(level: Level, p: Proposal) -> Level:
+    """The level with the proposed body, and its joint, in the first free places."""
+    polygons, model, state = level.size.polygons, level.model, level.state
+    polygon = first_free(model.active[:polygons]) & p.shape.is_polygon & p.possible
+    circle = first_free(model.active[polygons:]) & ~p.shape.is_polygon & p.possible
+    body = jnp.concatenate([polygon, circle])
+    mass, inertia = shape_mass(p.shape)
+    model = replace(
+        model,
+        active=model.active | body,
+        inverse_mass=put(model.inverse_mass, body, jnp.where(p.fixed, 0.0, inverse(mass))),
+        inverse_inertia=put(model.inverse_inertia, body, jnp.where(p.fixed, 0.0, inverse(inertia))),
+        vertices=put(model.vertices, polygon, corners(p.shape.half)),
+        radius=put(model.radius, circle, p.shape.radius),
+    )
+    state = replace(
+        state,
+        position=put(state.position, body, unvec(p.position)),
+        rotation=put(state.rotation, body, p.rotation),
+    )
+    level = replace(level, model=model, state=state, role=put(level.role, body, p.role))
+    return _insert_joint(level, p, body) if level.size.joints else level
+
+
+def _insert_joint(level: Level, p: Proposal, body: Bool[Array, "body lane"]) -> Level:
+    """The joint's first body is the one with the smaller number."""
+    model, joint = level.model, p.joint
+    place = first_free(model.joint_active) & p.joined
+    numbers = jnp.arange(level.size.bodies)[:, None]
+    own, target = at(numbers, body), at(numbers, joint.target)
+    target_first = target < own
+    first, second = (
+        where(target_first, joint.target_anchor, joint.anchor),
+        where(target_first, joint.anchor, joint.target_anchor),
+    )
+    rotation = p.rotation - at(level.state.rotation, joint.target)
+    rotation = jnp.where(joint.fixed, jnp.where(target_first, rotation, -rotation), 0.0)
+    model = replace(
+        model,
+        joint_active=model.joint_active | place,
+        joint_a=put(model.joint_a, place, jnp.minimum(own, target)),
+        joint_b=put(model.joint_b, place, jnp.maximum(own, target)),
+        joint_anchor_a=put(model.joint_anchor_a, place, unvec(first)),
+        joint_anchor_b=put(model.joint_anchor_b, place, unvec(second)),
+        joint_fixed=put(model.joint_fixed, place, joint.fixed),
+        joint_rotation=put(model.joint_rotation, place, rotation),
+        joint_limited=put(model.joint_limited, place, joint.limited),
+        joint_min=put(model.joint_min, place, joint.limit_min),
+        joint_max=put(model.joint_max, place, joint.limit_max),
+        motor_on=put(model.motor_on, place, joint.motor_on),
+        motor_speed=put(model.motor_speed, place, joint.motor_speed),
+        motor_power=put(model.motor_power, place, joint.motor_power),
+    )
+    return replace(level, model=model, motor_binding=put(level.motor_binding, place, joint.motor_binding))
+
+
+def no_joint(level: Level) -> Joint:
+    lanes = level.role.shape[-1]
+    zero, no = jnp.zeros(lanes), jnp.zeros(lanes, bool)
+    nobody = jnp.zeros((level.size.bodies, lanes), bool)
+    return Joint(nobody, Vec(zero, zero), Vec(zero, zero), no, no, zero, zero, no, zero, zero, no.astype(jnp.int32))
+
+
+def origin(like: Lane) -> Vec:
+    return Vec(jnp.zeros_like(like), jnp.zeros_like(like))
+
+
+def turned(v: Vec, angle: Lane) -> Vec:
+    return v.rotate(jnp.cos(angle), jnp.sin(angle))

@@ -1,0 +1,261 @@
+"""One environment as users of gymnax and of the reference know it, played on our levels.
+
+`env.reset(key, params)` and `env.step(key, state, action, params)` are functions of ONE environment, to be mapped
+with `jax.vmap`; the mapped axis becomes the engine's lanes (`levelgen.task.vmapped`). After an end, a step resets: to a
+level drawn from `params.levels`, or to `override_reset_state`.
+Facts: `kinetix.environment.env` and `spaces` 3.0.2.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from levelgen.level import ACTIONS, Level
+from levelgen.task import rules as task
+from levelgen.task.actions import CHOICES, DISCRETE_ACTIONS, Controls, continuous_controls, controls, discrete_controls
+from levelgen.task.observe.entities import entities, padded_shape, symbolic_padded
+from levelgen.task.observe.flat import LIMIT, feature_count, symbolic_flat
+from levelgen.task.observe.pixels import SIDE, pixels
+from levelgen.task.rules import TaskParams, TaskState
+from levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete, Space
+from levelgen.task.vmapped import single
+from physics.types import Model, Size
+
+
+class ActionType(StrEnum):
+    """How an action is written (`levelgen.task.actions`)."""
+
+    DISCRETE = "discrete"
+    MULTI_DISCRETE = "multi_discrete"
+    CONTINUOUS = "continuous"
+
+
+class ObservationType(StrEnum):
+    """What is seen of a state."""
+
+    SYMBOLIC_FLAT = "symbolic_flat"
+    SYMBOLIC_FLAT_PADDED = "symbolic_flat_padded"
+    SYMBOLIC_ENTITY = "symbolic_entity"
+    PIXELS = "pixels"
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class EnvParams:
+    """What may change without compiling again: the levels that resets draw from (level axis last, at least one)."""
+
+    levels: Level
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class EnvState:
+    """One environment, without an axis of lanes: what is constant in its level, and the episode under way."""
+
+    model: Model
+    role: Int[Array, " body"]
+    density: Float[Array, " body"]
+    motor_binding: Int[Array, " joint"]
+    motor_auto: Bool[Array, " joint"]
+    thruster_binding: Int[Array, " thruster"]
+    now: TaskState
+
+    @property
+    def level(self) -> Level:
+        """The level, its world as it is now."""
+        constant = {name: value for name, value in vars(self).items() if name != "now"}
+        return Level(state=self.now.state, **constant)
+
+    @staticmethod
+    def start(level: Level) -> "EnvState":
+        """An episode's beginning."""
+        constant = {name: value for name, value in vars(level).items() if name != "state"}
+        return EnvState(now=task.reset(level), **constant)
+
+
+Step = tuple[Any, EnvState, Float[Array, ""], Bool[Array, ""], dict[str, Array]]
+CONTROLS: dict[ActionType, Callable[[Level, Array], Controls]] = {
+    ActionType.DISCRETE: discrete_controls,
+    ActionType.MULTI_DISCRETE: controls,
+    ActionType.CONTINUOUS: continuous_controls,
+}
+LOOKS: dict[ObservationType, Callable[..., Any]] = {
+    ObservationType.SYMBOLIC_FLAT: symbolic_flat,
+    ObservationType.SYMBOLIC_FLAT_PADDED: symbolic_padded,
+    ObservationType.SYMBOLIC_ENTITY: entities,
+    ObservationType.PIXELS: jax.vmap(pixels, -1, -1),
+}
+
+
+def make(
+    levels: Level,
+    action_type: str = ActionType.MULTI_DISCRETE,
+    observation_type: str = ObservationType.SYMBOLIC_FLAT,
+    rules: TaskParams = task.DEFAULT_RULES,
+    auto_reset: bool = True,
+) -> tuple["Environment", EnvParams]:
+    """An environment and its default parameters.
+
+    Args:
+        levels: resets draw from these with equal chances; level axis last.
+        action_type: one of ActionType.
+        observation_type: one of ObservationType.
+        rules: of the task.
+        auto_reset: whether a step that ends an episode gives the first state of the next one.
+
+    Raises:
+        ValueError: no such type.
+    """
+    count = max(x.shape[-1] for x in jax.tree.leaves(levels))
+    levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], count)), levels)
+    env = Environment(levels, ActionType(action_type), ObservationType(observation_type), rules, auto_reset)
+    return env, env.default_params
+
+
+def starts(levels: Level) -> EnvState:
+    """The first state of every level, level axis FIRST: what `vmap` maps over, and `override_reset_state` takes."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), EnvState.start(levels))
+
+
+@dataclass(frozen=True, eq=False)
+class Environment:
+    """Made by `make`. Equal to itself only, so that it can be a static argument."""
+
+    levels: Level
+    action_type: ActionType
+    observation_type: ObservationType
+    rules: TaskParams
+    auto_reset: bool
+
+    @property
+    def default_params(self) -> EnvParams:
+        return EnvParams(self.levels)
+
+    @property
+    def size(self) -> Size:
+        return self.levels.size
+
+    @property
+    def name(self) -> str:
+        return "levelproof"
+
+    @property
+    def num_actions(self) -> int:
+        """Discrete actions, or entries of an action."""
+        return DISCRETE_ACTIONS if self.action_type == ActionType.DISCRETE else ACTIONS
+
+    @partial(jax.jit, static_argnums=0)
+    def reset(
+        self, key: Key[Array, ""], params: EnvParams | None = None, override_reset_state: EnvState | None = None
+    ) -> tuple[Any, EnvState]:
+        """The observation and the state at the start of an episode."""
+        return single(self._reset_lanes)(*self._restart(key, params, override_reset_state))
+
+    @partial(jax.jit, static_argnums=0)
+    def step(
+        self,
+        key: Key[Array, ""],
+        state: EnvState,
+        action: Array,
+        params: EnvParams | None = None,
+        override_reset_state: EnvState | None = None,
+    ) -> Step:
+        """One env step: observation, state, reward, done, info.
+
+        Where the episode ended and the environment resets itself, the observation and the state are those of the
+        next episode's start; the reward is always that of the step. `info` has the reference's entries: GoalR
+        (green touched blue) and distance (of green and blue at the end of the step, m).
+        """
+        if not self.auto_reset:
+            return self.step_env(key, state, action, params)
+        table, index, override = self._restart(key, params, override_reset_state)
+        return single(self._step_lanes)(table, index, (override, *_detached(state, action)))
+
+    def step_env(self, key: Key[Array, ""], state: EnvState, action: Array, params: EnvParams | None = None) -> Step:
+        """One env step without reset."""
+        del key, params  # the world has no chance in it
+        return single(self._advance_lanes)((), 0, _detached(state, action))
+
+    def reset_env(self, key: Key[Array, ""], params: EnvParams | None = None) -> tuple[Any, EnvState]:
+        return self.reset(key, params)
+
+    def get_obs(self, state: EnvState) -> Any:
+        """What is seen of a state."""
+        return single(lambda table, index, state: self._look(state))((), 0, state)
+
+    def action_space(self, params: EnvParams | None = None) -> Space:
+        del params
+        spaces: dict[ActionType, Space] = {
+            ActionType.DISCRETE: Discrete(DISCRETE_ACTIONS),
+            ActionType.MULTI_DISCRETE: MultiDiscrete(CHOICES),
+            ActionType.CONTINUOUS: Box(-1.0, 1.0, (ACTIONS,)),
+        }
+        return spaces[self.action_type]
+
+    def observation_space(self, params: EnvParams | None = None) -> Space:
+        del params
+        if self.observation_type == ObservationType.SYMBOLIC_FLAT:
+            return Box(-LIMIT, LIMIT, (feature_count(self.size),))
+        if self.observation_type == ObservationType.SYMBOLIC_FLAT_PADDED:
+            return Box(-LIMIT, LIMIT, padded_shape(self.size))
+        if self.observation_type == ObservationType.PIXELS:
+            return Dict({"image": Box(0.0, 1.0, (SIDE, SIDE, 3)), "global_info": Box(-jnp.inf, jnp.inf, (1,))})
+        return _space_of_entities(jax.eval_shape(lambda: self.reset(jax.random.key(0))[0]), self.size)
+
+    def _restart(self, key, params: EnvParams | None, override: EnvState | None) -> tuple[Any, Array | int, Any]:
+        """(levels to draw from, the one drawn, a state instead of them): what a reset in lanes needs."""
+        if override is not None:
+            return (), 0, override
+        levels = (params or self.default_params).levels
+        count = levels.state.rotation.shape[-1]
+        return levels, jax.random.randint(key, (), 0, count) if count > 1 else 0, None
+
+    def _reset_lanes(self, levels: Any, index: Int[Array, " lane"], override: EnvState | None) -> tuple[Any, EnvState]:
+        state = _first_state(levels, index, override)
+        return self._look(state), state
+
+    def _advance_lanes(self, table: Any, index: Int[Array, " lane"], given: tuple[EnvState, Array]) -> Step:
+        after, reward, done, info = self._advance(*given)
+        return self._look(after), after, reward, done, info
+
+    def _step_lanes(self, levels: Any, index: Int[Array, " lane"], given: tuple[Any, EnvState, Array]) -> Step:
+        override, state, action = given
+        after, reward, done, info = self._advance(state, action)
+        restart = _first_state(levels, index, override)
+        after = jax.tree.map(lambda fresh, x: jnp.where(done, fresh, x), restart, after)
+        return self._look(after), after, reward, done, info
+
+    def _advance(self, state: EnvState, action: Array) -> tuple[EnvState, Array, Array, dict[str, Array]]:
+        driven = CONTROLS[self.action_type](state.level, action)
+        now, outcome, distance = task.advance_driven(state.level, state.now, driven, self.rules)
+        return replace(state, now=now), outcome.reward, outcome.done, {"GoalR": outcome.goal, "distance": distance}
+
+    def _look(self, state: EnvState) -> Any:
+        return LOOKS[self.observation_type](state.level, state.now.state)
+
+
+def _detached(*given: Any) -> Any:
+    """Nothing is differentiated through the world."""
+    return jax.tree.map(jax.lax.stop_gradient, given)
+
+
+def _first_state(levels: Any, index: Int[Array, " lane"], override: EnvState | None) -> EnvState:
+    if override is not None:
+        return override
+    return EnvState.start(jax.tree.map(lambda x: x[..., index], levels))
+
+
+def _space_of_entities(seen: Any, size: Size) -> Dict:
+    """Masks are truth values, numbers of bodies are below their count, the rest is unbounded."""
+
+    def space(x: jax.ShapeDtypeStruct) -> Box:
+        bounds = {"b": (0, 1), "i": (0, size.bodies - 1)}.get(x.dtype.kind, (-jnp.inf, jnp.inf))
+        return Box(*bounds, x.shape, x.dtype)
+
+    return Dict({name: space(x) for name, x in vars(seen).items()})

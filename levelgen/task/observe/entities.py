@@ -1,0 +1,143 @@
+"""What an agent sees, as one row a thing: the padded symbolic observation, and entities with masks for attention.
+
+Lanes are last, as everywhere. The columns of a thing are those of the flat observation (`levelgen.task.observe.flat`).
+Facts: `kinetix.render.renderer_symbolic_flat` and `renderer_symbolic_entity` 3.0.2.
+"""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from levelgen.level import Level
+from levelgen.task.observe.flat import (
+    CIRCLE_ROWS,
+    GRAVITY_UNIT,
+    JOINT_ROWS,
+    POLYGON_ROWS,
+    THRUSTER_ROWS,
+    UNSEEN_WALLS,
+    body_rows,
+    joint_rows,
+    polygon_rows,
+    symbolic_flat,
+    thruster_rows,
+)
+from physics.pairs import PairKind, pairs_of
+from physics.types import Size, State
+
+KINDS = 4  # polygons, circles, joints, thrusters
+ATTENTION_MASKS = 4  # all to all, held together by joints, joined directly, in contact
+
+
+def padded_shape(size: Size) -> tuple[int, int]:
+    """Things and columns of `symbolic_padded`."""
+    blocks = blocks_of(size)
+    return sum(count for count, _ in blocks), max(rows for _, rows in blocks) + KINDS + 1
+
+
+def symbolic_padded(level: Level, state: State) -> Float[Array, "thing column lane"]:
+    """Polygons but the walls and the ceiling, circles, joints, thrusters: a row each.
+
+    Columns: those of the thing's kind, zeros, the kind one-hot, gravity.
+    """
+    size, flat = level.size, symbolic_flat(level, state)
+    (things, columns), lanes = padded_shape(size), flat.shape[-1]
+    rows, seen = [], 0
+    for kind, (count, width) in enumerate(blocks_of(size)):
+        own = flat[seen : seen + count * width].reshape(count, width, lanes)
+        zeros = jnp.zeros((count, columns - KINDS - 1 - width, lanes))
+        is_kind = jnp.broadcast_to(jnp.eye(KINDS)[kind][:, None], (count, KINDS, lanes))
+        rows.append(jnp.concatenate([own, zeros, is_kind], axis=1))
+        seen += count * width
+    gravity = jnp.broadcast_to(flat[-1], (things, 1, lanes))
+    return jnp.concatenate([jnp.concatenate(rows), gravity], axis=1)
+
+
+def blocks_of(size: Size) -> tuple[tuple[int, int], ...]:
+    """(how many, rows of each) in the order of the flat observation."""
+    return (
+        (size.polygons - len(UNSEEN_WALLS), POLYGON_ROWS),
+        (size.circles, CIRCLE_ROWS),
+        (size.joints, JOINT_ROWS + 2 * size.bodies),
+        (size.thrusters, THRUSTER_ROWS + size.bodies),
+    )
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class EntityObservation:
+    """Sets of things for attention. Every joint is there twice: as seen from body b, then from body a.
+
+    Numbers are neither clipped nor blank where a thing is not active (the masks tell). Bodies are numbered polygons
+    first. attention_mask[k, i, j]: i may look at j, both active, because (0) all may, (1) joints hold them together
+    or keep them from colliding, (2) a joint joins them, (3) i < j (a circle before a polygon) touched in the last
+    physics step.
+    """
+
+    circles: Float[Array, "circle 19 lane"]
+    polygons: Float[Array, "polygon 27 lane"]
+    joints: Float[Array, "joint_end 22 lane"]
+    thrusters: Float[Array, "thruster 8 lane"]
+    circle_mask: Bool[Array, "circle lane"]
+    polygon_mask: Bool[Array, "polygon lane"]
+    joint_mask: Bool[Array, "joint_end lane"]
+    thruster_mask: Bool[Array, "thruster lane"]
+    attention_mask: Bool[Array, "4 body body lane"]
+    joint_indexes: Int[Array, "joint_end 2 lane"]  # looks from, looks at; 0 where not active
+    thruster_indexes: Int[Array, "thruster lane"]  # its body
+
+
+def entities(level: Level, state: State) -> EntityObservation:
+    """The entities of a state."""
+    level, size = replace(level, state=jax.tree.map(jnp.nan_to_num, state)), level.size
+    model, polygons, circles = level.model, slice(0, size.polygons), slice(size.polygons, size.bodies)
+    radius = [model.radius, jnp.ones_like(model.radius)]
+    gravity = jnp.broadcast_to(model.gravity[1] / GRAVITY_UNIT, model.friction.shape)
+    joints = [_table(joint_rows(level, seen_from_a)) for seen_from_a in (False, True)]
+    index = jnp.where(model.joint_active, jnp.stack([model.joint_b, model.joint_a]), 0)  # [end, joint, lane]
+    return EntityObservation(
+        circles=_table([*body_rows(level, circles), *radius, gravity[circles]]),
+        polygons=_table([*body_rows(level, polygons), *polygon_rows(model, polygons), gravity[polygons]]),
+        joints=jnp.concatenate(joints),
+        thrusters=_table(thruster_rows(level)),
+        circle_mask=model.active[circles],
+        polygon_mask=model.active[polygons],
+        joint_mask=jnp.concatenate([model.joint_active] * 2),
+        thruster_mask=model.thruster_active,
+        attention_mask=_attention_mask(level, index),
+        joint_indexes=jnp.concatenate([jnp.stack([index[0], index[1]], 1), jnp.stack([index[1], index[0]], 1)]),
+        thruster_indexes=model.thruster_body,
+    )
+
+
+def _table(rows: list[Array]) -> Float[Array, "thing row lane"]:
+    return jnp.stack(jnp.broadcast_arrays(*(jnp.nan_to_num(row.astype(jnp.float32)) for row in rows)), axis=1)
+
+
+def _attention_mask(level: Level, joint_index: Int[Array, "2 joint lane"]) -> Bool[Array, "4 body body lane"]:
+    model, bodies = level.model, level.size.bodies
+    number = jnp.arange(bodies)[:, None]
+    is_end = (joint_index[:, :, None] == number) & model.joint_active[:, None]  # [end, joint, body, lane]
+    joined = (is_end[0][:, :, None] & is_end[1][:, None]).any(0)
+    masks = [jnp.ones_like(joined), ~model.collides, joined | joined.swapaxes(0, 1), _touching(level)]
+    both = model.active[:, None] & model.active[None]
+    return jnp.stack(jnp.broadcast_arrays(*(mask & both for mask in masks)))
+
+
+def _touching(level: Level) -> Bool[Array, "body body lane"]:
+    """Contacts of the last physics step, at their pair's two numbers."""
+    pairs, active = pairs_of(level.size), level.state.contact_active
+    n, m = len(pairs.polygon), len(pairs.circle_polygon)
+    kinds: list[tuple[PairKind, Array]] = [
+        (pairs.polygon, active[:n] | active[n : 2 * n]),
+        (pairs.circle_polygon, active[2 * n : 2 * n + m]),
+        (pairs.circle, active[2 * n + m :]),
+    ]
+    where = np.full((level.size.bodies, level.size.bodies), n + m + len(pairs.circle))  # the last row: no pair
+    for (kind, _), start in zip(kinds, (0, n, n + m), strict=True):
+        where[list(kind.a), list(kind.b)] = start + np.arange(len(kind))
+    none = jnp.zeros((1, active.shape[-1]), bool)
+    return jnp.concatenate([*(touch for _, touch in kinds), none])[where]

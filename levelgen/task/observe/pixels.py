@@ -1,0 +1,219 @@
+"""125x125 pixels for agents, drawn from the state of ONE environment (map with `jax.vmap`).
+
+A picture is a stack of shapes, the last one on top. All are convex, so a shape covers one interval of every column:
+its ends are computed once a column, and a pixel only compares its height with them.
+Facts: `kinetix.render.renderer_pixels` 3.0.2 at its downscale of 4. The thruster's drawing is our own, in its colours.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from levelgen.level import WORLD_SIDE, Level, Role
+from levelgen.task.observe.flat import GRAVITY_UNIT
+from physics.types import FIXED_POLYGONS, State
+
+PIXELS_PER_METRE = 25
+SIDE = int(WORLD_SIDE * PIXELS_PER_METRE)  # pixels
+PATCH = 2 * PIXELS_PER_METRE  # a body shows inside a square of this side only
+BORDER = 2 * PIXELS_PER_METRE  # invisible; patches are moved to lie inside it
+THRUSTER_SIDE = 4.0  # pixels
+BITS = 9  # of a packed colour's parts
+
+Colour = tuple[float, float, float]
+BACKGROUND: Colour = (255, 255, 255)
+FIXED: Colour = (80, 80, 80)
+SPOKE: Colour = (0, 0, 0)  # from a circle's centre to its rim
+ROLE_COLOUR: dict[Role, Colour] = {
+    Role.PLAIN: (160, 160, 160),
+    Role.GREEN: (0, 204, 0),
+    Role.BLUE: (0, 102, 204),
+    Role.RED: (255, 102, 102),
+}
+FIXED_SHADE = 0.5  # of a role's colour on what cannot move
+NO_MOTOR: Colour = (255, 255, 255)
+BINDING_COLOUR: tuple[Colour, ...] = ((255, 255, 0), (255, 0, 255), (0, 255, 255), (255, 153, 51))
+# Of the thruster: (from, to) along its axis and across it, as shares of its side from the middle; brightness, and
+# whether it has the binding's colour.
+NOZZLE = (((-0.5, -0.2), (-0.12, 0.12), 0.6, True), ((-0.2, 0.06), (-0.34, 0.34), 0.8, True))
+BASE = (((0.06, 0.5), (-0.4, 0.4), 0.3, False),)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PixelsObservation:
+    """What an agent sees."""
+
+    image: Float[Array, "x y 3"]  # y upwards; red, green, blue from 0 to 1
+    global_info: Float[Array, "1"]  # gravity / 10
+
+
+class Shape(NamedTuple):
+    """What a shape covers of each column, in pixels, and its colour."""
+
+    low: Float[Array, " x"]
+    high: Float[Array, " x"]
+    colour: Int[Array, ""]  # as `_packed` makes it
+
+
+def pixels(level: Level, state: State) -> PixelsObservation:
+    """The picture of a state; neither has an axis of lanes."""
+    height = jnp.arange(SIDE, dtype=jnp.float32)
+    # Stored before they are used, and the image too: XLA would compute them anew for every pixel and colour.
+    low, high, colour = jax.lax.optimization_barrier(jax.tree.map(lambda *x: jnp.stack(x), *_shapes(level, state)))
+    image = jnp.full((SIDE, SIDE), _packed(np.array(BACKGROUND)))
+    for number in range(len(low)):
+        covered = (low[number][:, None] <= height) & (height <= high[number][:, None])
+        image = jnp.where(covered, colour[number], image)
+    image = jax.lax.optimization_barrier(image)
+    parts = jnp.stack([image >> 2 * BITS, image >> BITS, image], axis=-1) & (2**BITS - 1)
+    return PixelsObservation(parts / jnp.float32(2 * 255), level.model.gravity[1:] / GRAVITY_UNIT)
+
+
+def _shapes(level: Level, state: State) -> list[Shape]:
+    """From the floor to the thrusters."""
+    model, size = level.model, level.size
+    place = state.position * PIXELS_PER_METRE
+    colours = _body_colours(level)
+    floor = place[0] + model.vertices[0] * PIXELS_PER_METRE  # its rotation is not drawn
+    floor_colour = _role_colour(level.role[0], jnp.array(True))
+    shapes = [_shape(_polygon_planes(floor), floor_colour)]
+    for body in range(FIXED_POLYGONS, size.polygons):
+        corners = place[body] + _turn(model.vertices[body] * PIXELS_PER_METRE, state.rotation[body])
+        interval = _meet(_columns(_polygon_planes(corners)), _patch(place[body]))
+        shapes.append(_if(model.active[body], Shape(*interval, colours[body])))
+    for circle in range(size.circles):
+        body = size.polygons + circle
+        disc = _meet(_disc(place[body], model.radius[circle] * PIXELS_PER_METRE), _patch(place[body]))
+        spoke = _meet(disc, _columns(_spoke_planes(place[body], state.rotation[body])))
+        shapes.append(_if(model.active[body], Shape(*disc, colours[body])))
+        shapes.append(_if(model.active[body], Shape(*spoke, _packed(np.array(SPOKE)))))
+    binding_colours = jnp.array(BINDING_COLOUR)
+    for joint in range(size.joints):
+        shapes.append(_joint(level, state, joint, binding_colours))
+    for thruster in range(size.thrusters):
+        shapes += _thruster(level, state, thruster, binding_colours)
+    return shapes
+
+
+def _joint(level: Level, state: State, joint: int, colours: Float[Array, "binding 3"]) -> Shape:
+    """One pixel."""
+    model, body = level.model, level.model.joint_a[joint]
+    driven = model.motor_on[joint] & ~model.joint_fixed[joint]
+    colour = jnp.where(driven, colours[level.motor_binding[joint]], jnp.array(NO_MOTOR))
+    x, y = jnp.round(_on_body(state, body, model.joint_anchor_a[joint]))
+    column = jnp.arange(SIDE) == x
+    return _if(
+        model.joint_active[joint], Shape(jnp.where(column, y, jnp.inf), jnp.where(column, y, -jnp.inf), _packed(colour))
+    )
+
+
+def _thruster(level: Level, state: State, thruster: int, colours: Float[Array, "binding 3"]) -> list[Shape]:
+    """Three rectangles along the thruster's axis."""
+    model, body = level.model, level.model.thruster_body[thruster]
+    place = jnp.round(_on_body(state, body, model.thruster_position[thruster]))
+    angle = model.thruster_rotation[thruster] + state.rotation[body]
+    tint = colours[level.thruster_binding[thruster]]
+    shapes = []
+    for along, across, brightness, tinted in (*NOZZLE, *BASE):
+        # Clockwise, as polygons are
+        corners = np.array([(along[0], across[0]), (along[0], across[1]), (along[1], across[1]), (along[1], across[0])])
+        planes = _polygon_planes(place + _turn(jnp.asarray(corners * THRUSTER_SIDE, jnp.float32), angle))
+        colour = brightness * (tint if tinted else jnp.array(BACKGROUND))
+        shapes.append(_if(model.thruster_active[thruster], _shape(planes, _packed(colour))))
+    return shapes
+
+
+class Planes(NamedTuple):
+    """Half-planes x * dx + y * dy <= bound, in pixels."""
+
+    dx: Float[Array, " plane"]
+    dy: Float[Array, " plane"]
+    bound: Float[Array, " plane"]
+
+
+def _polygon_planes(corners: Float[Array, "corner 2"]) -> Planes:
+    """Right of each side; a side without length has nothing on its right."""
+    ends = jnp.roll(corners, -1, axis=0)
+    dx, dy = corners[:, 1] - ends[:, 1], ends[:, 0] - corners[:, 0]
+    bound = corners[:, 0] * dx + corners[:, 1] * dy
+    return Planes(dx, dy, jnp.where((dx == 0) & (dy == 0), -jnp.inf, bound))
+
+
+def _spoke_planes(centre: Float[Array, "2"], angle: Float[Array, ""]) -> Planes:
+    """Two pixels wide, from the centre on."""
+    back = jnp.array([jnp.sin(angle), -jnp.cos(angle)])
+    side = jnp.array([-back[1], back[0]])
+    normals = jnp.stack([back, side, -side])
+    return Planes(normals[:, 0], normals[:, 1], normals @ centre + jnp.array([0.0, 1.0, 1.0]))
+
+
+Interval = tuple[Float[Array, " x"], Float[Array, " x"]]
+
+
+def _columns(planes: Planes) -> Interval:
+    """What lies in all half-planes, of each column."""
+    x = jnp.arange(SIDE, dtype=jnp.float32)[:, None]
+    room = planes.bound - x * planes.dx  # y * dy <= room
+    edge = room / jnp.where(planes.dy == 0, 1.0, planes.dy)
+    low = jnp.where(planes.dy < 0, edge, -jnp.inf).max(1)
+    high = jnp.where(planes.dy > 0, edge, jnp.inf)
+    high = jnp.where((planes.dy == 0) & (room < 0), -jnp.inf, high).min(1)
+    return low, high
+
+
+def _disc(centre: Float[Array, "2"], radius: Float[Array, ""]) -> Interval:
+    x = jnp.arange(SIDE, dtype=jnp.float32)
+    left = radius**2 - (x - centre[0]) ** 2
+    half = jnp.where(left >= 0, jnp.sqrt(jnp.maximum(left, 0.0)), -jnp.inf)
+    return centre[1] - half, centre[1] + half
+
+
+def _patch(centre: Float[Array, "2"]) -> Interval:
+    """The square in which a body shows."""
+    start = jnp.clip(jnp.trunc(centre + BORDER - PATCH / 2), 0, SIDE + 2 * BORDER - PATCH) - BORDER
+    x = jnp.arange(SIDE)
+    inside = (start[0] <= x) & (x < start[0] + PATCH)
+    return jnp.where(inside, start[1], jnp.inf), jnp.where(inside, start[1] + PATCH - 1, -jnp.inf)
+
+
+def _meet(one: Interval, other: Interval) -> Interval:
+    return jnp.maximum(one[0], other[0]), jnp.minimum(one[1], other[1])
+
+
+def _shape(planes: Planes, colour: Int[Array, ""]) -> Shape:
+    return Shape(*_columns(planes), colour)
+
+
+def _if(shown: Array, shape: Shape) -> Shape:
+    return shape._replace(low=jnp.where(shown, shape.low, jnp.inf))
+
+
+def _body_colours(level: Level) -> Int[Array, " body"]:
+    return _role_colour(level.role, level.model.inverse_mass == 0)
+
+
+def _role_colour(role: Int[Array, " *body"], fixed: Array) -> Int[Array, " *body"]:
+    colours = np.array([ROLE_COLOUR[Role(number)] for number in range(len(Role))], np.float32)
+    held = np.concatenate([[FIXED], FIXED_SHADE * colours[1:]])
+    return jnp.where(fixed, _packed(held)[role], _packed(colours)[role])
+
+
+def _packed(colour: Any) -> Int[Array, " *colours"]:
+    """(..., 3) numbers up to 255 as one each, in halves: what is half as bright is exact, too."""
+    red, green, blue = jnp.moveaxis((2 * jnp.asarray(colour, jnp.float32)).astype(jnp.int32), -1, 0)
+    return (red << 2 * BITS) | (green << BITS) | blue
+
+
+def _on_body(state: State, body: Int[Array, ""], anchor: Float[Array, "2"]) -> Float[Array, "2"]:
+    """A point of a body's frame, in pixels."""
+    return PIXELS_PER_METRE * (state.position[body] + _turn(anchor, state.rotation[body]))
+
+
+def _turn(vector: Float[Array, "*point 2"], angle: Float[Array, ""]) -> Float[Array, "*point 2"]:
+    cos, sin, x, y = jnp.cos(angle), jnp.sin(angle), vector[..., 0], vector[..., 1]
+    return jnp.stack([x * cos - y * sin, x * sin + y * cos], -1)

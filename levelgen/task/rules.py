@@ -1,0 +1,181 @@
+"""The task: make green and blue touch, never green and red. Reward, end of an episode, automatic reset.
+
+Facts: `kinetix.environment.env` 3.0.2.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from levelgen.level import Level, Role
+from levelgen.task.actions import Controls, controls
+from physics.pairs import pairs_of
+from physics.step import step as physics_step
+from physics.step import step_unseen
+from physics.types import Manifold, Params, State
+from physics.vector import rows, select, vec
+
+NO_DISTANCE = -1.0  # last_distance before the first step of an episode
+
+
+@dataclass(frozen=True)
+class TaskParams:
+    """Rules of the task (hashable: pass as a static argument)."""
+
+    frame_skip: int = 2  # physics steps per env step, with the same action
+    max_timesteps: int = 256  # env steps after which an episode ends
+    dense_reward_scale: float = 0.1  # 1/m; reward for each metre that green and blue come closer; 0: none
+    physics: Params = field(default_factory=Params)
+
+    def __post_init__(self) -> None:
+        for name in ("frame_skip", "max_timesteps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
+        if self.dense_reward_scale < 0:
+            raise ValueError(f"dense_reward_scale is {self.dense_reward_scale}: it must not be negative")
+
+
+DEFAULT_RULES = TaskParams()
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class TaskState:
+    """An episode under way."""
+
+    state: State
+    timestep: Int[Array, " lane"]  # env steps taken in this episode
+    last_distance: Float[Array, " lane"]  # m, between green and blue; NO_DISTANCE at the start
+
+
+class Outcome(NamedTuple):
+    """What one env step gave."""
+
+    reward: Float[Array, " lane"]
+    done: Bool[Array, " lane"]
+    goal: Bool[Array, " lane"]  # ended because green touched blue
+
+
+def reset(level: Level) -> TaskState:
+    """The first state of an episode in every lane."""
+    lanes = level.state.rotation.shape[-1]
+    return TaskState(level.state, jnp.zeros(lanes, jnp.int32), jnp.full(lanes, NO_DISTANCE, jnp.float32))
+
+
+def has_roles(level: Level, a, b, first: Role, second: Role) -> Bool[Array, "pair lane"]:
+    """Whether a pair of active bodies has these two roles, in either order."""
+    role = jnp.where(level.model.active, level.role, Role.PLAIN)
+    role_a, role_b = rows(role, a), rows(role, b)
+    return ((role_a == first) & (role_b == second)) | ((role_a == second) & (role_b == first))
+
+
+def touches(level: Level, active: Bool[Array, "contact lane"], first: Role, second: Role) -> Bool[Array, " lane"]:
+    """Whether bodies of these roles are in contact.
+
+    The first contact point of a polygon pair, or the contact of a circle pair, counts.
+    """
+    pairs = pairs_of(level.size)
+    n, m = len(pairs.polygon), len(pairs.circle_polygon)
+    at = {0: pairs.polygon, 2 * n: pairs.circle_polygon, 2 * n + m: pairs.circle}
+    hits = [
+        (has_roles(level, pair.a, pair.b, first, second) & active[start : start + len(pair)]).any(0)
+        for start, pair in at.items()
+        if len(pair)
+    ]
+    return jnp.stack(hits).any(0)
+
+
+def goal_distance(level: Level, state: State) -> Float[Array, " lane"]:
+    """Distance between the centres of green and blue, summed over all such pairs that may touch, m."""
+    position, pairs = vec(state.position), pairs_of(level.size)
+    total = jnp.zeros(state.rotation.shape[-1])
+    for pair in (pairs.polygon, pairs.circle_polygon, pairs.circle):
+        if len(pair):
+            between = position.map(lambda x, p=pair: rows(x, p.a) - rows(x, p.b))
+            total += jnp.where(has_roles(level, pair.a, pair.b, Role.GREEN, Role.BLUE), between.norm(), 0.0).sum(0)
+    return total
+
+
+class Frame(NamedTuple):
+    """What the task reads off one physics step."""
+
+    goal: Bool[Array, " lane"]
+    fail: Bool[Array, " lane"]
+    distance: Float[Array, " lane"]
+    seen: Manifold | None
+
+
+def advance(
+    level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
+) -> tuple[TaskState, Outcome]:
+    """One env step without reset: the next state, and what the step gave."""
+    return advance_driven(level, now, controls(level, action), params)[:2]
+
+
+def advance_driven(
+    level: Level, now: TaskState, driven: Controls, params: TaskParams
+) -> tuple[TaskState, Outcome, Float[Array, " lane"]]:
+    """The same under controls, whatever kind of action they come from; and the distance of the goal at the end, m."""
+    return _advance(level, now, driven, params, lambda *given: (step_unseen(*given), None))[:3]
+
+
+def advance_seen(
+    level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
+) -> tuple[TaskState, Outcome, Manifold]:
+    """The same, and the contacts of the last physics step."""
+    after, outcome, _, seen = _advance(level, now, controls(level, action), params, physics_step)
+    return after, outcome, seen
+
+
+def _advance(level: Level, now: TaskState, driven: Controls, params: TaskParams, physics) -> tuple:
+    motor, thrust = driven
+
+    def frame(state, _):
+        state, seen = physics(level.model, state, motor, thrust, params.physics)
+        fail = touches(level, state.contact_active, Role.GREEN, Role.RED)
+        goal = touches(level, state.contact_active, Role.GREEN, Role.BLUE) & ~fail
+        return state, Frame(goal, fail, goal_distance(level, state), seen)
+
+    state, frames = jax.lax.scan(frame, now.state, None, length=params.frame_skip)
+    ended = frames.goal | frames.fail
+    first = jnp.argmax(ended, axis=0)  # the first physics step that ended the episode counts
+    at_end = lambda x: select(x, jnp.where(ended.any(0), first, params.frame_skip - 1))
+    goal = select(frames.goal, first)
+    distance = at_end(frames.distance)
+    timestep = now.timestep + 1
+    done = ended.any(0) | (timestep >= params.max_timesteps) | has_nan(state)
+
+    closer = jnp.nan_to_num(now.last_distance - distance, nan=0.0, posinf=0.0, neginf=0.0)
+    shaping = jnp.where(now.last_distance == NO_DISTANCE, 0.0, params.dense_reward_scale * closer)
+    reward = goal.astype(jnp.float32) - select(frames.fail, first).astype(jnp.float32) + shaping
+    after = TaskState(state, timestep, jnp.where(done, NO_DISTANCE, distance))
+    return after, Outcome(reward, done, goal), distance, jax.tree.map(lambda x: x[-1], frames.seen)
+
+
+def has_nan(state: State) -> Bool[Array, " lane"]:
+    """Whether a lane's world has broken down."""
+    leaves = (state.position, state.rotation, state.velocity, state.angular_velocity)
+    return jnp.stack([jnp.isnan(x).any(tuple(range(x.ndim - 1))) for x in leaves]).any(0)
+
+
+def restart(level: Level, state: TaskState, done: Bool[Array, " lane"]) -> TaskState:
+    """The first state of the level in the lanes that are done."""
+    return jax.tree.map(lambda fresh, x: jnp.where(done, fresh, x), reset(level), state)
+
+
+def step(
+    level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams = DEFAULT_RULES
+) -> tuple[TaskState, Outcome]:
+    """One env step with automatic reset to the same level.
+
+    Args:
+        level: the level of each lane.
+        now: the episode under way in each lane.
+        action: multi-discrete, one entry per binding (`levelgen.task.actions`).
+        params: rules.
+    """
+    after, outcome = advance(level, now, action, params)
+    return restart(level, after, outcome.done), outcome

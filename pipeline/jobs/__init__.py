@@ -1,0 +1,1 @@
+"""Jobs that make splits: work units, who does them, and what is said meanwhile."""

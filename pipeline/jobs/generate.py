@@ -1,0 +1,130 @@
+"""The job of `levelproof generate`: what is left to do, done by workers or in this process, and said to the user."""
+
+import shlex
+from collections import Counter
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from configs.schema import JobConfig
+from pipeline.errors import Exit, Failure
+from pipeline.jobs.progress import Board, Tally
+from pipeline.jobs.schedule import Outcome, Queue, WorkUnit, levels_text, plan_units
+from pipeline.store.checkpoints import require_same_experts
+from pipeline.store.layout import quarantine_path
+from pipeline.store.manifest import Manifest, read_manifest
+from pipeline.store.split import note_job, writing
+
+
+def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids: Sequence[int] | None = None) -> Exit:
+    """Make what is missing of the job's levels, and commit it unit by unit.
+
+    Args:
+        job: what to make.
+        command: as typed, for the hint of how to go on.
+        console: where progress is shown.
+        level_ids: which levels, if not those of the job.
+
+    Raises:
+        UserError, Failure: see `store.split.writing` and `store.checkpoints.require_same_experts`; or the disk refuses.
+        KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; what is committed stays.
+    """
+    require_same_experts(job)
+    with writing(job) as (split, manifest):
+        wanted = set(job.level_ids if level_ids is None else map(int, level_ids))
+        done = wanted.intersection(manifest.level_ids.tolist())
+        queue = Queue.of(plan_units(sorted(wanted), done, job.levels_per_unit))
+        note_job(split, job, command, sorted(wanted))
+        if queue.waiting:
+            solved = _labels(manifest, wanted)["solved"]
+            board = Board(Tally(len(wanted), len(done), solved), console)
+            board.say(_opening(job, split, len(wanted), len(done)))
+            try:
+                with board.shown():
+                    _work(job, split, queue, board)
+            except KeyboardInterrupt:
+                board.say(
+                    f"Stopped: {board.tally.done} of {len(wanted)} levels are committed; the same command goes on."
+                )
+                raise
+            manifest = read_manifest(split, ["label", "env_steps", "steps_to_first_success"])
+            spent = _spent(manifest, wanted - done, board.tally) if board.tally.env_steps else ""
+        else:
+            print(f"Nothing to do: all {len(wanted)} levels are there.")
+            spent = ""
+        _closing(split, manifest, wanted, queue, spent)
+    return Exit.QUARANTINED if queue.quarantined else Exit.DONE
+
+
+def _work(job: JobConfig, split: Path, queue: Queue, board: Board) -> None:
+    def settle(outcomes: Sequence[Outcome]) -> None:
+        """Account for attempts that ended together."""
+        failed: dict[tuple[str, bool], list[WorkUnit]] = {}  # by cause, and whether they are given up
+        for outcome in outcomes:
+            unit = outcome.unit
+            board.ended(unit, outcome.summary)
+            if outcome.fatal:
+                raise Failure(outcome.fatal)
+            note = quarantine_path(split, unit.name)
+            if outcome.summary:
+                note.unlink(missing_ok=True)
+                continue
+            last = queue.failed(unit)
+            failed.setdefault((outcome.reason.strip().splitlines()[-1], last), []).append(unit)
+            if last:
+                note.parent.mkdir(exist_ok=True)
+                note.write_text(f"Failed {queue.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n")
+        for (cause, last), units in failed.items():
+            board.say(f"{levels_text(units).capitalize()} failed ({cause}): {'given up' if last else 'trying again'}.")
+
+    if job.executor == "inline":
+        from pipeline.jobs.inline import run
+    else:
+        from pipeline.jobs.cluster import run
+    run(job, split, queue, settle, board)
+
+
+def _labels(manifest: Manifest, wanted: Collection[int]) -> Counter[str]:
+    """How many of these levels have which label."""
+    return Counter(manifest.labels[np.isin(manifest.level_ids, list(wanted))].tolist())
+
+
+def _opening(job: JobConfig, split: Path, levels: int, done: int) -> str:
+    there = f", {done} are there already" if done else ""
+    return f"{levels} levels of size {job.size}, {job.budget} env steps each, into {split}{there}"
+
+
+def _spent(manifest: Manifest, made: Collection[int], tally: Tally) -> str:
+    """What this run's env steps were for."""
+    rows = manifest.table.filter(np.isin(manifest.level_ids, list(made)))
+    steps, first, label = (rows.column(name).to_numpy() for name in ("env_steps", "steps_to_first_success", "label"))
+    total = tally.env_steps + tally.evaluated + tally.idle
+    after = np.nansum(np.where(label == "solved", steps - first.astype(float), 0.0))
+    shares = {
+        "after a level's first success": after / total,
+        "of levels that stayed unsolved": steps[label == "unsolved"].sum() / total,
+        "of evaluations": tally.evaluated / total,
+        "in empty slots": tally.idle / total,
+    }
+    told = ", ".join(f"{share:.0%} {name}" for name, share in shares.items())
+    nothing = (after + tally.idle) / total
+    return f"{total:,} env steps: {told}. Decided nothing (after the first success, or empty): {nothing:.0%}."
+
+
+def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: Queue, spent: str) -> None:
+    """Where it is, what came of it, and what to type next. On stdout."""
+    labels, folder = _labels(manifest, wanted), shlex.quote(str(split))
+    total = sum(labels.values())
+    counts = ", ".join(f"{count} {label}" for label, count in labels.most_common())
+    print(f"{split}: {total} levels, {counts}." if total else f"{split}: nothing is committed.")
+    if spent:
+        print(spent)
+    for unit in queue.quarantined:
+        print(f"Given up: {levels_text([unit])}, for the reason in {quarantine_path(split, unit.name)}")
+    if total:
+        print(f"Next:  levelproof inspect {folder}")
+    solved = manifest.level_ids[manifest.labels == "solved"]
+    if len(solved):
+        print(f"       levelproof show {folder} {solved[0]} -o level.gif")

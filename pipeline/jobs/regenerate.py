@@ -1,0 +1,71 @@
+"""A split's levels again, at another budget: `levelproof regenerate manifest=data/256k/s budget=1M`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from configs.compose import compose_job, words_for
+from levelgen.identity.keys import SAMPLER_VERSION
+from pipeline.errors import Exit, UserError
+from pipeline.jobs.generate import generate
+from pipeline.look.inspect import select
+from pipeline.store.manifest import require_manifest
+
+OWN = ("manifest", "where", "continue")  # words that are not settings of a job
+NOT_OURS = ("size", "levels", "first_level")  # settings that the manifest decides
+HINT = "as in levelproof regenerate manifest=data/256k/s budget=1M where=\"label = 'unsolved'\""
+
+
+def regenerate(words: Sequence[str], console: Console) -> Exit:
+    """Train the levels of a manifest, all or those for which a condition holds, at another budget.
+
+    Args:
+        words: `manifest=SPLIT`, `budget=N`, and if wanted `where=SQL`, `continue=true` and settings of `generate`.
+        console: where progress is shown.
+
+    Raises:
+        UserError: a word is missing or wrong, no level is chosen, or as `generate`.
+        Failure: the manifest is damaged, or as `generate`.
+    """
+    own, settings = split_words(words)
+    source = Path(own["manifest"]).expanduser()
+    manifest = require_manifest(source)
+    config = manifest.config or {}
+    if config["sampler_version"] != SAMPLER_VERSION:
+        raise UserError(
+            f"The levels of {source} are of sampler version {config['sampler_version']}, and this program makes those "
+            f"of version {SAMPLER_VERSION}: use the levelproof that made them."
+        )
+    level_ids = select(manifest.table, own.get("where")).column("level_id").to_numpy()
+    if not len(level_ids):
+        raise UserError(f"The condition {own.get('where')!r} holds for none of the {len(manifest.level_ids)} levels.")
+    goes_on = [f"continue_from={source}"] if own.get("continue") == "true" else []
+    job = compose_job([*words_for(config), *settings, *goes_on])
+    return generate(job, ["levelproof", "regenerate", *words], console, level_ids)
+
+
+def split_words(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Our own words by name, and those that are settings.
+
+    Raises:
+        UserError: one is missing, or there is one that the manifest decides.
+    """
+    own, settings, names = {}, [], []
+    for word in words:
+        name, _, value = word.partition("=")
+        names.append(name)
+        if name in OWN:
+            own[name] = value
+        else:
+            settings.append(word)
+    if "manifest" not in own:
+        raise UserError(f"Which levels? Name the split they are in, {HINT}.")
+    if "budget" not in names:
+        raise UserError(f"Which budget? Give one, {HINT}.")
+    for name in NOT_OURS:
+        if name in names:
+            raise UserError(f"{name} cannot be changed here, it is that of the manifest: choose levels with where=SQL.")
+    if own.get("continue", "false") not in ("true", "false"):
+        raise UserError(f"continue is {own['continue']}: it must be true or false.")
+    return own, settings

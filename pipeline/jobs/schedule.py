@@ -1,0 +1,106 @@
+"""What is left to do: work units, their attempts and their quarantine. Knows nothing of workers or files."""
+
+from collections import deque
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipeline.store.layout import unit_name
+
+# How many units a worker may have at once, those included that failed as often: a unit that kills its worker takes
+# fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.
+COMPANY = (64, 8, 1)
+TOLD = 4  # runs of levels in a message
+
+
+@dataclass(frozen=True)
+class WorkUnit:
+    """Level ids of one multiple of the job's `unit`, done together and committed together."""
+
+    level_ids: tuple[int, ...]  # ascending
+
+    @property
+    def name(self) -> str:
+        return unit_name(self.level_ids[0], self.level_ids[-1])
+
+
+def plan_units(wanted: Iterable[int], done: Collection[int], unit: int) -> list[WorkUnit]:
+    """Units that cover what is wanted and not done.
+
+    A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same places.
+    """
+    left: dict[int, list[int]] = {}
+    for level_id in wanted:
+        if level_id not in done:
+            left.setdefault(level_id // unit, []).append(level_id)
+    return [WorkUnit(tuple(level_ids)) for level_ids in left.values()]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What travels back from a committed unit."""
+
+    levels: int
+    solved: int
+    env_steps: int  # of training
+    evaluated: int  # env steps of evaluations
+    idle: int  # env steps in slots without a level
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one attempt at a unit ended."""
+
+    unit: WorkUnit
+    summary: Summary | None = None  # None: it failed
+    reason: str = ""  # of the failure, for the quarantine file
+    fatal: str = ""  # a sentence, where no further attempt can succeed
+
+
+@dataclass
+class Queue:
+    """Units waiting, each with the attempts it has had."""
+
+    waiting: deque[WorkUnit]
+    attempts: dict[WorkUnit, int] = field(default_factory=dict)
+    quarantined: list[WorkUnit] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, units: Iterable[WorkUnit]) -> "Queue":
+        return cls(deque(units))
+
+    def take(self, running: Collection[WorkUnit] = ()) -> WorkUnit | None:
+        """The next unit for a worker that has these; None when none may join them (see `COMPANY`)."""
+        failures = {self.attempts.get(unit, 0) for unit in running}  # one number at most
+        if failures and len(running) >= COMPANY[max(failures)]:
+            return None  # without a look at all that wait: workers ask several times a second
+        for unit in self.waiting:
+            if not failures or self.attempts.get(unit, 0) in failures:
+                self.waiting.remove(unit)
+                return unit
+        return None
+
+    def failed(self, unit: WorkUnit) -> bool:
+        """Note a failed attempt; the unit waits again, or True when it is now quarantined."""
+        self.attempts[unit] = self.attempts.get(unit, 0) + 1
+        if self.attempts[unit] < len(COMPANY):
+            self.waiting.append(unit)
+            return False
+        self.quarantined.append(unit)
+        return True
+
+
+def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of each run of consecutive numbers, ascending."""
+    ordered = np.unique(np.asarray(numbers, np.int64))
+    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
+
+
+def levels_text(units: Iterable[WorkUnit]) -> str:
+    """Their levels, for people: `levels 0 to 31, 96 to 127`."""
+    ids = [level_id for unit in units for level_id in unit.level_ids]
+    of = [f"{first} to {last}" if last > first else f"{first}" for first, last in runs(ids)]
+    more = f" and {len(of) - TOLD} more runs of levels" if len(of) > TOLD else ""
+    return f"level{'s' if len(ids) > 1 else ''} {', '.join(of[:TOLD])}{more}"

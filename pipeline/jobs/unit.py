@@ -1,0 +1,160 @@
+"""One work unit: sample its levels, train their experts, replay every witness, write the shard, commit the fragment.
+
+Idempotent: an attempt that dies anywhere leaves at most a shard that no fragment names. Knows nothing of workers.
+"""
+
+import errno
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from configs.compose import again
+from configs.schema import JobConfig
+from experts.labels import WITNESSED, Label, Verdict
+from experts.pool import Pool
+from experts.train import UnitResult, new_pool, train_in
+from experts.witness import Record, replay, succeeds
+from levelgen.identity.content import content_hashes
+from levelgen.identity.signature import signatures
+from levelgen.level import Level, size_of
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import TaskParams
+from pipeline.errors import Failure
+from pipeline.jobs.schedule import Outcome, Summary, WorkUnit
+from pipeline.store.checkpoints import experts_for, save_experts
+from pipeline.store.fields import arrays_of, map_arrays, same_bits
+from pipeline.store.layout import attempt_paths, fragment_path
+from pipeline.store.locks import committing
+from pipeline.store.manifest import write_fragment
+from pipeline.store.provenance import device, versions
+from pipeline.store.shard import write_shard
+
+Report = Callable[[int, float, int], None]  # so far: env steps, levels, solved levels
+# The disk refuses: the next attempt would train for nothing.
+FATAL = {
+    errno.ENOSPC: "the disk is full: free some space",
+    errno.EDQUOT: "your disk quota is used up: free some space",
+    errno.EFBIG: "the disk refuses files this large: choose another folder or raise the limit",
+    errno.EROFS: "the disk is read-only: make it writable",
+    errno.EACCES: "writing is not permitted: check the folder's permissions",
+    errno.EPERM: "writing is not permitted: check the folder's permissions",
+}
+
+
+def attempt(job: JobConfig, split: Path, unit: WorkUnit, report: Report, pool: Pool) -> Outcome:
+    """One attempt at a unit, with its failure as a value: exceptions do not travel between processes."""
+    try:
+        return Outcome(unit, run_unit(job, split, unit, report, pool))
+    except OSError as error:
+        fatal = FATAL.get(error.errno or 0, "")
+        sentence = fatal and f"Cannot write to {split}, {fatal}, then run the same command again."
+        return Outcome(unit, reason=traceback.format_exc(), fatal=sentence)
+    except Exception:
+        return Outcome(unit, reason=traceback.format_exc())
+
+
+def pool_for(job: JobConfig) -> Pool:
+    """Where a job's experts train, those of several units side by side."""
+    return new_pool(job.env_steps, job.expert, job.stop, job.task)
+
+
+def run_unit(job: JobConfig, split: Path, unit: WorkUnit, report: Report, pool: Pool) -> Summary:
+    """Make and commit one unit.
+
+    Raises:
+        Failure: a witness does not replay.
+        OSError: the disk refuses; nothing is committed.
+    """
+    ids = np.asarray(unit.level_ids, np.int32)
+    levels = sample_levels(jnp.asarray(ids), size_of(job.size), job.distribution)
+    result = train_in(pool, levels, ids, report, experts_for(job, unit.level_ids), job.keep_experts)
+    check_witnesses(result, job.task)
+    commit(job, split, unit, result)
+    labels = [verdict.label for verdict in result.verdicts]
+    return Summary(len(labels), labels.count(Label.SOLVED), *result.spent)
+
+
+def check_witnesses(result: UnitResult, task: TaskParams) -> None:
+    """The commit gate: every witness, replayed from its level and its actions, is its record and reaches the goal.
+
+    Raises:
+        Failure: one is not, or does not.
+    """
+    again = replay(result.levels, result.record.action, task)
+    wrong, reached = unlike_fields(result.record, again), succeeds(np.asarray(again.done), np.asarray(again.goal))
+    for i, (level_id, verdict) in enumerate(zip(result.level_ids, result.verdicts, strict=True)):
+        if verdict.label not in WITNESSED:
+            continue
+        if verdict.label == Label.TRIVIAL and result.record.action[..., i].any():
+            raise Failure(f"The witness of level {level_id}, which is called trivial, does something.")
+        if i in wrong:
+            raise Failure(f"The witness of level {level_id} does not replay: its {wrong[i]} differs.")
+        if not reached[i]:
+            raise Failure(f"The witness of level {level_id} does not reach the goal when replayed.")
+
+
+def unlike_fields(record: Record, again: Record) -> dict[int, str]:
+    """The first field whose bits differ, for each level (by its place) that is not the same in both."""
+    ours, theirs = arrays_of(record), arrays_of(again)
+    wrong: dict[int, str] = {}
+    for name, values in ours.items():
+        for i in np.flatnonzero(~same_bits(values, theirs[name])):
+            wrong.setdefault(int(i), name)
+    return wrong
+
+
+def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> None:
+    """The shard first, under this attempt's own name, then the fragment that names it.
+
+    Raises:
+        OSError: the disk refuses; nothing is committed.
+    """
+    kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label in WITNESSED]
+    shard, experts = attempt_paths(split, unit.name)
+    rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
+    for row, content, signature in zip(rows, content_hashes(result.levels), signatures(result.levels), strict=True):
+        row |= {"content_hash": content, "signature": signature}
+    for place, i in enumerate(kept):
+        rows[i] |= {"shard": str(shard.relative_to(split)), "row": place}
+    for row in rows if result.experts else ():
+        if row["level_id"] in result.experts:
+            row["experts"] = str(experts.relative_to(split))
+    with committing(split):
+        if result.experts:
+            save_experts(experts, result.experts)
+        if kept:
+            write_shard(
+                shard, [int(result.level_ids[i]) for i in kept], shard_arrays(result.levels, result.record, kept)
+            )
+        write_fragment(fragment_path(split, unit.name), rows, job.hash, job.results)
+
+
+def shard_arrays(levels: Level, record: Record, kept: list[int]) -> dict[str, np.ndarray]:
+    """Every field of the levels at these places, by its name in the shard."""
+    chosen = (map_arrays(lambda x: x[..., kept], tree) for tree in (levels, record))
+    return {
+        name: x
+        for tree, path in zip(chosen, ("level/", "record/"), strict=True)
+        for name, x in arrays_of(tree, path).items()
+    }
+
+
+def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, Any]:
+    """A level's row, without its identity and without a shard."""
+    return asdict(verdict) | {
+        "level_id": level_id,
+        "size": job.size,
+        "budget": job.budget,
+        "shard": None,
+        "row": None,
+        "experts": None,
+        "config_hash": job.hash,
+        "versions": versions(),
+        "device": device(),
+        "command": f"{again(job)} first_level={level_id} levels=1",
+    }

@@ -1,0 +1,1 @@
+"""Splits looked at: counts, rows, pictures."""

@@ -1,0 +1,120 @@
+"""Levels that are there twice: within a split, in another split, or among level files.
+
+By the manifest's columns `content_hash` (the same content) and `signature` (nearly the same): docs/levels.md, Identity.
+DuckDB groups and joins, and each level is told with one partner only, so a split of many copies stays small to tell.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pyarrow as pa
+
+from pipeline.errors import UserError
+from pipeline.store.manifest import require_manifest
+from pipeline.store.schema import COLUMNS
+
+COMPARED = ("content_hash", "signature")
+# The few that share a half of a signature; the same content has the same signature. Grouping hashes of 8 bytes takes a
+# tenth of the time and the memory that grouping strings takes.
+HALVES = ("signature[1]", "signature[2]")
+ALIKE_WITHIN = "CREATE TABLE alike AS SELECT * FROM levels WHERE " + " OR ".join(
+    f"hash({half}) IN (SELECT hash({half}) AS half FROM levels GROUP BY half HAVING count(*) > 1)" for half in HALVES
+)
+ALIKE_BETWEEN = "CREATE TABLE {alike} AS SELECT * FROM {levels} WHERE " + " OR ".join(
+    f"hash({half}) IN (SELECT hash({half}) FROM {{others}})" for half in HALVES
+)
+SAME_WITHIN = """
+    SELECT name, partner FROM alike
+    JOIN (SELECT content_hash, min(name) AS partner FROM alike GROUP BY content_hash) USING (content_hash)
+    WHERE partner < name
+"""
+SAME_BETWEEN = """
+    SELECT name, partner FROM alike
+    JOIN (SELECT content_hash, min(name) AS partner FROM there GROUP BY content_hash) USING (content_hash)
+"""
+NEAR = """
+    one AS (SELECT signature[1] AS half, min(name) AS partner FROM theirs GROUP BY half),
+    two AS (SELECT signature[2] AS half, min(name) AS partner FROM theirs GROUP BY half)
+    SELECT name, least(one.partner, two.partner) AS partner FROM ours
+    LEFT JOIN one ON signature[1] = one.half
+    LEFT JOIN two ON signature[2] = two.half
+"""
+NEAR_WITHIN = f"""
+    WITH ours AS (SELECT min(name) AS name, first(signature) AS signature FROM alike GROUP BY content_hash),
+    theirs AS (FROM ours), {NEAR} WHERE least(one.partner, two.partner) < name
+"""
+NEAR_BETWEEN = f"""
+    WITH ours AS (FROM alike ANTI JOIN there USING (content_hash)),
+    theirs AS (FROM there), {NEAR} WHERE least(one.partner, two.partner) IS NOT NULL
+"""
+
+Found = dict[str, dict[str, Any]]  # same, near -> levels (how many), pairs (the first: a level and its partner)
+
+
+def compared(manifest_table: pa.Table) -> pa.Table:
+    """What is compared of a manifest's rows; a level's name is its id."""
+    return manifest_table.select(["level_id", *COMPARED]).rename_columns(["name", *COMPARED])
+
+
+def compared_in(source: Path) -> pa.Table:
+    """The same of the levels of a split, of a level file, or of all level files below a folder, named by their paths.
+
+    Raises:
+        UserError: there is nothing of that kind, or a level file cannot be used.
+        Failure: a fragment is damaged.
+    """
+    if source.is_file():
+        return _of_files([source])
+    if not source.is_dir() or (source / "manifest").is_dir():
+        return compared(require_manifest(source, COMPARED).table)
+    if not (files := sorted(source.rglob("*.json"))):
+        raise UserError(f"There is neither a split nor a level file in {source}: give a folder that has one.")
+    return _of_files(files)
+
+
+def within(levels: pa.Table, shown: int) -> Found:
+    """Levels with an earlier one of the same content; contents that an earlier one is nearly the same as."""
+    with duckdb.connect() as connection:
+        connection.register("levels", levels)
+        connection.execute(ALIKE_WITHIN)
+        return {"same": _pairs(connection, SAME_WITHIN, shown), "near": _pairs(connection, NEAR_WITHIN, shown)}
+
+
+def between(levels: pa.Table, others: pa.Table, shown: int) -> Found:
+    """Levels with one of the same content among the others; the rest of them with one that is nearly the same."""
+    with duckdb.connect() as connection:
+        connection.register("levels", levels)
+        connection.register("others", others)
+        connection.execute(ALIKE_BETWEEN.format(alike="alike", levels="levels", others="others"))
+        connection.execute(ALIKE_BETWEEN.format(alike="there", levels="others", others="alike"))
+        return {"same": _pairs(connection, SAME_BETWEEN, shown), "near": _pairs(connection, NEAR_BETWEEN, shown)}
+
+
+def told(found: Found) -> str:
+    """In words: how many, and the first of them."""
+    words = []
+    for kind, of in found.items():
+        example = " (such as {} and {})".format(*of["pairs"][0]) if of["pairs"] else ""
+        words.append(f"{of['levels']:,} {kind}{example}")
+    return ", ".join(words)
+
+
+def _pairs(connection: duckdb.DuckDBPyConnection, query: str, shown: int) -> dict[str, Any]:
+    connection.execute(f"CREATE OR REPLACE TEMP TABLE pairs AS {query}")
+    count = connection.execute("SELECT count(*) FROM pairs").fetchall()[0][0]
+    pairs = connection.execute("SELECT * FROM pairs ORDER BY name LIMIT ?", [shown]).fetchall()
+    return {"levels": count, "pairs": [list(pair) for pair in pairs]}
+
+
+def _of_files(files: list[Path]) -> pa.Table:
+    from levelgen.identity.content import content_hashes  # here, so that a question about a split need not wait for JAX
+    from levelgen.identity.signature import signatures
+    from pipeline.read.levels import level_file
+
+    rows = []
+    for path in files:
+        level = level_file(path).level
+        rows.append({"name": str(path), "content_hash": content_hashes(level)[0], "signature": signatures(level)[0]})
+    schema = pa.schema([pa.field("name", pa.string()), *(COLUMNS.field(name) for name in COMPARED)])
+    return pa.Table.from_pylist(rows, schema)

@@ -1,0 +1,175 @@
+"""What is in a split: counts, rates, quantiles, duplicates and rows, by DuckDB over the manifest.
+
+Reads no shard's data.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+from rich.console import Console
+from rich.table import Table
+
+from configs.compose import identified
+from configs.convert import typed
+from levelgen.sampling.distribution import Distribution
+from pipeline.errors import UserError
+from pipeline.look import duplicates
+from pipeline.store.manifest import Manifest, require_manifest
+from pipeline.store.schema import RECORD_STEPS
+from pipeline.store.shard import stored_bytes
+
+QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps")
+
+
+def inspect(split: Path, where: str | None, rows: int, as_json: bool, against: Sequence[Path] = ()) -> None:
+    """Print what is in `split`, of the rows for which the SQL condition `where` holds.
+
+    The same levels are looked for in `against`: other splits, level files, folders of level files.
+
+    Raises:
+        UserError: no split, a condition that DuckDB cannot use, or nothing to look in.
+        Failure: a fragment is damaged.
+    """
+    facts = survey(split, where, rows, against)
+    if as_json:
+        json.dump(facts, sys.stdout, indent=2, allow_nan=False)
+        print()
+    else:
+        _print(facts, Console(highlight=False))
+
+
+def survey(split: Path, where: str | None = None, rows: int = 10, against: Sequence[Path] = ()) -> dict[str, Any]:
+    """The facts that `inspect` prints, as JSON's types."""
+    manifest = require_manifest(split)
+    chosen = select(manifest.table, where)
+    solved, tried = (select(chosen, f"label IN ({names})") for names in ("'solved'", "'solved', 'unsolved'"))
+    levels, shown = duplicates.compared(chosen), max(rows, 0)
+    stored = sum(stored_bytes(split / shard) for shard in manifest.shards)
+    kept = manifest.table.num_rows - manifest.table.column("shard").null_count
+    return {
+        "split": str(split),
+        "config_hash": manifest.config_hash,
+        "distribution": dict(zip(("name", "hash"), _distribution(manifest), strict=True)),
+        "levels": chosen.num_rows,
+        "labels": _counts(chosen, "label"),
+        "unsolvable": _counts(select(chosen, "label = 'unsolvable'"), "label_reason"),
+        "failed_by_noop": sum(chosen.column("failed_by_noop").to_pylist()),
+        "solve_rate": solved.num_rows / tried.num_rows if tried.num_rows else None,  # of the levels with an expert
+        "steps_to_goal": _quantiles(solved, "steps_to_goal"),
+        "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
+        "duplicates": duplicates.within(levels, shown),
+        "against": {str(other): duplicates.between(levels, duplicates.compared_in(other), shown) for other in against},
+        "env_steps": total(chosen, "env_steps"),
+        "env_steps_after_success": total(solved, "env_steps - coalesce(steps_to_first_success, env_steps)"),
+        "env_steps_unsolved": total(select(chosen, "label = 'unsolved'"), "env_steps"),
+        "split_bytes": stored,  # of all the split's shards, whatever the condition
+        "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
+        "rows": [_plain(row) for row in chosen.slice(0, shown).to_pylist()],
+    }
+
+
+def _distribution(manifest: Manifest) -> tuple[str | None, str]:
+    return identified(typed(Distribution, (manifest.config or {})["distribution"], "distribution"))
+
+
+def select(table: pa.Table, where: str | None) -> pa.Table:
+    """The manifest's rows for which the SQL condition holds, sorted by level id.
+
+    Raises:
+        UserError: DuckDB cannot use the condition.
+    """
+    if where is None:
+        return table
+    with duckdb.connect() as connection:
+        connection.register("manifest", table)
+        connection.execute("SET enable_external_access = false")  # a condition reads the manifest, no other file
+        try:
+            return connection.sql(f"SELECT * FROM manifest WHERE ({where}\n) ORDER BY level_id").to_arrow_table()
+        except duckdb.Error as error:
+            reason = str(error).strip().splitlines()[0]
+            columns = ", ".join(table.column_names)
+            raise UserError(
+                f"Cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
+            ) from None
+
+
+def total(table: pa.Table, expression: str) -> int:
+    """Sum of an SQL expression over the rows."""
+    with duckdb.connect() as connection:
+        connection.register("manifest", table)
+        rows = connection.sql(f"SELECT coalesce(sum({expression}), 0) AS sum FROM manifest").to_arrow_table()
+    return int(rows.column("sum")[0].as_py())
+
+
+def _counts(table: pa.Table, column: str) -> dict[str, int]:
+    """How often each value of a column is there."""
+    entries = table.column(column).value_counts().to_pylist()
+    return dict(sorted((entry["values"], entry["counts"]) for entry in entries))
+
+
+def _quantiles(table: pa.Table, column: str) -> dict[str, float] | None:
+    values = table.column(column).drop_null().to_numpy()
+    if not len(values):
+        return None
+    found = np.quantile(values, QUANTILES, method="nearest").tolist()
+    return {f"{quantile:.0%}": value for quantile, value in zip(QUANTILES, found, strict=True)}
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN and no infinity: null."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    return value if not isinstance(value, float) or abs(value) < float("inf") else None
+
+
+def _print(facts: dict[str, Any], console: Console) -> None:
+    labels = ", ".join(f"{count} {label}" for label, count in facts["labels"].items()) or "none"
+    distribution = facts["distribution"]
+    lines = {
+        "split": facts["split"],
+        "distribution": f"{distribution['name'] or 'of its own'} ({distribution['hash']})",
+        "levels": f"{facts['levels']} ({labels})",
+        "unsolvable": "; ".join(f"{count} {reason}" for reason, count in facts["unsolvable"].items()) or None,
+        "failed by doing nothing": str(facts["failed_by_noop"]),
+        "solve rate of experts": f"{facts['solve_rate']:.1%}" if facts["solve_rate"] is not None else None,
+        "steps to goal": _told(facts["steps_to_goal"]),
+        "training steps to first success": _told(facts["steps_to_first_success"]),
+        "duplicates": duplicates.told(facts["duplicates"]),
+        **{f"duplicates in {other}": duplicates.told(found) for other, found in facts["against"].items()},
+        "training env steps": _steps_told(facts),
+        "shards": f"{facts['split_bytes']:,} bytes",
+        "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
+    }
+    for name, text in lines.items():
+        if text is not None:
+            console.print(f"{name + ':':32} {text}", markup=False, soft_wrap=True)
+    table = Table(*SHOWN, box=None, pad_edge=False, padding=(0, 1, 0, 0))  # fits 80 columns
+    for row in facts["rows"]:
+        table.add_row(*(_cell(row[name]) for name in SHOWN))
+    if facts["rows"]:
+        console.print()
+        console.print(table)
+
+
+def _steps_told(facts: dict[str, Any]) -> str:
+    steps, after, unsolved = (facts[f"env_steps{of}"] for of in ("", "_after_success", "_unsolved"))
+    if not steps:
+        return "0"
+    return f"{steps:,} ({after / steps:.0%} after a first success, {unsolved / steps:.0%} of levels unsolved)"
+
+
+def _told(quantiles: dict[str, float] | None) -> str | None:
+    return ", ".join(f"{name}: {value:,.0f}" for name, value in quantiles.items()) if quantiles else None
+
+
+def _cell(value: Any) -> str:
+    return "-" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)

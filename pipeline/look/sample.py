@@ -1,0 +1,53 @@
+"""A sheet of sampled levels: what a size and a distribution are like, before anything is trained."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+from configs.compose import identified
+from configs.schema import JobConfig
+from levelgen.level import size_of
+from levelgen.pictures.raster import Caption, draw, sheet, write_png
+from levelgen.sampling.sampler import sample_levels
+from pipeline.errors import UserError
+from pipeline.runtime import prepare_jax
+
+LEVELS = 15  # unless the command says how many
+MOST_LEVELS = 100
+COLUMNS = 5
+PIXELS = 220  # width of one level's picture
+
+
+def sample(job: JobConfig, out: Path) -> None:
+    """Draw the initial worlds of the job's levels to `out`, and tell so in one line.
+
+    Raises:
+        UserError: too many levels, or a file that cannot be written.
+    """
+    ids = job.level_ids
+    if out.suffix.lower() != ".png":
+        raise UserError(f"Cannot draw to {out}: its name has to end in .png.")
+    if len(ids) > MOST_LEVELS:
+        raise UserError(f"levels is {job.levels}: a sheet has room for {MOST_LEVELS}.")
+    prepare_jax()
+    page = sheet_of(job)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_png(page, out)
+    except OSError as error:
+        raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another file with -o.") from None
+    name, _ = identified(job.distribution)
+    print(f"{out}: levels {ids[0]} to {ids[-1]} of size {job.size}, distribution {name or 'of your own'}")
+
+
+def sheet_of(job: JobConfig) -> Image.Image:
+    """The initial worlds of the job's levels, row after row."""
+    levels = jax.tree.map(np.asarray, sample_levels(jnp.array(job.level_ids), size_of(job.size), job.distribution))
+    pictures = []
+    for lane, level_id in enumerate(job.level_ids):
+        level = jax.tree.map(lambda x, lane=lane: x[..., lane : lane + 1], levels)
+        pictures.append(draw(level, level.state, caption=Caption(f"level {level_id}"), pixels=PIXELS))
+    return sheet(pictures, COLUMNS)

@@ -1,0 +1,271 @@
+"""One level as a picture or a film: its witness, or what doing nothing does where it has none."""
+
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from configs.convert import typed
+from levelgen.level import ACTIONS, Level, name_of
+from levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
+from levelgen.pictures.scene import Caption, Scene, scene_of
+from levelgen.pictures.svg import write_svg
+from levelgen.task.rules import Outcome, TaskParams, TaskState, advance, has_nan, reset
+from physics.types import State
+from pipeline.errors import Failure, UserError
+from pipeline.read.levels import find_row, is_level_file, level_file, level_of
+from pipeline.runtime import prepare_jax
+from pipeline.store.fields import tree_of
+from pipeline.store.manifest import Manifest, require_manifest
+from pipeline.store.shard import Shard
+
+STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures a second
+LAST_SECONDS = 1.5  # how long a film rests on its last picture
+MOST_STEPS = 256  # env steps of doing nothing that are shown
+MOST_FRAMES = 2048  # and physics steps, whatever a level file's rules say
+SHOWN_SECONDS = (0.02, 2.0)  # shortest and longest of a picture; rules may have any time step
+SHEET = (3, 2)  # columns and rows of a still
+
+
+def show(source: Path, level_id: int | None, out: Path) -> None:
+    """Draw a level of a split, or that of a level file, to `out`, and tell in one line what was drawn.
+
+    `.gif`, `.mp4` and `.svg` are films: of the witness's first episode, or of doing nothing where there is no witness.
+    `.png` is a sheet of pictures of the witness, or the initial world.
+
+    Raises:
+        UserError: no such level, or a file that cannot be read or written.
+        Failure: the split is damaged.
+    """
+    suffix = out.suffix.lower()
+    write = WRITERS.get(suffix)
+    if write is None:
+        raise UserError(f"Cannot draw to {out}: its name has to end in {', '.join(WRITERS)}.")
+    film = film_of(source, level_id, plays=suffix != ".png")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write(film, out)
+    except OSError as error:
+        raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another file with -o.") from None
+    print(f"{out}: {film.told}")
+
+
+@dataclass(frozen=True)
+class Film:
+    """Scenes of one level, the time of each, and what they show."""
+
+    scenes: Sequence[Scene]
+    seconds: Sequence[float]  # how long each is shown
+    told: str
+
+
+def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
+    """What there is to see of a level; `plays`: doing nothing may be a film.
+
+    Raises:
+        UserError: no such level, or a file that cannot be read.
+        Failure: the split is damaged.
+    """
+    if is_level_file(source):
+        if level_id is not None:
+            raise UserError(f"{source} is a level file, which has one level: leave out the id {level_id}.")
+        return file_film(source, plays)
+    manifest = require_manifest(source)
+    if level_id is None:
+        raise UserError(f"Which level of {source}? Add its id, such as {manifest.level_ids[0]}.")
+    row = find_row(manifest, level_id)
+    return witness_film(manifest, row) if row["shard"] else row_film(manifest, row, plays)
+
+
+def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
+    """The first successful episode of a solved level's record."""
+    arrays = Shard(manifest.split / row["shard"]).read([row["row"]])
+    level = tree_of(Level, _below(arrays, "level/"))
+    states = tree_of(State, _below(arrays, "record/state/"))
+    done, goal, action = (arrays[f"record/{name}"][..., 0] for name in ("done", "goal", "action"))
+    first, last = first_success(done, goal)
+    rules = _rules(manifest)
+    second = rules.frame_skip * rules.physics.dt  # of an env step
+    shown = [*range(first, last + 1, STEPS_A_PICTURE), last + 1]
+    scenes = []
+    for step in shown:
+        state = _at(states, step) if step <= last else _touch(_at(states, last), rules)
+        caption = Caption(_title(row), f"{(step - first) * second:.1f} s", "goal reached" if step > last else "")
+        scenes.append(scene_of(level, state, action=action[min(step, last)], caption=caption))
+    seconds = [second * (after - step) for step, after in pairwise(shown)] + [LAST_SECONDS]
+    steps = last - first + 1
+    told = f"solved in {steps} step{'s' if steps > 1 else ''} ({steps * second:.1f} s)"
+    return Film(scenes, seconds, f"level {row['level_id']} of size {row['size']}, {told}")
+
+
+def row_film(manifest: Manifest, row: dict[str, Any], plays: bool) -> Film:
+    """A level without a witness."""
+    caption = Caption(_title(row), outcome=row["label"], good=False)
+    told = f"level {row['level_id']} of size {row['size']} is {row['label']} ({row['label_reason']})"
+    return _without_witness(level_of(manifest, row), _rules(manifest), caption, f"{told}: there is no witness", plays)
+
+
+def file_film(path: Path, plays: bool) -> Film:
+    """A level file."""
+    file = level_file(path)
+    size = name_of(file.level.size)
+    caption = Caption(f"{' '.join(path.stem.split())} · size {size}")
+    told = f"{path.name}, a level of size {size}: a level file has no witness"
+    return _without_witness(file.level, file.rules, caption, told, plays)
+
+
+def _without_witness(level: Level, rules: TaskParams, caption: Caption, told: str, plays: bool) -> Film:
+    """What doing nothing does, or the initial world."""
+    if not plays:
+        scene = scene_of(level, level.state, caption=replace(caption, clock="0.0 s"))
+        return Film([scene], [LAST_SECONDS], f"{told}, so this is its initial world")
+    every = STEPS_A_PICTURE * rules.frame_skip
+    states, end = do_nothing(level, rules)
+    shown, nothing = [*range(0, len(states) - 1, every), len(states) - 1], np.zeros(ACTIONS, np.int32)
+    scenes = []
+    for frame in shown:
+        now = replace(caption, clock=f"doing nothing · {frame * rules.physics.dt:.1f} s")
+        if end and frame == shown[-1]:
+            now = replace(now, outcome=end, good=end == GOAL)
+        scenes.append(scene_of(level, states[frame], action=nothing, caption=now))
+    shortest, longest = SHOWN_SECONDS
+    times = [min(max(rules.physics.dt * (after - frame), shortest), longest) for frame, after in pairwise(shown)]
+    length = f"{shown[-1] * rules.physics.dt:.1f} s"
+    told = f"{told}, so this is what doing nothing does ({f'{end} after' if end else 'the first'} {length})"
+    return Film(scenes, [*times, LAST_SECONDS], told)
+
+
+GOAL, FAIL, LATE, BROKEN = "goal reached", "touched red", "time is up", "world breaks down"
+
+
+def do_nothing(level: Level, rules: TaskParams) -> tuple[list[State], str]:
+    """The worlds before and after each physics step of the first episode, and how it ends; "" if it lasts longer."""
+    prepare_jax()
+    frames = min(MOST_STEPS * rules.frame_skip, MOST_FRAMES)
+    limit = min(rules.max_timesteps * rules.frame_skip, MOST_FRAMES + 1)
+    frame = replace(rules, frame_skip=1, max_timesteps=limit, dense_reward_scale=0.0)
+    now = reset(level)
+    states = [now.state]
+    for _ in range(frames):
+        now, outcome, broken = _idle_frame(level, now, frame)
+        if broken[0]:
+            return states, BROKEN
+        states.append(now.state)
+        if outcome.done[0]:
+            return states, GOAL if outcome.goal[0] else FAIL if outcome.reward[0] < 0 else LATE
+    return states, ""
+
+
+@partial(jax.jit, static_argnames="frame")
+def _idle_frame(level: Level, now: TaskState, frame: TaskParams) -> tuple[TaskState, Outcome, Bool[Array, " lane"]]:
+    after, outcome = advance(level, now, jnp.zeros((ACTIONS, 1), jnp.int32), frame)
+    return after, outcome, has_nan(after.state)
+
+
+def first_success(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time"]) -> tuple[int, int]:
+    """First and last step of the first episode that ends in the goal.
+
+    Raises:
+        Failure: none does.
+    """
+    ends = np.flatnonzero(goal)
+    if not len(ends):
+        raise Failure("The record of this level never reaches the goal: run `levelproof verify` on its split.")
+    last = int(ends[0])
+    before = np.flatnonzero(done[:last])
+    return (int(before[-1]) + 1 if len(before) else 0), last
+
+
+def write_film(film: Film, path: Path) -> None:
+    write_gif(map(rasterised, film.scenes), path, film.seconds)
+
+
+def write_sheet(film: Film, path: Path) -> None:
+    """A few of the film's pictures, the first and the last among them."""
+    columns, rows = SHEET
+    chosen = np.unique(np.linspace(0, len(film.scenes) - 1, columns * rows).round().astype(int))
+    write_png(sheet([rasterised(film.scenes[i]) for i in chosen], columns), path)
+
+
+def write_vectors(film: Film, path: Path) -> None:
+    write_svg(film.scenes, path, film.seconds)
+
+
+def write_mp4(film: Film, path: Path) -> None:
+    """By the program ffmpeg: the machine's, or the one of the extra `video`.
+
+    Raises:
+        UserError: there is none.
+        Failure: it fails.
+    """
+    program = shutil.which("ffmpeg") or packaged_ffmpeg()
+    if program is None:
+        raise UserError(
+            f"Cannot draw to {path}: MP4 needs the program ffmpeg. "
+            "Run `pip install imageio-ffmpeg`, or use a name ending in .gif."
+        )
+    rate = 1 / film.seconds[0]
+    rest = round(film.seconds[-1] * rate)
+    pictures = list(map(rasterised, film.scenes))
+    width, height = pictures[0].size
+    command = [program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    command += ["-r", f"{rate:.6g}", "-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
+    raw = b"".join(picture.tobytes() for picture in [*pictures, *pictures[-1:] * (rest - 1)])
+    done = subprocess.run([*command, str(path)], input=raw, capture_output=True, check=False)
+    if done.returncode:
+        raise Failure(f"ffmpeg could not write {path}: {done.stderr.decode(errors='replace').strip()[-200:]}")
+
+
+def packaged_ffmpeg() -> str | None:
+    """The ffmpeg that comes with the package imageio-ffmpeg, where it is installed."""
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        return None
+    return imageio_ffmpeg.get_ffmpeg_exe()
+
+
+WRITERS: dict[str, Callable[[Film, Path], None]] = {
+    ".gif": write_film,
+    ".png": write_sheet,
+    ".mp4": write_mp4,
+    ".svg": write_vectors,
+}
+
+
+def _rules(manifest: Manifest) -> TaskParams:
+    return typed(TaskParams, (manifest.config or {})["task"])
+
+
+def _below(arrays: dict[str, np.ndarray], path: str) -> dict[str, np.ndarray]:
+    return {name.removeprefix(path): values for name, values in arrays.items() if name.startswith(path)}
+
+
+def _at(states: State, step: int) -> State:
+    return State(**{name: values[step] for name, values in vars(states).items()})
+
+
+def _touch(state: State, rules: TaskParams) -> State:
+    """The world about when the goal was touched: records keep states before steps, so speeds lead on from the last.
+
+    The last of a step's physics steps looks for contacts after the others have moved the bodies.
+    """
+    seconds = (rules.frame_skip - 1) * rules.physics.dt
+    return replace(
+        state,
+        position=state.position + seconds * state.velocity,
+        rotation=state.rotation + seconds * state.angular_velocity,
+    )
+
+
+def _title(row: dict[str, Any]) -> str:
+    return f"level {row['level_id']} · size {row['size']}"

@@ -1,0 +1,1 @@
+"""Splits read back: checked, and given to other programs."""

@@ -1,0 +1,32 @@
+"""Levels of a split for other programs: as a level file, which the reference and its editor open."""
+
+from pathlib import Path
+
+from configs.convert import typed
+from levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
+from levelgen.task.rules import TaskParams
+from pipeline.errors import UserError
+from pipeline.read.levels import find_row, level_of
+from pipeline.store.manifest import require_manifest
+
+
+def export(split: Path, level_id: int, out: Path) -> None:
+    """Write a level of `split` and the rules it was played by to `out`, and tell so in one line.
+
+    Raises:
+        UserError: no such level, one that a level file cannot hold, or a file that cannot be written.
+        Failure: the split is damaged.
+    """
+    if out.suffix.lower() != ".json":
+        raise UserError(f"Cannot export to {out}: its name has to end in .json.")
+    manifest = require_manifest(split)
+    row = find_row(manifest, level_id)
+    file = LevelFile(level_of(manifest, row), typed(TaskParams, (manifest.config or {})["task"], "task"))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_level_file(file, out)
+    except LevelFileError as error:
+        raise UserError(f"Cannot export level {level_id} of {split}: {error}.") from None
+    except OSError as error:
+        raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another file with -o.") from None
+    print(f"{out}: level {level_id} of size {row['size']}, for Kinetix")

@@ -1,0 +1,62 @@
+"""One level that a user names: by its id in a split, or by a level file."""
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from configs.convert import typed
+from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
+from levelgen.level import Level, size_of
+from levelgen.sampling.sampler import Distribution, sample_levels
+from pipeline.errors import UserError
+from pipeline.runtime import prepare_jax
+from pipeline.store.fields import tree_of
+from pipeline.store.manifest import Manifest
+from pipeline.store.shard import Shard
+
+
+def find_row(manifest: Manifest, level_id: int) -> dict[str, Any]:
+    """The manifest's row of a level.
+
+    Raises:
+        UserError: it has none.
+    """
+    ids = manifest.level_ids
+    place = int(np.searchsorted(ids, level_id))
+    if place == len(ids) or ids[place] != level_id:
+        raise UserError(
+            f"There is no level {level_id} in {manifest.split}: it has {len(ids)} levels, from {ids[0]} to {ids[-1]}."
+        )
+    return manifest.table.slice(place, 1).to_pylist()[0]
+
+
+def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
+    """The level of a row, one lane: as its shard has it, or made again from its id where it has no shard.
+
+    Raises:
+        Failure: the shard is damaged.
+    """
+    if row["shard"]:
+        return tree_of(Level, Shard(manifest.split / row["shard"]).read([row["row"]]), "level/")
+    prepare_jax()
+    distribution = typed(Distribution, (manifest.config or {})["distribution"])
+    return sample_levels(jnp.array([row["level_id"]], jnp.int32), size_of(row["size"]), distribution)
+
+
+def is_level_file(source: Path) -> bool:
+    """Whether a user who writes this means a level file, not a split."""
+    return source.is_file() or (source.suffix.lower() == ".json" and not source.is_dir())
+
+
+def level_file(path: Path) -> LevelFile:
+    """What a level file says.
+
+    Raises:
+        UserError: it cannot be used.
+    """
+    try:
+        return read_level_file(path)
+    except LevelFileError as error:
+        raise UserError(str(error)) from None

@@ -1,0 +1,137 @@
+"""Experts on the disk, so that a larger budget goes on instead of starting again: one Orbax checkpoint per unit."""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from configs.schema import JobConfig
+from experts.config import Rule
+from experts.judge import Kept
+from experts.labels import Label
+from experts.slots import begin
+from levelgen.level import size_of
+from levelgen.sampling.sampler import sample_levels
+from pipeline.errors import Failure, UserError
+from pipeline.store.manifest import differences, read_manifest, require_manifest, told
+
+ORBAX = Lock()  # it numbers its operations by process: two at once wait for each other's files, for ever
+
+
+def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
+    """Write these experts, by level id.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    import orbax.checkpoint as ocp  # takes seconds, and most jobs keep no experts
+
+    rows = [experts[level_id] for level_id in sorted(experts)]
+    longest = max(len(row.curve) for row in rows)
+    curves = np.full((len(rows), longest), np.nan, np.float32)
+    for place, row in enumerate(rows):
+        curves[place, : len(row.curve)] = row.curve
+    begun = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows))
+    tree = {"level_id": np.array(sorted(experts)), "curve": curves, "begun": begun}
+    with ORBAX, ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(path.absolute(), tree)
+
+
+def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
+    """All experts of a checkpoint, by level id.
+
+    Raises:
+        Failure: it is damaged or gone, or of another version of this program.
+    """
+    import orbax.checkpoint as ocp
+
+    level = sample_levels(jnp.zeros(1, jnp.int32), size_of(job.size), job.distribution)
+    like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), job.expert), level)
+    try:
+        with ORBAX, ocp.StandardCheckpointer() as checkpointer:
+            found = checkpointer.metadata(path.absolute()).item_metadata.tree
+            count, longest = found["curve"].shape
+            shaped = {
+                "level_id": np.zeros(count, found["level_id"].dtype),
+                "curve": np.zeros((count, longest), np.float32),
+                "begun": jax.tree.map(lambda x: np.zeros((count, *x.shape[1:]), x.dtype), like),
+            }
+            tree: Any = checkpointer.restore(path.absolute(), shaped)
+    except Exception as error:  # Orbax and TensorStore raise many kinds
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise Failure(
+            f"The experts in {path} cannot be read ({reason}): leave out continue_from to train them from the start."
+        ) from error
+    experts = {}
+    for place, level_id in enumerate(tree["level_id"].tolist()):
+        begun = jax.tree.map(lambda x, place=place: x[place], tree["begun"])
+        curve = tree["curve"][place, : int(begun.training.course.updates)]
+        experts[level_id] = Kept(begun, curve.tolist())
+    return experts
+
+
+def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
+    """Experts of the split `job.continue_from` that can go on with these levels; others begin.
+
+    A level that is solved ends the same with any larger budget, unless experts get their whole budget, or the last
+    evaluation alone solved it: those begin again.
+
+    Raises:
+        Failure: a checkpoint is damaged.
+    """
+    if not job.continue_from:
+        return {}
+    source = Path(job.continue_from).expanduser()
+    rows = _kept_in(source)
+    paths: dict[str, set[int]] = {}
+    for level_id in level_ids:
+        label, path = rows.get(level_id, ("", None))
+        if path and (label == Label.UNSOLVED or job.stop.rule == Rule.BUDGET):
+            paths.setdefault(path, set()).add(level_id)
+    found: dict[int, Kept] = {}
+    for path, ids in paths.items():
+        experts = load_experts(source / path, job)
+        found |= {level_id: experts[level_id] for level_id in ids}
+    return found
+
+
+@cache
+def _kept_in(source: Path) -> dict[int, tuple[str, str | None]]:
+    """Label and checkpoint of every level, read once in a worker: it asks for every unit."""
+    table = read_manifest(source, ["label", "experts"]).table
+    columns = (table.column(name).to_pylist() for name in ("level_id", "label", "experts"))
+    return {level_id: (label, path) for level_id, label, path in zip(*columns, strict=True)}
+
+
+def require_same_experts(job: JobConfig) -> None:
+    """Refuse to take experts from a split whose experts cannot go on with this job.
+
+    Raises:
+        UserError: it kept no experts, was made with other settings, or with a larger budget.
+        Failure: it is damaged.
+    """
+    if not job.continue_from:
+        return
+    source = require_manifest(Path(job.continue_from).expanduser())
+    if source.table.column("experts").null_count == source.table.num_rows:
+        raise UserError(
+            f"{source.split} has kept no experts: make it with keep_experts=true, or leave out continue_from."
+        )
+    config = source.config or {}
+    changes = differences(config, job.results)
+    changes.pop("budget", None)
+    if changes:
+        raise UserError(
+            f"Experts of {source.split} cannot go on under other settings ({told(changes)}): "
+            "use the same ones, or leave out continue_from."
+        )
+    if config["budget"] >= job.env_steps:
+        raise UserError(
+            f"Experts of {source.split} have had {config['budget']:,} env steps: give a larger budget than that, "
+            f"not {job.budget}."
+        )

@@ -1,0 +1,45 @@
+"""What a row was made with: versions and device. Bits are promised on the same stack only."""
+
+import functools
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from levelgen.identity.keys import SAMPLER_VERSION
+
+
+@functools.cache
+def versions() -> dict[str, str | int]:
+    """The manifest's `versions`."""
+    return {
+        "levelproof": _version("levelproof"),
+        "python": platform.python_version(),
+        "jax": _version("jax"),
+        "jaxlib": _version("jaxlib"),
+        "sampler": SAMPLER_VERSION,
+    }
+
+
+@functools.cache
+def device() -> str:
+    """The kind of device JAX computes on here, such as `cpu: AMD EPYC 7B13`."""
+    import jax  # starts JAX's backend, so only on a worker
+
+    first = jax.devices()[0]
+    return f"{first.platform}: {_processor() if first.platform == 'cpu' else first.device_kind}"
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:  # run from a checkout that was not installed
+        return "uninstalled"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,0 +1,130 @@
+"""What is written: the manifest's columns and the shard's field table, with their versions.
+
+A fragment or shard of another version is refused with a sentence, never guessed at.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+MANIFEST_VERSION = 3
+SHARD_VERSION = 1
+RECORD_STEPS = 256  # of a record, with automatic reset inside
+
+# Keys of a fragment's metadata
+VERSION_KEY = b"levelproof.manifest_version"
+HASH_KEY = b"levelproof.config_hash"
+CONFIG_KEY = b"levelproof.config"  # the settings that decide results, as JSON
+
+COLUMNS = pa.schema(
+    [
+        pa.field("level_id", pa.int64(), nullable=False),
+        pa.field("content_hash", pa.string(), nullable=False),  # levelgen.identity.content
+        pa.field("signature", pa.list_(pa.string()), nullable=False),  # levelgen.identity.signature
+        pa.field("size", pa.string(), nullable=False),
+        pa.field("budget", pa.string(), nullable=False),  # as typed
+        pa.field("label", pa.string(), nullable=False),  # solved, unsolved, unsolvable, trivial
+        pa.field("label_reason", pa.string(), nullable=False),
+        pa.field("failed_by_noop", pa.bool_(), nullable=False),  # doing nothing lets green touch red
+        pa.field("witness", pa.string()),  # most probable, sampled, exploration, nothing; null: there is none
+        # of the last evaluation; NaN: no episode ended, or there was none
+        pa.field("success_rate", pa.float32(), nullable=False),  # of sampled attempts
+        pa.field("most_probable_succeeds", pa.bool_(), nullable=False),
+        pa.field("sticky_success_rate", pa.float32(), nullable=False),
+        pa.field("moved_success_rate", pa.float32(), nullable=False),
+        pa.field("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: none
+        pa.field("steps_to_first_success", pa.int64()),  # env steps of training; null: never
+        pa.field("env_steps", pa.int64(), nullable=False),  # used of the budget
+        pa.field(
+            "learning_curve", pa.list_(pa.float32()), nullable=False
+        ),  # success rate per update, NaN: no episode ended
+        pa.field("best_return", pa.float32(), nullable=False),
+        pa.field("episodes", pa.int64(), nullable=False),
+        pa.field("shard", pa.string()),  # path below the split; null: no witness
+        pa.field("row", pa.int32()),  # of the shard
+        pa.field("experts", pa.string()),  # path below the split of the checkpoint with its expert; null: none is kept
+        pa.field("config_hash", pa.string(), nullable=False),
+        pa.field(
+            "versions",
+            pa.struct(
+                [
+                    pa.field("levelproof", pa.string(), nullable=False),
+                    pa.field("python", pa.string(), nullable=False),
+                    pa.field("jax", pa.string(), nullable=False),
+                    pa.field("jaxlib", pa.string(), nullable=False),
+                    pa.field("sampler", pa.int32(), nullable=False),
+                ]
+            ),
+            nullable=False,
+        ),
+        pa.field("device", pa.string(), nullable=False),
+        pa.field("command", pa.string(), nullable=False),  # makes this row again
+    ]
+)
+
+# Packed arrays of a shard; the number is the bits of a component. What changes along time: (level, component, 256).
+PACKED = {"dyn32": 32, "dyn8": 8, "act": 8, "lvl32": 32, "lvl8": 8}
+ALONG_TIME = ("dyn32", "dyn8", "act")
+
+# Integer fields whose values fit 8 bits by what they are (counts, indices and enumerations of one level).
+SMALL = frozenset(
+    {
+        "record/action",
+        "level/role",
+        "level/motor_binding",
+        "level/thruster_binding",
+        "level/model/n_vertices",
+        "level/model/collision_mode",
+        "level/model/joint_a",
+        "level/model/joint_b",
+        "level/model/thruster_body",
+    }
+)
+
+
+@dataclass(frozen=True)
+class FieldPlace:
+    """Where one field lies in the packed arrays."""
+
+    name: str  # record/... (changes along time) or level/... (constant)
+    dtype: str  # of the original
+    shape: tuple[int, ...]  # per level and step
+    array: str  # one of PACKED
+    first: int  # component at which it starts
+
+    @property
+    def count(self) -> int:
+        return int(np.prod(self.shape, dtype=int))
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self) | {"shape": list(self.shape)}
+
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> "FieldPlace":
+        return cls(**{**entry, "shape": tuple(entry["shape"])})
+
+
+def array_for(name: str, dtype: np.dtype) -> str:
+    """Which packed array holds a field."""
+    if name == "record/action":
+        return "act"
+    bits = 8 if dtype.kind == "b" or name in SMALL else 32
+    if bits == 32 and dtype.itemsize != 4:
+        raise TypeError(f"{name} is {dtype}: fields are bool, int32 or float32")
+    return f"{'dyn' if name.startswith('record/') else 'lvl'}{bits}"
+
+
+def field_table(arrays: Mapping[str, np.ndarray]) -> list[FieldPlace]:
+    """The places of all fields, in the order of `arrays` (level axis last; time first for `record/` fields)."""
+    used = dict.fromkeys(PACKED, 0)
+    table = []
+    for name, values in arrays.items():
+        target = array_for(name, values.dtype)
+        shape = values.shape[1:-1] if name.startswith("record/") else values.shape[:-1]
+        place = FieldPlace(name, str(values.dtype), shape, target, used[target])
+        used[target] += place.count
+        table.append(place)
+    return table

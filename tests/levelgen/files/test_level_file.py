@@ -1,0 +1,354 @@
+"""Level files without the reference: round trips, and what happens to a file that nobody vouches for."""
+
+import copy
+import dataclasses
+import functools
+import json
+import os
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from levelgen.files.entries import LevelFileError
+from levelgen.files.kinetix import MANIFOLDS
+from levelgen.files.level_file import (
+    MOST_BYTES,
+    LevelFile,
+    from_document,
+    parse,
+    read_level_file,
+    to_document,
+    write_level_file,
+)
+from levelgen.level import SIZES, Level
+from levelgen.sampling.sampler import Distribution, sample_levels
+from levelgen.sampling.scenery import empty_level
+from levelgen.task.rules import TaskParams
+from physics.types import Params, Size
+
+RULES = TaskParams(frame_skip=3, max_timesteps=100, dense_reward_scale=0.5, physics=Params(dt=0.01, motor_power=500.0))
+MOST_MEMORY = 250e6  # bytes, for the worst that MOST_BYTES can say
+
+
+@functools.cache
+def levels(size: Size, count: int = 8) -> Level:
+    return jax.tree.map(np.asarray, sample_levels(np.arange(count), size, Distribution()))
+
+
+def one(level: Level, lane: int) -> Level:
+    return jax.tree.map(lambda x: x[..., lane : lane + 1], level)
+
+
+@functools.cache
+def document() -> Any:
+    """A level of size s as JSON has it. Not to be changed."""
+    return json.loads(json.dumps(to_document(LevelFile(one(levels(SIZES["s"]), 2), TaskParams()))))
+
+
+def changed(path: str, value: object) -> Any:
+    """That level with another value at a path such as `env_state.polygon.4.radius`."""
+    made = copy.deepcopy(document())
+    *parents, last = path.split(".")
+    parent = functools.reduce(lambda x, key: x[int(key) if isinstance(x, list) else key], parents, made)
+    parent[int(last) if isinstance(parent, list) else last] = value
+    return made
+
+
+def assert_same(ours: LevelFile, theirs: LevelFile) -> None:
+    assert ours.rules == theirs.rules
+    for (path, a), (_, b) in zip(*map(jax.tree_util.tree_leaves_with_path, (ours.level, theirs.level)), strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=jax.tree_util.keystr(path))
+        assert a.dtype == b.dtype
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [*SIZES.values(), Size(polygons=7, circles=1, joints=3, thrusters=4)], ids=str)
+def test_a_sampled_level_survives_a_round_trip(size: Size, tmp_path: Path) -> None:
+    for lane in range(8):
+        file = LevelFile(one(levels(size), lane), RULES)
+        write_level_file(file, tmp_path / "level.json")
+        assert_same(read_level_file(tmp_path / "level.json"), file)
+    assert os.listdir(tmp_path) == ["level.json"]
+
+
+@pytest.mark.parametrize("size", [Size(5, 0, 0, 0), Size(4, 1, 0, 0), Size(64, 64, 64, 64)], ids=str)
+def test_the_smallest_and_the_largest_sizes_fit(size: Size, tmp_path: Path) -> None:
+    write_level_file(LevelFile(empty_level(size, 1), TaskParams()), tmp_path / "level.json")
+    assert (tmp_path / "level.json").stat().st_size < MOST_BYTES
+    assert read_level_file(tmp_path / "level.json").level.size == size
+
+
+def test_a_file_has_what_the_reference_asks_for() -> None:
+    world = document()["env_state"]
+    assert list(document()) == ["env_state", "env_params", "static_env_params"]
+    assert [len(world[kind]) for kind in ("polygon", "circle", "joint", "thruster", *MANIFOLDS)] == [
+        *(5, 2, 1, 1),
+        *(8, 10, 1),  # two points of each of four polygon pairs, circle-polygon pairs, circle pairs
+    ]
+    assert world["gravity"] == {"0": 0.0, "1": float(np.float32(-9.81))}
+    assert world["polygon"][0]["vertices"]["3"] == {"0": -2.5, "1": float(np.float32(5.2))}
+    assert document()["env_params"]["baumgarte_coefficient_collision"] == 0.2
+
+
+def test_places_of_joints_are_where_their_two_bodies_say() -> None:
+    """A joint's place is written from body a; at the start of a level it is that of body b too."""
+    found = 0
+    for lane in range(8):
+        world = to_document(LevelFile(one(levels(SIZES["m"]), lane), TaskParams()))["env_state"]
+        bodies = world["polygon"] + world["circle"]
+        for joint in world["joint"]:
+            if joint["active"]:
+                body, anchor = bodies[joint["b_index"]], joint["b_relative_pos"]
+                turned = complex(anchor["0"], anchor["1"]) * np.exp(1j * body["rotation"])
+                place = complex(body["position"]["0"], body["position"]["1"]) + turned
+                assert abs(place - complex(joint["global_position"]["0"], joint["global_position"]["1"])) < 1e-5
+                found += 1
+    assert found > 3
+
+
+def test_whatever_a_level_cannot_say_in_a_file_is_refused() -> None:
+    level = one(levels(SIZES["s"]), 2)
+    assert level.model.joint_active.all()
+    own_will = dataclasses.replace(level, motor_auto=np.ones_like(level.motor_auto))
+    touching = dataclasses.replace(
+        level, state=dataclasses.replace(level.state, contact_active=np.ones_like(level.state.contact_active))
+    )
+    broken = dataclasses.replace(
+        level, state=dataclasses.replace(level.state, position=np.full_like(level.state.position, np.nan))
+    )
+    for made, words in (
+        (levels(SIZES["s"]), "8 levels"),
+        (own_will, "runs by itself"),
+        (touching, "starts with contacts"),
+        (broken, r"polygon\[0\]\.position\.0 is NaN"),
+    ):
+        with pytest.raises(LevelFileError, match=words):
+            to_document(LevelFile(made, TaskParams()))
+
+
+NUMBER = r"it has to be a number from -1,000 to 1,000"
+WRONG = [
+    ("env_state.polygon.4.position.1", float("nan"), rf"^env_state\.polygon\[4\]\.position\.1 is NaN, {NUMBER}$"),
+    ("env_state.polygon.4.position.1", float("inf"), f"is Infinity, {NUMBER}"),
+    ("env_state.polygon.4.position.1", 1e30, f"is 1e.30, {NUMBER}"),
+    ("env_state.polygon.4.position.1", "0.5", f'is "0.5", {NUMBER}'),
+    ("env_state.polygon.4.position.1", True, f"is true, {NUMBER}"),
+    ("env_state.polygon.4.position", 3, r"position is 3, it has to be an object$"),
+    ("env_state.polygon.4.position", [1, 2], "position is a list, it has to be an object"),
+    ("env_state.polygon.4.position", {"0": 1}, r"polygon\[4\]\.position\.1 is missing$"),
+    ("env_state.polygon.4", None, r"polygon\[4\] is null, it has to be an object"),
+    ("env_state.circle.1.radius", -1, r"circle\[1\]\.radius is -1, it has to be a number from 0 to 1,000"),
+    ("env_state.circle.1.active", 1, "active is 1, it has to be true or false"),
+    ("env_state.circle.1.role", 4, "role is 4, it has to be a whole number from 0 to 3"),
+    ("env_state.circle.1.role", 1.0, "role is 1.0, it has to be a whole number"),
+    ("env_state.joint.0.a_index", 7, r"joint\[0\]\.a_index is 7, it has to be a whole number from 0 to 6"),
+    ("env_state.joint.0.b_index", -1, "b_index is -1"),
+    ("env_state.joint.0.motor_binding", 4, r"joint\[0\] has a motor_binding beyond 3"),
+    ("env_state.thruster.0.object_index", 10**30, r"object_index is 10{30}, it has"),
+    ("env_state.thruster.0.object_index", 10**4000, r"object_index is 10+ \.\.\., it has"),
+    ("env_state.thruster", {}, r"thruster is an object, static_env_params.num_thrusters says 1"),
+    ("env_state.polygon", [], "polygon is a list of 0, static_env_params.num_polygons says 5"),
+    ("env_state.polygon", [0] * 1_000_000, "polygon is a list of 1000000, static_env_params.num_polygons says 5"),
+    ("env_state.polygon.4.n_vertices", 2, r"polygon\[4\] is active and has fewer than 3 vertices"),
+    ("env_state.polygon.2.inverse_mass", 1, r"polygon\[2\] is scenery and may move"),
+    ("env_state.polygon.0.velocity", {"0": 0, "1": 1}, r"polygon\[0\] is scenery and may move"),
+    ("static_env_params.num_polygons", 1_000_000, r"num_polygons is 1000000, it has to be a whole number from 4 to 64"),
+    ("static_env_params.num_polygons", 3, "num_polygons is 3"),
+    ("static_env_params.solver_batch_size", 8, "solver_batch_size is 8, this engine has 16 only"),
+    ("static_env_params.do_warm_starting", False, "do_warm_starting is false, this engine has true only"),
+    ("static_env_params.frame_skip", 0, "frame_skip is 0, it has to be a whole number from 1 to 1e.06"),
+    ("env_params.dt", 0, "env_params.dt is 0, it has to be a number from 1e-06 to 1"),
+    ("env_params", "x" * 1000, r'^env_params is "x{39} \.\.\., it has to be an object'),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "words"), WRONG, ids=lambda x: str(x)[:30])
+def test_wrong_values_are_named_with_their_place(path: str, value: object, words: str) -> None:
+    assert document()["env_state"]["thruster"][0]["active"] in (True, False)
+    with pytest.raises(LevelFileError, match=words):
+        parse(json.dumps(changed(path, value)).encode())
+
+
+def test_a_joint_from_a_body_to_itself() -> None:
+    made = changed("env_state.joint.0.a_index", 4)
+    made["env_state"]["joint"][0]["b_index"] = 4
+    with pytest.raises(LevelFileError, match="joins a body to itself"):
+        from_document(made)
+
+
+@pytest.mark.parametrize(
+    ("kind", "binding", "most", "names"),
+    [
+        ("joint", 4, 3, "motor"),
+        ("joint", 255, 3, "motor"),
+        ("thruster", 2, 1, "thruster"),
+        ("thruster", 3, 1, "thruster"),
+    ],
+)
+def test_active_actuators_have_bindings_that_exist(kind: str, binding: int, most: int, names: str) -> None:
+    """A motor that is off and a fixed joint, too: a policy reads their bindings."""
+    for switches in ({}, {"motor_on": False}, {"is_fixed_joint": True}):
+        made = changed(f"env_state.{kind}.0.{names}_binding", binding)
+        made["env_state"][kind][0] |= {"active": True, **(switches if kind == "joint" else {})}
+        with pytest.raises(LevelFileError, match=rf"^env_state\.{kind}\[0\] has a {names}_binding beyond {most}$"):
+            from_document(made)
+
+
+@pytest.mark.parametrize("kind", ["motor", "thruster"])
+@pytest.mark.parametrize("binding", [-1, 256, 1.0, None])
+def test_bindings_of_no_kind_are_refused_everywhere(kind: str, binding: object) -> None:
+    thing = "joint" if kind == "motor" else kind
+    made = changed(f"env_state.{thing}.0.{kind}_binding", binding)
+    made["env_state"][thing][0]["active"] = False
+    with pytest.raises(LevelFileError, match=rf"{kind}_binding is .*, it has to be a whole number from 0 to 255$"):
+        from_document(made)
+
+
+def test_actuators_that_are_not_there_may_be_bound_to_anything() -> None:
+    """As two thrusters of the reference's own levels are."""
+    made = changed("env_state.thruster.0.thruster_binding", 3)
+    made["env_state"]["thruster"][0]["active"] = False
+    assert from_document(made).level.thruster_binding[0, 0] == 3
+
+
+def test_a_world_without_places_for_bodies() -> None:
+    made = changed("static_env_params.num_polygons", 4)
+    made["static_env_params"]["num_circles"] = 0
+    with pytest.raises(LevelFileError, match="no place for a body"):
+        from_document(made)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"", "it is not JSON"),
+        (b"\xff\xfe", "it is no text"),
+        (b"{", "it is not JSON"),
+        (b"[" * MOST_BYTES, "nested too deeply"),
+        (b'{"a":' * (MOST_BYTES // 5), "nested too deeply"),
+        (b"1" * 5000, "it is not JSON"),
+        (b"[]", "the whole is a list, it has to be an object"),
+        (b"{}", "^env_state is missing$"),
+        (b"null", "the whole is null"),
+    ],
+    ids=lambda x: str(x)[:12],
+)
+def test_what_is_no_level(text: bytes, words: str) -> None:
+    with pytest.raises(LevelFileError, match=words):
+        parse(text)
+
+
+JUNK = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.sampled_from([0, 1, -1, 3, 64, 65, 255, 2**31, 2**63, 10**400])
+    | st.floats()
+    | st.sampled_from([1e-45, 1e38, 1e39, -0.0])
+    | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.sampled_from(["0", "1", "a"]), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@functools.cache
+def places() -> list[tuple[str, ...]]:
+    """Paths of everything in the level that is read."""
+
+    def below(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+        yield path
+        entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+        for key, entry in entries:
+            if key not in (*MANIFOLDS, "collision_matrix"):
+                yield from below(entry, (*path, str(key)))
+
+    return [path for path in below(document(), ()) if path]
+
+
+@given(st.lists(st.tuples(st.integers(0, 10_000), st.just("set") | st.just("drop"), JUNK), min_size=1, max_size=3))
+@settings(max_examples=400, deadline=None)
+def test_a_level_with_anything_anywhere_is_refused_in_a_sentence_or_read(changes) -> None:
+    made = copy.deepcopy(document())
+    for number, what, junk in changes:
+        *parents, last = places()[number % len(places())]
+        try:
+            parent = functools.reduce(lambda x, key: x[int(key) if isinstance(x, list) else key], parents, made)
+            key = int(last) if isinstance(parent, list) else last
+            if what == "set":
+                parent[key] = copy.deepcopy(junk)
+            else:
+                del parent[key]
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError):
+            continue  # an earlier change took the place away
+    assert_sentence_or_level(json.dumps(made).encode())
+
+
+@given(st.binary(max_size=60), st.integers(0, 3_000), st.integers(0, 40))
+@settings(max_examples=300, deadline=None)
+def test_bytes_of_any_kind_are_refused_in_a_sentence_or_read(junk: bytes, start: int, gone: int) -> None:
+    assert_sentence_or_level(junk)
+    text = json.dumps(document()).encode()
+    assert_sentence_or_level(text[:start] + junk + text[start + gone :])
+
+
+def assert_sentence_or_level(text: bytes) -> None:
+    refused, file = "", None
+    try:
+        file = parse(text)
+    except LevelFileError as error:
+        refused = str(error)
+    if file is None:
+        assert 0 < len(refused) < 400
+        assert "\n" not in refused
+        return
+    for leaf in jax.tree.leaves(file.level):
+        assert np.isfinite(leaf).all()
+    assert_same(from_document(to_document(file)), file)
+
+
+BITS = {"objects": b"{},", "fuller objects": b'{"":0},', "lists in lists": b"[" * 900 + b"]" * 900 + b","}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bit", BITS.values(), ids=BITS)
+def test_memory_is_bounded_whatever_the_file_says(bit: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "level.json"
+    path.write_bytes(b"[" + bit * ((MOST_BYTES - 3) // len(bit)) + b"0]")
+    assert peak_memory(path) < MOST_MEMORY
+
+
+def test_a_gigabyte_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "level.json"
+    with path.open("wb") as file:
+        file.truncate(1 << 30)  # sparse: takes no room
+    assert peak_memory(path) < 1e6
+
+
+def peak_memory(path: Path) -> int:
+    """Bytes that Python takes to refuse a file."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(LevelFileError, match=r"^Cannot use the level file "):
+            read_level_file(path)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_what_is_no_ordinary_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    for name, words in (
+        ("pipe.json", "no ordinary file"),
+        (".", "no ordinary file"),
+        ("nothing.json", r"^Cannot read the level file .*nothing\.json \(No such file or directory\)\.$"),
+        ("x" * 300, "File name too long"),
+    ):
+        with pytest.raises(LevelFileError, match=words):
+            read_level_file(tmp_path / name)

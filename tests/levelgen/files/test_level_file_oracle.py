@@ -1,0 +1,125 @@
+"""Level files against the reference: all of its handmade levels, and ours, opened by it. Skipped where it is not."""
+
+import functools
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from levelgen.files.kinetix import level_from_kinetix
+from levelgen.files.level_file import LevelFile, read_level_file, write_level_file
+from levelgen.level import SIZES, Level
+from levelgen.sampling.sampler import Distribution, sample_levels
+from levelgen.task.rules import TaskParams, TaskState, advance
+from physics.types import Size
+from tests.levelgen.opened import Played, handmade_levels, open_in_reference
+
+pytestmark = pytest.mark.slow
+HANDMADE = {"s": 10, "m": 24, "l": 40}
+STEPS = 32  # env steps that each level is played
+OURS = 4  # levels of our sampler that are opened with the handmade ones
+
+
+@pytest.fixture(scope="module")
+def handmade(reference: Path) -> dict[str, list[Path]]:
+    """The level files of the reference's installation by size."""
+    folder = handmade_levels(reference)
+    return {size: sorted((folder / size).glob("*.json")) for size in SIZES}
+
+
+@pytest.fixture(scope="module")
+def played(reference: Path, handmade, tmp_path_factory):
+    """Of each size: the handmade levels, one of them written by us, and levels of our sampler; all played."""
+    folder = tmp_path_factory.mktemp("levels")
+
+    @functools.cache
+    def play(size: str) -> Played:
+        again = folder / f"{size}-again.json"
+        write_level_file(read_level_file(handmade[size][0]), again)
+        files = [*handmade[size], again, *exported(SIZES[size], folder, size)]
+        return open_in_reference(reference, files, folder / f"{size}.npz", STEPS)
+
+    return play
+
+
+def exported(size: Size, folder: Path, name: str, count: int = OURS) -> list[Path]:
+    """Files of the first levels of a size."""
+    levels = sample_levels(np.arange(count), size, Distribution())
+    paths = [folder / f"{name}-{i}.json" for i in range(count)]
+    for i, path in enumerate(paths):
+        level = jax.tree.map(lambda x, i=i: np.asarray(x)[..., i : i + 1], levels)
+        write_level_file(LevelFile(level, TaskParams()), path)
+    return paths
+
+
+def side_by_side(files: list[Path]) -> Level:
+    levels = [read_level_file(path).level for path in files]
+    return jax.tree.map(lambda *x: np.concatenate(x, -1), *levels)
+
+
+def assert_same(ours: Level, theirs: Level) -> None:
+    for (path, a), (_, b) in zip(*map(jax.tree_util.tree_leaves_with_path, (ours, theirs)), strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=jax.tree_util.keystr(path))
+        assert a.dtype == b.dtype
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_handmade_level_is_read_with_its_rules(handmade, size) -> None:
+    assert len(handmade[size]) == HANDMADE[size]
+    for path in handmade[size]:
+        file = read_level_file(path)
+        assert file.level.size == SIZES[size]
+        assert file.rules == TaskParams()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_handmade_level_survives_a_round_trip(handmade, size, tmp_path) -> None:
+    for path in handmade[size]:
+        file = read_level_file(path)
+        write_level_file(file, tmp_path / path.name)
+        again = read_level_file(tmp_path / path.name)
+        assert_same(again.level, file.level)
+        assert again.rules == file.rules
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_reference_opens_the_same_levels(played, size) -> None:
+    """Bit for bit: the handmade levels as we read them, and ours as we wrote them."""
+    of = played(size)
+    assert len(of.files) == HANDMADE[size] + 1 + OURS
+    assert_same(side_by_side(of.files), of.levels())
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_level_steps_as_in_the_reference(played, size) -> None:
+    """One env step of ours from each state of the reference's play."""
+    of = played(size)
+    steps, levels = of.arrays["action"].shape[:2]
+    before = {name: values[:-1].reshape(steps * levels, *values.shape[2:]) for name, values in of.states().items()}
+    after = {name: values[1:].reshape(steps * levels, *values.shape[2:]) for name, values in of.states().items()}
+    level, then = level_from_kinetix(before), level_from_kinetix(after).state
+    now = TaskState(level.state, before["timestep"], before["last_distance"])
+    action = of.arrays["action"].reshape(steps * levels, -1).T.astype(np.int32)
+    rules = read_level_file(of.files[0]).rules
+    step = jax.jit(lambda level, now, action: advance(level, now, action, rules)[:2])
+    ours, outcome = jax.tree.map(np.asarray, step(level, now, action))
+
+    off = np.zeros(steps * levels)
+    for name in ("position", "rotation", "velocity", "angular_velocity"):
+        gap = np.abs(getattr(ours.state, name) - getattr(then, name))
+        off = np.maximum(off, gap.reshape(-1, gap.shape[-1]).max(0))
+    off = off.reshape(steps, levels)
+    assert (off < 1e-3).mean() >= 0.995, np.sort(off.ravel())[-20:]
+    assert (off < 1e-4).mean() >= 0.97
+    median = dict(zip((path.stem for path in of.files), np.median(off, 0), strict=True))
+    assert max(median.values()) < 1e-4, median  # no level is always off
+    same = np.abs(outcome.reward - of.arrays["reward"].ravel()) < 1e-3
+    same &= (outcome.done == of.arrays["done"].ravel()) & (outcome.goal == of.arrays["goal"].ravel())
+    assert same.mean() >= 0.999
+
+
+def test_a_custom_size_opens_in_the_reference(reference, tmp_path) -> None:
+    files = exported(Size(polygons=7, circles=1, joints=3, thrusters=4), tmp_path, "custom", count=2)
+    of = open_in_reference(reference, files, tmp_path / "out.npz")
+    assert_same(side_by_side(files), of.levels())

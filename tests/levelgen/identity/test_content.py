@@ -1,0 +1,345 @@
+"""The content hash: the same for every numbering and naming of a level, another for any other level."""
+
+import itertools
+from functools import cache
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from levelgen.files.level_file import LevelFile, read_level_file, write_level_file
+from levelgen.identity.content import MOST_FORMS, NO_ENTRY, Push, Side, World, canonical_form, content_hashes
+from levelgen.identity.signature import signatures
+from levelgen.level import MOTOR_BINDINGS, SIZES, Level
+from levelgen.task.rules import TaskParams, reset, step
+from tests.levelgen.variants import (
+    COUNT,
+    edited,
+    idle_changed,
+    more_room,
+    names,
+    one,
+    renamed,
+    renumbered,
+    sampled,
+    turned,
+    weakened,
+    with_names,
+)
+
+EXAMPLES = settings(max_examples=60, deadline=None)
+ANY_LEVEL = st.tuples(st.sampled_from("sml"), st.integers(0, COUNT - 1))
+SEED = st.integers(0, 2**32 - 1)
+SAME = (renumbered, turned, renamed, more_room, idle_changed)
+
+
+@pytest.mark.parametrize("change", SAME, ids=lambda change: change.__name__)
+@EXAMPLES
+@given(ANY_LEVEL, SEED)
+def test_numbers_names_room_and_what_is_idle_do_not_matter(change, which: tuple[str, int], seed: int) -> None:
+    level = one(*which)
+    other = change(level, np.random.default_rng(seed))
+    assert content_hashes(other) == content_hashes(level)
+    assert signatures(other) == signatures(level)
+
+
+@EXAMPLES
+@given(ANY_LEVEL, SEED)
+def test_nor_do_all_of_them_together(which: tuple[str, int], seed: int) -> None:
+    level, rng = one(*which), np.random.default_rng(seed)
+    other = level
+    for change in rng.permutation(np.array(SAME)):
+        other = change(other, rng)
+    assert content_hashes(other) == content_hashes(level)
+
+
+BODIES = ("position", "rotation", "velocity", "angular_velocity", "role", "inverse_mass", "inverse_inertia")
+BODIES += ("friction", "restitution", "collision_mode")
+HELD = ("joint_anchor_a", "joint_anchor_b", "joint_impulse", "joint_angular_impulse", "joint_fixed")
+LIMITS = ("joint_rotation", "joint_min", "joint_max")
+MOTORS = ("motor_speed", "motor_power", "motor_auto", "motor_on")
+THRUSTERS = ("thruster_position", "thruster_rotation", "thruster_power", "thruster_active")
+WHO = ("joint_a", "joint_b", "thruster_body", "active", "joint_active", "collides", "gravity", "vertices", "radius")
+
+
+def counts(level: Level, name: str) -> np.ndarray:
+    """(thing, level): those whose attribute counts."""
+    model = level.model
+    moves = model.inverse_mass != 0
+    held = np.take_along_axis(moves, model.joint_a, 0) | np.take_along_axis(moves, model.joint_b, 0)
+    joints = model.joint_active & held
+    limited, runs = joints & model.joint_limited, joints & model.motor_on
+    which = {
+        **dict.fromkeys((*BODIES, "active"), model.active),
+        **dict.fromkeys((*HELD, "joint_active"), joints),
+        **dict.fromkeys(("joint_a", "joint_b"), joints & (model.joint_active.sum(0) == 1)),  # no other does the same
+        **dict.fromkeys(LIMITS, limited & ~model.joint_fixed),
+        **dict.fromkeys(MOTORS, runs & ~model.joint_fixed),
+        **dict.fromkeys(THRUSTERS, model.thruster_active),
+        "thruster_body": model.thruster_active & (model.thruster_active.sum(0) == 1),
+        "vertices": model.active[: level.size.polygons],
+        "radius": model.active[level.size.polygons :],
+        "collides": model.active & moves,
+        "gravity": np.ones((2, COUNT), bool),
+    }
+    return which[name]
+
+
+@cache
+def having(name: str) -> list[tuple[str, int, int]]:
+    """All things of all levels whose attribute counts: size, level, number."""
+    return [(size, i, k) for size in SIZES for k, i in np.argwhere(counts(sampled(size), name)).tolist()]
+
+
+@pytest.mark.parametrize("name", BODIES + HELD + LIMITS + MOTORS + THRUSTERS + WHO)
+@EXAMPLES
+@given(st.data())
+def test_everything_else_matters(name: str, data: st.DataObject) -> None:
+    """The smallest change there is, of one thing, changes the hash."""
+    size, number, thing = data.draw(st.sampled_from(having(name)))
+    level = one(size, number)
+    before, values = content_hashes(level), field(level, name)
+    row = values[thing]
+    if name in ("joint_a", "joint_b", "thruster_body"):
+        taken = (
+            {int(field(level, end)[thing, 0]) for end in ("joint_a", "joint_b")} if "joint" in name else {int(row[0])}
+        )
+        row[...] = data.draw(st.sampled_from(sorted({*np.flatnonzero(level.model.active).tolist()} - taken)))
+    elif name == "collides":
+        other = data.draw(st.sampled_from(sorted({*np.flatnonzero(level.model.active).tolist()} - {thing})))
+        row[other] = values[other, thing] = ~row[other]
+    elif name == "vertices":
+        row[0, 0] = np.nextafter(row[0, 0], np.float32(9))
+    elif row.dtype == np.float32:
+        row[...] = np.nextafter(row, np.float32(9))
+    else:
+        row[...] = ~row if row.dtype == bool else row + 1
+    assert content_hashes(level) != before
+
+
+def field(level: Level, name: str) -> np.ndarray:
+    return next(getattr(part, name) for part in (level, level.model, level.state) if hasattr(part, name))
+
+
+def test_what_obeys_together_and_against_each_other_matters() -> None:
+    model = sampled("l").model
+    motors = model.joint_active & model.motor_on & ~model.joint_fixed & (model.motor_speed != 0)
+    chosen = np.flatnonzero(motors.sum(0) >= 2)
+    assert len(chosen) > 20
+    for i in chosen[:50]:
+        level = one("l", i)
+        level.model.joint_limited[...], level.motor_binding[...] = False, 2
+        first, second = np.flatnonzero(motors[:, i])[:2]
+        level.motor_binding[[first, second]] = 0
+        together = content_hashes(level)
+        level.model.motor_speed[second] *= -1
+        against = content_hashes(level)
+        level.motor_binding[second] = 1
+        apart = content_hashes(level)
+        level.model.motor_speed[second] *= -1
+        assert content_hashes(level) == apart  # alone on its entry, a motor's direction is a name
+        assert len({*together, *against, *apart}) == 3
+
+
+def test_a_weakened_motor_that_runs_the_other_way_is_another() -> None:
+    """The engine weakens a motor where its control, not its speed, goes towards the limit."""
+    weak = weakened(sampled("l")) & sampled("l").model.joint_active & (sampled("l").model.motor_speed != 0)
+    for i in np.flatnonzero(weak.any(0))[:20]:
+        level = one("l", i)
+        before = content_hashes(level)
+        level.model.motor_speed[np.flatnonzero(weak[:, i])[0]] *= -1
+        assert content_hashes(level) != before
+
+
+def test_what_the_engine_skips_is_no_content() -> None:
+    """A joint between bodies that cannot move, and a thruster without power."""
+    level = one("s", int(np.flatnonzero(sampled("s").model.joint_active.any(0))[0]))
+    level.model.inverse_mass[...], level.model.thruster_power[...] = 0, 0
+    before = content_hashes(level), signatures(level)
+    level.model.joint_anchor_a[...], level.model.motor_on[...] = 0.3, False
+    level.model.joint_active[...], level.model.thruster_active[...] = False, False
+    assert (content_hashes(level), signatures(level)) == before
+
+
+def test_sampled_levels_are_all_different() -> None:
+    for size in SIZES:
+        assert len(set(content_hashes(sampled(size)))) == COUNT
+
+
+def test_a_mirror_image_is_another_level() -> None:
+    level = one("s", 3)
+    mirrored = level.state.position * np.array([[-1], [1]], np.float32) + np.array([[5], [0]], np.float32)
+    assert content_hashes(edited(level, state={"position": mirrored})) != content_hashes(level)
+
+
+def test_hashes_stay_what_they_are() -> None:
+    """Of a level made without the sampler, whose last bits may differ from machine to machine."""
+    level: Level = jax.tree.map(np.zeros_like, one("m", 0))
+    level.model.active[[0, 4, 6]] = True
+    level.model.inverse_mass[[4, 6]] = np.array([[0.5], [0.25]])
+    level.model.n_vertices[...], level.model.radius[...], level.model.gravity[1] = 4, 0.5, -9.8
+    level.model.vertices[4, :, :, 0] = [[-1, 1], [1, 1], [1, -1], [-1, -1]]
+    level.state.position[4], level.state.position[6] = 1.5, 3.5
+    level.model.joint_active[0], level.model.joint_a[0], level.model.joint_b[0] = True, 4, 6
+    level.model.motor_on[0], level.model.motor_speed[0], level.model.motor_power[0] = True, 1.0, 2.0
+    assert content_hashes(level) == ["c1:0d3efd675e229a4120e42a7630fc95d8"]
+    assert signatures(level) == [["n1:aba1dfcb80240912", "n1:4b1994e94f32b348"]]
+
+
+# Played alike: what the hash calls the same
+
+
+def play(level: Level, actions: np.ndarray) -> np.ndarray:
+    """Places and angles of all bodies after each env step, (step, body, 3, level)."""
+    rules, now, seen = TaskParams(dense_reward_scale=0.0), reset(level), []
+    go = jax.jit(lambda now, action: step(level, now, action, rules)[0])
+    for action in actions:
+        now = go(now, action)
+        seen.append(np.concatenate([now.state.position, np.asarray(now.state.rotation)[:, None]], 1))
+    return np.array(seen)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_what_is_idle_has_no_effect_on_a_single_bit(size: str) -> None:
+    level, rng = sampled(size), np.random.default_rng(0)
+    actions = rng.integers(0, 2, (8, 6, COUNT)).repeat(3, 0).astype(np.int32)
+    active = level.model.active[:, None]
+    ours, other = play(level, actions), play(idle_changed(level, rng), actions)
+    np.testing.assert_array_equal(np.where(active, ours, 0), np.where(active, other, 0))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_other_sides_and_names_are_played_alike(size: str) -> None:
+    """But for the last bits, which the solver's sums in another order change, and chaos makes grow."""
+    level, rng = sampled(size), np.random.default_rng(0)
+    weak = (weakened(level) & level.model.joint_active).any(0)
+    assert weak.any() == (size != "s")  # whose joints have no limits
+    motor, thruster, backward = names(rng)
+    actions = rng.integers(0, [[3]] * MOTOR_BINDINGS + [[2], [2]], (4, 6, COUNT)).repeat(3, 0).astype(np.int32)
+    other_actions = np.array(actions)
+    against = np.array([0, 2, 1])[actions[:, :MOTOR_BINDINGS]]
+    other_actions[:, motor] = np.where(backward[:, None], against, actions[:, :MOTOR_BINDINGS])
+    other_actions[:, MOTOR_BINDINGS + thruster] = actions[:, MOTOR_BINDINGS:]
+    gap = np.abs(play(with_names(turned(level, rng), motor, thruster, backward), other_actions) - play(level, actions))
+    worst = np.where(level.model.active[:, None], gap, 0).max((0, 1, 2))
+    assert (worst < 1e-3).mean() > 0.97, np.sort(worst)[-20:]
+    assert (worst[weak] < 1e-3).all() or (worst[weak] < 1e-3).mean() > 0.9
+
+
+# Exact copies of bodies
+
+
+def worlds(bodies: int) -> st.SearchStrategy[World]:
+    """Copies of one body, tied in all ways but by a few joints and thrusters."""
+    body = st.integers(0, bodies - 1)
+
+    def joined(a: int, b: int, row: bytes, direction: int, entry: int) -> tuple[Side, Side]:
+        back = row if row == b"both" else row + b" back"
+        direction = 0 if entry == NO_ENTRY else direction
+        return Side(a, b, row, direction, entry), Side(b, a, back, -direction, entry)
+
+    parts = (body, body, st.sampled_from([b"both", b"left"]), st.sampled_from([1, -1]), st.integers(NO_ENTRY, 1))
+    joints = st.lists(st.tuples(*parts).filter(lambda x: x[0] != x[1]).map(lambda x: joined(*x)), max_size=5)
+    pushes = st.lists(st.builds(Push, body, st.just(b"push"), st.integers(0, 1)), max_size=2)
+    apart = st.lists(st.tuples(body, body).filter(lambda x: x[0] < x[1]), max_size=2, unique=True)
+    return st.builds(World, st.just(b""), st.just([b"copy"] * bodies), joints, pushes, apart)
+
+
+def by_hand(world: World) -> list[str]:
+    """The least of all ways to write a world down: every numbering, every naming."""
+    ways = itertools.product(
+        itertools.permutations(range(len(world.bodies))),
+        itertools.permutations(range(2)),
+        itertools.permutations(range(2)),
+        itertools.product((1, -1), repeat=2),
+    )
+
+    def written(place, entry, flame, sign) -> list[str]:
+        lines = [
+            str(sorted((place[s.first], place[s.second], s.row, s.direction, -1) if s.entry == NO_ENTRY else
+                       (place[s.first], place[s.second], s.row, s.direction * sign[s.entry], entry[s.entry])
+                       for s in sides))
+            for sides in world.joints
+        ]  # fmt: skip
+        lines += [f"push {place[p.body]} {p.row!r} {flame[p.entry]}" for p in world.pushes]
+        return sorted(lines + [f"apart {sorted((place[i], place[j]))}" for i, j in world.apart])
+
+    return min(written(*way) for way in ways)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(2, 4).flatmap(lambda count: st.tuples(worlds(count), worlds(count))))
+def test_copies_are_told_apart_exactly_as_by_trying_everything(both: tuple[World, World]) -> None:
+    assert (canonical_form(both[0]) == canonical_form(both[1])) == (by_hand(both[0]) == by_hand(both[1]))
+
+
+def moved(world: World, rng: np.random.Generator) -> World:
+    place = rng.permutation(len(world.bodies)).tolist()
+    side = lambda s: s._replace(first=place[s.first], second=place[s.second])
+    joints = [(side(a), side(b)) for a, b in world.joints]
+    return World(world.gravity, world.bodies, [joints[i] for i in rng.permutation(len(joints))], [], [])
+
+
+def ring_of(*links: tuple[int, int], bodies: int) -> World:
+    joints = [(Side(a, b, b"", 0, NO_ENTRY), Side(b, a, b"", 0, NO_ENTRY)) for a, b in links]
+    return World(b"", [b"copy"] * bodies, joints, [], [])
+
+
+def test_a_ring_of_six_copies_is_not_two_rings_of_three() -> None:
+    """Colour refinement alone cannot tell."""
+    six = ring_of(*((i, (i + 1) % 6) for i in range(6)), bodies=6)
+    threes = ring_of((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), bodies=6)
+    assert canonical_form(six) != canonical_form(threes)
+    rng = np.random.default_rng(0)
+    assert {canonical_form(moved(six, rng)) for _ in range(20)} == {canonical_form(six)}
+
+
+def test_very_many_copies_are_hashed_at_once_whatever_their_order() -> None:
+    pairs = ring_of(*((2 * i, 2 * i + 1) for i in range(60)), bodies=128)
+    rng = np.random.default_rng(0)
+    assert {canonical_form(moved(pairs, rng)) for _ in range(3)} == {canonical_form(pairs)}
+    fewer = ring_of(*((2 * i, 2 * i + 1) for i in range(59)), bodies=128)
+    assert canonical_form(pairs) != canonical_form(fewer)
+    assert MOST_FORMS == 120  # five copies are still told apart in every way
+
+
+# Signatures, files
+
+
+def jittered(level: Level, by: float) -> Level:
+    """Everything but the scenery a little elsewhere, m and rad."""
+    rng, state = np.random.default_rng(0), level.state
+    noise = [rng.normal(0, by, x.shape).astype(np.float32) for x in (state.position, state.rotation)]
+    for x in noise:
+        x[:4] = 0
+    return edited(level, state={"position": state.position + noise[0], "rotation": state.rotation + noise[1]})
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_level_a_little_elsewhere_is_near(size: str) -> None:
+    level = sampled(size)
+    near = {}
+    for by in (0.001, 0.01, 0.3):
+        other = jittered(level, by)
+        assert not set(content_hashes(other)) & set(content_hashes(level))
+        both = zip(signatures(other), signatures(level), strict=True)
+        near[by] = np.mean([any(a == b for a, b in zip(*pair, strict=True)) for pair in both])
+    assert near[0.001] > 0.98
+    assert near[0.01] > 0.85
+    assert near[0.3] < 0.1
+
+
+def test_different_levels_are_not_near() -> None:
+    for size in SIZES:
+        assert len({half for both in signatures(sampled(size)) for half in both}) == 2 * COUNT
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_level_file_keeps_the_content(size: str, tmp_path: Path) -> None:
+    for number in range(20):
+        level = one(size, number)
+        write_level_file(LevelFile(level, TaskParams()), tmp_path / "level.json")
+        assert content_hashes(read_level_file(tmp_path / "level.json").level) == content_hashes(level)

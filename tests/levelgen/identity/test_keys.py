@@ -1,0 +1,45 @@
+"""A level's keys: the same everywhere, one for each id and stream."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION, Stream, key_for, level_key
+
+
+def data(level_id: int, stream: Stream) -> tuple[int, ...]:
+    return tuple(np.asarray(jax.random.key_data(key_for(level_id, stream))).tolist())
+
+
+@pytest.mark.parametrize(
+    ("level_id", "stream", "expected"),
+    [
+        (0, Stream.LEVEL, (2067023257, 4011464742)),
+        (2, Stream.LEVEL, (4146040655, 930402587)),
+        (MAX_LEVEL_ID, Stream.EXPERT, (221172097, 3166419195)),
+    ],
+)
+def test_keys_are_those_of_version_1(level_id: int, stream: Stream, expected: tuple[int, int]) -> None:
+    """Integer arithmetic alone: they hold on every machine. If they change, raise SAMPLER_VERSION."""
+    assert SAMPLER_VERSION == 1
+    assert data(level_id, stream) == expected
+
+
+def test_no_key_is_used_twice() -> None:
+    ids = [0, 1, 2, 63, 64, 2**16, 2**31 - 2, MAX_LEVEL_ID]
+    keys = {data(level_id, stream) for level_id in ids for stream in Stream}
+    assert len(keys) == len(ids) * len(Stream)
+    assert not keys & {tuple(np.asarray(jax.random.key_data(level_key(level_id))).tolist()) for level_id in ids}
+
+
+def test_keys_do_not_depend_on_how_many_are_made() -> None:
+    ids = jnp.array([7, 0, MAX_LEVEL_ID])
+    keys = jax.jit(jax.vmap(lambda level_id: key_for(level_id, Stream.EVALUATION)))(ids)
+    for key, level_id in zip(jax.random.key_data(keys), ids.tolist(), strict=True):
+        assert tuple(np.asarray(key).tolist()) == data(level_id, Stream.EVALUATION)
+
+
+def test_the_generator_is_named() -> None:
+    """Whatever JAX's default is."""
+    assert "fry" in str(key_for(0, Stream.LEVEL).dtype)

@@ -1,0 +1,139 @@
+"""Pictures: what must be visible is, colours mean what the module says, films play."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from levelgen.level import WORLD_SIDE, Role
+from levelgen.pictures.raster import draw, sheet, write_gif, write_png
+from levelgen.pictures.scene import (
+    BINDING_COLOUR,
+    BORDER,
+    HEADER,
+    ROLE_COLOUR,
+    Caption,
+    live_entries,
+)
+from tests.golden.load import HERE, load
+
+OFF = np.zeros(6, np.int32)
+
+
+@pytest.fixture(scope="module")
+def golden():
+    return load(HERE / "m.npz")
+
+
+def colours(picture: Image.Image) -> set[tuple[int, int, int]]:
+    return set(map(tuple, np.asarray(picture).reshape(-1, 3).tolist()))
+
+
+def changed(left: Image.Image, right: Image.Image) -> int:
+    return int((np.asarray(left) != np.asarray(right)).any(-1).sum())
+
+
+def lane_with(flag: np.ndarray) -> int:
+    """A lane where some entry of (thing, lane) holds."""
+    return int(np.flatnonzero(flag.any(0))[0])
+
+
+def test_bodies_have_their_role_colours(golden) -> None:
+    model = golden.level.model
+    movable = model.active & (model.inverse_mass != 0)
+    for role in Role:
+        lanes = np.flatnonzero((movable & (golden.level.role == role) & (golden.state.position[:, 1] > 0.3)).any(0))[:5]
+        seen = [ROLE_COLOUR[role] in colours(draw(golden.level, golden.state, lane)) for lane in lanes]
+        assert sum(seen) >= 4, role  # a body may hide behind another
+
+
+def test_a_picture_keeps_to_one_size(golden) -> None:
+    plain = draw(golden.level, golden.state, 0)
+    assert plain.size[0] == 480
+    assert draw(golden.level, golden.state, 1).size == plain.size
+    assert draw(golden.level, golden.state, 1, action=OFF).size[1] > plain.size[1]
+    assert draw(golden.level, golden.state, 0, pixels=240).size[0] == 240
+
+
+def test_what_cannot_move_is_hatched(golden) -> None:
+    """The same circle, held and free: the held one has more edge than fill."""
+    model = golden.level.model
+    lane = lane_with(model.active & (model.inverse_mass != 0) & (golden.level.role == Role.PLAIN))
+    inverse_mass = model.inverse_mass.copy()
+    inverse_mass[:, lane] = 0
+    held = dataclasses.replace(golden.level, model=dataclasses.replace(model, inverse_mass=inverse_mass))
+    assert changed(draw(golden.level, golden.state, lane), draw(held, golden.state, lane)) > 100
+    assert ROLE_COLOUR[Role.PLAIN] not in colours(draw(held, golden.state, lane))
+
+
+@pytest.mark.parametrize("thing", ["motor", "thruster"])
+def test_actuators_show_when_they_are_used(golden, thing: str) -> None:
+    level, model = golden.level, golden.level.model
+    if thing == "motor":
+        acts = model.joint_active & model.motor_on & ~model.joint_fixed & ~level.motor_auto
+    else:
+        acts = model.thruster_active
+    lane = lane_with(acts[:1])
+    used = OFF.copy()
+    entry = int(level.motor_binding[0, lane]) if thing == "motor" else 4 + int(level.thruster_binding[0, lane])
+    used[entry] = 1
+    off, on = draw(level, golden.state, lane, action=OFF), draw(level, golden.state, lane, action=used)
+    world = (0, 40, 480, off.size[1] - 30)  # without the words and the keys
+    assert changed(off.crop(world), on.crop(world)) > 20
+    assert BINDING_COLOUR[entry] in colours(on)
+
+
+def test_the_flame_points_away_from_the_push(golden) -> None:
+    """The engine pushes a body along its thruster; hot gas leaves on the other side."""
+    model, state = golden.level.model, golden.state
+    lane = lane_with(model.thruster_active[:1])
+    body = int(model.thruster_body[0, lane])
+    turn = state.rotation[body, lane] + np.array([0, model.thruster_rotation[0, lane]])
+    arm = model.thruster_position[0, :, lane]
+    place = state.position[body, :, lane] + np.array(
+        [
+            arm[0] * np.cos(turn[0]) - arm[1] * np.sin(turn[0]),
+            arm[0] * np.sin(turn[0]) + arm[1] * np.cos(turn[0]),
+        ]
+    )
+    push = np.array([np.cos(turn.sum()), np.sin(turn.sum())])
+    used = OFF.copy()
+    used[4 + int(golden.level.thruster_binding[0, lane])] = 1
+    off, on = (np.asarray(draw(golden.level, state, lane, action=x)).astype(int) for x in (OFF, used))
+    rows, columns = np.nonzero((off != on).any(-1)[40:-30])
+    scale = 480 / (WORLD_SIDE + 2 * BORDER)
+    middle = np.array([columns.mean() / scale - BORDER, WORLD_SIDE + BORDER + HEADER - (rows.mean() + 40) / scale])
+    assert np.dot(middle - place, push) < -0.1
+
+
+def test_live_entries_are_those_that_do_something(golden) -> None:
+    for lane in range(64):
+        one = jax.tree.map(lambda x, lane=lane: x[..., lane], golden.level)
+        assert golden.action_mask[live_entries(one), lane].all()  # that mask counts motors that are off, too
+
+
+def test_the_words_show(golden) -> None:
+    bare = draw(golden.level, golden.state, 0)
+    told = draw(golden.level, golden.state, 0, caption=Caption("level 7 · size m", "1.2 s", "goal reached"))
+    bad = draw(golden.level, golden.state, 0, caption=Caption("level 7 · size m", "1.2 s", "touched red", good=False))
+    assert changed(bare, told) > 500
+    assert ROLE_COLOUR[Role.GREEN] in colours(told.crop((0, 0, 480, 34)))
+    assert ROLE_COLOUR[Role.RED] in colours(bad.crop((0, 0, 480, 34)))
+
+
+def test_a_film_plays(golden, tmp_path) -> None:
+    pictures = [draw(golden.level, golden.state, lane, pixels=160) for lane in range(5)]
+    write_gif(pictures, tmp_path / "film.gif", [0.07] * 4 + [1.0])
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames == 5
+        assert film.info["loop"] == 0
+        assert film.info["duration"] == 70
+        film.seek(4)
+        assert film.info["duration"] == 1000
+        seen = np.asarray(film.convert("RGB")).astype(int)
+    assert np.abs(seen - np.asarray(pictures[4]).astype(int)).mean() < 4  # 128 colours are enough
+    write_png(sheet(pictures, 3), tmp_path / "sheet.png")
+    with Image.open(tmp_path / "sheet.png") as page:
+        assert page.size == (3 * pictures[0].size[0], 2 * pictures[0].size[1])

@@ -1,0 +1,308 @@
+"""Random levels: the reference's statistics, and what holds for every level."""
+
+import dataclasses
+import hashlib
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from configs.compose import distributions
+from levelgen.files.kinetix import state_to_kinetix
+from levelgen.level import SIZES, WORLD_SIDE, Level, Role
+from levelgen.sampling.distribution import Distribution
+from levelgen.sampling.overlap import Circles, count_contacts
+from levelgen.sampling.sampler import BLOCK, sample_levels
+from levelgen.sampling.scenery import FLOOR_TOP, empty_level
+from levelgen.sampling.shuffle import separate
+from levelgen.task.actions import action_mask
+from physics.pairs import pairs_of
+from physics.step import step
+from physics.types import FIXED_POLYGONS, Size
+from physics.vector import Vec
+from tests.golden.level_statistics import statistics
+from tests.golden.load import HERE, load
+
+COUNTS = {"s": 4096, "m": 4096, "l": 2048}  # levels
+CUSTOM = [Size(5, 1, 0, 1), Size(4, 3, 2, 2), Size(8, 0, 3, 0)]
+SIGNIFICANT = 1e-3  # over all statistics of a size together
+RARE = 10  # values seen less often, in both samples together, are counted as one
+
+
+@cache
+def sampled(size: Size, count: int = COUNTS["s"], distribution: Distribution | None = None) -> Level:
+    return jax.tree.map(np.asarray, sample_levels(np.arange(count), size, distribution or Distribution()))
+
+
+@pytest.fixture(params=COUNTS)
+def level(request: pytest.FixtureRequest) -> Level:
+    return sampled(SIZES[request.param], COUNTS[request.param])
+
+
+def summaries(level: Level) -> dict[str, np.ndarray]:
+    lanes = level.role.shape[-1]
+    return statistics(state_to_kinetix(level, level.state, np.zeros(lanes, np.int32), np.zeros(lanes, np.float32)))
+
+
+def reference_statistics(size: str) -> dict[str, dict[str, np.ndarray]]:
+    """{statistic: values and counts, or quantiles and count}."""
+    read: dict[str, dict[str, np.ndarray]] = {}
+    with np.load(HERE / "level_statistics.npz") as file:
+        for path in file.files:
+            if path.startswith(f"{size}/"):
+                _, name, part = path.split("/")
+                read.setdefault(name, {})[part] = file[path]
+    return read
+
+
+def p_value(ours: np.ndarray, theirs: dict[str, np.ndarray]) -> float:
+    """Of the hypothesis that both samples have one distribution: chi-square of counts, or Kolmogorov-Smirnov."""
+    ours = np.asarray(ours, np.float32)
+    if "quantiles" in theirs:
+        expected = np.linspace(0, 1, len(theirs["quantiles"]))
+        found = np.searchsorted(np.sort(ours), theirs["quantiles"], "right") / len(ours)
+        count = 1 / (1 / len(ours) + 1 / theirs["counts"].item())
+        return float(stats.kstwobign.sf(np.abs(found - expected).max() * np.sqrt(count)))
+    values = np.union1d(ours, theirs["values"])
+    table = np.zeros((2, len(values)))
+    table[0] = [(ours == value).sum() for value in values]
+    table[1, np.searchsorted(values, theirs["values"])] = theirs["counts"]
+    rare = table.sum(0) < RARE
+    table = np.concatenate([table[:, ~rare], table[:, rare].sum(1, keepdims=True)], 1)
+    table = table[:, table.sum(0) > 0]
+    return float(stats.chi2_contingency(table)[1]) if table.shape[1] > 1 else 1.0
+
+
+@pytest.mark.parametrize("size", COUNTS)
+def test_statistics_of_the_reference(size: str) -> None:
+    ours, theirs = summaries(sampled(SIZES[size], COUNTS[size])), reference_statistics(size)
+    assert {name for name, values in ours.items() if len(values)} == set(theirs)
+    p = {name: p_value(ours[name], theirs[name]) for name in theirs}
+    assert len(p) >= 90
+    worst = dict(sorted(p.items(), key=lambda item: item[1])[:5])
+    assert min(p.values()) > SIGNIFICANT / len(p), f"differs from the reference: {worst}"
+
+
+def test_the_statistics_notice_a_change() -> None:
+    """Three motors in four are on, instead of four in five; no other statistic."""
+    changed = Distribution(motor_chance=0.75)
+    ours, theirs = summaries(sampled(SIZES["s"], COUNTS["s"], changed)), reference_statistics("s")
+    p = {name: p_value(ours[name], theirs[name]) for name in theirs}
+    assert [name for name in p if p[name] < SIGNIFICANT / len(p)] == ["joint motor on"]
+
+
+def test_a_level_depends_on_its_id_alone(level: Level) -> None:
+    """Bit for bit, in any company, order and place."""
+    ids = np.array([5, 3, 5, BLOCK + 2, 0])
+    alone = [sample_levels(ids[i : i + 1], level.size) for i in range(len(ids))]
+    together = sample_levels(jnp.asarray(ids), level.size)
+    for many, few, *single in zip(*map(jax.tree.leaves, (level, together, *alone)), strict=True):
+        assert few.dtype == many.dtype
+        np.testing.assert_array_equal(many[..., ids], few)
+        np.testing.assert_array_equal(np.concatenate(single, -1), few)
+
+
+def test_levels_of_version_1() -> None:
+    """Bodies, roles, joints, thrusters of the first 64 levels: if they change, SAMPLER_VERSION must."""
+    digests = {}
+    for name, size in SIZES.items():
+        level, model = sampled(size, COUNTS[name]), sampled(size, COUNTS[name]).model
+        whole = (model.active, level.role, model.joint_a, model.joint_b, model.joint_fixed, model.motor_on)
+        whole += (model.thruster_body, level.motor_binding, level.thruster_binding, model.inverse_mass == 0)
+        text = b"".join(np.asarray(values)[..., :64].astype(np.uint8).tobytes() for values in whole)
+        digests[name] = hashlib.sha256(text).hexdigest()[:16]
+    assert digests == {"s": "e8988f5977c671a4", "m": "13e88ef1ba1b54dc", "l": "9e8317e219c8246d"}
+
+
+def test_no_levels() -> None:
+    none = sample_levels(np.arange(0), SIZES["s"])
+    assert none.role.shape == (SIZES["s"].bodies, 0)
+
+
+def test_every_level_has_one_green_and_one_blue(level: Level) -> None:
+    for role, most in ((Role.GREEN, 1), (Role.BLUE, 1), (Role.RED, 1)):
+        count = (level.model.active & (level.role == role)).sum(0)
+        assert count.max() == most
+        assert role == Role.RED or count.min() == 1
+    assert (level.role[1:FIXED_POLYGONS] == Role.PLAIN).all()
+
+
+def test_green_or_blue_can_move(level: Level) -> None:
+    goal = level.model.active & ((level.role == Role.GREEN) | (level.role == Role.BLUE))
+    assert (goal & (level.model.inverse_mass > 0)).any(0).all()
+
+
+def test_something_can_act(level: Level) -> None:
+    assert np.asarray(action_mask(level)).any(0).all()
+
+
+def test_small_worlds_have_no_fixed_bodies() -> None:
+    model = sampled(SIZES["s"], COUNTS["s"]).model
+    assert (model.inverse_mass[FIXED_POLYGONS:] > 0)[model.active[FIXED_POLYGONS:]].all()
+
+
+def test_free_bodies_are_within_the_world(level: Level) -> None:
+    """Where nothing joins or lowers them."""
+    model, polygons, numbers = level.model, level.size.polygons, np.arange(level.size.bodies)[:, None, None]
+    joined = ((model.joint_a == numbers) | (model.joint_b == numbers)) & model.joint_active
+    free = model.active & (model.inverse_mass > 0) & ~joined.any(1)
+    reach = np.concatenate([np.hypot(*np.moveaxis(model.vertices, 2, 0)).max(1), model.radius])
+    x, y = np.moveaxis(level.state.position, 1, 0)
+    assert free[:polygons].any()
+    assert free[polygons:].any()
+    slack = 1e-5
+    for low, high in ((x - reach, x + reach), (y - reach - FLOOR_TOP, y + reach)):
+        assert (low > -slack)[free].all()
+        assert (high < WORLD_SIDE + slack)[free].all()
+
+
+def test_what_is_not_there_is_empty(level: Level) -> None:
+    model, gone = level.model, ~level.model.active
+    assert (level.state.position[np.broadcast_to(gone[:, None], level.state.position.shape)] == 0).all()
+    assert (level.role[gone] == Role.PLAIN).all()
+    assert (model.inverse_mass[gone] == 0).all()
+    assert (model.motor_power[~model.joint_active] == 0).all()
+    assert (model.thruster_power[~model.thruster_active] == 0).all()
+    for name in ("velocity", "angular_velocity", "contact_normal_impulse", "joint_impulse"):
+        assert (getattr(level.state, name) == 0).all()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_scenery_and_chains_are_those_of_the_reference(size: str) -> None:
+    golden = load(HERE / f"{size}.npz").level
+    ours, lanes = empty_level(SIZES[size], golden.role.shape[-1]), np.s_[:FIXED_POLYGONS]
+    np.testing.assert_array_equal(jax.jit(separate)(golden.model), golden.model.collides)
+    for name in ("vertices", "inverse_mass", "collision_mode", "active", "n_vertices"):
+        np.testing.assert_array_equal(getattr(ours.model, name)[lanes], getattr(golden.model, name)[lanes])
+    for name in ("position", "rotation"):
+        np.testing.assert_array_equal(getattr(ours.state, name)[lanes], getattr(golden.state, name)[lanes])
+    assert np.abs(np.asarray(ours.model.gravity) - [[0], [-9.81]]).max() < 1e-6
+
+
+def test_contacts_of_a_new_body() -> None:
+    """As many as the engine finds, with the last polygon or the last circle as the new body."""
+    level = sampled(SIZES["m"], COUNTS["m"])
+    model, state, polygons = level.model, level.state, level.size.polygons
+    controls = (np.zeros((len(x), state.rotation.shape[-1]), np.float32) for x in (model.joint_a, model.thruster_body))
+    still = dataclasses.replace(model, gravity=np.zeros_like(model.gravity))
+    pairs, active = pairs_of(level.size), np.asarray(jax.jit(step)(still, state, *controls)[1].active)
+    kinds = (pairs.polygon, pairs.polygon, pairs.circle_polygon, pairs.circle)
+    a, b = (np.concatenate([getattr(kind, end) for kind in kinds]) for end in "ab")
+    for last in (polygons - 1, level.size.bodies - 1):
+        there = model.active[last]
+        expected = active[(a == last) | (b == last)].sum(0)
+        others = model.active & (np.arange(level.size.bodies) != last)[:, None]
+        rest = dataclasses.replace(model, active=others)
+        corners = model.vertices[min(last, polygons - 1)]
+        cos, sin = np.cos(state.rotation[last]), np.sin(state.rotation[last])
+        turned = np.stack([cos * corners[:, 0] - sin * corners[:, 1], sin * corners[:, 0] + cos * corners[:, 1]], 1)
+        body = Circles(Vec(*state.position[last][:, None]), model.radius[max(last - polygons, 0)][None])
+        found = count_contacts(rest, state, turned + state.position[last], body, jnp.full(there.shape, last < polygons))
+        assert expected[there].sum() > 100
+        np.testing.assert_array_equal(np.asarray(found)[there], expected[there])
+
+
+@pytest.mark.parametrize("size", CUSTOM, ids=str)
+def test_any_size(size: Size) -> None:
+    level = sampled(size, BLOCK)
+    model = level.model
+    assert level.size == size
+    assert model.active[:FIXED_POLYGONS].all()
+    for role in (Role.GREEN, Role.BLUE):
+        assert ((model.active & (level.role == role)).sum(0) == 1).all()
+    assert np.asarray(action_mask(level)).any(0).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(level))
+
+
+@pytest.mark.parametrize("size", [Size(4, 1, 1, 1), Size(3, 4, 1, 1), Size(5, 2, -1, 0)], ids=str)
+def test_sizes_without_room_are_refused(size: Size) -> None:
+    with pytest.raises(ValueError, match="leave no room for"):
+        sample_levels(np.arange(1), size)
+
+
+@pytest.mark.parametrize("level_id", [-1, 2**31])
+def test_ids_out_of_range_are_refused(level_id: int) -> None:
+    with pytest.raises(ValueError, match="they run from 0 to 2147483647"):
+        sample_levels(np.array([level_id]), SIZES["s"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"motor_chance": 1.3}, "motor_chance is 1.3: it must be between 0 and 1"),
+        ({"floor_red_chance": -0.1}, "floor_red_chance is -0.1: it must be between 0 and 1"),
+        ({"hidden_penalty": -1.0}, "hidden_penalty is -1.0: it must be 0 or more"),
+        ({"proposals": 0}, "proposals is 0: it must be more than 0"),
+        ({"max_limit": float("nan")}, "max_limit is nan: it must be a finite number"),
+        ({"max_motor_speed": 0.1}, "min_motor_speed is 0.4: it must be at most max_motor_speed, 0.1"),
+        ({"connected_circle_chance": 2.0}, "connected_circle_chance is 2.0: it must be between 0 and 1"),
+        ({"motor_only_weight": -1.0}, "motor_only_weight is -1.0: it must be 0 or more"),
+        (
+            {"motor_only_weight": 0.0, "thruster_only_weight": 0.0, "motor_and_thruster_weight": 0.0},
+            "motor_and_thruster_weight is 0: one of motor_only_weight, thruster_only_weight and "
+            "motor_and_thruster_weight must be more",
+        ),
+        ({"floor_blue_chance": 0.95}, "floor_red_chance is 0.08: the floor's chances add up to 1.03, over 1"),
+        ({"max_size": 0.1}, "max_size is 0.1: shapes would be smaller than min_half_side or min_radius"),
+        ({"max_size": 1.5}, "max_size is 1.5: shapes would reach 1.50 m, over 1.25 m"),
+        ({"goal_size_factor": 2.0}, "goal_size_factor is 2.0: shapes would reach 2.00 m, over 1.25 m"),
+    ],
+)
+def test_a_wrong_distribution_says_what_is_wrong(changes: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match="is") as refused:
+        Distribution(**changes)  # type: ignore[arg-type]
+    assert str(refused.value) == message
+
+
+def test_what_must_act_follows_its_weights() -> None:
+    """A thruster always; a motor too in three levels of four. Size s has no bodies joined but for a motor's sake."""
+    changed = Distribution(motor_only_weight=0.0, motor_and_thruster_weight=3.0)
+    model = sampled(SIZES["s"], COUNTS["s"], changed).model
+    assert model.thruster_active.any(0).all()
+    assert abs(model.joint_active.any(0).mean() - 0.75) < 0.03
+
+
+@pytest.mark.parametrize("chance", [0.0, 1.0])
+def test_wheels_follow_their_chance(chance: float) -> None:
+    """Green, blue and a body joined to one of them: a rectangle to anything, or a circle to rectangles."""
+    of = {"thruster_only_weight": 0.0, "connected_weight": 0.0, "free_weight": 0.0, "proposals": 1}
+    size = Size(7, 3, 1, 1)
+    model = sampled(size, BLOCK, Distribution(connected_circle_chance=chance, **of)).model  # type: ignore[arg-type]
+    circles, joint = model.active[size.polygons :].sum(0), model.joint_active[0]
+    assert joint.all()
+    assert circles.min() == chance  # of the levels whose green and blue are rectangles
+
+
+@pytest.mark.parametrize("name", distributions())
+def test_presets_are_what_they_say(name: str) -> None:
+    level = sampled(SIZES["m"], BLOCK, distributions()[name])
+    model = level.model
+    movable = np.s_[FIXED_POLYGONS:]
+    there, fixed = model.active[movable], (model.inverse_mass == 0)[movable] & model.active[movable]
+    says = {
+        "kinetix": fixed.any() and model.motor_on.any() and model.thruster_active.any(),
+        "free": not fixed.any(),
+        "thrusters": not model.motor_on.any() and model.thruster_active.any(0).all(),
+        "vehicles": model.motor_on[model.joint_active].all()
+        and model.joint_active.any(0).all()
+        and not model.thruster_active.any(),
+        "clutter": there.all() and not fixed.any(),
+        "obstacles": fixed.sum() > there.sum() / 2,
+    }
+    assert says[name]
+    assert np.asarray(action_mask(level)).any(0).all()
+    for role in (Role.GREEN, Role.BLUE):
+        assert ((model.active & (level.role == role)).sum(0) == 1).all()
+
+
+def test_a_floor_that_is_green_or_blue_comes_with_the_other() -> None:
+    for floor, other in ((Role.GREEN, Role.BLUE), (Role.BLUE, Role.GREEN)):
+        chances = {"floor_red_chance": 0.0, "floor_blue_chance": 0.0, f"floor_{floor.name.lower()}_chance": 1.0}
+        level = sampled(Size(5, 1, 0, 1), BLOCK, Distribution(small_world=0, proposals=1, fixed_chance=0.5, **chances))
+        assert (level.role[0] == floor).all()
+        body = level.model.active & (level.role == other)
+        assert (body.sum(0) == 1).all()
+        assert (level.model.inverse_mass > 0)[body].all()

@@ -1,0 +1,44 @@
+"""Pixels against the reference's in 512 states a size, and what must be seen in them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from levelgen.level import Level
+from levelgen.task.observe.pixels import SIDE, pixels
+from tests.golden.load_seen import load_seen
+
+
+def draw(level: Level) -> np.ndarray:
+    """(lane, x, y, 3), from 0 to 255."""
+    image = jax.jit(jax.vmap(lambda level: pixels(level, level.state).image, in_axes=-1))(level)
+    return 255 * np.asarray(image)
+
+
+@pytest.mark.parametrize("size", ["s", "m", "l"])
+def test_pixels_are_the_references(size: str) -> None:
+    seen = load_seen(size)
+    ours = draw(seen.level)
+    theirs = np.stack([seen.palette_image(lane) for lane in range(len(ours))]).astype(np.float32)
+    assert ours.shape == (512, SIDE, SIDE, 3) == theirs.shape
+    off = np.abs(ours - theirs).mean((1, 2, 3))
+    assert off.mean() < 0.2
+    assert off.max() < 2  # of 255, in the worst picture
+
+
+def test_nothing_active_nothing_drawn() -> None:
+    level = jax.tree.map(lambda x: x[..., :8], load_seen("m").level)
+    off = {name: np.zeros_like(getattr(level.model, name)) for name in ("active", "joint_active", "thruster_active")}
+    bare = draw(dataclasses.replace(level, model=dataclasses.replace(level.model, **off)))
+    assert (bare[:, :, 12:] == 255).all()  # above the floor, which is always there
+    assert (bare[:, :, :10] < 255).any(-1).all()
+
+
+def test_a_world_that_broke_down_is_drawn_without_what_is_lost() -> None:
+    level = jax.tree.map(lambda x: x[..., :2], load_seen("s").level)
+    lost = jnp.asarray(level.state.position).at[4:].set(jnp.nan)
+    state = dataclasses.replace(level.state, position=lost)
+    assert np.isfinite(draw(dataclasses.replace(level, state=state))).all()

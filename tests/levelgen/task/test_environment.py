@@ -1,0 +1,204 @@
+"""The environment for users of gymnax: one at a time, mapped, mapped twice, around loops: always the same world."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from levelgen.level import SIZES, Level
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task import rules as task
+from levelgen.task.actions import CHOICES
+from levelgen.task.environment import ActionType, Environment, EnvParams, EnvState, ObservationType, make, starts
+from levelgen.task.observe.flat import symbolic_flat
+from levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete
+
+LEVELS, STEPS = 24, 12
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return sample_levels(np.arange(LEVELS), SIZES["s"])
+
+
+@pytest.fixture(scope="module")
+def made(levels: Level) -> tuple[Environment, EnvParams]:
+    return make(levels)
+
+
+@pytest.fixture(scope="module")
+def keys() -> jax.Array:
+    return jax.random.split(jax.random.key(3), LEVELS)
+
+
+@pytest.fixture(scope="module")
+def actions() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, np.array(CHOICES), (STEPS, LEVELS, 6)).astype(np.int32)
+
+
+def lane(tree, index: int):
+    return jax.tree.map(lambda x: x[..., index], tree)
+
+
+def lanes_last(tree):
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
+
+
+def assert_same(left, right) -> None:
+    jax.tree.map(np.testing.assert_array_equal, left, right)
+
+
+def play(env: Environment, params: EnvParams, state: EnvState, keys: jax.Array, actions):
+    """Mapped steps in a loop: (state, (observations, rewards, ends))."""
+
+    def step(state, inputs):
+        number, action = inputs
+        each = jax.vmap(lambda key: jax.random.fold_in(key, number))(keys)
+        seen, state, reward, done, _ = jax.vmap(env.step, (0, 0, 0, None))(each, state, action, params)
+        return state, (seen, reward, done)
+
+    return jax.jit(lambda: jax.lax.scan(step, state, (jnp.arange(STEPS), jnp.asarray(actions))))()
+
+
+def test_a_mapped_step_is_the_tasks_step(levels: Level, keys, actions) -> None:
+    env, params = make(levels, auto_reset=False)
+    state, (seen, reward, done) = play(env, params, starts(levels), keys, actions)
+    world = task.reset(levels)
+    for step in range(STEPS):
+        world, outcome = task.advance(levels, world, jnp.asarray(actions[step].T), env.rules)
+        np.testing.assert_array_equal(reward[step], outcome.reward)
+        np.testing.assert_array_equal(done[step], outcome.done)
+    assert_same(lanes_last(state.now), world)
+    np.testing.assert_allclose(seen[-1].T, symbolic_flat(levels, world.state), rtol=1e-6)
+
+
+def test_one_environment_is_a_lane_of_many(levels: Level, made, keys, actions) -> None:
+    env, params = made
+    many = jax.vmap(env.step, (0, 0, 0, None))(keys, starts(levels), actions[0], params)
+    one = env.step(keys[5], jax.tree.map(lambda x: x[5], starts(levels)), actions[0, 5], params)
+    assert_same(jax.tree.map(lambda x: x[5], many[1:]), one[1:])
+    np.testing.assert_allclose(many[0][5], one[0], rtol=1e-6)
+
+
+def test_mapped_twice_is_mapped_once(levels: Level, made, keys, actions) -> None:
+    env, params = made
+    fold = lambda tree: jax.tree.map(lambda x: x.reshape(4, 6, *x.shape[1:]), tree)
+    given = (keys, starts(levels), jnp.asarray(actions[0]))
+    once = jax.vmap(env.step, (0, 0, 0, None))(*given, params)
+    inner = jax.vmap(env.step, (0, 0, 0, None))
+    across = jax.vmap(inner, (1, 1, 1, None), 1)(*fold(given), params)
+    assert_same(fold(once[1:]), across[1:])
+    same = jnp.broadcast_to(actions[0, 0], actions[0].shape)
+    alone = jax.vmap(env.step, (0, 0, 0, None))(*given[:2], same, params)
+    shared = jax.vmap(jax.vmap(env.step, (0, 0, None, None)), (0, 0, None, None))(
+        *fold(given[:2]), actions[0, 0], params
+    )
+    assert_same(fold(alone[1:]), shared[1:])
+
+
+def test_a_mapped_loop_is_a_loop_of_mapped_steps(levels: Level, made, keys, actions) -> None:
+    env, params = made
+
+    def episode(key, state, actions):
+        def step(state, inputs):
+            number, action = inputs
+            seen, state, reward, done, _ = env.step(jax.random.fold_in(key, number), state, action, params)
+            return state, (seen, reward, done)
+
+        return jax.lax.scan(step, state, (jnp.arange(STEPS), actions))
+
+    state, (_, reward, done) = jax.jit(jax.vmap(episode, (0, 0, 1)))(keys, starts(levels), jnp.asarray(actions))
+    looped, (_, rewards, ends) = play(env, params, starts(levels), keys, actions)
+    assert_same(state.now, looped.now)
+    assert_same((reward.T, done.T), (rewards, ends))
+
+
+def test_levels_may_differ_between_mapped_parameters(levels: Level, made, keys) -> None:
+    """Mapping over the parameters too: each environment draws from its own levels."""
+    env, _ = made
+    groups = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], 4, 6), -2, 0), EnvParams(env.levels))
+    _, state = jax.vmap(env.reset)(keys[:4], groups)
+    for group in range(4):
+        _, one = env.reset(keys[group], jax.tree.map(lambda x, group=group: x[group], groups))
+        assert_same(jax.tree.map(lambda x, group=group: x[group], state), one)
+
+
+def test_resets_draw_from_all_levels(levels: Level, made) -> None:
+    env, params = made
+    _, state = jax.vmap(env.reset, (0, None))(jax.random.split(jax.random.key(0), 300), params)
+    start = np.asarray(levels.state.position.reshape(-1, LEVELS).T)
+    drawn = (np.asarray(state.now.state.position.reshape(300, -1))[:, None] == start).all(-1)
+    assert (drawn.sum(1) == 1).all()
+    assert drawn.any(0).all()
+
+
+def test_an_end_resets(levels: Level, keys) -> None:
+    env, params = make(levels, rules=task.TaskParams(max_timesteps=1))
+    stop, own = jnp.zeros((LEVELS, 6), jnp.int32), starts(levels)
+    seen, state, _, done, info = jax.vmap(env.step, (0, 0, 0, None, 0))(keys, own, stop, params, own)
+    assert done.all()
+    assert set(info) == {"GoalR", "distance"}
+    assert (np.asarray(info["distance"]) > 0).all()
+    assert_same(state, own)  # the given state, and what is seen of it
+    np.testing.assert_array_equal(seen, jax.vmap(env.get_obs)(own))
+    _, drawn, _, done, _ = jax.vmap(env.step, (0, 0, 0, None))(keys, own, stop, params)
+    assert done.all()
+    assert (np.asarray(drawn.now.timestep) == 0).all()
+    assert not np.array_equal(drawn.model.inverse_mass, own.model.inverse_mass)  # other levels
+
+
+def test_parameters_are_those_of_make_where_none_are_given(levels: Level, made) -> None:
+    env, params = made
+    assert_same(env.reset(jax.random.key(1)), env.reset(jax.random.key(1), params))
+    first = EnvParams(jax.tree.map(lambda x: x[..., :1], env.levels))
+    assert_same(env.reset(jax.random.key(1), first)[1], EnvState.start(lane(levels, 0)))
+
+
+@pytest.mark.parametrize("observation_type", list(ObservationType))
+def test_observations_are_in_their_space(levels: Level, observation_type: str) -> None:
+    env, params = make(levels, observation_type=observation_type)
+    seen, state = env.reset(jax.random.key(0), params)
+    space = env.observation_space(params)
+    shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)
+    if isinstance(space, Dict):
+        seen = vars(seen)
+        assert {name: (x.shape, x.dtype) for name, x in space.spaces.items()} == shapes(seen)
+    else:
+        assert (space.shape, space.dtype) == shapes(seen)
+    assert space.contains(seen)
+    assert shapes(space.sample(jax.random.key(1))) == shapes(seen)
+    assert shapes(env.get_obs(state)) == shapes(env.reset(jax.random.key(0), params)[0])
+
+
+@pytest.mark.parametrize("action_type", list(ActionType))
+def test_actions_of_their_space_are_taken(levels: Level, keys, action_type: str) -> None:
+    env, params = make(levels, action_type)
+    space = env.action_space(params)
+    action = jax.vmap(space.sample)(keys)
+    assert jax.vmap(space.contains)(action).all()
+    kind = {"discrete": Discrete, "multi_discrete": MultiDiscrete, "continuous": Box}[action_type]
+    assert isinstance(space, kind)
+    _, state, _, _, _ = jax.vmap(env.step, (0, 0, 0, None))(keys, starts(levels), action, params)
+    assert np.isfinite(state.now.state.position).all()
+
+
+def test_spaces_know_what_is_not_in_them() -> None:
+    assert not Discrete(11).contains(11)
+    assert not MultiDiscrete(CHOICES).contains(jnp.array([0, 0, 0, 0, 2, 0]))
+    assert not Box(-1.0, 1.0, (6,)).contains(jnp.full(6, 1.1))
+
+
+def test_unknown_types_are_refused(levels: Level) -> None:
+    with pytest.raises(ValueError, match="symbols"):
+        make(levels, observation_type="symbols")
+
+
+def test_nothing_is_differentiated_through_the_world(levels: Level) -> None:
+    env, params = make(levels, ActionType.CONTINUOUS)
+    _, state = env.reset(jax.random.key(0), params)
+
+    def reward(strength):
+        seen, _, reward, _, _ = env.step(jax.random.key(1), state, strength * jnp.ones(6), params)
+        return reward + seen.sum() + strength
+
+    assert jax.grad(reward)(0.5) == 1

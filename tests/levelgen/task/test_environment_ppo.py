@@ -1,0 +1,90 @@
+"""A public PPO that was written for gymnax, rejax 0.1.3, learns here; and whole runs may be mapped."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnax.environments import spaces
+from rejax import PPO
+
+from levelgen.level import SIZES
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.environment import ActionType, Environment, EnvParams, make
+
+STEPS = 262_144
+EPISODES = 128  # of an evaluation
+
+
+class WithGymnaxSpace(Environment):
+    """rejax asks for the class of gymnax's own space of discrete actions; all else it takes as it is."""
+
+    def action_space(self, params: EnvParams | None = None) -> spaces.Discrete:
+        return spaces.Discrete(super().action_space(params).n)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def solved(algo, ts, rng) -> jax.Array:
+    """Share of first episodes that reach the goal."""
+    act = algo.make_act(ts)
+
+    def play(rng):
+        rng, first = jax.random.split(rng)
+        obs, state = algo.env.reset(first, algo.env_params)
+
+        def step(carry, key):
+            obs, state, over, goal = carry
+            act_key, step_key = jax.random.split(key)
+            obs, state, _, done, info = algo.env.step(step_key, state, act(obs, act_key), algo.env_params)
+            return (obs, state, over | done, goal | (~over & (info["GoalR"] > 0))), None
+
+        start = (obs, state, jnp.bool_(False), jnp.bool_(False))
+        return jax.lax.scan(step, start, jax.random.split(rng, 256))[0][3]
+
+    return jax.vmap(play)(jax.random.split(rng, EPISODES)).mean()
+
+
+@pytest.mark.slow
+def test_it_learns() -> None:
+    """On four random levels; of which some are solved by chance."""
+    env, params = make(sample_levels(jnp.arange(4), SIZES["s"]), ActionType.DISCRETE)
+    algo = PPO.create(
+        env=WithGymnaxSpace(**vars(env)), env_params=params, num_envs=64, num_steps=64, num_epochs=4,
+        num_minibatches=4, learning_rate=1e-3, max_grad_norm=0.5, total_timesteps=STEPS, eval_freq=STEPS,
+    )  # fmt: skip
+    before, after = jax.jit(algo.replace(eval_callback=solved).train)(jax.random.key(0))[1]
+    assert after > before + 0.15, (before, after)
+
+
+@pytest.mark.slow
+def test_continuous_actions_train_without_ado() -> None:
+    env, params = make(sample_levels(jnp.arange(4), SIZES["s"]), ActionType.CONTINUOUS)
+    algo = PPO.create(
+        env=env, env_params=params, num_envs=16, num_steps=32, num_minibatches=2, num_epochs=1,
+        total_timesteps=1024, eval_freq=1024, skip_initial_evaluation=True,
+    )  # fmt: skip
+    algo = algo.replace(eval_callback=lambda algo, ts, rng: ts.global_step)
+    state, steps = jax.jit(algo.train)(jax.random.key(0))
+    assert int(steps[-1]) == 1024
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.actor_ts.params))
+
+
+def test_seeds_train_side_by_side() -> None:
+    """`vmap` of a whole training run, as people do for error bars: here of one rollout."""
+    env, params = make(sample_levels(jnp.arange(2), SIZES["s"]), ActionType.DISCRETE)
+
+    def rollout(rng):
+        _, state = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(rng, 3), params)
+
+        def step(state, rng):
+            action = jax.random.randint(rng, (3,), 0, env.num_actions)
+            obs, state, reward, done, _ = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
+                jax.random.split(rng, 3), state, action, params
+            )
+            return state, (obs, reward, done)
+
+        return jax.lax.scan(step, state, jax.random.split(rng, 8))[1]
+
+    seeds = jax.random.split(jax.random.PRNGKey(1), 2)
+    together = jax.jit(jax.vmap(rollout))(seeds)
+    for seed in range(2):
+        alone = jax.jit(rollout)(seeds[seed])
+        jax.tree.map(lambda x, y, seed=seed: np.testing.assert_allclose(x[seed], y, rtol=1e-6), together, alone)

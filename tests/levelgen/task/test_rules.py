@@ -1,0 +1,250 @@
+"""The task: rewards, ends and restarts, against the reference and from first principles."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from levelgen.level import Level, Role
+from levelgen.task.rules import (
+    NO_DISTANCE,
+    TaskParams,
+    TaskState,
+    advance,
+    goal_distance,
+    has_nan,
+    has_roles,
+    reset,
+    restart,
+    step,
+    touches,
+)
+from physics.pairs import pairs_of
+from physics.types import Manifold
+from tests.golden.load import HERE, Golden, load
+
+OFF = 0  # every entry of an action
+
+
+@functools.cache
+def golden(size: str) -> Golden:
+    return load(HERE / f"{size}.npz")
+
+
+@functools.cache
+def env_step(size: str):
+    """Our env step from every golden state: the next task state and the outcome, on the host."""
+    of = golden(size)
+    params = TaskParams(
+        frame_skip=of.about["frame_skip"], dense_reward_scale=float(np.float32(of.about["dense_reward_scale"]))
+    )
+    now = TaskState(of.state, of.timestep, of.last_distance)
+    compiled = jax.jit(lambda level, now, action: advance(level, now, action, params)[:2])
+    return jax.tree.map(np.asarray, compiled(of.level, now, of.action))
+
+
+@functools.cache
+def episode_step(max_timesteps: int = 256):
+    """A compiled env step with automatic reset."""
+    params = TaskParams(max_timesteps=max_timesteps)
+    return jax.jit(lambda level, now, action: step(level, now, action, params))
+
+
+def lanes_of(tree, lanes):
+    return jax.tree.map(lambda x: np.asarray(x)[..., lanes], tree)
+
+
+def as_level(of: Golden, lanes) -> Level:
+    return lanes_of(of.level, lanes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["s", "m", "l"])
+class TestAgainstTheReference:
+    def test_reward_done_and_goal(self, size: str) -> None:
+        of, (_, outcome) = golden(size), env_step(size)
+        same = np.abs(outcome.reward - of.reward) < 1e-4
+        same &= (outcome.done == of.done) & (outcome.goal == of.goal)
+        assert same.mean() >= 0.995, np.flatnonzero(~same)
+        assert of.goal.sum() > 40  # goals, ends by red and steps in between are all there
+        assert (of.reward < -0.5).sum() > 20
+        assert (~of.done).sum() > 300
+
+    def test_the_next_state(self, size: str) -> None:
+        of, (after, _) = golden(size), env_step(size)
+        worst = np.zeros(of.reward.size)
+        for name in ("position", "rotation", "velocity", "angular_velocity"):
+            gap = np.abs(getattr(after.state, name) - getattr(of.env_after, name))
+            worst = np.maximum(worst, gap.reshape(-1, gap.shape[-1]).max(0))
+        assert (worst < 1e-3).mean() >= 0.99, np.sort(worst)[-10:]  # two physics steps
+
+    def test_clock_and_distance(self, size: str) -> None:
+        of, (after, _) = golden(size), env_step(size)
+        np.testing.assert_array_equal(after.timestep, of.env_timestep)
+        assert (np.abs(after.last_distance - of.env_last_distance) < 1e-3).mean() >= 0.995
+
+
+@functools.cache
+def still() -> Level:
+    """Eight levels of size s, taken from golden states that are not at an end."""
+    of = golden("s")
+    return as_level(of, np.flatnonzero(~of.done & (of.timestep < 200))[:8])
+
+
+def actions(level: Level) -> np.ndarray:
+    return np.full((6, level.role.shape[-1]), OFF, np.int32)
+
+
+def test_an_episode_starts_with_the_level() -> None:
+    level = still()
+    fresh = reset(level)
+    assert fresh.state is level.state
+    assert (np.asarray(fresh.timestep) == 0).all()
+    assert (np.asarray(fresh.last_distance) == NO_DISTANCE).all()
+
+
+@pytest.mark.slow
+def test_no_shaping_on_the_first_step() -> None:
+    level = still()
+    now, first = episode_step()(level, reset(level), actions(level))
+    assert (np.asarray(first.reward)[~np.asarray(first.done)] == 0).all()
+    assert (np.asarray(now.last_distance)[~np.asarray(first.done)] > 0).all()
+    after, second = episode_step()(level, now, actions(level))
+    expected = 0.1 * (np.asarray(now.last_distance) - np.asarray(after.last_distance))
+    going = ~np.asarray(second.done)
+    np.testing.assert_allclose(np.asarray(second.reward)[going], expected[going], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_time_limit_ends_and_restarts() -> None:
+    level = still()
+    start = reset(level)
+    late = dataclasses.replace(start, timestep=jnp.full_like(start.timestep, 255))
+    now, outcome = episode_step()(level, late, actions(level))
+    assert np.asarray(outcome.done).all()
+    assert (np.asarray(now.timestep) == 0).all()
+    assert (np.asarray(now.last_distance) == NO_DISTANCE).all()
+    for ours, initial in zip(jax.tree.leaves(now.state), jax.tree.leaves(level.state), strict=True):
+        np.testing.assert_array_equal(ours, initial)
+    earlier = dataclasses.replace(start, timestep=jnp.full_like(start.timestep, 254))
+    now, outcome = episode_step()(level, earlier, actions(level))
+    assert not (np.asarray(outcome.done) & ~np.asarray(outcome.goal) & (np.asarray(outcome.reward) > -0.5)).any()
+    assert (np.asarray(now.timestep)[~np.asarray(outcome.done)] == 255).all()
+
+
+@pytest.mark.slow
+def test_nan_ends_its_own_episode_only() -> None:
+    level = still()
+    velocity = np.array(level.state.velocity)
+    velocity[5, 0, 2] = np.nan
+    broken = dataclasses.replace(reset(level), state=dataclasses.replace(level.state, velocity=velocity))
+    now, outcome = episode_step()(level, broken, actions(level))
+    _, unharmed = episode_step()(level, reset(level), actions(level))
+    others = np.arange(8) != 2
+    assert np.asarray(outcome.done)[2]
+    assert not np.asarray(outcome.goal)[2]
+    assert np.isfinite(np.asarray(outcome.reward)).all()
+    assert not np.asarray(has_nan(now.state)).any()  # restarted
+    np.testing.assert_array_equal(np.asarray(outcome.done)[others], np.asarray(unharmed.done)[others])
+    np.testing.assert_array_equal(np.asarray(outcome.reward)[others], np.asarray(unharmed.reward)[others])
+
+
+def test_restart_touches_only_what_is_done() -> None:
+    level = still()
+    now = dataclasses.replace(reset(level), timestep=jnp.arange(8, dtype=jnp.int32) + 1)
+    done = jnp.arange(8) % 2 == 0
+    np.testing.assert_array_equal(restart(level, now, done).timestep, np.where(done, 0, now.timestep))
+
+
+def with_roles(level: Level, roles: dict[int, Role], active: bool = True) -> Level:
+    """All bodies plain but for `roles`, all active or none."""
+    role = np.full_like(level.role, Role.PLAIN)
+    for body, value in roles.items():
+        role[body] = value
+    flags = np.full_like(level.model.active, active)
+    return dataclasses.replace(level, role=role, model=dataclasses.replace(level.model, active=flags))
+
+
+def contacts_with(level: Level, contact: int | None) -> Manifold:
+    """No contact but one."""
+    contacts, lanes = pairs_of(level.size).contacts, level.role.shape[-1]
+    active = np.zeros((contacts, lanes), bool)
+    if contact is not None:
+        active[contact] = True
+    return jnp.asarray(active)
+
+
+def pair_contacts(level: Level) -> list[tuple[int, int, int, bool]]:
+    """(contact, body a, body b, whether the task looks at it) of every contact."""
+    pairs = pairs_of(level.size)
+    polygon = list(zip(pairs.polygon.a, pairs.polygon.b, strict=True))
+    others = [pair for kind in (pairs.circle_polygon, pairs.circle) for pair in zip(kind.a, kind.b, strict=True)]
+    rows = [(a, b, True) for a, b in polygon] + [(a, b, False) for a, b in polygon] + [(a, b, True) for a, b in others]
+    return [(number, *row) for number, row in enumerate(rows)]
+
+
+@pytest.mark.parametrize("first", list(Role))
+@pytest.mark.parametrize("second", list(Role))
+def test_touching_follows_the_roles(first: Role, second: Role) -> None:
+    """Green with blue is the goal, green with red the end; no other two roles mean anything."""
+    one = as_level(golden("s"), slice(0, 1))
+    for contact, a, b, counts in pair_contacts(one):
+        level, active = with_roles(one, {a: first, b: second}), contacts_with(one, contact)
+        goal = bool(touches(level, active, Role.GREEN, Role.BLUE)[0])
+        fail = bool(touches(level, active, Role.GREEN, Role.RED)[0])
+        assert goal == (counts and {first, second} == {Role.GREEN, Role.BLUE}), (contact, a, b)
+        assert fail == (counts and {first, second} == {Role.GREEN, Role.RED}), (contact, a, b)
+
+
+def test_inactive_bodies_have_no_role() -> None:
+    one = as_level(golden("s"), slice(0, 1))
+    contact, a, b, _ = pair_contacts(one)[-1]
+    asleep = with_roles(one, {a: Role.GREEN, b: Role.BLUE}, active=False)
+    assert not touches(asleep, contacts_with(one, contact), Role.GREEN, Role.BLUE)[0]
+    assert not has_roles(asleep, [a], [b], Role.GREEN, Role.BLUE).any()
+    assert goal_distance(asleep, asleep.state)[0] == 0
+
+
+def test_distance_is_between_centres_summed_over_pairs() -> None:
+    one = as_level(golden("s"), slice(0, 1))
+    level = with_roles(one, {4: Role.BLUE, 5: Role.GREEN, 6: Role.BLUE})
+    place = np.asarray(level.state.position)[..., 0]
+    expected = np.linalg.norm(place[5] - place[4]) + np.linalg.norm(place[5] - place[6])
+    np.testing.assert_allclose(goal_distance(level, level.state)[0], expected, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_red_wins_over_blue() -> None:
+    """Green touching both in the same physics step is no goal."""
+    of = golden("s")
+    pairs = pairs_of(of.level.size)
+    n, m = len(pairs.polygon), len(pairs.circle_polygon)
+    at = 2 * n + list(zip(pairs.circle_polygon.a, pairs.circle_polygon.b, strict=True)).index((5, 0))
+    circles = 2 * n + m
+    both = np.flatnonzero(of.after.contact_active[at] & of.after.contact_active[circles])
+    assert len(both) > 3  # circle 5 touches the floor and the other circle
+    level = with_roles(as_level(of, both), {5: Role.GREEN, 0: Role.RED, 6: Role.BLUE})
+    _, outcome = episode_step()(level, reset(level), np.zeros((6, len(both)), np.int32))
+    assert np.asarray(outcome.done).all()
+    assert not np.asarray(outcome.goal).any()
+    np.testing.assert_array_equal(outcome.reward, -1.0)
+    level = with_roles(as_level(of, both), {5: Role.GREEN, 6: Role.BLUE})
+    _, outcome = episode_step()(level, reset(level), np.zeros((6, len(both)), np.int32))
+    assert np.asarray(outcome.goal).all()
+    np.testing.assert_array_equal(outcome.reward, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"frame_skip": 0}, "frame_skip is 0"),
+        ({"max_timesteps": 0}, "max_timesteps"),
+        ({"dense_reward_scale": -1.0}, "negative"),
+    ],
+)
+def test_impossible_rules_are_refused(change: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        TaskParams(**change)

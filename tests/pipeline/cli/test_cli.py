@@ -1,0 +1,269 @@
+"""The command as people meet it: help, errors, questions. Everything through a process of its own."""
+
+import json
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.store.manifest import fragment_paths, read_manifest
+from tests.pipeline.command import ROOT, TINY, assert_refused, run
+
+COMMANDS = ("generate", "regenerate", "sample", "inspect", "show", "export", "status", "verify", "bench")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a real, tiny split `data/5k/s`. Not to be changed."""
+    folder = tmp_path_factory.mktemp("made")
+    done = run(["generate", *TINY, "executor=inline"], folder)
+    assert done.returncode == 0, done.stderr
+    assert "4/4 levels" in done.stderr
+    return folder
+
+
+@pytest.fixture
+def split(made: Path, tmp_path: Path) -> Path:
+    """A copy of it that may be damaged."""
+    shutil.copytree(made / "data", tmp_path / "data")
+    return tmp_path / "data/5k/s"
+
+
+def solved_level(split: Path) -> int:
+    manifest = read_manifest(split)
+    return int(manifest.level_ids[manifest.labels == "solved"][0])
+
+
+def test_help_answers_at_once_and_names_every_command(tmp_path: Path) -> None:
+    times = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        done = run(["--help"], tmp_path)
+        times.append(time.perf_counter() - begin)
+    assert done.returncode == 0
+    assert all(command in done.stdout for command in COMMANDS)
+    assert min(times) < 0.5
+
+
+@pytest.mark.parametrize("command", COMMANDS[:-1])
+def test_every_command_has_help_with_an_example(tmp_path: Path, command: str) -> None:
+    done = run([command, "--help"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"example: levelproof {command} " in done.stdout
+
+
+def test_the_help_of_generate_lists_every_setting(tmp_path: Path) -> None:
+    text = run(["generate", "--help"], tmp_path).stdout
+    for line in ("levels=64", "budget='128k'", "expert.learning_rate=0.002", "stop.rule='solved'", "task.frame_skip=2"):
+        assert line in text
+    assert "distribution.floor_red_chance=" in text
+
+
+def test_version(tmp_path: Path) -> None:
+    assert run(["--version"], tmp_path).stdout.startswith("levelproof ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["size=xl"], ["size is 'xl'", "choose one of s, m, l"]),
+        (["budget=0"], ["budget is '0'", "at least 1"]),
+        (["budget=1000"], ["1024"]),
+        (["stop=never"], ["there is no stop never", "choose one of budget, halving, solved"]),
+        (["stop.rule=never"], ["stop.rule", "never"]),
+        (["levels=abc"], ["levels is 'abc'", "64k"]),
+        (["levls=5"], ["no setting levls", "did you mean levels?"]),
+        (["64"], ["NAME=VALUE"]),
+    ],
+)
+def test_a_wrong_setting_is_refused_in_one_sentence(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    assert_refused(run(["generate", *arguments], tmp_path), 2, *words)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("arguments", [[], ["generat"], ["inspect"], ["show"], ["inspect", "x", "--rows", "a"]])
+def test_a_command_that_is_none_gets_the_usage(tmp_path: Path, arguments: list[str]) -> None:
+    done = run(arguments, tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("usage: levelproof")
+
+
+@pytest.mark.parametrize("command", [["inspect"], ["status"], ["verify"]])
+def test_a_split_that_is_not_there_is_named(tmp_path: Path, command: list[str]) -> None:
+    assert_refused(run([*command, "data/1k/s"], tmp_path), 2, "no split at data/1k/s")
+
+
+def test_an_out_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "data").write_text("a file in the way")
+    assert_refused(run(["generate", *TINY], tmp_path), 2, "Cannot write to data/5k/s", "out=NAME")
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write anywhere")
+def test_an_out_without_permission_is_named(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir(mode=0o500)
+    assert_refused(run(["generate", *TINY], tmp_path), 2, "Cannot write to data/5k/s", "Permission denied")
+
+
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+    done = run(["status", "nowhere", "--debug"], tmp_path)
+    assert done.returncode != 0
+    assert "Traceback" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_second_run_says_that_all_is_there(made: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.suffix in (".parquet", ".zarr")}
+    done = run(["generate", *TINY, "executor=inline"], made)
+    assert done.returncode == 0
+    assert "Nothing to do: all 4 levels are there" in done.stdout
+    assert "levelproof inspect data/5k/s" in done.stdout
+    assert before == {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.suffix in (".parquet", ".zarr")}
+
+
+@pytest.mark.slow
+def test_another_configuration_names_what_differs(made: Path) -> None:
+    done = run(["generate", *TINY, "expert.width=32", "expert.clip=0.1"], made)
+    assert_refused(done, 2, "data/5k/s", "expert.clip was 0.2, now 0.1; expert.width was 64, now 32", "out=NAME")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [["generate", *TINY], ["inspect", "data/5k/s"], ["status", "data/5k/s"]])
+def test_a_damaged_fragment_is_named(split: Path, command: list[str]) -> None:
+    fragment_paths(split)[1].write_bytes(b"PAR1 and then nothing")
+    done = run(command, split.parents[2])
+    assert_refused(done, 1, "000000000001-000000000001.parquet is damaged", "delete it")
+
+
+@pytest.mark.slow
+def test_a_deleted_fragment_is_made_again_with_the_same_rows(split: Path) -> None:
+    before = read_manifest(split).table.drop(["shard"]).to_pylist()
+    fragment_paths(split)[1].unlink()
+    done = run(["generate", *TINY, "executor=inline"], split.parents[2])
+    assert done.returncode == 0, done.stderr
+    assert "3 are there already" in done.stderr
+    assert repr(read_manifest(split).table.drop(["shard"]).to_pylist()) == repr(before)
+    assert len(list((split / "shards").iterdir())) == len(read_manifest(split).shards)
+
+
+@pytest.mark.slow
+def test_verify_passes_what_is_whole_and_names_what_is_not(split: Path) -> None:
+    done = run(["verify", "data/5k/s", "--json"], split.parents[2])
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    kept = read_manifest(split).table.column("shard")
+    assert facts["witnesses"] == facts["same_bits"] == len(kept) - kept.null_count > 0
+    assert facts["wrong"] == []
+    shard = split / sorted(read_manifest(split).shards)[0]
+    file = shard / "dyn32/c/0/0/0"
+    file.write_bytes(file.read_bytes()[:-200] + bytes(200))
+    done = run(["verify", "data/5k/s"], split.parents[2])
+    assert done.returncode == 1
+    assert f"{shard.name} is missing or damaged" in done.stdout
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_inspect_tells_what_is_there(made: Path) -> None:
+    manifest = read_manifest(made / "data/5k/s")
+    done = run(["inspect", "data/5k/s"], made)
+    assert done.returncode == 0, done.stderr
+    for word in ("solve rate", "steps to goal", "bytes per transition", "level_id", "solved"):
+        assert word in done.stdout
+    facts = json.loads(run(["inspect", "data/5k/s", "--json", "--rows", "2"], made).stdout)
+    assert facts["levels"] == 4
+    assert facts["labels"]["solved"] == manifest.labels.tolist().count("solved")
+    assert [row["level_id"] for row in facts["rows"]] == [0, 1]
+    assert facts["bytes_per_transition"] > 0
+
+
+@pytest.mark.slow
+def test_inspect_takes_a_condition_and_refuses_what_is_none(made: Path) -> None:
+    facts = json.loads(run(["inspect", "data/5k/s", "--json", "--where", "level_id >= 2 -- the last two"], made).stdout)
+    assert facts["levels"] == 2
+    done = run(["inspect", "data/5k/s", "--where", "no_such_column = 1"], made)
+    assert_refused(done, 2, "no_such_column", "columns level_id, content_hash")
+    done = run(["inspect", "data/5k/s", "--where", "label IN (SELECT content FROM read_text('/etc/passwd'))"], made)
+    assert_refused(done, 2, "Cannot use the condition")
+
+
+@pytest.mark.slow
+def test_status_tells_how_far_it_is(split: Path) -> None:
+    facts = json.loads(run(["status", "data/5k/s", "--json"], split.parents[2]).stdout)
+    assert (facts["wanted"], facts["done"], facts["running"], facts["quarantined"]) == (4, 4, False, [])
+    fragment_paths(split)[0].unlink()
+    text = run(["status", "data/5k/s"], split.parents[2]).stdout
+    assert "3 of 4 levels committed" in text
+    assert "To go on: levelproof generate levels=4 unit=1 budget=5k executor=inline" in text
+
+
+@pytest.mark.slow
+def test_show_draws_a_witness(made: Path, tmp_path: Path) -> None:
+    level = solved_level(made / "data/5k/s")
+    done = run(["show", "data/5k/s", str(level), "-o", str(tmp_path / "level.gif")], made)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "level.gif").read_bytes().startswith(b"GIF8")
+
+
+@pytest.mark.slow
+def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(made: Path, tmp_path: Path) -> None:
+    """A limit on the size of files stands in for a full disk: both refuse in the middle of a write."""
+    limit = 2_000  # bytes; a shard's data is longer
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    done = run(["generate", *TINY, "executor=inline"], tmp_path, preexec_fn=limited)
+    assert_refused(done, 1, "Cannot write to data/5k/s", "run the same command again")
+    assert fragment_paths(tmp_path / "data/5k/s") == []
+    assert run(["generate", *TINY, "executor=inline"], tmp_path).returncode == 0
+    assert len(read_manifest(tmp_path / "data/5k/s").level_ids) == 4
+
+
+@pytest.mark.slow
+def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path) -> None:
+    """Steps that a 32-bit counter cannot count: every attempt fails, the command says so and ends with 3."""
+    done = run(["generate", "levels=1", "budget=5k", "task.max_timesteps=3000000000", "executor=inline"], tmp_path)
+    assert done.returncode == 3, done.stderr
+    assert done.stderr.count("trying again") == 2
+    assert "given up" in done.stderr
+    (note,) = (tmp_path / "data/5k/s/quarantine").iterdir()
+    assert str(note.relative_to(tmp_path)) in done.stdout
+    assert "Failed 3 times" in note.read_text()
+
+
+@pytest.mark.slow
+def test_a_closed_pipe_is_no_error(made: Path) -> None:
+    command = f"{sys.executable} -m pipeline.cli.main inspect data/5k/s --json | head -c 1"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=made, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "{"
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_the_readme_s_reader_reads(made: Path) -> None:
+    text = (ROOT / "README.md").read_text()
+    program, _ = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert "data/128k/s" in program
+    command = [sys.executable, "-c", program.replace("data/128k/s", "data/5k/s")]
+    done = subprocess.run(command, cwd=made, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[ True]"
+
+
+@pytest.mark.slow
+def test_the_readme_s_environment_steps(tmp_path: Path) -> None:
+    _, program = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    command = [sys.executable, "-c", program + "\nprint(obs.shape, reward.shape)"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["(256,", "140)", "(256,)"]

@@ -1,0 +1,107 @@
+"""A dataset of a size without a letter, and of a preset: every command works on it. And sheets of sampled levels."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from pipeline.look.inspect import inspect, survey
+from pipeline.look.show import show
+from pipeline.look.status import look
+from pipeline.read.export import export
+from pipeline.read.verify import examine
+from pipeline.store.fields import same_bits
+from pipeline.store.manifest import read_manifest
+from pipeline.store.shard import Shard
+from tests.pipeline.command import assert_refused, run
+
+SIZE = "5-3-2-2"
+SPLIT = f"data/5k/{SIZE}"
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a real, tiny split of this size."""
+    folder = tmp_path_factory.mktemp("custom")
+    words = [f"size={SIZE}", "distribution=free", "levels=4", "budget=5k", "executor=inline"]
+    done = run(["generate", *words], folder)
+    assert done.returncode == 0, done.stderr
+    assert f"of size {SIZE}" in done.stderr
+    return folder
+
+
+def test_the_manifest_names_size_and_distribution(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = read_manifest(made / SPLIT).table.to_pylist()
+    assert [row["size"] for row in rows] == [SIZE] * 4
+    assert rows[0]["command"] == f"levelproof generate size={SIZE} budget=5k distribution=free first_level=0 levels=1"
+    inspect(made / SPLIT, None, 0, False)
+    name, mark = survey(made / SPLIT)["distribution"].values()
+    assert name == "free"
+    assert f"free ({mark})" in capsys.readouterr().out
+
+
+def test_every_question_is_answered(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    split, level, picture = made / SPLIT, made / "level.json", made / "level.png"
+    facts = look(split)
+    assert (facts["wanted"], facts["done"]) == (4, 4)
+    findings = examine(split)
+    assert findings.witnesses > 0
+    assert findings.wrong == []
+    rows = {row["shard"] is not None: row["level_id"] for row in read_manifest(split).table.to_pylist()}
+    assert rows.keys() == {True, False}
+    for level_id in rows.values():
+        show(split, level_id, picture)
+        assert f"level {level_id} of size {SIZE}" in capsys.readouterr().out
+    export(split, rows[False], level)
+    show(level, None, picture)
+    assert f"a level of size {SIZE}" in capsys.readouterr().out
+
+
+def test_a_rows_command_makes_the_row_again(made: Path) -> None:
+    row = next(row for row in read_manifest(made / SPLIT).table.to_pylist() if row["shard"])
+    words = shlex.split(row["command"])[1:]
+    done = run([*words, "executor=inline", "out=again"], made)
+    assert done.returncode == 0, done.stderr
+    again = read_manifest(made / "again" / "5k" / SIZE).table.to_pylist()[0]
+    where = ("shard", "row")
+    assert repr({k: v for k, v in again.items() if k not in where}) == repr(
+        {k: v for k, v in row.items() if k not in where}
+    )
+    one, two = (
+        Shard(path / r["shard"]).read([r["row"]])
+        for path, r in ((made / SPLIT, row), (made / "again" / "5k" / SIZE, again))
+    )
+    assert all(same_bits(values, two[name]).all() for name, values in one.items())
+
+
+def test_another_distribution_needs_another_folder(made: Path) -> None:
+    done = run(["generate", f"size={SIZE}", "levels=4", "budget=5k", "executor=inline"], made)
+    assert_refused(done, 2, "distribution.max_fixed_chance was 0", "out=NAME")
+
+
+def test_sample_draws_a_sheet(tmp_path: Path) -> None:
+    done = run(
+        ["sample", "size=6-2-1-1", "distribution=clutter", "levels=7", "first_level=3", "-o", "a/b.png"], tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "a/b.png: levels 3 to 9 of size 6-2-1-1, distribution clutter"
+    with Image.open(tmp_path / "a/b.png") as sheet:
+        assert sheet.size[0] == 5 * 220
+        assert len(sheet.getcolors(1 << 20) or []) > 10
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["-o", "sheet.gif"], "has to end in .png"),
+        (["levels=101"], "a sheet has room for 100"),
+        (["size=7"], "choose one of s, m, l"),
+        (["distribution=messy"], "there is no distribution messy"),
+        (["levels=1", "-o", "/dev/null/sheet.png"], "Cannot write /dev/null/sheet.png"),
+    ],
+)
+def test_sample_says_what_is_wrong(tmp_path: Path, words: list[str], sentence: str) -> None:
+    assert_refused(run(["sample", *words], tmp_path), 2, sentence)

@@ -1,0 +1,98 @@
+"""What people see while they wait."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from pipeline.jobs.progress import Board, Tally, duration
+from pipeline.jobs.schedule import Summary, WorkUnit
+
+UNIT = WorkUnit(tuple(range(16)))
+
+
+def tally(done: int = 0) -> Tally:
+    return Tally(levels=64, done=done, solved=done // 2)
+
+
+def test_the_share_grows_with_the_levels() -> None:
+    now = tally()
+    assert now.share == 0
+    now.progress(UNIT, 8_000, 7.5, 3)
+    assert now.share == pytest.approx(7.5 / 64)
+    assert (now.trained, now.solved_so_far) == (7, 3)
+    now.progress(UNIT, 9_000, 16, 3)
+    assert now.share == pytest.approx(16 / 64)
+    now.ended(UNIT, Summary(levels=16, solved=5, env_steps=16_000, evaluated=0, idle=0))
+    assert (now.share, now.done, now.solved_so_far) == (pytest.approx(16 / 64), 16, 5)
+
+
+def test_a_failed_attempt_takes_its_progress_back() -> None:
+    now = tally()
+    now.progress(UNIT, 8_000, 8.0, 3)
+    now.ended(UNIT, None)
+    assert (now.share, now.solved_so_far) == (0, 0)
+
+
+def test_rate_and_time_left_do_not_count_the_compiling() -> None:
+    now = tally()
+    for second in range(100):
+        now.tick(float(second))
+        assert "compiling" in now.text(second)
+    for second in range(100, 110):
+        now.progress(UNIT, (second - 99) * 800, (second - 99) * 0.8, 0)
+        now.tick(float(second))
+    assert now.rate == pytest.approx(800)
+    left = now.left(109.0)
+    assert left is not None
+    assert left == pytest.approx((64 - 8) / 0.8, rel=0.02)
+
+
+def test_levels_of_earlier_runs_are_no_pace() -> None:
+    now = tally(done=32)
+    assert now.share == 0.5
+    now.tick(0.0)
+    assert now.left(10.0) is None
+
+
+def test_lines_where_there_is_no_terminal() -> None:
+    text = io.StringIO()
+    board = Board(tally(), Console(file=text))
+    with board.shown():
+        board.refresh()
+        board.refresh()
+        for first in range(0, 64, 4):
+            board.ended(WorkUnit(tuple(range(first, first + 4))), Summary(4, 1, 4_000, 0, 0))
+    lines = text.getvalue().splitlines()
+    assert len(lines) == 2  # not one for every refresh, nor for every commit where they come fast
+    assert "0/64 levels" in lines[0]
+    assert lines[1] == "64/64 levels · 16 solved · done"
+
+
+def test_commits_are_told_when_the_last_line_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = io.StringIO()
+    board = Board(tally(), Console(file=text))
+    monkeypatch.setattr("pipeline.jobs.progress.LINE_AFTER", 0.0)
+    board.refresh()
+    board.ended(UNIT, Summary(16, 5, 16_000, 0, 0))
+    assert "16/64 levels · 5 solved" in text.getvalue().splitlines()[1]
+
+
+def test_what_is_trained_is_still_to_be_written() -> None:
+    now = Tally(levels=16, done=0, solved=0)
+    now.progress(UNIT, 16_000, 16.0, 5)
+    now.tick(1.0)
+    assert now.text(1.0) == "16/16 levels · 5 solved · writing"
+
+
+def test_a_bar_on_a_terminal() -> None:
+    text = io.StringIO()
+    board = Board(tally(), Console(file=text, force_terminal=True, width=160))
+    with board.shown():
+        board.ended(UNIT, Summary(16, 5, 16_000, 0, 0))
+    assert "16/64 levels · 5 solved" in text.getvalue()
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (89, "89 s"), (90, "2 min"), (5400, "1.5 h")])
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

@@ -1,0 +1,129 @@
+"""The budget ladder on real splits: levels of a manifest again, from the start or where their experts were."""
+
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from experts.labels import Label
+from pipeline.errors import Failure, UserError
+from pipeline.jobs.regenerate import split_words
+from pipeline.read.verify import examine
+from pipeline.store.checkpoints import load_experts, require_same_experts
+from pipeline.store.manifest import read_manifest
+from tests.pipeline.command import run
+from tests.pipeline.made import made_job
+
+SETTINGS = ["levels=12", "executor=inline", "expert.width=16", "expert.environments=24"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with data/8k/s, made with `keep_experts=true` by workers that save several units at once."""
+    folder = tmp_path_factory.mktemp("ladder")
+    done = run(["generate", *SETTINGS, "budget=8k", "keep_experts=true", "executor=ray", "unit=2"], folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def rows_of(split: Path) -> list[dict]:
+    """What a manifest says, but for names of files."""
+    rows = read_manifest(split).table.to_pylist()
+    return [
+        {name: str(value) for name, value in row.items() if name not in ("shard", "experts", "row")} for row in rows
+    ]
+
+
+@pytest.mark.slow
+def test_going_on_equals_having_trained_through(folder: Path) -> None:
+    unsolved = [row["level_id"] for row in rows_of(folder / "data/8k/s") if row["label"] == Label.UNSOLVED]
+    assert unsolved
+    where = "where=label = 'unsolved'"
+    done = run(["regenerate", "manifest=data/8k/s", "budget=24k", where, "continue=true", "unit=1"], folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"data/24k/s: {len(unsolved)} levels")
+    again = ["regenerate", "manifest=data/8k/s", "budget=24k", where, "out=through", "executor=inline"]
+    assert run(again, folder).returncode == 0
+    continued, through = rows_of(folder / "data/24k/s"), rows_of(folder / "through/24k/s")
+    assert [row["level_id"] for row in continued] == unsolved
+    assert continued == through
+    assert any(int(row["env_steps"]) > 8_000 for row in through)
+    assert not examine(folder / "data/24k/s").wrong
+    assert "levels committed" in run(["status", "data/24k/s"], folder).stdout
+    assert run(again, folder).stdout.startswith("Nothing to do")
+
+
+@pytest.mark.slow
+def test_experts_come_back_bit_for_bit(folder: Path) -> None:
+    job = made_job("data", *SETTINGS, "budget=8k")
+    rows = read_manifest(folder / "data/8k/s").table.to_pylist()
+    paths = {row["experts"] for row in rows if row["experts"]}
+    assert len(paths) > 1
+    experts = {i: kept for path in paths for i, kept in load_experts(folder / "data/8k/s" / path, job).items()}
+    trained = {row["level_id"]: row for row in rows if row["label"] in (Label.SOLVED, Label.UNSOLVED)}
+    assert experts.keys() == trained.keys()
+    for level_id, kept in experts.items():
+        assert int(kept.begun.training.progress.env_steps) == trained[level_id]["env_steps"]
+        np.testing.assert_array_equal(np.float32(kept.curve), np.float32(trained[level_id]["learning_curve"]))
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(kept.begun.training.expert.params))
+
+
+@pytest.mark.slow
+def test_what_cannot_go_on_is_refused(folder: Path, tmp_path: Path) -> None:
+    source = folder / "data/8k/s"
+
+    def refused(*settings: str) -> str:
+        with pytest.raises(UserError) as error:
+            require_same_experts(made_job("data", *SETTINGS, f"continue_from={source}", *settings))
+        return str(error.value)
+
+    assert "give a larger budget" in refused("budget=8k")
+    assert "expert.width was 16, now 32" in refused("budget=24k", "expert.width=32")
+    without = tmp_path / "data"
+    assert run(["generate", *SETTINGS, "levels=2", "budget=2k", f"out={without}"], tmp_path).returncode == 0
+    with pytest.raises(UserError, match="has kept no experts: make it with keep_experts=true"):
+        require_same_experts(made_job("x", "budget=24k", f"continue_from={without / '2k/s'}"))
+
+
+@pytest.mark.slow
+def test_a_damaged_checkpoint_is_named(folder: Path, tmp_path: Path) -> None:
+    path = next((folder / "data/8k/s/experts").iterdir())
+    copy = tmp_path / "damaged"
+    shutil.copytree(path, copy)
+    for file in copy.rglob("*"):
+        if file.is_file() and file.stat().st_size > 1000:
+            file.write_bytes(file.read_bytes()[:500])
+    with pytest.raises(Failure, match=r"experts in .*damaged cannot be read .* leave out continue_from"):
+        load_experts(copy, made_job("data", *SETTINGS, "budget=8k"))
+
+
+@pytest.mark.slow
+def test_experts_that_no_fragment_names_are_removed(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "data", tmp_path / "data")
+    experts = tmp_path / "data/8k/s/experts"
+    named = set(experts.iterdir())
+    shutil.copytree(min(named), experts / "000000000000-000000000011-dead0000")
+    assert run(["generate", *SETTINGS, "budget=8k", "keep_experts=true"], tmp_path).returncode == 0
+    assert set(experts.iterdir()) == named
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["budget=1M"], "Which levels"),
+        (["manifest=data/8k/s"], "Which budget"),
+        (["manifest=data/8k/s", "budget=1M", "levels=5"], "levels cannot be changed here"),
+        (["manifest=data/8k/s", "budget=1M", "continue=perhaps"], "continue is perhaps"),
+    ],
+)
+def test_mistakes_are_named(words: list[str], sentence: str) -> None:
+    with pytest.raises(UserError, match=sentence):
+        split_words(words)
+
+
+def test_a_manifest_that_is_not_there_is_named(tmp_path: Path) -> None:
+    done = run(["regenerate", "manifest=data/8k/s", "budget=1M"], tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("Error: There is no split at data/8k/s")

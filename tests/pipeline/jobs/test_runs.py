@@ -1,0 +1,163 @@
+"""Runs on real Ray workers, undisturbed and killed in every way: afterwards the split is the same."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.store.fields import same_bits
+from pipeline.store.manifest import fragment_paths, read_manifest
+from pipeline.store.shard import Shard
+from tests.pipeline.command import PATIENCE, ROOT, run, start, until
+
+LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
+COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
+SPLIT = Path("data/5k/s")
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    done = run(COMMAND, folder)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return folder / SPLIT
+
+
+def content(split: Path) -> tuple[str, dict[int, dict]]:
+    """The rows without their places, and the stored fields of every solved level."""
+    manifest = read_manifest(split)
+    rows = manifest.table.to_pylist()
+    fields = {row["level_id"]: Shard(split / row["shard"]).read([row["row"]]) for row in rows if row["shard"]}
+    return repr([row | {"shard": bool(row["shard"]), "row": None} for row in rows]), fields
+
+
+def assert_same_content(split: Path, other: Path) -> None:
+    (rows, fields), (other_rows, other_fields) = content(split), content(other)
+    assert rows == other_rows
+    assert fields.keys() == other_fields.keys()
+    for level_id, arrays in fields.items():
+        assert all(same_bits(values, other_fields[level_id][name]).all() for name, values in arrays.items())
+    assert {f"shards/{path.name}" for path in (split / "shards").iterdir()} == read_manifest(split).shards
+
+
+def descendants(process: subprocess.Popen[str]) -> set[int]:
+    """All processes below this one; Ray's are in sessions of their own, but its children all the same."""
+    parents = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and (status := _status(int(entry.name))):
+            parents[int(entry.name)] = int(status[1])
+    found, below = set(), {process.pid}
+    while below:
+        below = {pid for pid, parent in parents.items() if parent in below}
+        found |= below
+    return found
+
+
+def _status(pid: int) -> list[str] | None:
+    """State, parent, ... of a process; None when it is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+
+
+def workers(process: subprocess.Popen[str]) -> list[int]:
+    """Ray's workers that are attempting a unit now."""
+    return sorted(pid for pid in descendants(process) if _title(pid).startswith("ray::Worker.attempt"))
+
+
+def _title(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0").decode(errors="replace")
+    except OSError:
+        return ""
+
+
+def assert_all_gone(pids: set[int]) -> None:
+    end = time.monotonic() + 30
+    while left := {pid for pid in pids if (status := _status(pid)) and status[0] != "Z"}:
+        assert time.monotonic() < end, f"orphans: {left}"
+        time.sleep(0.1)
+
+
+def test_an_undisturbed_run_is_whole_and_leaves_no_process(undisturbed: Path) -> None:
+    manifest = read_manifest(undisturbed)
+    assert manifest.level_ids.tolist() == list(range(LEVELS))
+    assert "solved" in manifest.labels
+    assert not (undisturbed / "quarantine").exists()
+
+
+def test_without_ray_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
+    done = run([*COMMAND, "executor=inline"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert_same_content(tmp_path / SPLIT, undisturbed)
+
+
+def test_in_other_units_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
+    assert run(["generate", "levels=1", "first_level=2", "budget=5k", "executor=inline"], tmp_path).returncode == 0
+    assert run(["generate", f"levels={LEVELS}", "unit=16", "budget=5k", "executor=inline"], tmp_path).returncode == 0
+    assert_same_content(tmp_path / SPLIT, undisturbed)
+
+
+def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path) -> None:
+    process = start(COMMAND, tmp_path)
+    until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    family = {pid for pid in descendants(process) if "Agent" not in _title(pid)}
+    process.kill()
+    process.communicate()
+    assert_all_gone(family)  # but for two idle helpers of Ray, which try for a minute to report that it died
+    assert 1 <= len(fragment_paths(tmp_path / SPLIT)) < LEVELS
+    done = run(COMMAND, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "are there already" in done.stderr
+    assert_same_content(tmp_path / SPLIT, undisturbed)
+
+
+def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
+    process = start(COMMAND, tmp_path)
+    found: list[int] = []
+    until(lambda: found.extend(workers(process)) or found, process)
+    os.kill(found[0], signal.SIGKILL)
+    _, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, err
+    assert "trying again" in err
+    assert "Traceback" not in err
+    assert_same_content(tmp_path / SPLIT, undisturbed)
+    assert not (tmp_path / SPLIT / "quarantine").exists()
+
+
+def heed_ctrl_c() -> None:
+    """As a command in a terminal's foreground: a shell's background jobs, and what they start, ignore SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
+    process = start(COMMAND, tmp_path, preexec_fn=heed_ctrl_c)
+    until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    family = descendants(process)
+    os.killpg(process.pid, number)  # as a terminal does
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Stopped: " in err
+    assert "Traceback" not in err
+    assert_all_gone(family)
+    done = run([*COMMAND, "executor=inline"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert_same_content(tmp_path / SPLIT, undisturbed)
+
+
+def test_the_command_itself_does_not_start_jax(tmp_path: Path) -> None:
+    """On a GPU it would take the memory that the worker needs; and threads and cache are set before JAX starts."""
+    program = (
+        "from configs.compose import compose_job; compose_job([]); import pipeline.jobs.generate, pipeline.jobs.cluster"
+    )
+    environment = os.environ | {"JAX_PLATFORMS": "no_such_platform", "PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)

@@ -1,0 +1,138 @@
+"""One work unit on real levels: the commit gate, the commit, the failure as a value."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from configs.schema import JobConfig
+from experts.labels import WITNESSED, Label
+from experts.train import UnitResult, train_levels
+from experts.witness import Record, replay
+from levelgen.level import SIZES, Level
+from levelgen.sampling.sampler import sample_levels
+from pipeline.errors import Failure
+from pipeline.jobs.schedule import Summary, WorkUnit
+from pipeline.jobs.unit import attempt, check_witnesses, commit, pool_for, run_unit
+from pipeline.store.fields import arrays_of, same_bits, tree_of
+from pipeline.store.manifest import read_manifest
+from pipeline.store.shard import Shard
+from tests.pipeline.made import made_job, made_result
+
+UNIT = WorkUnit((0, 1, 2, 3))
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def job() -> JobConfig:
+    return made_job("data", "budget=5k")
+
+
+@pytest.fixture(scope="module")
+def result(job: JobConfig) -> UnitResult:
+    """Real levels, experts and witnesses."""
+    ids = np.array(UNIT.level_ids, np.int32)
+    levels = sample_levels(ids, SIZES[job.size], job.distribution)
+    result = train_levels(levels, ids, job.env_steps, job.expert, job.stop, job.task)
+    assert Label.SOLVED in [verdict.label for verdict in result.verdicts], "the tests need a solved level"
+    return result
+
+
+def solved_place(result: UnitResult) -> int:
+    return [verdict.label for verdict in result.verdicts].index(Label.SOLVED)
+
+
+def test_real_witnesses_pass_the_gate(job: JobConfig, result: UnitResult) -> None:
+    check_witnesses(result, job.task)
+
+
+@pytest.mark.parametrize("name", ["reward", "last_distance", "timestep", "done"])
+def test_a_record_that_differs_in_one_bit_does_not_pass(job: JobConfig, result: UnitResult, name: str) -> None:
+    place = solved_place(result)
+    values = np.array(getattr(result.record, name))
+    at = values[200:201, place : place + 1]
+    at[...] = ~at if at.dtype == bool else (at.view(np.uint32) ^ 1).view(at.dtype)
+    wrong = dataclasses.replace(result, record=dataclasses.replace(result.record, **{name: values}))
+    with pytest.raises(
+        Failure, match=f"witness of level {result.level_ids[place]} does not replay: its {name} differs"
+    ):
+        check_witnesses(wrong, job.task)
+
+
+def test_a_level_that_is_another_does_not_pass(job: JobConfig, result: UnitResult) -> None:
+    turned = jax.tree.map(lambda x: np.roll(x, 1, axis=-1), result.levels)
+    with pytest.raises(Failure, match="does not replay"):
+        check_witnesses(dataclasses.replace(result, levels=turned), job.task)
+
+
+def test_a_record_that_replays_but_misses_the_goal_does_not_pass(job: JobConfig, result: UnitResult) -> None:
+    """Doing nothing gives a faithful record; called solved, it is caught by the goal."""
+    verdicts = [dataclasses.replace(verdict, label=Label.SOLVED) for verdict in result.verdicts]
+    idle = replay(result.levels, np.zeros_like(result.record.action), job.task)
+    with pytest.raises(Failure, match="does not reach the goal"):
+        check_witnesses(dataclasses.replace(result, record=idle, verdicts=verdicts), job.task)
+
+
+def test_a_trivial_level_whose_witness_does_something_does_not_pass(job: JobConfig, result: UnitResult) -> None:
+    called = [
+        dataclasses.replace(v, label=Label.TRIVIAL if v.label is Label.SOLVED else v.label) for v in result.verdicts
+    ]
+    with pytest.raises(Failure, match="called trivial, does something"):
+        check_witnesses(dataclasses.replace(result, verdicts=called), job.task)
+
+
+def test_a_unit_is_committed_with_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
+    seen: list[tuple[int, float, int]] = []
+    summary = run_unit(job, tmp_path, UNIT, lambda *totals: seen.append(totals), pool_for(job))
+    manifest = read_manifest(tmp_path)
+    assert manifest.level_ids.tolist() == list(UNIT.level_ids)
+    solved, trained = manifest.labels.tolist().count("solved"), sum(manifest.table["env_steps"].to_pylist())
+    assert summary == Summary(4, solved, trained, summary.evaluated, summary.idle)
+    assert summary.evaluated >= 256
+    assert seen == sorted(seen)
+    for row in manifest.table.to_pylist():
+        assert (row["label"] in WITNESSED) == (row["shard"] is not None)
+        if row["shard"]:
+            assert Shard(tmp_path / row["shard"]).level_ids[row["row"]] == row["level_id"]
+
+
+def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: JobConfig, result: UnitResult) -> None:
+    commit(job, tmp_path, UNIT, result)
+    first = read_manifest(tmp_path)
+    run_unit(job, tmp_path, UNIT, lambda steps, levels, solved: None, pool_for(job))
+    second = read_manifest(tmp_path)
+    assert repr(first.table.drop(["shard"]).to_pylist()) == repr(second.table.drop(["shard"]).to_pylist())
+    (old,), (new,) = first.shards, second.shards
+    a, b = Shard(tmp_path / old).read(), Shard(tmp_path / new).read()
+    assert all(same_bits(values, b[name]).all() for name, values in a.items())
+
+
+def test_a_shard_holds_what_was_trained(tmp_path: Path, job: JobConfig) -> None:
+    result = made_result([4, 5, 7], [Label.UNSOLVED, Label.SOLVED, Label.SOLVED])
+    commit(job, tmp_path, WorkUnit((4, 5, 7)), result)
+    (name,) = read_manifest(tmp_path).shards
+    shard = Shard(tmp_path / name)
+    assert shard.level_ids == [5, 7]
+    found = shard.read()
+    for tree, kind, path in ((result.levels, Level, "level/"), (result.record, Record, "record/")):
+        back = arrays_of(tree_of(kind, found, path))
+        assert all(same_bits(back[name], values[..., [1, 2]]).all() for name, values in arrays_of(tree).items())
+
+
+def test_a_unit_without_solved_levels_has_no_shard(tmp_path: Path, job: JobConfig) -> None:
+    commit(job, tmp_path, WorkUnit((4,)), made_result([4], [Label.UNSOLVED]))
+    manifest = read_manifest(tmp_path)
+    assert manifest.labels.tolist() == ["unsolved"]
+    assert not manifest.shards
+    assert not (tmp_path / "shards").exists()
+
+
+def test_a_failed_attempt_is_a_value(tmp_path: Path) -> None:
+    broken = made_job("data", "budget=5k", "task.max_timesteps=3000000000")  # no 32-bit counter reaches it
+    outcome = attempt(broken, tmp_path, UNIT, lambda steps, levels, solved: None, pool_for(broken))
+    assert outcome.summary is None
+    assert "Traceback" in outcome.reason
+    assert not list(tmp_path.rglob("*.parquet"))

@@ -1,0 +1,176 @@
+"""Levels that are there twice are found: in a split, between splits, and among level files."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from experts.labels import Label
+from levelgen.files.level_file import LevelFile, read_level_file, write_level_file
+from levelgen.identity.content import content_hashes
+from levelgen.identity.signature import signatures
+from levelgen.level import Level
+from levelgen.task.rules import TaskParams
+from pipeline.errors import UserError
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.jobs.unit import commit
+from pipeline.look.duplicates import between, compared_in, told, within
+from pipeline.look.inspect import survey
+from pipeline.store.layout import split_path
+from pipeline.store.manifest import require_manifest
+from tests.levelgen.opened import handmade_levels
+from tests.levelgen.variants import edited, more_room, one, renamed, renumbered, turned
+from tests.pipeline.command import assert_refused, run
+from tests.pipeline.made import made_job, made_result
+
+NONE = {"levels": 0, "pairs": []}
+COUNT = 12
+COPY, NUDGED = 9, 10  # levels of the split: 9 is level 3 renumbered, 10 is level 5 with a body elsewhere
+
+
+def table(*rows: tuple[int | str, str, str, str]) -> pa.Table:
+    """Of names, content hashes and both halves of the signature."""
+    names, contents, *halves = zip(*rows, strict=True)
+    return pa.table({"name": names, "content_hash": contents, "signature": list(zip(*halves, strict=True))})
+
+
+LEVELS = table((0, "a", "x", "p"), (1, "b", "x", "q"), (2, "a", "x", "p"), (3, "c", "y", "q"), (4, "d", "z", "r"))
+
+
+def test_each_level_is_told_with_the_first_it_is_like() -> None:
+    assert within(LEVELS, 10) == {
+        "same": {"levels": 1, "pairs": [[2, 0]]},
+        "near": {"levels": 2, "pairs": [[1, 0], [3, 1]]},  # by one half each; contents count, not levels
+    }
+    assert within(LEVELS.slice(3), 10) == {"same": NONE, "near": NONE}
+    assert within(LEVELS.slice(0, 0), 10) == {"same": NONE, "near": NONE}
+
+
+def test_between_splits_what_is_the_same_is_not_near_as_well() -> None:
+    others = table(("file b", "a", "x", "p"), ("file a", "a", "x", "p"), ("file c", "e", "x", "r"))
+    assert between(LEVELS, others, 10) == {
+        "same": {"levels": 2, "pairs": [[0, "file a"], [2, "file a"]]},
+        "near": {"levels": 2, "pairs": [[1, "file a"], [4, "file c"]]},
+    }
+    assert between(LEVELS, others, 1)["same"] == {"levels": 2, "pairs": [[0, "file a"]]}
+    assert between(LEVELS, others.slice(0, 0), 10) == {"same": NONE, "near": NONE}
+
+
+def test_in_words() -> None:
+    assert told(within(LEVELS, 1)) == "1 same (such as 2 and 0), 2 near (such as 1 and 0)"
+    assert told(within(LEVELS, 0)) == "1 same, 2 near"
+
+
+def test_many_levels_are_compared_at_once() -> None:
+    """100,000 levels of which each third is there twice."""
+    contents = [str(i - i % 3 // 2) for i in range(100_000)]
+    many = table(*((i, contents[i], f"x{contents[i]}", f"y{contents[i]}") for i in range(100_000)))
+    found = within(many, 2)
+    assert found == {"same": {"levels": 33_333, "pairs": [[2, 1], [5, 4]]}, "near": NONE}
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A real split of real levels, two of them planted; what is stored beside them is made up."""
+    rng = np.random.default_rng(0)
+    levels = [one("s", i) for i in range(COUNT)]
+    levels[COPY] = renumbered(levels[3], rng)
+    place = np.array(levels[5].state.position)
+    place[np.flatnonzero(levels[5].model.active)[-1]] += 1e-4
+    levels[NUDGED] = edited(levels[5], state={"position": place})
+    return committed(tmp_path_factory.mktemp("data"), levels)
+
+
+def committed(folder: Path, levels: list[Level]) -> Path:
+    job = made_job(str(folder), "size=s", f"levels={len(levels)}")
+    path, ids = split_path(job.out, job.budget, job.size), list(range(len(levels)))
+    path.mkdir(parents=True)
+    side_by_side = jax.tree.map(lambda *x: np.concatenate(x, -1), *levels)
+    result = dataclasses.replace(made_result(ids, [Label.SOLVED] * len(ids)), levels=side_by_side)
+    commit(job, path, WorkUnit(tuple(ids)), result)
+    return path
+
+
+def test_every_row_has_the_identity_of_its_level(split: Path) -> None:
+    for row in require_manifest(split).table.to_pylist():
+        if row["level_id"] not in (COPY, NUDGED):
+            level = one("s", row["level_id"])
+            assert [row["content_hash"]] == content_hashes(level)
+            assert [row["signature"]] == signatures(level)
+
+
+def test_planted_duplicates_are_told(split: Path) -> None:
+    facts = survey(split, rows=3)
+    assert facts["duplicates"] == {
+        "same": {"levels": 1, "pairs": [[COPY, 3]]},
+        "near": {"levels": 1, "pairs": [[NUDGED, 5]]},
+    }
+    assert facts["against"] == {}
+    assert survey(split, "level_id != 3")["duplicates"]["same"] == NONE
+
+
+@pytest.mark.slow
+def test_the_same_levels_are_found_in_splits_files_and_folders(split: Path, tmp_path: Path) -> None:
+    """By the command, as people ask."""
+    other, folder = committed(tmp_path / "other", [one("s", 40), one("s", 3)]), tmp_path / "handmade"
+    (folder / "deep").mkdir(parents=True)
+    seven = folder / "deep" / "seven.json"
+    write_level_file(LevelFile(one("s", 7), TaskParams()), seven)
+    write_level_file(LevelFile(one("m", 7), TaskParams()), folder / "other.json")
+    words = [word for path in (other, folder, seven) for word in ("--against", str(path))]
+    facts = json.loads(run(["inspect", str(split), *words, "--json", "--rows", "0"], tmp_path).stdout)
+    assert facts["duplicates"]["same"] == {"levels": 1, "pairs": []}
+    facts = json.loads(run(["inspect", str(split), *words, "--json"], tmp_path).stdout)
+    assert facts["against"] == {
+        str(other): {"same": {"levels": 2, "pairs": [[3, 1], [COPY, 1]]}, "near": NONE},
+        str(folder): {"same": {"levels": 1, "pairs": [[7, str(seven)]]}, "near": NONE},
+        str(seven): {"same": {"levels": 1, "pairs": [[7, str(seven)]]}, "near": NONE},
+    }
+    shown = run(["inspect", str(split), *words], tmp_path).stdout
+    assert "1 same (such as 9 and 3), 1 near (such as 10 and 5)" in shown
+    assert f"duplicates in {other}: 2 same (such as 3 and 1), 0 near" in shown
+
+
+@pytest.mark.slow
+def test_where_there_is_nothing_to_look_in_that_is_said(split: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="neither a split nor a level file"):
+        compared_in(tmp_path)
+    with pytest.raises(UserError, match="There is no split"):
+        compared_in(tmp_path / "missing")
+    (tmp_path / "bad.json").write_text("{}")
+    assert_refused(run(["inspect", str(split), "--against", str(tmp_path)], tmp_path), 2, "bad.json")
+
+
+@pytest.fixture(scope="module")
+def handmade(reference: Path) -> Path:
+    return handmade_levels(reference)
+
+
+def test_no_handmade_level_is_like_another(handmade: Path) -> None:
+    levels = compared_in(handmade)
+    assert levels.num_rows == 74
+    assert within(levels, 3) == {"same": NONE, "near": NONE}
+    assert between(levels, levels, 0)["same"]["levels"] == 74
+
+
+def test_every_handmade_level_is_known_in_another_order(handmade: Path) -> None:
+    """Two of them, the walkers, have legs that are exact copies of each other at one place."""
+    rng = np.random.default_rng(0)
+    for path in sorted(handmade.rglob("*.json")):
+        level = read_level_file(path).level
+        known = content_hashes(level)
+        for change in (renumbered, turned, renamed, more_room):
+            level = change(level, rng)
+            assert content_hashes(level) == known, (path.name, change.__name__)
+
+
+def test_a_split_has_no_handmade_level_until_one_is_planted(handmade: Path, split: Path, tmp_path: Path) -> None:
+    assert survey(split, against=[handmade])["against"][str(handmade)] == {"same": NONE, "near": NONE}
+    known = next(iter(sorted(handmade.glob("s/*.json"))))
+    planted = renumbered(read_level_file(known).level, np.random.default_rng(0))
+    found = survey(committed(tmp_path, [one("s", 0), planted]), against=[handmade])["against"][str(handmade)]
+    assert found == {"same": {"levels": 1, "pairs": [[1, str(known)]]}, "near": NONE}

@@ -1,0 +1,176 @@
+"""Pictures of a real split: levels that solve themselves, replayed and committed as a work unit does."""
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from levelgen.level import SIZES
+from levelgen.pictures.raster import draw, rasterised
+from levelgen.proofs import examine
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import TaskParams, advance, reset
+from pipeline.errors import Failure, UserError
+from pipeline.look.show import MOST_FRAMES, MOST_STEPS, do_nothing, first_success, show, witness_film
+from pipeline.read.levels import find_row
+from pipeline.store.manifest import require_manifest
+from tests.pipeline.made import PLAYED, made_job, played_split
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory) -> Path:
+    return played_split(tmp_path_factory.mktemp("data"))
+
+
+def level_with(split: Path, label: str) -> int:
+    """The level with that label whose shown episode is longest."""
+    rows = [row for row in require_manifest(split).table.to_pylist() if row["label"] == label]
+    return int(rows[-1]["level_id"])
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".GIF", ".png", ".svg"])
+def test_a_witness_is_drawn(split, tmp_path, capsys, suffix) -> None:
+    level_id, out = level_with(split, "solved"), tmp_path / "new" / f"level{suffix}"
+    show(split, level_id, out)
+    told = capsys.readouterr().out
+    assert told.startswith(str(out))
+    assert f"level {level_id} of size s, solved in " in told
+    assert told.count("\n") == 1
+    steps = int(re.search(r"solved in (\d+) step", told)[1])  # type: ignore[index]
+    if suffix == ".svg":
+        assert out.read_text().startswith("<svg ")
+        assert f'dur="{steps / 30 + 1.5:.3f}'.rstrip("0") in out.read_text()
+        return
+    with Image.open(out) as picture:
+        if suffix == ".png":
+            assert picture.size[0] == 480 * min(3, steps // 2 + 2)
+        else:
+            assert picture.n_frames == (steps + 1) // 2 + 1  # type: ignore[attr-defined]
+            seconds = 0.0
+            for number in range(picture.n_frames):  # type: ignore[attr-defined]
+                picture.seek(number)
+                seconds += picture.info["duration"] / 1000
+            assert seconds == pytest.approx(steps / 30 + 1.5, rel=0.15)
+
+
+def test_an_unsolved_level_shows_its_beginning_and_says_so(split, tmp_path, capsys) -> None:
+    level_id = level_with(split, "unsolved")
+    show(split, level_id, tmp_path / "level.png")
+    assert f"level {level_id} of size s is unsolved" in (told := capsys.readouterr().out)
+    assert "there is no witness, so this is its initial world" in told
+    with Image.open(tmp_path / "level.png") as picture:
+        assert picture.size[0] == 480
+
+
+def test_an_unsolved_level_plays_doing_nothing_and_says_so(split, tmp_path, capsys) -> None:
+    show(split, level_with(split, "unsolved"), tmp_path / "level.gif")
+    assert "there is no witness, so this is what doing nothing does (" in capsys.readouterr().out
+    with Image.open(tmp_path / "level.gif") as picture:
+        assert picture.n_frames > 10  # type: ignore[attr-defined]
+
+
+class TestDoingNothing:
+    RULES = TaskParams()
+
+    def test_it_is_the_tasks_episode(self) -> None:
+        """Physics step by physics step, to the same ends."""
+        levels = sample_levels(jnp.arange(16), SIZES["s"])
+        act = jax.jit(lambda now: advance(levels, now, jnp.zeros((6, 16), jnp.int32), self.RULES))
+        after, ends = reset(levels), {}
+        for number in range(1, 257):
+            after, outcome = act(after)
+            for lane in np.flatnonzero(outcome.done):
+                ends.setdefault(int(lane), (number, bool(outcome.goal[lane]), float(outcome.reward[lane])))
+        kinds = set()
+        for lane in range(16):
+            one = jax.tree.map(lambda x, lane=lane: x[..., lane : lane + 1], levels)
+            states, end = do_nothing(one, self.RULES)
+            steps, goal, _ = ends[lane]
+            assert -(-(len(states) - 1) // 2) == steps
+            assert (end == "goal reached") == goal
+            kinds.add(end)
+        assert kinds == {"goal reached", "touched red", "time is up"}
+
+    def test_no_rules_make_it_long(self) -> None:
+        level = sample_levels(jnp.array([ends_late()]), SIZES["s"])
+        for rules in (TaskParams(frame_skip=10**6, max_timesteps=10**6), TaskParams(max_timesteps=10**6)):
+            states, end = do_nothing(level, rules)
+            assert len(states) == 1 + min(MOST_FRAMES, MOST_STEPS * rules.frame_skip)
+            assert end == ""
+
+    def test_a_world_that_breaks_down_ends(self) -> None:
+        level = sample_levels(jnp.array([ends_late()]), SIZES["s"])
+        model = replace(level.model, gravity=level.model.gravity * np.nan)
+        states, end = do_nothing(replace(level, model=model), self.RULES)
+        assert (len(states), end) == (1, "world breaks down")
+
+
+def ends_late() -> int:
+    """A level of s where doing nothing lasts until the time is up."""
+    levels = sample_levels(jnp.arange(64), SIZES["s"])
+    facts = examine(levels, TaskParams(), 256)
+    return int(np.flatnonzero(~facts.reaches & ~facts.fails)[0])
+
+
+def test_the_drawing_of_a_level_made_again_is_that_of_its_shard(split, tmp_path) -> None:
+    """The first picture of a witness is the level that its id rebuilds."""
+    manifest = require_manifest(split)
+    row = find_row(manifest, level_with(split, "solved"))
+    film = witness_film(manifest, row)
+    again = sample_levels(jnp.array([row["level_id"]], jnp.int32), SIZES["s"], made_job().distribution)
+    world = (0, 40, 480, 480)
+    bare = draw(again, again.state, action=np.zeros(6, np.int32)).crop(world)
+    ours = rasterised(film.scenes[0]).crop(world)
+    assert (np.asarray(bare) != np.asarray(ours)).any(-1).mean() < 0.02  # but for actuators at work
+
+
+@pytest.mark.parametrize("level_id", [PLAYED, -1, 10**9])
+def test_a_level_that_is_not_there(split, tmp_path, level_id) -> None:
+    with pytest.raises(UserError, match=rf"^There is no level {level_id} in .*64 levels, from 0 to 63\.$"):
+        show(split, level_id, tmp_path / "level.gif")
+
+
+@pytest.mark.parametrize("name", ["level.jpg", "level", "level.gif.txt"])
+def test_a_suffix_that_nobody_draws(split, tmp_path, name) -> None:
+    with pytest.raises(UserError, match=r"has to end in \.gif, \.png, \.mp4, \.svg\.$"):
+        show(split, 0, tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+def test_a_split_that_is_not_there(tmp_path) -> None:
+    with pytest.raises(UserError, match="There is no split at"):
+        show(tmp_path / "nothing", 0, tmp_path / "level.gif")
+
+
+def test_a_file_that_cannot_be_written(split, tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"^Cannot write .*: choose another file with -o"):
+        show(split, 0, tmp_path / "file" / "level.gif")
+
+
+def test_a_film_as_mp4(split, tmp_path) -> None:
+    show(split, level_with(split, "solved"), tmp_path / "level.mp4")
+    assert (tmp_path / "level.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_mp4_needs_ffmpeg(split, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(UserError, match="ffmpeg"):
+        show(split, level_with(split, "solved"), tmp_path / "other.mp4")
+
+
+def test_the_first_episode_that_reaches_the_goal_is_shown() -> None:
+    done, goal = np.zeros(256, bool), np.zeros(256, bool)
+    done[[10, 30, 60]], goal[[30, 60]] = True, True
+    assert first_success(done, goal) == (11, 30)
+    with pytest.raises(Failure, match="never reaches the goal"):
+        first_success(done, np.zeros(256, bool))

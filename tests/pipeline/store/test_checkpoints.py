@@ -1,0 +1,40 @@
+"""Checkpoints of experts, where several units of a worker keep theirs at once."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experts.judge import Kept
+from experts.slots import begin
+from levelgen.level import SIZES
+from levelgen.sampling.sampler import sample_levels
+from pipeline.store.checkpoints import load_experts, save_experts
+from tests.pipeline.made import made_job
+
+UNITS = 6
+
+
+@pytest.mark.slow
+def test_units_in_threads_keep_their_experts_at_once(tmp_path: Path) -> None:
+    job = made_job("data", "expert.width=8", "expert.environments=24")
+    ids = np.arange(UNITS, dtype=np.int32)
+    levels = sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution)
+    begun = jax.tree.map(np.asarray, begin(levels, ids, job.expert))
+    together = Barrier(UNITS)
+
+    def saved_and_loaded(level_id: int) -> Kept:
+        kept = Kept(jax.tree.map(lambda x: x[level_id], begun), [0.0])
+        together.wait()
+        save_experts(tmp_path / str(level_id), {level_id: kept})
+        together.wait()
+        return load_experts(tmp_path / str(level_id), job)[level_id]
+
+    with ThreadPoolExecutor(UNITS) as threads:
+        for level_id, kept in enumerate(threads.map(saved_and_loaded, range(UNITS))):
+            pairs = zip(jax.tree.leaves(begun), jax.tree.leaves(kept.begun), strict=True)
+            assert all(before[level_id].tobytes() == np.asarray(after).tobytes() for before, after in pairs)

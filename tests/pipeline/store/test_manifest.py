@@ -1,0 +1,137 @@
+"""Fragments: committed at once or not at all, damage is seen, each level counts once."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from configs.schema import JobConfig
+from experts.labels import Label
+from pipeline.errors import Failure, UserError
+from pipeline.jobs.unit import manifest_row
+from pipeline.store.layout import fragment_path, unit_name
+from pipeline.store.manifest import differences, fragment_paths, read_manifest, require_manifest, told, write_fragment
+from pipeline.store.schema import COLUMNS
+from tests.pipeline.made import made_job, made_verdict
+
+
+@pytest.fixture
+def job() -> JobConfig:
+    return made_job()
+
+
+def commit(split: Path, job: JobConfig, level_ids: list[int], label: Label = Label.SOLVED) -> Path:
+    path = fragment_path(split, unit_name(level_ids[0], level_ids[-1]))
+    rows = [manifest_row(job, i, made_verdict(label)) for i in level_ids]
+    rows = [row | {"shard": f"shards/{path.stem}-ab.zarr", "row": i} for i, row in enumerate(rows)]
+    rows = [row | {"content_hash": f"c1:{row['level_id']}", "signature": ["n1:a", "n1:b"]} for row in rows]
+    write_fragment(path, rows, job.hash, job.results)
+    return path
+
+
+def test_rows_come_back_sorted_with_every_column(tmp_path: Path, job: JobConfig) -> None:
+    commit(tmp_path, job, [16, 17], Label.UNSOLVED)
+    commit(tmp_path, job, [0, 3])
+    manifest = read_manifest(tmp_path)
+    assert manifest.level_ids.tolist() == [0, 3, 16, 17]
+    assert manifest.labels.tolist() == ["solved", "solved", "unsolved", "unsolved"]
+    assert manifest.table.schema.equals(COLUMNS)
+    assert (manifest.config_hash, manifest.config) == (job.hash, job.results)
+    row = manifest.table.to_pylist()[1]
+    assert (row["budget"], row["steps_to_goal"], row["env_steps"]) == ("128k", 17, 4096)
+    assert np.isnan(row["learning_curve"][0])
+    assert row["command"] == "levelproof generate size=s budget=128k first_level=3 levels=1"
+    assert manifest.table.to_pylist()[2]["steps_to_goal"] is None
+
+
+def test_the_issue_s_columns_are_there() -> None:
+    asked = "level_id size budget label label_reason success_rate steps_to_goal steps_to_first_success env_steps"
+    asked += " learning_curve shard row config_hash versions device"
+    assert set(asked.split()) <= set(COLUMNS.names)
+
+
+def test_a_level_counts_once_and_all_its_shards_are_kept(tmp_path: Path, job: JobConfig) -> None:
+    commit(tmp_path, job, [0, 1, 2])
+    commit(tmp_path, job, [2, 3])
+    manifest = read_manifest(tmp_path)
+    assert manifest.level_ids.tolist() == [0, 1, 2, 3]
+    assert len(manifest.shards) == 2
+
+
+def test_columns_asked_for_are_enough(tmp_path: Path, job: JobConfig) -> None:
+    commit(tmp_path, job, [0])
+    assert read_manifest(tmp_path, ["label"]).table.column_names == ["level_id", "shard", "experts", "label"]
+
+
+def test_nothing_committed_is_an_empty_manifest(tmp_path: Path) -> None:
+    manifest = read_manifest(tmp_path)
+    assert len(manifest.level_ids) == 0
+    assert manifest.config is None
+    with pytest.raises(UserError, match="Nothing is committed"):
+        require_manifest(tmp_path)
+    with pytest.raises(UserError, match="There is no split"):
+        require_manifest(tmp_path / "nowhere")
+
+
+def test_a_half_written_fragment_is_none(tmp_path: Path, job: JobConfig) -> None:
+    commit(tmp_path, job, [0])
+    (tmp_path / "manifest/.000000000001-000000000001.parquet.77").write_bytes(b"PAR1")
+    assert len(fragment_paths(tmp_path)) == 1
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path, job: JobConfig) -> None:
+    path = fragment_path(tmp_path, "x")
+    with pytest.raises((pa.ArrowException, ValueError, TypeError)):
+        write_fragment(path, [{"level_id": "no number"}], job.hash, job.results)
+    assert not list(tmp_path.rglob("*.parquet*"))
+
+
+def test_any_damaged_byte_of_a_fragment_is_seen_or_harmless(tmp_path: Path, job: JobConfig) -> None:
+    path = commit(tmp_path, job, [0, 1])
+    before, whole = read_manifest(tmp_path).table.to_pylist(), path.read_bytes()
+    seen = 0
+    for at in range(0, len(whole), 23):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x40]) + whole[at + 1 :])
+        try:
+            assert repr(read_manifest(tmp_path).table.to_pylist()) == repr(before)  # repr: NaN is NaN
+        except Failure:
+            seen += 1
+    assert seen > len(whole) / 23 / 2
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1", b"not parquet at all, but long enough to look at" * 9])
+def test_a_fragment_that_is_none_is_named(tmp_path: Path, job: JobConfig, content: bytes) -> None:
+    path = commit(tmp_path, job, [0])
+    path.write_bytes(content)
+    with pytest.raises(Failure, match=r"is damaged .* delete it and run the same `levelproof generate` again"):
+        read_manifest(tmp_path)
+
+
+def test_another_version_is_refused(tmp_path: Path, job: JobConfig) -> None:
+    path = commit(tmp_path, job, [0])
+    table = pq.read_table(path)
+    metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"9"}
+    pq.write_table(table.replace_schema_metadata(metadata), path)
+    with pytest.raises(Failure, match="has manifest version 9, this program reads 3"):
+        read_manifest(tmp_path)
+
+
+def test_two_configurations_in_one_split_are_named(tmp_path: Path, job: JobConfig) -> None:
+    commit(tmp_path, job, [0])
+    commit(tmp_path, made_job("data", "expert.width=32"), [1])
+    with pytest.raises(Failure, match=r"mixes two configurations.*expert.width was 64, now 32"):
+        read_manifest(tmp_path)
+
+
+def test_differences_name_old_and_new() -> None:
+    changes = differences({"a": {"b": 1, "gone": 2}, "same": 0}, {"a": {"b": 3}, "same": 0, "new": 4})
+    assert changes == {"a.b": (1, 3), "a.gone": (2, "absent"), "new": ("absent", 4)}
+    assert told({f"s{i}": (i, -i) for i in range(8)}).endswith("s5 was 5, now -5 and 2 more")
+
+
+def test_units_have_names_that_sort_as_their_ids() -> None:
+    names = [unit_name(first, first + 1) for first in (0, 9, 10, 999_999, 10**9)]
+    assert all(a < b for a, b in itertools.pairwise(names))

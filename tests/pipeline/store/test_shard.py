@@ -1,0 +1,146 @@
+"""Shards: every bit comes back, damage is seen, and only what was asked for is read."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from experts.witness import Record
+from levelgen.level import SIZES, Level
+from pipeline.errors import Failure
+from pipeline.store.fields import arrays_of, same_bits, tree_of
+from pipeline.store.packing import pack, unpack
+from pipeline.store.schema import ALONG_TIME, RECORD_STEPS, FieldPlace, field_table
+from pipeline.store.shard import Shard, stored_bytes, write_shard
+from tests.pipeline.made import made_level, made_record
+
+LEVELS = [5, 9, 12]
+
+
+def fields_of(size: str, seed: int = 0) -> dict[str, np.ndarray]:
+    count = len(LEVELS)
+    return arrays_of(made_level(size, count, seed), "level/") | arrays_of(made_record(size, count, seed), "record/")
+
+
+def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        assert found[name].dtype == values.dtype
+        assert same_bits(found[name], values).all(), name
+
+
+@pytest.fixture(scope="module")
+def fields() -> dict[str, np.ndarray]:
+    return fields_of("s")
+
+
+@pytest.fixture
+def shard(tmp_path: Path, fields: dict[str, np.ndarray]) -> Path:
+    path = tmp_path / "000000000005-000000000012-abcd.zarr"
+    write_shard(path, LEVELS, fields)
+    return path
+
+
+@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(size=st.sampled_from(sorted(SIZES)), seed=st.integers(0, 2**32))
+def test_every_bit_of_every_field_comes_back(tmp_path: Path, size: str, seed: int) -> None:
+    fields = fields_of(size, seed)
+    path = tmp_path / f"{size}-{seed}.zarr"
+    if not path.exists():
+        write_shard(path, LEVELS, fields)
+    shard = Shard(path)
+    assert shard.level_ids == LEVELS
+    assert_same(shard.read(), fields)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.sampled_from(sorted(SIZES)), st.integers(0, 2**32))
+def test_packing_is_undone_by_unpacking(size: str, seed: int) -> None:
+    fields = fields_of(size, seed)
+    table = field_table(fields)
+    assert_same(unpack(pack(fields, table), table), fields)
+
+
+def test_places_do_not_overlap_and_leave_no_gaps(fields: dict[str, np.ndarray]) -> None:
+    table = field_table(fields)
+    for name, packed in pack(fields, table).items():
+        taken = [range(place.first, place.first + place.count) for place in table if place.array == name]
+        assert sorted(i for places in taken for i in places) == list(range(packed.shape[1]))
+        assert packed.shape[2:] == ((RECORD_STEPS,) if name in ALONG_TIME else ())
+    assert [FieldPlace.from_json(place.as_json()) for place in table] == table
+
+
+def test_a_value_that_does_not_fit_is_refused(fields: dict[str, np.ndarray]) -> None:
+    fields = fields | {"record/action": np.full_like(fields["record/action"], 300)}
+    with pytest.raises(ValueError, match="record/action has values from 300"):
+        pack(fields, field_table(fields))
+
+
+def test_trees_come_back_from_their_fields() -> None:
+    level, record = made_level(), made_record()
+    assert_same(arrays_of(tree_of(Level, arrays_of(level))), arrays_of(level))
+    assert_same(arrays_of(tree_of(Record, arrays_of(record, "record/"), "record/")), arrays_of(record))
+
+
+def test_same_bits_tells_zero_from_minus_zero_and_knows_nan() -> None:
+    a = np.array([[0.0, np.nan, 1.0]], np.float32)
+    assert same_bits(a, a.copy()).all()
+    assert same_bits(a, -a).tolist() == [False, False, False]
+    assert not same_bits(a, a.astype(np.float64)).any()
+
+
+@pytest.mark.parametrize("rows", [[0], [2, 0], [1, 1], [0, 1, 2], []])
+def test_rows_are_read_in_the_order_asked_for(shard: Path, fields: dict[str, np.ndarray], rows: list[int]) -> None:
+    assert_same(Shard(shard).read(rows), {name: values[..., rows] for name, values in fields.items()})
+
+
+def test_only_the_fields_asked_for_are_read(shard: Path, fields: dict[str, np.ndarray]) -> None:
+    (shard / "dyn32/c/0/0/0").unlink()  # not needed for what follows
+    found = Shard(shard).read(fields=["record/action", "level/role"])
+    assert_same(found, {name: fields[name] for name in ("level/role", "record/action")})
+
+
+def test_it_is_plain_zarr_that_others_can_read(shard: Path) -> None:
+    group = zarr.open_group(shard, mode="r")
+    assert {name for name, _ in group.arrays()} == {"dyn32", "dyn8", "act", "lvl32", "lvl8"}
+    assert group["act"].shape == (len(LEVELS), 6, RECORD_STEPS)  # type: ignore[union-attr]
+    assert group.attrs["format"] == "levelproof.shard"
+
+
+def test_an_attempt_never_writes_over_another(shard: Path, fields: dict[str, np.ndarray]) -> None:
+    with pytest.raises(FileExistsError):
+        write_shard(shard, LEVELS, fields)
+
+
+def test_stored_bytes_counts_every_file(shard: Path) -> None:
+    assert stored_bytes(shard) == sum(path.stat().st_size for path in shard.rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("array", ["dyn32", "dyn8", "act", "lvl32", "lvl8"])
+def test_any_damaged_byte_is_seen(shard: Path, array: str) -> None:
+    file = next(path for path in (shard / array / "c").rglob("*") if path.is_file())
+    whole = file.read_bytes()
+    for at in range(0, len(whole), max(1, len(whole) // 7)):
+        file.write_bytes(whole[:at] + bytes([whole[at] ^ 0x40]) + whole[at + 1 :])
+        with pytest.raises(Failure, match=r"missing or damaged .* delete .*000000000005-000000000012.parquet"):
+            Shard(shard).read()
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(Failure, match="missing or damaged"):
+        Shard(shard).read()
+
+
+@pytest.mark.parametrize("file", ["zarr.json", "dyn8/zarr.json", "dyn8/c/0/0/0"])
+def test_a_missing_file_is_seen(shard: Path, file: str) -> None:
+    (shard / file).unlink()
+    with pytest.raises(Failure, match="missing or damaged"):
+        Shard(shard).read()
+
+
+def test_another_version_is_refused(shard: Path) -> None:
+    attributes = shard / "zarr.json"
+    attributes.write_text(attributes.read_text().replace('"version": 1', '"version": 2'))
+    with pytest.raises(Failure, match="has version 2, this program reads 1"):
+        Shard(shard)
