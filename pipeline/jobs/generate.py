@@ -3,6 +3,7 @@
 import shlex
 from collections import Counter
 from collections.abc import Collection, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from rich.console import Console
 
 from configs.schema import JobConfig
 from pipeline.errors import Exit, Failure
-from pipeline.jobs.progress import Board, Tally
+from pipeline.jobs.progress import Board, Tally, say
 from pipeline.jobs.schedule import Outcome, Queue, WorkUnit, levels_text, plan_units
 from pipeline.store.checkpoints import require_same_experts
 from pipeline.store.layout import quarantine_path
@@ -32,7 +33,7 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
         KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; what is committed stays.
     """
     require_same_experts(job)
-    with writing(job) as (split, manifest):
+    with writing(job, partial(say, console)) as (split, manifest):
         wanted = set(job.level_ids if level_ids is None else map(int, level_ids))
         done = wanted.intersection(manifest.level_ids.tolist())
         queue = Queue.of(plan_units(sorted(wanted), done, job.levels_per_unit))

@@ -96,6 +96,11 @@ class Tally:
         return f"{self.trained}/{self.levels} levels · {self.solved_so_far} solved · {tail}"
 
 
+def say(console: Console, text: str) -> None:
+    """A line that stays, as it is."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
 class Display:
     """A bar on a terminal, plain lines now and then elsewhere."""
 
@@ -125,7 +130,7 @@ class Display:
 
     def say(self, text: str) -> None:
         """A line that stays."""
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+        say(self._console, text)
 
 
 class Board(Display):

@@ -29,7 +29,7 @@ from pipeline.jobs.schedule import Outcome, Summary, WorkUnit
 from pipeline.store.checkpoints import experts_for, save_experts
 from pipeline.store.fields import arrays_of, map_arrays, same_bits
 from pipeline.store.layout import attempt_paths, fragment_path
-from pipeline.store.locks import committing
+from pipeline.store.locks import LockRefused, committing
 from pipeline.store.manifest import write_fragment
 from pipeline.store.provenance import device, versions
 from pipeline.store.shard import write_shard
@@ -50,6 +50,8 @@ def attempt(job: JobConfig, split: Path, unit: WorkUnit, report: Report, pool: P
     """One attempt at a unit, with its failure as a value: exceptions do not travel between processes."""
     try:
         return Outcome(unit, run_unit(job, split, unit, report, pool))
+    except LockRefused as refused:
+        return Outcome(unit, reason=traceback.format_exc(), fatal=str(refused))
     except OSError as error:
         fatal = FATAL.get(error.errno or 0, "")
         sentence = fatal and f"Cannot write to {split}, {fatal}, then run the same command again."

@@ -1,19 +1,30 @@
-"""Locks between processes, held by open files: the system frees them when a process dies, however it dies."""
+"""Locks between processes, held by open files: the system frees them when a process dies, however it dies.
+
+Lock files are opened for reading and writing: NFS makes these locks out of others, and takes a shared one only of a
+file that may be read, an exclusive one only of a file that may be written.
+"""
 
 import fcntl
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+from pipeline.errors import UserError
 from pipeline.store.layout import COMMIT_LOCK, WRITER_LOCK
 
 PATIENCE = 1.0  # s; `is_written` holds the writer's lock for a moment
+NOTICE = 2.0  # s of waiting after which people are told for what
+POLL = 0.05  # s between two tries
 
 
 class Locked(Exception):
     """Another process holds the lock."""
+
+
+class LockRefused(UserError):
+    """The file system has no locks."""
 
 
 @contextmanager
@@ -22,42 +33,60 @@ def only_writer(split: Path) -> Iterator[None]:
 
     Raises:
         Locked: another one is at work.
+        LockRefused: the file system has no locks.
     """
-    end = time.monotonic() + PATIENCE
-    with (split / WRITER_LOCK).open("a") as file:
-        while not _take(file):
-            if time.monotonic() > end:
-                raise Locked
-            time.sleep(PATIENCE / 20)
+    with _opened(split / WRITER_LOCK) as file:
+        if not _taken_within(PATIENCE, file):
+            raise Locked
         yield
-
-
-def _take(file: IO[str]) -> bool:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 @contextmanager
 def committing(split: Path) -> Iterator[None]:
-    """Held while a unit writes its shard and its fragment; many units may at once."""
-    with (split / COMMIT_LOCK).open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_SH)
+    """Held while a unit writes its shard and its fragment; many units may at once.
+
+    Raises:
+        LockRefused: the file system has no locks.
+    """
+    with _opened(split / COMMIT_LOCK) as file:
+        _take(file, fcntl.LOCK_SH)
         yield
 
 
 @contextmanager
-def nobody_commits(split: Path) -> Iterator[None]:
-    """Waits until no unit is between its shard and its fragment, such as one of a killed run that is still ending."""
-    with (split / COMMIT_LOCK).open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Waits until no unit is between its shard and its fragment, such as one of a killed run that is still ending.
+
+    Args:
+        split: the folder `{out}/{budget}/{size}`.
+        say: told what is waited for, when that takes long.
+
+    Raises:
+        LockRefused: the file system has no locks.
+    """
+    path = split / COMMIT_LOCK
+    with _opened(path) as file:
+        if not _taken_within(NOTICE, file):
+            say(
+                f"Waiting for a worker of an earlier run, which still writes and holds {path}: "
+                f"if it does not end, find it with `fuser -v {path}` on its machine and stop it."
+            )
+            _take(file, fcntl.LOCK_EX)
         yield
 
 
+def require_locks(split: Path) -> None:
+    """Take the locks that workers take: a file system that refuses them is named before anything trains.
+
+    Raises:
+        LockRefused: it does.
+    """
+    with committing(split):
+        pass
+
+
 def is_written(split: Path) -> bool:
-    """Whether a `levelproof generate` is at work on this split now; takes nothing and writes nothing."""
+    """Whether a `levelproof generate` is at work on this split now; writes nothing, and needs to read only."""
     try:
         with (split / WRITER_LOCK).open() as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -66,3 +95,31 @@ def is_written(split: Path) -> bool:
     except OSError:  # never written to, or not ours to ask
         return False
     return False
+
+
+def _opened(path: Path) -> IO[str]:
+    return path.open("a+")
+
+
+def _taken_within(seconds: float, file: IO[str]) -> bool:
+    """Whether the exclusive lock was free before these seconds were over."""
+    end = time.monotonic() + seconds
+    while not _take(file, fcntl.LOCK_EX | fcntl.LOCK_NB):
+        if time.monotonic() > end:
+            return False
+        time.sleep(POLL)
+    return True
+
+
+def _take(file: IO[str], how: int) -> bool:
+    """Take a lock; False where another process holds it and `how` is not to wait."""
+    try:
+        fcntl.flock(file, how)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise LockRefused(
+            f"The file system of {file.name} refuses locks ({error.strerror}): "
+            "choose a folder on another one with out=NAME, or have it mounted with locks."
+        ) from error
+    return True

@@ -4,7 +4,7 @@ import json
 import os
 import shlex
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,23 +12,28 @@ from configs.schema import JobConfig
 from pipeline.errors import UserError
 from pipeline.jobs.schedule import runs
 from pipeline.store.layout import EXPERTS, JOB, MANIFEST, SHARDS, split_path
-from pipeline.store.locks import Locked, nobody_commits, only_writer
+from pipeline.store.locks import Locked, nobody_commits, only_writer, require_locks
 from pipeline.store.manifest import Manifest, differences, read_manifest, told
 
 
 @contextmanager
-def writing(job: JobConfig) -> Iterator[tuple[Path, Manifest]]:
+def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, Manifest]]:
     """The job's split, locked, cleaned, and of this configuration; with what is committed.
 
+    Args:
+        job: whose split.
+        say: told what people should know meanwhile, in sentences.
+
     Raises:
-        UserError: it cannot be written, is being written, or was made with another configuration.
+        UserError: it cannot be written or locked, is being written, or was made with another configuration.
         Failure: a fragment is damaged.
     """
     split = split_path(job.out, job.budget, job.size)
     _make_writable(split)
     try:
         with only_writer(split):
-            manifest = clean(split)
+            require_locks(split)
+            manifest = clean(split, say)
             require_same(manifest, job)
             yield split, manifest
     except Locked:
@@ -52,12 +57,12 @@ def require_same(manifest: Manifest, job: JobConfig) -> None:
     )
 
 
-def clean(split: Path) -> Manifest:
+def clean(split: Path, say: Callable[[str], None]) -> Manifest:
     """Remove shards and experts that no fragment names and half-written files; what is committed stays.
 
     Done while nobody commits: a worker of a killed run may still be about to name its shard.
     """
-    with nobody_commits(split):
+    with nobody_commits(split, say):
         manifest = read_manifest(split)
         for path in (split / SHARDS).glob("*.zarr"):
             if f"{SHARDS}/{path.name}" not in manifest.shards:

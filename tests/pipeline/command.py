@@ -1,6 +1,7 @@
 """The command `levelproof` as people run it, in a process of its own."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -39,6 +40,11 @@ def run(arguments: Sequence[str], cwd: Path, **options: Any) -> subprocess.Compl
     process = start(arguments, cwd, **options)
     out, err = process.communicate(timeout=300)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def heed_ctrl_c() -> None:
+    """As a command in a terminal's foreground: a shell's background jobs, and what they start, ignore SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:

@@ -12,7 +12,7 @@ import pytest
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard
-from tests.pipeline.command import PATIENCE, ROOT, run, start, until
+from tests.pipeline.command import PATIENCE, ROOT, heed_ctrl_c, run, start, until
 
 LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
 COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
@@ -131,11 +131,6 @@ def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
     assert "Traceback" not in err
     assert_same_content(tmp_path / SPLIT, undisturbed)
     assert not (tmp_path / SPLIT / "quarantine").exists()
-
-
-def heed_ctrl_c() -> None:
-    """As a command in a terminal's foreground: a shell's background jobs, and what they start, ignore SIGINT."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

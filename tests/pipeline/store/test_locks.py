@@ -1,0 +1,121 @@
+"""Locks: on file systems of several kinds, and what people are told while they wait."""
+
+import errno
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import Exit, UserError
+from pipeline.jobs.schedule import Outcome, WorkUnit
+from pipeline.jobs.unit import attempt
+from pipeline.store import locks
+from pipeline.store.layout import COMMIT_LOCK
+from pipeline.store.locks import Locked, LockRefused, committing, is_written, nobody_commits, only_writer
+from pipeline.store.split import writing
+from tests.pipeline.command import ROOT, heed_ctrl_c, start
+from tests.pipeline.made import made_job
+
+
+def test_commits_do_not_wait_for_each_other(tmp_path: Path) -> None:
+    with committing(tmp_path), committing(tmp_path):
+        pass
+    with nobody_commits(tmp_path, print):
+        pass
+
+
+# NFS makes locks of byte ranges out of `flock`: so does this process, which holds one until its input ends.
+HOLDER = """
+import fcntl, pathlib, sys
+fcntl.flock = fcntl.lockf
+from pipeline.store import locks
+with getattr(locks, sys.argv[1])(pathlib.Path(sys.argv[2])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def held_elsewhere(lock: str, split: Path) -> Iterator[subprocess.Popen[str]]:
+    program = [sys.executable, "-c", HOLDER, lock, str(split)]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        yield holder
+
+
+def test_locks_exclude_on_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fcntl, "flock", fcntl.lockf)
+    monkeypatch.setattr(locks, "PATIENCE", 0.1)
+    monkeypatch.setattr(locks, "NOTICE", 0.1)
+    with held_elsewhere("only_writer", tmp_path):
+        assert is_written(tmp_path)
+        with pytest.raises(Locked), only_writer(tmp_path):
+            pass
+    assert not is_written(tmp_path)
+    with only_writer(tmp_path):
+        pass
+    said: list[str] = []
+    with held_elsewhere("committing", tmp_path) as worker:
+
+        def then_end_it(text: str) -> None:
+            said.append(text)
+            worker.communicate()
+
+        with committing(tmp_path):
+            pass
+        with nobody_commits(tmp_path, then_end_it):
+            assert worker.returncode == 0
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("refused", [fcntl.LOCK_SH, fcntl.LOCK_EX])
+def test_a_file_system_without_locks_is_named_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: int
+) -> None:
+    flock = fcntl.flock
+
+    def without(file: Any, how: int) -> None:
+        if how & refused:
+            raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+        flock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", without)
+    with (
+        pytest.raises(UserError, match=r"refuses locks \(No locks available\): choose a folder .* out=NAME"),
+        writing(made_job(str(tmp_path / "data")), print),
+    ):
+        pytest.fail("something would have trained")
+
+
+def test_a_worker_whose_file_system_has_no_locks_stops_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise LockRefused("no locks here")
+
+    monkeypatch.setattr("pipeline.jobs.unit.run_unit", refuse)
+    unit = WorkUnit((0,))
+    ended = attempt(made_job(), tmp_path, unit, lambda *_: None, None)  # type: ignore[arg-type]
+    assert ended == Outcome(unit, reason=ended.reason, fatal="no locks here")
+
+
+def test_waiting_for_a_worker_of_an_earlier_run_is_told_and_can_be_stopped(tmp_path: Path) -> None:
+    split = tmp_path / "data/5k/s"
+    split.mkdir(parents=True)
+    with committing(split):
+        process = start(["generate", "budget=5k", "executor=inline"], tmp_path, preexec_fn=heed_ctrl_c)
+        assert process.stderr is not None
+        told = process.stderr.readline()
+        assert "Waiting for a worker of an earlier run" in told
+        assert f"data/5k/s/{COMMIT_LOCK}" in told
+        assert "fuser" in told
+        os.killpg(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == Exit.INTERRUPTED
+    assert err == ""
