@@ -23,15 +23,15 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.document import between_marks
+from benchmarks.oracle import environment, oracle_python, tell
+from benchmarks.reference.level_statistics import statistics
 from experts.before import facts_of
 from levelgen.files.kinetix import level_from_kinetix, state_to_kinetix
 from levelgen.level import SIZES, Level
 from levelgen.proofs import Proof
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
-from pipeline.bench.oracle import environment, oracle_python, tell
 from pipeline.runtime import cache_folder
-from tests.golden.level_statistics import statistics
 
 SIGNIFICANT = 1e-3
 COUNTED = 40  # statistics with at most so many different values are compared by their counts

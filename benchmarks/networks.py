@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from benchmarks.document import between_marks
+from benchmarks.endless import endless_queue, go_on
 from experts.config import ExpertConfig, Network
 from experts.networks.entity import KINDS
 from experts.networks.layers import LOGITS
@@ -22,7 +23,6 @@ from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.observe.flat import DYNAMIC_ROWS
 from physics.types import FIXED_POLYGONS, Size
-from pipeline.bench.endless import endless_queue, go_on
 from pipeline.runtime import own_cores, prepare_jax
 
 SLOTS, UPDATES, REPEATS = 4, 5, 9  # REPEATS in turns, so that medians compare

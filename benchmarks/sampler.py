@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.document import between_marks
-from pipeline.bench.oracle import environment, oracle_python
+from benchmarks.oracle import environment, oracle_python
 
 LEVELS = 4096
 MARK = "sampler"

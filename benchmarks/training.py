@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.endless import endless_queue, go_on
 from experts import ppo
 from experts.config import ExpertConfig
 from experts.policy import network_of
@@ -24,7 +25,6 @@ from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.actions import CHOICES, action_mask
 from levelgen.task.rules import DEFAULT_RULES
-from pipeline.bench.endless import endless_queue, go_on
 from pipeline.runtime import own_cores, prepare_jax
 
 REPEATS = 30

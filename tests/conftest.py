@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from pipeline.bench import oracle
+from benchmarks import oracle
 from pipeline.errors import Failure
 from pipeline.runtime import CACHE_VARIABLE, prepare_jax
 

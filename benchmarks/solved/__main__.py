@@ -5,7 +5,7 @@
     python -m benchmarks.solved plot FILES... --out docs/unsolved-by-budget.svg [--write docs/experts.md]
 
 `run` appends a line per level to a file and skips the levels that are there: run it again to go on, or for more levels.
-The variant `original` runs in the reference's own environment, made on first use as for `levelproof bench`.
+The variant `original` runs in the reference's own environment, made on first use as for `python -m benchmarks`.
 Levels below 1,000,000 are for tuning, those above for reports.
 """
 

@@ -1,6 +1,6 @@
 """The variant `original`: our levels in the reference's own environment, trained by its users' PPO.
 
-A process of the reference's Python (pipeline/bench/reference_solved.py) trains and evaluates; what an evaluation says
+A process of the reference's Python (benchmarks/reference/solved.py) trains and evaluates; what an evaluation says
 of a level is judged here, as for every variant. Witnesses are not replayed: they hold in the reference's physics.
 """
 
@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
+from benchmarks import oracle
+from benchmarks.race.contest import Process
 from benchmarks.solved.measure import Progress, Trained, row_of
 from benchmarks.solved.results import Header
 from benchmarks.solved.variants import Variant
 from experts.config import RECORD_STEPS, ExpertConfig
 from experts.labels import Label, Verdict
 from levelgen.level import Level
-from pipeline.bench import oracle
-from pipeline.bench.contest import Process
 from pipeline.errors import LevelproofError
 from pipeline.jobs.schedule import Summary, WorkUnit
 from pipeline.runtime import cache_folder, prepare_jax
@@ -70,7 +70,7 @@ def started(python: Path, core: int, header: Header, config: ExpertConfig) -> It
     words = ["--size", header.size, "--width", WIDTH, "--core", core, "--cache", cache_folder() / "reference-jax"]
     words += ["--environments", config.environments, "--horizon", config.horizon]
     words += ["--attempts", config.attempts, "--steps", RECORD_STEPS]
-    command = [str(word) for word in (python, oracle.HERE / "reference_solved.py", *words)]
+    command = [str(word) for word in (python, oracle.SCRIPTS / "solved.py", *words)]
     with ExitStack() as stack, tempfile.TemporaryFile("w+") as errors, tempfile.TemporaryDirectory() as folder:
         process = Process(command, oracle.environment(), stack, errors)
         process.wake()

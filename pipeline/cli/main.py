@@ -20,12 +20,7 @@ SPLIT = "folder of a split, such as data/128k/s"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; its exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if words[:1] == ["bench"]:  # has a parser of its own
-        words, bench = ["bench"], words[1:]
-    else:
-        bench = []
     arguments = _parser().parse_args(words)
-    arguments.bench = bench
     try:
         return int(arguments.run(arguments))
     except (LevelproofError, ConfigError) as error:
@@ -165,8 +160,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     _split(sub)
     _json(sub)
-
-    command("bench", _bench, "measure this program beside the reference", "levelproof bench physics --size s --json")
     return parser
 
 
@@ -249,12 +242,6 @@ def _verify(arguments: argparse.Namespace) -> int:
     from pipeline.read.verify import verify
 
     return verify(arguments.split, arguments.json)
-
-
-def _bench(arguments: argparse.Namespace) -> int:
-    from pipeline.bench import main as bench
-
-    return bench(arguments.bench)
 
 
 if __name__ == "__main__":

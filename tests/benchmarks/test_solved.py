@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
+from benchmarks import oracle
 from benchmarks.solved import __main__ as command
 from benchmarks.solved import original, plot, tables
 from benchmarks.solved.measure import measure, rows_there, work
@@ -21,7 +22,6 @@ from configs.convert import plain
 from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.labels import Label, Source
 from levelgen.task.actions import CHOICES
-from pipeline.bench import oracle
 from pipeline.errors import UserError
 
 SMALL = ExpertConfig(
@@ -120,8 +120,8 @@ def test_an_ablation_changes_one_thing() -> None:
 
 
 def test_the_reference_has_the_hyperparameters_of_its_users(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(oracle.HERE)
-    theirs = importlib.import_module("reference_experts")
+    monkeypatch.syspath_prepend(oracle.SCRIPTS)
+    theirs = importlib.import_module("ppo")
     names = {
         "WIDTH": "width",
         "EPOCHS": "epochs",

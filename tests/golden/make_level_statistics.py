@@ -3,7 +3,8 @@
 This script runs inside the reference's own environment and imports nothing of ours:
 
     python -m venv REF && REF/bin/pip install kinetix-env==3.0.2 "jax[cpu]"
-    REF/bin/python tests/golden/make_level_statistics.py tests/golden/level_statistics.npz
+    PYTHONPATH=benchmarks/reference REF/bin/python tests/golden/make_level_statistics.py \
+        tests/golden/level_statistics.npz
 
 It samples levels and writes, for each size and statistic of level_statistics.py, either the values and how often
 each occurs, or QUANTILES + 1 quantiles and the number of values. `--levels FILE` also keeps the levels themselves

@@ -1,4 +1,4 @@
-"""Level files opened by the reference, in its own environment (`reference_levels.py` runs there)."""
+"""Level files opened by the reference, in its own environment (`benchmarks/reference/levels.py` runs there)."""
 
 import subprocess
 from pathlib import Path
@@ -6,11 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks import oracle
 from levelgen.files.kinetix import Fields, level_from_kinetix
 from levelgen.level import Level
-from pipeline.bench import oracle
-
-ROOT = Path(__file__).parents[2]
 
 
 def handmade_levels(python: Path) -> Path:
@@ -39,10 +37,9 @@ class Played(NamedTuple):
 
 def open_in_reference(python: Path, files: list[Path], out: Path, steps: int = 0) -> Played:
     environment = dict(oracle.environment()) | {
-        "PYTHONPATH": str(ROOT / "pipeline" / "bench"),
         "JAX_COMPILATION_CACHE_DIR": str(oracle.cache_folder() / "reference-jax"),
     }
-    command = [python, ROOT / "tests" / "levelgen" / "reference_levels.py", out, str(steps), *files]
+    command = [python, oracle.SCRIPTS / "levels.py", out, str(steps), *files]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     with np.load(out) as arrays:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.reference.level_statistics import statistics
 from configs.compose import distributions
 from levelgen.files.kinetix import state_to_kinetix
 from levelgen.level import SIZES, WORLD_SIDE, Level, Role
@@ -23,7 +24,6 @@ from physics.pairs import pairs_of
 from physics.step import step
 from physics.types import FIXED_POLYGONS, Size
 from physics.vector import Vec
-from tests.golden.level_statistics import statistics
 from tests.golden.load import HERE, load
 
 COUNTS = {"s": 4096, "m": 4096, "l": 2048}  # levels

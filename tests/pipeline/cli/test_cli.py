@@ -15,7 +15,7 @@ import pytest
 from pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import ROOT, TINY, assert_refused, run
 
-COMMANDS = ("generate", "regenerate", "sample", "inspect", "show", "export", "status", "verify", "bench")
+COMMANDS = ("generate", "regenerate", "sample", "inspect", "show", "export", "status", "verify")
 
 
 @pytest.fixture(scope="module")

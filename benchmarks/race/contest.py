@@ -9,8 +9,8 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from typing import IO
 
-from pipeline.bench.oracle import tell
-from pipeline.bench.serve import MARK
+from benchmarks.oracle import tell
+from benchmarks.reference.serve import MARK
 from pipeline.errors import Failure
 
 

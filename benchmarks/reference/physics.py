@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false
-"""The reference's side of `levelproof bench physics`, inside its own environment.
+"""The reference's side of `python -m benchmarks physics`, inside its own environment.
 
 Env steps under given actions with automatic reset to the same level; the observation is not asked for, so XLA
 leaves it out. One run starts where the last one ended.
@@ -8,8 +8,8 @@ leaves it out. One run starts where the last one ended.
 import argparse
 
 import numpy as np
-from reference_world import load_levels, stay_on
 from serve import serve, timed
+from world import load_levels, stay_on
 
 
 def main() -> None:

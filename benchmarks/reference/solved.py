@@ -1,7 +1,7 @@
 # pyright: reportMissingImports=false
 """The reference's side of `python -m benchmarks.solved run --variant original`, inside its own environment.
 
-Trains and evaluates the experts of reference_experts.py. Answers requests (see serve.py):
+Trains and evaluates the experts of ppo.py. Answers requests (see serve.py):
     begin     fresh experts for the levels of the file `levels`, with their `level_id`
     update    one update of all of them
     evaluate  writes to the file `out` what training and then an evaluation showed, level axis first, and answers with
@@ -12,9 +12,9 @@ import argparse
 import time
 
 import numpy as np
-from reference_experts import programs
-from reference_world import load_levels, stay_on
+from ppo import programs
 from serve import answer
+from world import load_levels, stay_on
 
 
 def main() -> None:

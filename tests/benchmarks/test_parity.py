@@ -1,4 +1,4 @@
-"""`levelproof bench parity`: scenes, distances, causes and tables on golden states; a small campaign for real."""
+"""`python -m benchmarks parity`: scenes, distances, causes and tables on golden states; a small campaign for real."""
 
 import dataclasses
 import io
@@ -12,15 +12,16 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks import oracle
+from benchmarks.parity import causes, episodes, scenes
+from benchmarks.parity.campaign import SizeReport
+from benchmarks.parity.distance import distances, gap
+from benchmarks.parity.engines import Played, Stepped, play_ours, step_ours
+from benchmarks.parity.onestep import Pool, distinct, one_step, picked
+from benchmarks.parity.report import Report, tables
+from benchmarks.parity.worlds import BLOCK, blocks, contact_bodies, lanes_of, nudged
+from benchmarks.race.command import main
 from physics.types import FIXED_POLYGONS, Params
-from pipeline.bench import main, oracle
-from pipeline.bench.parity import causes, episodes, scenes
-from pipeline.bench.parity.campaign import SizeReport
-from pipeline.bench.parity.distance import distances, gap
-from pipeline.bench.parity.engines import Played, Stepped, play_ours, step_ours
-from pipeline.bench.parity.onestep import Pool, distinct, one_step, picked
-from pipeline.bench.parity.report import Report, tables
-from pipeline.bench.parity.worlds import BLOCK, blocks, contact_bodies, lanes_of, nudged
 from pipeline.errors import Exit, Failure, UserError
 from tests.golden.load import HERE, load
 
@@ -334,8 +335,8 @@ class TestReport:
 def test_a_small_campaign_for_real(reference, level_file, tmp_path) -> None:
     """As a user types it. Handmade levels, scenes, episodes: all that differs is rounding."""
     words = ["--size", "s", "--states", "120", "--episodes", "12", "--level-file", str(level_file), "--json"]
-    code = "import sys; from pipeline.cli.main import main; sys.exit(main())"
-    command = [sys.executable, "-c", code, "bench", "parity", *words]
+    code = "import sys; from benchmarks.race.command import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "parity", *words]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
     keep = ["--keep", str(tmp_path / "kept")]
     done = subprocess.run([*command, *keep], capture_output=True, text=True, cwd=ROOT, env=environment, check=False)

@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 
+from benchmarks.parity.causes import MOVES, is_broken, near_worlds, reached
+from benchmarks.parity.distance import MOTION, OFF, evolving_gaps, gap, largest
+from benchmarks.parity.engines import Played, Reference, env_step_ours, play_ours
+from benchmarks.parity.onestep import Pool
+from benchmarks.parity.scenes import movable
+from benchmarks.parity.worlds import BLOCK, lanes_of, nudged_tree, starting_in
 from levelgen.level import Level
 from physics.types import State
-from pipeline.bench.parity.causes import MOVES, is_broken, near_worlds, reached
-from pipeline.bench.parity.distance import MOTION, OFF, evolving_gaps, gap, largest
-from pipeline.bench.parity.engines import Played, Reference, env_step_ours, play_ours
-from pipeline.bench.parity.onestep import Pool
-from pipeline.bench.parity.scenes import movable
-from pipeline.bench.parity.worlds import BLOCK, lanes_of, nudged_tree, starting_in
 
 STEPS = 256  # env steps; by then every first episode has ended
 TARGETS = {"s": 0.97, "m": 0.95, "l": 0.9}  # share of the pairs with the same outcome

@@ -9,17 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import oracle
+from benchmarks.levels import load_levels
+from benchmarks.parity.engines import Reference
+from benchmarks.parity.episodes import STEPS, Block, Episodes, play_block, summed
+from benchmarks.parity.onestep import OneStep, Pool, distinct, one_step, picked, pool_of
+from benchmarks.parity.progress import Board
+from benchmarks.parity.scenes import SCENES
+from benchmarks.parity.worlds import blocks, joined, lanes_of
+from benchmarks.reference.actions import sticky_actions
 from levelgen.level import SIZES, Level, Role, name_of, size_of
 from levelgen.sampling.sampler import sample_levels
-from pipeline.bench import oracle
-from pipeline.bench.actions import sticky_actions
-from pipeline.bench.parity.engines import Reference
-from pipeline.bench.parity.episodes import STEPS, Block, Episodes, play_block, summed
-from pipeline.bench.parity.onestep import OneStep, Pool, distinct, one_step, picked, pool_of
-from pipeline.bench.parity.progress import Board
-from pipeline.bench.parity.scenes import SCENES
-from pipeline.bench.parity.worlds import blocks, joined, lanes_of
-from pipeline.bench.worlds import load_levels
 from pipeline.errors import UserError
 
 SAMPLED, HANDMADE = "sampled", "handmade"

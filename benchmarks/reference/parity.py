@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false
-"""The reference's side of `levelproof bench parity`, inside its own environment: it plays and steps given worlds.
+"""The reference's side of `python -m benchmarks parity`, inside its own environment: it plays and steps given worlds.
 
 Answers requests (see serve.py), each with the name of a file to write, `out`:
     handmade  the levels of that size that come with the reference
@@ -11,8 +11,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from reference_world import flatten, load_levels, static_of, stay_on
 from serve import answer
+from world import flatten, load_levels, static_of, stay_on
 
 BODIES, MANIFOLDS = ("polygon", "circle"), ("acc_rr_manifolds", "acc_cr_manifolds", "acc_cc_manifolds")
 EVOLVING = [f"{kind}/{x}" for kind in BODIES for x in ("position", "rotation", "velocity", "angular_velocity")]

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from benchmarks.parity.distance import CONTACT_IMPULSES, JOINT_IMPULSES, MOTION, OFF, evolving_gaps
+from benchmarks.parity.engines import Stepped
+from benchmarks.parity.worlds import BLOCK, contact_bodies, lanes_of, nudged_tree
 from levelgen.level import Level
 from physics.pairs import pairs_of
 from physics.types import State
-from pipeline.bench.parity.distance import CONTACT_IMPULSES, JOINT_IMPULSES, MOTION, OFF, evolving_gaps
-from pipeline.bench.parity.engines import Stepped
-from pipeline.bench.parity.worlds import BLOCK, contact_bodies, lanes_of, nudged_tree
 
 COPIES = BLOCK  # neighbours, the state itself first
 MOVES = (1, 4, 16)  # units in the last place

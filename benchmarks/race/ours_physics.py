@@ -1,10 +1,10 @@
-"""Our side of `levelproof bench physics`: one process, which steps blocks of lanes that stay in a core's cache."""
+"""Our side of `python -m benchmarks physics`: one process, which steps blocks of lanes that stay in a core's cache."""
 
 import argparse
 
 import numpy as np
 
-from pipeline.bench.serve import serve, timed
+from benchmarks.reference.serve import serve, timed
 from pipeline.runtime import prepare_jax
 
 
@@ -21,8 +21,8 @@ def main() -> None:
 
     import jax
 
+    from benchmarks.levels import load_levels
     from levelgen.task import rules as task
-    from pipeline.bench.worlds import load_levels
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
 

@@ -1,10 +1,10 @@
-"""Our side of `levelproof bench experts`: one process of it. Experts train as in `levelproof generate`."""
+"""Our side of `python -m benchmarks experts`: one process of it. Experts train as in `levelproof generate`."""
 
 import argparse
 
 import numpy as np
 
-from pipeline.bench.serve import serve, timed
+from benchmarks.reference.serve import serve, timed
 from pipeline.runtime import prepare_jax
 
 # What the reference's side does; ours may have other defaults.
@@ -36,13 +36,13 @@ def main() -> None:
 
     import jax
 
+    from benchmarks.endless import endless_queue, go_on
+    from benchmarks.levels import load_levels
     from experts.config import ExpertConfig
     from experts.pool import slot_count
     from experts.slots import Queue, Training, empty_slots
     from experts.witness import take
     from levelgen.task.rules import TaskParams
-    from pipeline.bench.endless import endless_queue, go_on
-    from pipeline.bench.worlds import load_levels
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
     # the reference's hyperparameters; no evaluation comes within the measured updates

@@ -1,4 +1,4 @@
-"""The words of `levelproof bench`, and what each bench starts."""
+"""The words of `python -m benchmarks`, and what each bench starts."""
 
 import argparse
 import os
@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-import pipeline
+import benchmarks
+from benchmarks import oracle
+from benchmarks.race.contest import Entry, compete
+from benchmarks.race.report import Result, summary, write_json, write_table
+from benchmarks.reference.actions import STICKINESS, sticky_actions
 from levelgen.level import size_of
 from physics.types import FIXED_POLYGONS
-from pipeline.bench import oracle
-from pipeline.bench.actions import STICKINESS, sticky_actions
-from pipeline.bench.contest import Entry, compete
-from pipeline.bench.report import Result, summary, write_json, write_table
 from pipeline.errors import Exit, UserError
 from pipeline.runtime import own_cores, prepare_jax
 
@@ -38,11 +38,11 @@ def main(argv: Sequence[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="levelproof bench",
+        prog="python -m benchmarks",
         description="Measure this program beside the reference (Kinetix 3.0.2) in the same run: same machine, levels "
         "and actions, in turns. The reference runs in an environment of its own, made on first use in the cache folder "
         f"(LEVELPROOF_CACHE_DIR); {oracle.PYTHON_VARIABLE} names a Python that has it already.",
-        epilog="example: levelproof bench physics --size s --json",
+        epilog="example: python -m benchmarks physics --size s --json",
     )
     benches = parser.add_subparsers(metavar="BENCH", required=True)
 
@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
             name,
             help=does,
             description=f"{does[0].upper()}{does[1:]}.",
-            epilog=f"example: levelproof bench {name} --size s",
+            epilog=f"example: python -m benchmarks {name} --size s",
         )
         sub.add_argument("--level-file", type=Path, help="levels as the reference's arrays (default: it samples some)")
         sub.add_argument("--json", action="store_true", help="print JSON")
@@ -116,9 +116,9 @@ def parity(given: argparse.Namespace) -> None:
     if given.level_file is not None and len(given.size) > 1:
         raise UserError("--level-file has levels of one size: give that one as --size.")
     prepare_jax()
-    from pipeline.bench.parity.campaign import campaign  # compiles functions as it is imported
-    from pipeline.bench.parity.progress import Board
-    from pipeline.bench.parity.report import Report
+    from benchmarks.parity.campaign import campaign  # compiles functions as it is imported
+    from benchmarks.parity.progress import Board
+    from benchmarks.parity.report import Report
 
     python = oracle.oracle_python()
     with Board(Console(stderr=True)).shown() as board:
@@ -150,8 +150,8 @@ def physics(given: argparse.Namespace) -> Result:
             ]
             return Entry(name, _words(commands), _environment(name), steps)
 
-        ours = [sys.executable, "-m", "pipeline.bench.ours_physics", "--block", given.block]
-        theirs = [python, oracle.HERE / "reference_physics.py", "--size", given.size]
+        ours = [sys.executable, "-m", "benchmarks.race.ours_physics", "--block", given.block]
+        theirs = [python, oracle.SCRIPTS / "physics.py", "--size", given.size]
         theirs += ["--block", given.reference_block or given.lanes]
         shared = share(given.lanes, cores)
         entries = [entry(OURS, ours, shared), entry(PINNED, theirs, shared)]
@@ -178,10 +178,10 @@ def experts(given: argparse.Namespace) -> Result:
         commands = [[*script, *shape, "--first", first, "--count", count, *_on(core)] for core, first, count in places]
         return Entry(name, _words(commands), _environment(name), steps)
 
-    theirs = [python, oracle.HERE / "reference_experts.py", "--size", given.size]
+    theirs = [python, oracle.SCRIPTS / "experts.py", "--size", given.size]
     shared = share(given.levels, cores)
     entries = [
-        entry(OURS, [sys.executable, "-m", "pipeline.bench.ours_experts"], shared),
+        entry(OURS, [sys.executable, "-m", "benchmarks.race.ours_experts"], shared),
         entry(PINNED, theirs, shared),
     ]
     if len(cores) > 1:
@@ -207,6 +207,6 @@ def _environment(name: str) -> dict[str, str]:
     """Of a contestant's processes. Ours finds the packages wherever they were imported from."""
     if name != OURS:
         return dict(oracle.environment())
-    root = str(Path(pipeline.__file__).parent.parent)
+    root = str(Path(benchmarks.__file__).parent.parent)
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
     return dict(os.environ) | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}

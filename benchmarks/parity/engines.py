@@ -15,6 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from benchmarks import oracle
+from benchmarks.parity.worlds import record_from_kinetix
+from benchmarks.race.contest import Process
 from levelgen.files.kinetix import MANIFOLDS, level_from_kinetix, state_from_kinetix, state_to_kinetix
 from levelgen.level import Level
 from levelgen.task import rules as task
@@ -22,9 +25,6 @@ from levelgen.task.actions import controls
 from levelgen.task.rules import TaskParams, TaskState
 from physics.step import step as physics_step
 from physics.types import Manifold, Params, State
-from pipeline.bench import oracle
-from pipeline.bench.contest import Process
-from pipeline.bench.parity.worlds import record_from_kinetix
 from pipeline.runtime import cache_folder
 
 RULES = TaskParams(dense_reward_scale=0.0)  # rewards are -1, 0 and 1
@@ -115,7 +115,7 @@ class Reference:
         cache = cache_folder() / "reference-jax"
         for folder in filter(None, (cache, keep)):
             folder.mkdir(parents=True, exist_ok=True)
-        command = [python, oracle.HERE / "reference_parity.py", "--size", size, "--cache", cache]
+        command = [python, oracle.SCRIPTS / "parity.py", "--size", size, "--cache", cache]
         with ExitStack() as stack, tempfile.TemporaryFile("w+") as errors, tempfile.TemporaryDirectory() as folder:
             process = Process([str(word) for word in command], oracle.environment(), stack, errors)
             yield Reference(size, process, Path(folder), keep)
@@ -178,7 +178,7 @@ def _fields(level: Level, start: State, actions: np.ndarray) -> dict[str, np.nda
 def _digest(request: dict[str, Any], fields: dict[str, np.ndarray]) -> str:
     """Of a question, and of the script that answers it."""
     text = hashlib.sha256(json.dumps(request).encode())
-    text.update((oracle.HERE / "reference_parity.py").read_bytes())
+    text.update((oracle.SCRIPTS / "parity.py").read_bytes())
     text.update("\n".join(oracle.REQUIREMENTS).encode())
     for name in sorted(fields):
         text.update(f"{name} {fields[name].dtype} {fields[name].shape}".encode())

@@ -10,7 +10,7 @@ from typing import IO, Any
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.bench.contest import Score
+from benchmarks.race.contest import Score
 from pipeline.runtime import own_cores
 from pipeline.store.provenance import device, versions
 

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from benchmarks.parity.engines import Stepped
+from benchmarks.parity.worlds import contact_bodies
 from levelgen.level import Level
 from physics.types import State
-from pipeline.bench.parity.engines import Stepped
-from pipeline.bench.parity.worlds import contact_bodies
 
 OFF = 1e-3  # a state with a larger difference is looked into
 MOTION = ("position", "rotation", "velocity", "angular_velocity")

@@ -8,12 +8,12 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
+from benchmarks.parity.causes import Step, find_cause
+from benchmarks.parity.distance import OFF, UNITS, Distances, distances
+from benchmarks.parity.engines import RULES, Stepped, step_ours
+from benchmarks.parity.worlds import blocks, joined, lanes_of, starting_in
 from levelgen.level import Level
 from physics.types import State
-from pipeline.bench.parity.causes import Step, find_cause
-from pipeline.bench.parity.distance import OFF, UNITS, Distances, distances
-from pipeline.bench.parity.engines import RULES, Stepped, step_ours
-from pipeline.bench.parity.worlds import blocks, joined, lanes_of, starting_in
 
 LIMITS = (1e-6, 1e-5, 1e-4, 1e-3)
 DEFECT_OFF = (1e-4, 1e-2)

@@ -1,18 +1,14 @@
 # pyright: reportMissingImports=false
-"""The reference's side of `levelproof bench experts`, inside its own environment.
+"""The PPO that the reference's users would write today, inside the reference's own environment.
 
-The PPO that its users would write today: one agent per level, in the manner of PureJaxRL, vmapped over levels, with
-our experts' network and hyperparameters. One run trains fresh experts for a number of updates. What these experts
-solve is measured by reference_solved.py, with the same programs.
+One agent per level, in the manner of PureJaxRL, with our experts' network; to be vmapped over levels.
 """
 
-import argparse
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from reference_world import load_levels, static_of, stay_on
-from serve import serve, timed
+from world import static_of
 
 CHOICES = (3, 3, 3, 3, 2, 2)
 WIDTH = 64
@@ -21,48 +17,6 @@ RATE, ADAM_EPSILON, MAX_NORM = 3e-4, 1e-5, 1.0
 DISCOUNT, LAMBDA, CLIP = 0.995, 0.9, 0.2
 VALUE_WEIGHT, ENTROPY_WEIGHT = 0.5, 0.01
 DENSE_REWARD = 0.2
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--levels", required=True, help="file of levels")
-    parser.add_argument("--size", required=True)
-    parser.add_argument("--first", type=int, required=True, help="first level of this process")
-    parser.add_argument("--count", type=int, required=True, help="levels of this process")
-    parser.add_argument("--environments", type=int, required=True)
-    parser.add_argument("--horizon", type=int, required=True)
-    parser.add_argument("--updates", type=int, required=True)
-    parser.add_argument("--core", type=int)
-    given = parser.parse_args()
-    stay_on(given.core)
-
-    import jax
-
-    levels = load_levels(given.levels, given.size, given.first, given.count)
-    start, update, _ = programs(given.size, given.environments, given.horizon)
-    keys = jax.random.split(jax.random.PRNGKey(given.first), given.count)
-
-    def compile_both():
-        first = jax.jit(jax.vmap(start)).lower(keys, levels).compile()
-        return first, jax.jit(jax.vmap(update)).lower(first(keys, levels), levels).compile()
-
-    seconds, (first, compiled) = timed(compile_both)
-    jax.block_until_ready(compiled(first(keys, levels), levels))  # the first run touches memory
-
-    def train():
-        learner, ends = first(keys, levels), []
-        for _ in range(given.updates):
-            learner, seen = compiled(learner, levels)
-            ends.append(seen)
-        return jax.block_until_ready((learner, ends))
-
-    def run() -> dict:
-        seconds, (learner, ends) = timed(train)
-        done, goal = (sum(float(end[k].sum()) for end in ends) for k in (0, 1))
-        finite = all(bool(np.isfinite(np.asarray(x)).all()) for x in jax.tree.leaves(learner.params))
-        return {"seconds": seconds, "done": done, "goal": goal, "finite": finite}
-
-    serve({"compile_seconds": seconds}, run)
 
 
 class Learner(NamedTuple):
@@ -213,7 +167,3 @@ def programs(size: str, environments: int, horizon: int) -> Programs:
         return jax.lax.scan(act, (worlds, observation), jax.random.split(of_steps, steps))[1]
 
     return Programs(start, update, evaluate)
-
-
-if __name__ == "__main__":
-    main()

@@ -11,9 +11,9 @@ from typing import IO, Any
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.bench.parity.campaign import SizeReport
-from pipeline.bench.parity.episodes import FIRST_OFF, NOT_EXPLAINED
-from pipeline.bench.parity.onestep import DEFECT_OFF, LIMITS
+from benchmarks.parity.campaign import SizeReport
+from benchmarks.parity.episodes import FIRST_OFF, NOT_EXPLAINED
+from benchmarks.parity.onestep import DEFECT_OFF, LIMITS
 from pipeline.errors import Failure
 from pipeline.store.provenance import device, versions
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import oracle
+from benchmarks.levels import load_levels
+from benchmarks.race.command import OURS, main, share
+from benchmarks.race.contest import Entry, Score, compete
+from benchmarks.race.report import summary, write_json, write_table
+from benchmarks.reference.actions import sticky_actions
 from levelgen.task.actions import CHOICES
-from pipeline.bench import main, oracle
-from pipeline.bench.actions import sticky_actions
-from pipeline.bench.command import OURS, share
-from pipeline.bench.contest import Entry, Score, compete
-from pipeline.bench.report import summary, write_json, write_table
-from pipeline.bench.worlds import load_levels
 from pipeline.errors import Exit, Failure, UserError
 from pipeline.runtime import own_cores
 
@@ -85,7 +85,7 @@ class TestArithmetic:
 class TestProcesses:
     """Real processes that speak the protocol of `serve`."""
 
-    HEAD = "from pipeline.bench.serve import serve\n"
+    HEAD = "from benchmarks.reference.serve import serve\n"
 
     @staticmethod
     def entry(name: str, *programs: str) -> Entry:
@@ -177,8 +177,8 @@ class TestInput:
 def test_a_tiny_bench_for_real(reference, level_file, words) -> None:
     """As a user types it, on one core where the system can, so that the reference has one way to run."""
     pin = f"hasattr(os, 'sched_setaffinity') and os.sched_setaffinity(0, {{{own_cores()[0]}}})"
-    code = f"import os, sys; {pin}; from pipeline.cli.main import main; sys.exit(main())"
-    command = [sys.executable, "-c", code, "bench", *words, "--repeats", "2", "--level-file", str(level_file), "--json"]
+    code = f"import os, sys; {pin}; from benchmarks.race.command import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, *words, "--repeats", "2", "--level-file", str(level_file), "--json"]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
     assert done.returncode == Exit.DONE, done.stderr

@@ -16,7 +16,7 @@ PYTHON_VARIABLE = "LEVELPROOF_ORACLE_PYTHON"  # a Python that has the reference 
 REQUIREMENTS = ("kinetix-env==3.0.2", "jax2d==1.0.1", "jax[cpu]==0.9.0")
 LEVELS = 1024  # sampled per size and kept; more lanes go round
 SEED = 0
-HERE = Path(__file__).parent
+SCRIPTS = Path(__file__).parent / "reference"
 
 
 def oracle_python() -> Path:
@@ -48,7 +48,7 @@ def sampled_levels(python: Path, size: str) -> Path:
             path.parent.mkdir(parents=True, exist_ok=True)
             unfinished = path.with_name(f"unfinished-{path.name}")
             words = [unfinished, "--size", size, "--count", LEVELS, "--seed", SEED]
-            _run([python, HERE / "reference_world.py", *words], "sample levels with the reference")
+            _run([python, SCRIPTS / "world.py", *words], "sample levels with the reference")
             unfinished.replace(path)
     return path
 

@@ -1,7 +1,7 @@
 # pyright: reportMissingImports=false
 """The reference opens level files and plays them. Runs inside its own environment; of ours, only `flatten`.
 
-    python tests/levelgen/reference_levels.py OUT.npz STEPS FILE...
+    python benchmarks/reference/levels.py OUT.npz STEPS FILE...
 
 The files are of one size. OUT has, by the reference's own names: `state/NAME` (STEPS + 1, level, ...), the states
 before each action and the last one; `action`, `reward`, `done` and `goal` (STEPS, level, ...), of sticky random
@@ -16,7 +16,7 @@ import numpy as np
 from kinetix.environment.env import make_kinetix_env
 from kinetix.environment.spaces import ActionType, ObservationType
 from kinetix.util.saving import load_from_json_file
-from reference_world import flatten
+from world import flatten
 
 CHOICES = np.array([3, 3, 3, 3, 2, 2])
 STICKINESS = 0.9  # chance that an action entry stays as it was

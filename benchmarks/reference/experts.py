@@ -1,0 +1,58 @@
+# pyright: reportMissingImports=false
+"""The reference's side of `python -m benchmarks experts`, inside its own environment.
+
+One run trains fresh experts (ppo.py) for a number of updates. What they solve is measured by solved.py.
+"""
+
+import argparse
+
+import numpy as np
+from ppo import programs
+from serve import serve, timed
+from world import load_levels, stay_on
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--levels", required=True, help="file of levels")
+    parser.add_argument("--size", required=True)
+    parser.add_argument("--first", type=int, required=True, help="first level of this process")
+    parser.add_argument("--count", type=int, required=True, help="levels of this process")
+    parser.add_argument("--environments", type=int, required=True)
+    parser.add_argument("--horizon", type=int, required=True)
+    parser.add_argument("--updates", type=int, required=True)
+    parser.add_argument("--core", type=int)
+    given = parser.parse_args()
+    stay_on(given.core)
+
+    import jax
+
+    levels = load_levels(given.levels, given.size, given.first, given.count)
+    start, update, _ = programs(given.size, given.environments, given.horizon)
+    keys = jax.random.split(jax.random.PRNGKey(given.first), given.count)
+
+    def compile_both():
+        first = jax.jit(jax.vmap(start)).lower(keys, levels).compile()
+        return first, jax.jit(jax.vmap(update)).lower(first(keys, levels), levels).compile()
+
+    seconds, (first, compiled) = timed(compile_both)
+    jax.block_until_ready(compiled(first(keys, levels), levels))  # the first run touches memory
+
+    def train():
+        learner, ends = first(keys, levels), []
+        for _ in range(given.updates):
+            learner, seen = compiled(learner, levels)
+            ends.append(seen)
+        return jax.block_until_ready((learner, ends))
+
+    def run() -> dict:
+        seconds, (learner, ends) = timed(train)
+        done, goal = (sum(float(end[k].sum()) for end in ends) for k in (0, 1))
+        finite = all(bool(np.isfinite(np.asarray(x)).all()) for x in jax.tree.leaves(learner.params))
+        return {"seconds": seconds, "done": done, "goal": goal, "finite": finite}
+
+    serve({"compile_seconds": seconds}, run)
+
+
+if __name__ == "__main__":
+    main()
