@@ -66,7 +66,6 @@ def trivial_reason(steps: int) -> str:
 ARGUMENTS = {
     Proof.NOTHING_ACTS: "no action has an effect",
     Proof.GOAL_STANDS: "no green and blue body that could touch ever move",
-    Proof.OUT_OF_REACH: "what acts cannot reach anything that moves",
 }
 
 

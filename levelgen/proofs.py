@@ -11,12 +11,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from levelgen.arms import Arms, driven, find_arms, still, within_reach
 from levelgen.level import ACTIONS, Level, Role
-from levelgen.task.rules import TaskParams, TaskState, advance_seen, has_nan, has_roles, reset
-from physics.pairs import PairKind, pairs_of
+from levelgen.task.rules import TaskParams, TaskState, advance, has_nan, has_roles, reset
+from physics.manifold import may_touch
+from physics.pairs import pairs_of
 from physics.types import Model, Params
 from physics.vector import rows
 
@@ -29,7 +30,6 @@ class Proof(IntEnum):
     NONE = 0  # it may: nothing is known
     NOTHING_ACTS = 1  # no actuator can change any velocity
     GOAL_STANDS = 2  # whether green touches blue is the same at every step
-    OUT_OF_REACH = 3  # what acts are arms, and all that moves stays out of their reach
 
 
 class Facts(NamedTuple):
@@ -41,59 +41,65 @@ class Facts(NamedTuple):
 
 
 class Idle(NamedTuple):
-    """Doing nothing, so far. At most one of the first four holds, from when it happened on."""
+    """Doing nothing, so far. At most one holds, from when it happened on."""
 
     reaches: Bool[Array, " lane"]
     fails: Bool[Array, " lane"]
     lasts: Bool[Array, " lane"]  # the time limit came first
     breaks: Bool[Array, " lane"]  # the world broke down first
-    disturbed: Bool[Array, " lane"]  # an arm could have had an effect before that
 
 
 @partial(jax.jit, static_argnames=("rules", "env_steps"))
 def examine(level: Level, rules: TaskParams, env_steps: int) -> Facts:
     """The facts, from watching `env_steps` env steps; an episode that lasts longer proves nothing."""
-    arms = find_arms(level, rules.physics)
-    idle = stay_idle(level, arms, rules, env_steps)
+    idle = stay_idle(level, rules, env_steps)
     proof = jnp.select(
-        [~driven(level).any(0), goal_stands(level, rules.physics), arms.known & ~idle.disturbed],
-        [int(kind) for kind in (Proof.NOTHING_ACTS, Proof.GOAL_STANDS, Proof.OUT_OF_REACH)],
+        [~driven(level).any(0), goal_stands(level, rules.physics)],
+        [int(kind) for kind in (Proof.NOTHING_ACTS, Proof.GOAL_STANDS)],
         int(Proof.NONE),
     )
     sound = moderate(level, rules.physics) & (idle.fails | idle.lasts)
     return Facts(idle.reaches, idle.fails, jnp.where(sound, proof, int(Proof.NONE)))
 
 
-def stay_idle(level: Level, arms: Arms, rules: TaskParams, env_steps: int) -> Idle:
-    """Do nothing, physics step by physics step: what happens is what happens to it in env steps."""
-    lanes, skip = level.role.shape[-1], rules.frame_skip
-    frame = replace(rules, frame_skip=1, max_timesteps=rules.max_timesteps * skip, dense_reward_scale=0.0)
+def stay_idle(level: Level, rules: TaskParams, env_steps: int) -> Idle:
+    """Do nothing until the first episode ends."""
+    lanes = level.role.shape[-1]
+    sparse = replace(rules, dense_reward_scale=0.0)
     nothing = jnp.zeros((ACTIONS, lanes), jnp.int32)
 
-    def act(carry: tuple[TaskState, Idle], _) -> tuple[tuple[TaskState, Idle], None]:
+    def act(carry: tuple[TaskState, Idle], _: None) -> tuple[tuple[TaskState, Idle], None]:
         now, so_far = carry
-        after, outcome, _ = advance_seen(level, now, nothing, frame)
+        after, result = advance(level, now, nothing, sparse)
         going = ~(so_far.reaches | so_far.fails | so_far.lasts | so_far.breaks)
-        broken = has_nan(after.state)
-        mixed = (after.state.contact_active & arms.mixing).any(0)
+        broken, neither = has_nan(after.state), result.reward == 0
         happened = Idle(
-            reaches=outcome.goal,
-            fails=outcome.reward < 0,
-            lasts=outcome.done & (outcome.reward == 0) & ~broken,
-            breaks=broken & (outcome.reward == 0),
-            disturbed=within_reach(arms, level.model, now.state) | mixed,
+            reaches=result.goal,
+            fails=result.reward < 0,
+            lasts=result.done & neither & ~broken,
+            breaks=broken & neither,
         )
         return (after, Idle(*(old | (new & going) for old, new in zip(so_far, happened, strict=True)))), None
 
     start = reset(level), Idle(*jnp.zeros((len(Idle._fields), lanes), bool))
-    return jax.lax.scan(act, start, length=env_steps * skip)[0][1]
+    return jax.lax.scan(act, start, length=env_steps)[0][1]
 
 
-def moderate(level: Level, params: Params) -> Bool[Array, " lane"]:
-    """Whether every number of a level and of the engine is one, and no larger than LARGEST."""
-    floats = [x for x in jax.tree.leaves((level.model, level.state)) if x.dtype == jnp.float32]
-    small = [(jnp.abs(x) <= LARGEST).all(tuple(range(x.ndim - 1))) for x in floats]
-    return jnp.stack(small).all(0) & all(abs(x) <= LARGEST for x in astuple(params))
+def driven(level: Level) -> Bool[Array, "body lane"]:
+    """Bodies whose velocity an action can change: ends of a joint whose motor obeys, carriers of a thruster."""
+    model, number = level.model, jnp.arange(level.size.bodies)[:, None]
+    of = lambda index: (index[:, None] == number) & model.active  # [thing, body, lane], one-hot
+    a, b = of(model.joint_a), of(model.joint_b)
+    holds = model.joint_active & a.any(1) & b.any(1)
+    obeys = holds & ~model.joint_fixed & model.motor_on & ~level.motor_auto & (model.motor_power != 0)
+    pushes = model.thruster_active & (model.thruster_power != 0)
+    acts = ((a | b) & obeys[:, None]).any(0) | (of(model.thruster_body) & pushes[:, None]).any(0)
+    return acts & ~immovable(model)
+
+
+def immovable(model: Model) -> Bool[Array, "body lane"]:
+    """Bodies that no impulse moves."""
+    return (model.inverse_mass == 0) & (model.inverse_inertia == 0)
 
 
 def goal_stands(level: Level, params: Params) -> Bool[Array, " lane"]:
@@ -101,13 +107,21 @@ def goal_stands(level: Level, params: Params) -> Bool[Array, " lane"]:
     moves, found = ~still(level, params), []
     pairs = pairs_of(level.size)
     for pair in (pairs.polygon, pairs.circle_polygon, pairs.circle):
-        goal = has_roles(level, pair.a, pair.b, Role.GREEN, Role.BLUE) & may_touch(level.model, pair)
+        a, b = np.array(pair.a, int), np.array(pair.b, int)
+        goal = has_roles(level, pair.a, pair.b, Role.GREEN, Role.BLUE) & may_touch(level.model, a, b)
         found.append((goal & (rows(moves, pair.a) | rows(moves, pair.b))).any(0))
     return ~jnp.stack(found).any(0)
 
 
-def may_touch(model: Model, pair: PairKind) -> Bool[Array, "pair lane"]:
-    """Both bodies are active and their collision modes allow it, as in `physics.manifold`."""
-    mode_a, mode_b = rows(model.collision_mode, pair.a), rows(model.collision_mode, pair.b)
-    modes = (mode_a == 2) | (mode_b == 2) | (mode_a * mode_b > 0)
-    return modes & rows(model.active, pair.a) & rows(model.active, pair.b)
+def still(level: Level, params: Params) -> Bool[Array, "body lane"]:
+    """Bodies that stay where they are, whatever happens."""
+    state = level.state
+    rests = (state.velocity == 0).all(1) & (state.angular_velocity == 0)
+    return immovable(level.model) & rests & (jnp.abs(state.position) <= params.max_position).all(1)
+
+
+def moderate(level: Level, params: Params) -> Bool[Array, " lane"]:
+    """Whether every number of a level and of the engine is one, and no larger than LARGEST."""
+    floats = [x for x in jax.tree.leaves((level.model, level.state)) if x.dtype == jnp.float32]
+    small = [(jnp.abs(x) <= LARGEST).all(tuple(range(x.ndim - 1))) for x in floats]
+    return jnp.stack(small).all(0) & all(abs(x) <= LARGEST for x in astuple(params))

@@ -1,4 +1,4 @@
-"""Area, centroid and moment of inertia of polygons and circles, per unit of density.
+"""Area and moment of inertia of polygons and circles, per unit of density.
 
 As Jax2D 1.0.1 computes them (`jax2d.engine`: calc_inverse_mass_polygon, calc_inverse_inertia_polygon and their
 likes for circles). It deviates from the textbook in three places, kept because masses are part of its results: the
@@ -24,12 +24,6 @@ def polygon_area(vertices: Vertices, n_vertices: Int[Array, "polygon lane"]) -> 
         a, b = (vec(vertices[:, i] - vertices[:, 0]) for i in (k, k + 1))
         area += jnp.where(k < n_vertices - 1, jnp.abs(a.cross(b)) / 2, 0.0)
     return area
-
-
-def polygon_centroid(vertices: Vertices, n_vertices: Int[Array, "polygon lane"]) -> Float[Array, "polygon 2 lane"]:
-    """m, the mean of the vertices in use."""
-    used = jnp.arange(MAX_VERTICES)[:, None] < n_vertices[:, None]
-    return jnp.where(used[:, :, None], vertices, 0.0).sum(1) / n_vertices[:, None]
 
 
 def polygon_inertia(vertices: Vertices, n_vertices: Int[Array, "polygon lane"]) -> Float[Array, "polygon lane"]:

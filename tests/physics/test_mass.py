@@ -10,7 +10,6 @@ from physics.mass import (
     circle_inertia,
     inverse,
     polygon_area,
-    polygon_centroid,
     polygon_inertia,
 )
 from physics.types import FIXED_POLYGONS
@@ -53,13 +52,11 @@ def test_rectangle(half_width: float, half_height: float) -> None:
     mass = 4 * half_width * half_height
     np.testing.assert_allclose(polygon_area(vertices, four), mass, rtol=1e-5)
     np.testing.assert_allclose(polygon_inertia(vertices, four), mass * (half_width**2 + half_height**2) / 3, rtol=1e-5)
-    np.testing.assert_allclose(polygon_centroid(vertices, four), 0, atol=1e-6)
 
 
 def test_triangle() -> None:
     vertices, three = one([(0, 2), (3, 0), (0, 0)])
     np.testing.assert_allclose(polygon_area(vertices, three), 3)
-    np.testing.assert_allclose(polygon_centroid(vertices, three)[0, :, 0], [1, 2 / 3], rtol=1e-6)
 
 
 def test_a_circle_has_half_the_inertia_of_a_disc() -> None:
