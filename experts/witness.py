@@ -31,7 +31,7 @@ T = TypeVar("T")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Record:
-    """What happened in 256 steps; time first, level last. Numpy arrays on the host."""
+    """What happened in 256 env steps with automatic reset: numpy arrays, time first, level last; SI units."""
 
     state: State  # [256, ..., level]: before each action
     manifold: Manifold  # [256, contact, ..., level]: of the physics step that led there; zero at an episode's start
@@ -46,9 +46,14 @@ class Record:
 
 
 def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -> Record:
-    """The record of these actions [256, 6, level], on the host.
+    """What happens in 256 env steps under these actions, as numpy arrays.
 
     The same bits on the same machine and versions, at any count of levels.
+
+    Args:
+        level: levels, level axis last.
+        action: int [256, 6, level], multi-discrete: one entry a binding (`levelgen.task.actions`).
+        rules: of the task.
     """
     level = jax.tree.map(np.asarray, level)
     actions = np.asarray(action, np.int32)

@@ -36,7 +36,10 @@ class Role(IntEnum):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Level:
-    """An initial world. `model` and `state` are the engine's, the rest is what the task adds."""
+    """An immutable initial world, or many: the level axis is the last of every array (`lane`).
+
+    `model` (what is constant) and `state` (what evolves) are the engine's, the rest is what the task adds.
+    """
 
     model: Model
     state: State

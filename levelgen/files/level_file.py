@@ -55,14 +55,14 @@ PATHS = {  # where levelgen.files.kinetix has what a file keeps with a thing
 
 @dataclass(frozen=True)
 class LevelFile:
-    """What a level file says."""
+    """What a level file says: one level and the rules it is played by."""
 
-    level: Level  # one lane, on the host
+    level: Level  # one lane, numpy arrays
     rules: TaskParams
 
 
 def read_level_file(path: Path) -> LevelFile:
-    """The level in a file.
+    """The level in a file that Kinetix or its editor wrote, or `write_level_file`.
 
     Raises:
         LevelFileError: there is no such file, or it has no level that can be used.
@@ -82,10 +82,11 @@ def read_level_file(path: Path) -> LevelFile:
 
 
 def write_level_file(file: LevelFile, path: Path) -> None:
-    """Write a level as the reference does.
+    """Write a level as JSON that Kinetix and its editor open; the file appears whole or not at all.
 
     Raises:
-        LevelFileError: such a file cannot hold the level.
+        LevelFileError: such a file cannot hold the level: it is not one lane, or starts with contacts, or has motors
+            that run by themselves.
         OSError: it cannot be written.
     """
     text = json.dumps(to_document(file)) + "\n"

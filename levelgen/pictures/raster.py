@@ -47,7 +47,16 @@ def draw(
     caption: Caption | None = None,
     pixels: int = PIXELS,
 ) -> Image.Image:
-    """The picture of `scene_of`."""
+    """A picture of one level in a state, for people.
+
+    Args:
+        level: the level, or many of them (level axis last).
+        state: bodies where they are, one lane for each of the levels; `level.state` for the start.
+        index: the lane to draw.
+        action: multi-discrete, one entry a binding: shown as pressed keys, flames and arrows; None: not shown.
+        caption: words above the world.
+        pixels: width of the picture; its height follows.
+    """
     return rasterised(scene_of(level, state, index, action, caption), pixels)
 
 

@@ -65,10 +65,15 @@ class Plan(NamedTuple):
 
 
 def sample_levels(level_ids: Int[Array, " level"], size: Size, distribution: Distribution = DEFAULT) -> Level:
-    """The levels with these ids, level axis last.
+    """The levels with these ids, as float32 and int32 arrays in SI units, level axis last.
 
     A level depends on its id, the size, `identity.SAMPLER_VERSION` and the distribution alone: whatever the number
     of ids, they go through one compiled program in blocks of BLOCK. So call it outside `jax.jit`.
+
+    Args:
+        level_ids: whole numbers from 0 to MAX_LEVEL_ID, in any order.
+        size: how many things a level has room for: one of SIZES, or a Size of your own.
+        distribution: what random levels are like.
 
     Raises:
         ValueError: the size has no room for the scenery, a green and a blue body; an id is not 0 .. MAX_LEVEL_ID.

@@ -124,7 +124,7 @@ class Manifest:
 
 
 def read_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest:
-    """The manifest of a split, empty where nothing is committed yet.
+    """The manifest of a split, one row for each level that was tried; empty where nothing is committed yet.
 
     Args:
         split: the folder `{out}/{budget}/{size}`.

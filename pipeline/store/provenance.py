@@ -2,20 +2,21 @@
 
 import functools
 import platform
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 
 from levelgen.identity.keys import SAMPLER_VERSION
+from pipeline.version import __version__
 
 
 @functools.cache
 def versions() -> dict[str, str | int]:
     """The manifest's `versions`."""
     return {
-        "levelproof": _version("levelproof"),
+        "levelproof": __version__,
         "python": platform.python_version(),
-        "jax": _version("jax"),
-        "jaxlib": _version("jaxlib"),
+        "jax": version("jax"),
+        "jaxlib": version("jaxlib"),
         "sampler": SAMPLER_VERSION,
     }
 
@@ -27,13 +28,6 @@ def device() -> str:
 
     first = jax.devices()[0]
     return f"{first.platform}: {_processor() if first.platform == 'cpu' else first.device_kind}"
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:  # run from a checkout that was not installed
-        return "uninstalled"
 
 
 def _processor() -> str:

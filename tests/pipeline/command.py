@@ -15,7 +15,7 @@ TINY = ("levels=4", "unit=1", "budget=5k")  # four real units with two updates e
 
 
 def start(
-    arguments: Sequence[str], cwd: Path, address: str = "", module: str = "pipeline.cli.main", **options: Any
+    arguments: Sequence[str], cwd: Path, address: str = "", module: str = "levelproof", **options: Any
 ) -> subprocess.Popen[str]:
     """Start it in a process group of its own, so that Ctrl-C can be sent as a terminal sends it: to the whole group.
 

@@ -1,0 +1,8 @@
+"""The version of this program, as it is installed."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("levelproof")
+except PackageNotFoundError:  # run from a checkout that was not installed
+    __version__ = "uninstalled"

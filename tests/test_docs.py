@@ -1,0 +1,49 @@
+"""Every Python block of the README and the docs runs as it stands, and imports of ours the one door."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.read.export import export
+from pipeline.store.manifest import read_manifest
+from tests.pipeline.made import played_split
+
+ROOT = Path(__file__).parent.parent
+INSIDE = {"physics", "levelgen", "experts", "configs", "pipeline", "benchmarks", "tests"}
+
+
+def blocks(page: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
+PAGES = [page for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))] if blocks(page)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a reader is who has typed the commands: the README's split, and a level of it as a file."""
+    folder = tmp_path_factory.mktemp("reader")
+    split = played_split(folder / "data")
+    assert split == folder / "data/128k/s"
+    export(split, int(read_manifest(split).level_ids[0]), folder / "level.json")
+    return folder
+
+
+def test_the_readme_has_python() -> None:
+    assert PAGES[0].name == "README.md"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_a_page_s_python_runs_from_top_to_bottom(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    exec(compile("\n".join(blocks(page)), str(page), "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_a_page_imports_of_ours_the_door_alone(page: Path) -> None:
+    nodes = list(ast.walk(ast.parse("\n".join(blocks(page)))))
+    modules = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    modules += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+    assert not {module.partition(".")[0] for module in modules} & INSIDE
