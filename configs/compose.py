@@ -16,7 +16,8 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from configs.convert import ConfigError, flat, plain, suggestion, typed
+from configs.convert import flat, plain, typed
+from configs.errors import ConfigError, suggestion
 from configs.schema import JobConfig, hash_of
 from experts.config import ExpertConfig, StopConfig
 from levelgen.sampling.distribution import Distribution

@@ -5,24 +5,15 @@ Every value is checked against the dataclass's annotations, ranges by its own `_
 """
 
 import dataclasses
-import difflib
 import math
 import types
 from collections.abc import Iterable, Mapping
 from enum import Enum
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from configs.errors import ConfigError, suggestion
+
 T = TypeVar("T")
-
-
-class ConfigError(ValueError):
-    """A setting is wrong; the message is one sentence that names it."""
-
-
-def suggestion(word: str, known: Iterable[str]) -> str:
-    """`' (did you mean x?)'` for the closest of `known`, else `''`."""
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return f" (did you mean {close[0]}?)" if close else ""
 
 
 def typed(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:

@@ -5,7 +5,8 @@ import json
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
-from configs.convert import ConfigError, plain
+from configs.convert import plain
+from configs.errors import ConfigError
 from configs.numbers import parse_count
 from experts.config import ExpertConfig, StopConfig
 from levelgen.identity.keys import SAMPLER_VERSION

@@ -17,7 +17,8 @@ from benchmarks.document import between_marks
 from benchmarks.solved import measure, original, plot, tables
 from benchmarks.solved.results import Header, count, read_all
 from benchmarks.solved.variants import VARIANTS
-from configs.convert import ConfigError, plain
+from configs.convert import plain
+from configs.errors import ConfigError
 from configs.numbers import parse_count
 from levelgen.level import size_of
 from pipeline.errors import Exit, LevelproofError, UserError

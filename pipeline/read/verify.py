@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from configs.convert import ConfigError, typed
+from configs.convert import typed
+from configs.errors import ConfigError
 from experts.labels import WITNESSED, Label
 from experts.witness import Record, replay, steps_to_goal, succeeds
 from levelgen.level import Level

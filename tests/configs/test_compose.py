@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from configs.compose import again, compose_job, distributions, identified, listing
-from configs.convert import ConfigError, flat
+from configs.convert import flat
+from configs.errors import ConfigError
 from configs.schema import WITHOUT_EFFECT
 from experts.config import ExpertConfig
 from levelgen.sampling.distribution import Distribution

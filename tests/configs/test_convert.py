@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from configs.convert import ConfigError, flat, plain, suggestion, typed
+from configs.convert import flat, plain, typed
+from configs.errors import ConfigError, suggestion
 
 
 class Colour(Enum):

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from configs.convert import ConfigError
+from configs.errors import ConfigError
 from configs.numbers import LARGEST, parse_count
 
 
