@@ -1,152 +1,33 @@
-"""What a level consists of, however its things are numbered and named: a canonical form, and its hash.
+"""What a level consists of, and a hash of it that does not depend on how its things are numbered and named.
 
-Levels of the same content have the same hash. What counts as content and what does not: docs/levels.md, Identity.
-Numpy on the host.
-
-A level is a graph: bodies with their own numbers, held together by joints. Sorted by their own numbers, bodies have
-an order that no numbering changes, so the form can be written down at once. Only exact copies of a body (at one
-place, with one motion) remain tied. Colour refinement tells them apart by what is joined to them, and where it cannot,
-each of the tied is tried as the first and the least of the forms counts. That may take as many tries as there are
-ways to exchange the copies: beyond MOST_FORMS the refined colours are hashed, tied as they are.
+What counts as content and what does not: docs/levels.md, Identity. Levels with the same hash have the same content,
+but for the chance of 128 bits. Levels with the same content have the same hash, unless they have exact copies of a
+body, at one position with one motion, that are joined alike as well: their hash may depend on how the copies are
+numbered. No sampled and no handmade level has such copies. Numpy on the host.
 """
 
 import hashlib
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import islice, pairwise
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from levelgen.identity.form import NO_ENTRY, Push, Side, World, canonical_form
 from levelgen.level import Level
 from physics.types import FIXED_POLYGONS, MAX_VERTICES
 
 VERSION = 1  # of the form; hashes of different versions never compare equal
 DIGITS = 32  # of a hash, hexadecimal: 128 bits
-MOST_FORMS = 120  # tried for one level
-EXACT, TIED = b"exact", b"tied"
-NOBODY = -1  # in place of a neighbour's colour
-NO_ENTRY = -1
-
-
-class Side(NamedTuple):
-    """A joint that acts, as seen from one of its two bodies."""
-
-    first: int
-    second: int
-    row: bytes  # numbers, turned around where it is seen from b
-    direction: int  # that the entry's forward turns it in: 1, -1, or 0 where that makes no difference
-    entry: int  # of the action, that the motor obeys
-
-
-class Push(NamedTuple):
-    """A thruster that acts."""
-
-    body: int
-    row: bytes
-    entry: int
-
-
-@dataclass(frozen=True)
-class World:
-    """The content of one level, bodies numbered at will."""
-
-    gravity: bytes
-    bodies: list[bytes]  # own numbers of each active body
-    joints: list[tuple[Side, Side]]
-    pushes: list[Push]
-    apart: list[tuple[int, int]]  # bodies that do not collide
 
 
 def content_hashes(level: Level) -> list[str]:
     """A hash for each level, such as `c1:` and 32 digits. Levels start without contacts; none are looked at."""
-    return [f"c{VERSION}:{hashlib.sha256(canonical_form(world)).hexdigest()[:DIGITS]}" for world in _worlds(level)]
+    return [f"c{VERSION}:{hashlib.sha256(canonical_form(world)).hexdigest()[:DIGITS]}" for world in worlds(level)]
 
 
 def level_first(level: Level) -> Any:
     """The same on the host, with the level axis first."""
     return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), -1, 0), level)
-
-
-# The form
-
-
-def canonical_form(world: World) -> bytes:
-    """The same bytes for the same content, and other bytes for any other content while the form is exact."""
-    colours = _refined(world, _ranks(world.bodies))
-    forms = list(islice(_forms(world, colours), MOST_FORMS + 1))
-    return _joined(TIED, _written(world, colours)) if len(forms) > MOST_FORMS else _joined(EXACT, min(forms))
-
-
-def _forms(world: World, colours: list[int]) -> Iterator[bytes]:
-    """Forms of all numberings that the colours leave open; how many does not depend on the numbering given."""
-    tied = next((c for c, after in pairwise(sorted(colours)) if c == after), None)
-    if tied is None:
-        yield _written(world, colours)
-        return
-    for body in np.flatnonzero(np.array(colours) == tied):
-        marked = [(c, c == tied and i != body) for i, c in enumerate(colours)]
-        yield from _forms(world, _refined(world, _ranks(marked)))
-
-
-def _refined(world: World, colours: list[int]) -> list[int]:
-    """The colours told apart by what is joined to a body, and by whom it is joined to."""
-    while len(set(colours)) < len(colours):
-        ties: list[list[tuple[int, bytes]]] = [[] for _ in colours]
-        for sides in world.joints:
-            for side in sides:
-                ties[side.first].append((colours[side.second], side.row))
-        for push in world.pushes:
-            ties[push.body].append((NOBODY, push.row))
-        for i, j in world.apart:
-            ties[i].append((colours[j], b""))
-            ties[j].append((colours[i], b""))
-        finer = _ranks([(colour, tuple(sorted(held))) for colour, held in zip(colours, ties, strict=True)])
-        if max(finer) == max(colours):
-            break
-        colours = finer
-    return colours
-
-
-def _ranks(keys: Sequence[Any]) -> list[int]:
-    """Numbers from 0 in the order of the keys, the same for equal ones."""
-    number = {key: i for i, key in enumerate(sorted(set(keys)))}
-    return [number[key] for key in keys]
-
-
-def _written(world: World, colours: list[int]) -> bytes:
-    """All there is, with the bodies' colours for names. Joints, thrusters and entries of the action have none."""
-    name = [colour.to_bytes(4, "little") for colour in colours]
-    held, motors, flames = [], defaultdict(list), defaultdict(list)
-    for sides in world.joints:
-        side = min(sides, key=lambda s: (colours[s.first], colours[s.second], s.row, s.direction))
-        line = _joined(name[side.first], name[side.second], side.row)
-        if side.entry == NO_ENTRY:
-            held.append(line)
-        else:
-            motors[side.entry].append((line, side.direction))
-    for push in world.pushes:
-        flames[push.entry].append(_joined(name[push.body], push.row))
-    # which direction of an entry is forward is a name, too
-    both_ways = [[sorted((line, way * d) for line, d in bound) for way in (1, -1)] for bound in motors.values()]
-    return _joined(
-        world.gravity,
-        _joined(*sorted(_joined(*pair) for pair in zip(name, world.bodies, strict=True))),
-        _joined(*sorted(held)),
-        _joined(*sorted(_joined(*(line + bytes([1 + d]) for line, d in min(ways))) for ways in both_ways)),
-        _joined(*sorted(_joined(*sorted(lines)) for lines in flames.values())),
-        _joined(*sorted(_joined(*sorted((name[i], name[j]))) for i, j in world.apart)),
-    )
-
-
-def _joined(*parts: bytes) -> bytes:
-    """One string that says where each part ends."""
-    return b"".join(len(part).to_bytes(4, "little") + part for part in parts)
-
-
-# From a level to its content
 
 
 class _Rows(NamedTuple):
@@ -163,7 +44,8 @@ class _Rows(NamedTuple):
     push_acts: np.ndarray
 
 
-def _worlds(level: Level) -> list[World]:
+def worlds(level: Level) -> list[World]:
+    """The content of each level."""
     levels = level_first(level)
     model = levels.model
     count, polygons = model.n_vertices.shape
@@ -185,17 +67,17 @@ def _world(rows: _Rows, i: int) -> World:
     """Of level i. Its active bodies are numbered one after another."""
     model = rows.levels.model
     bodies = np.flatnonzero(model.active[i]).tolist()
-    place = {body: k for k, body in enumerate(bodies)}
+    number = {body: k for k, body in enumerate(bodies)}
     ends = np.stack([model.joint_a[i], model.joint_b[i]], 1).tolist()
 
     def side(j: int, way: int) -> Side:
-        first, second = (place[end] for end in ends[j][::way])
+        first, second = (number[end] for end in ends[j][::way])
         row, direction = rows.joints[way]
         return Side(first, second, row[i, j].tobytes(), int(direction[i, j]), int(rows.entries[i, j]))
 
     pushes = [
         Push(
-            place[int(model.thruster_body[i, t])], rows.pushes[i, t].tobytes(), int(rows.levels.thruster_binding[i, t])
+            number[int(model.thruster_body[i, t])], rows.pushes[i, t].tobytes(), int(rows.levels.thruster_binding[i, t])
         )
         for t in np.flatnonzero(rows.push_acts[i])
     ]
@@ -276,7 +158,7 @@ def _joint_rows(levels: Any) -> dict[int, tuple[np.ndarray, np.ndarray]]:
 
 
 def _apart(collides: np.ndarray, moves: np.ndarray, bodies: list[int]) -> list[tuple[int, int]]:
-    """Pairs that do not collide, as places in `bodies`. Two that cannot move never push each other."""
+    """Pairs that do not collide, as indices into `bodies`. Two that cannot move never push each other."""
     able = moves[bodies]
     kept = ~collides[np.ix_(bodies, bodies)] & (able | able[:, None])
     one, other = np.nonzero(np.triu(kept, 1))
