@@ -33,33 +33,33 @@ class ExpertConfig:
     """Hyperparameters of one expert (hashable: pass as a static argument)."""
 
     # network
-    network: Network = Network.FLAT
+    network: Network = Network.FLAT  # what an expert sees, and through which network
     width: int = 64  # units of a hidden layer
     depth: int = 2  # hidden layers of the policy and of the value function, which share none
     encoding: int = 16  # units of the first hidden layer of an entity network, of each kind of thing
     # experience
     environments: int = 32  # lanes an expert acts in
     horizon: int = 32  # env steps in each lane between updates
-    dense_reward_scale: float = 0.2  # 1/m; shaping while training, see levelgen.task.rules.TaskParams
+    dense_reward_scale: float = 0.2  # 1/m; shaping while training, in place of task.dense_reward_scale
     rehearsals: int = 8  # lanes that repeat the first success of training, once there is one
-    persistence: float = 0.9  # chance that these lanes repeat their last action, before
+    persistence: float = 0.9  # probability that these lanes repeat their last action, before
     # PPO (Schulman et al. 2017, arXiv:1707.06347)
     epochs: int = 4  # passes over the experience of an update
-    minibatches: int = 4  # per epoch
-    learning_rate: float = 2e-3
-    adam_epsilon: float = 1e-5
-    max_gradient_norm: float = 1.0  # global norm of one expert's gradient
-    discount: float = 0.995  # per env step
-    gae_lambda: float = 0.9  # Schulman et al. 2016, arXiv:1506.02438
-    clip: float = 0.2  # of the probability ratio, and of the value's change
-    value_weight: float = 0.5
-    entropy_weight: float = 0.01
+    minibatches: int = 4  # updates of the weights in an epoch
+    learning_rate: float = 2e-3  # Adam's step size
+    adam_epsilon: float = 1e-5  # Adam's epsilon
+    max_gradient_norm: float = 1.0  # global norm that one expert's gradient is cut to
+    discount: float = 0.995  # of rewards, per env step
+    gae_lambda: float = 0.9  # of advantages (Schulman et al. 2016, arXiv:1506.02438)
+    clip: float = 0.2  # of the probability ratio, and of the value's change, to either side
+    value_weight: float = 0.5  # of the value function's loss
+    entropy_weight: float = 0.01  # of the policy's entropy, which the loss rewards
     # evaluation: each lane rolls out one record
     attempts: int = 8  # lanes as they are: the first by the most probable actions, the others sampled
     sticky_attempts: int = 8  # lanes where an action is sometimes repeated against the expert's will
     moved_attempts: int = 8  # lanes that start with other velocities
     # witness
-    witness: Choice = Choice.RECORD
+    witness: Choice = Choice.RECORD  # which of a level's successes becomes its witness
     exploration: bool = False  # a success of training is a witness, too, where evaluation has none
     # machine
     slots: int = 0  # experts that train side by side in one program; 0: as many as suit the device
@@ -113,13 +113,13 @@ class ExpertConfig:
 class StopConfig:
     """When a level leaves its slot (hashable: pass as a static argument)."""
 
-    rule: Rule = Rule.SOLVED
-    successes: int = 1  # attempts of an evaluation that must succeed for a level to be decided as solved
+    rule: Rule = Rule.SOLVED  # when a level leaves its slot
+    successes: int = 1  # attempts of an evaluation that must succeed for a level to be solved
     share: float = 0.25  # of an update's finished episodes that must reach the goal before an evaluation is worth it
     wait: int = 2048  # env steps of training between an evaluation that failed and the next; doubles each time
     polish: int = 0  # env steps of training after a level is solved, for a shorter way to the goal
     first_rung: int = 16_384  # env steps of training at the first rung; each is twice the one before
-    gain: float = 0.05  # that the best return must have grown by since the rung before
+    gain: float = 0.05  # by which the best return must have grown since the rung before
 
     def __post_init__(self) -> None:
         for name in ("successes", "first_rung"):

@@ -44,18 +44,18 @@ class Params:
     contact_bias: float = 0.2  # share of the penetration beyond the slop undone per step
     joint_bias_velocity: float = 2.0  # 1/s; pull of a joint's ends towards each other
     joint_bias_position: float = 0.7  # share of the gap closed per solver iteration
-    fixed_joint_bias: float = 2.0  # 1/s
-    joint_limit_bias: float = 5.0  # 1/s
+    fixed_joint_bias: float = 2.0  # 1/s; pull of a fixed joint to its angle
+    joint_limit_bias: float = 5.0  # 1/s; pull of a joint back within its limits
     joint_stiffness: float = 0.6  # share of the joint impulse applied per solver iteration
-    max_position: float = 15.0  # m
-    max_velocity: float = 100.0  # m/s
-    max_angular_velocity: float = 50.0  # rad/s
-    motor_speed: float = 6.0  # rad/s at motor_speed 1
-    motor_power: float = 900.0  # N m per kg m^2 at motor_power 1
+    max_position: float = 15.0  # m, to either side; bodies are kept within
+    max_velocity: float = 100.0  # m/s, of each axis, to either side
+    max_angular_velocity: float = 50.0  # rad/s, to either side
+    motor_speed: float = 6.0  # rad/s, of a joint whose motor speed is 1
+    motor_power: float = 900.0  # N m per kg m^2, of a joint whose motor power is 1
     motor_decay: float = 0.1  # s/rad; steepness of the speed control
     motor_limit_zone: float = 0.1  # rad; a motor weakens this near to a joint limit
-    thruster_power: float = 10.0  # N at power 1
-    base_friction: float = 0.4
+    thruster_power: float = 10.0  # N, of a thruster whose power is 1
+    base_friction: float = 0.4  # times the friction of each body, in every contact
     faithful_padding: bool = True  # reproduce the reference's padding defect, see docs/physics.md
 
 

@@ -15,16 +15,18 @@ CONTROL_WEIGHTS = ("motor_only_weight", "thruster_only_weight", "motor_and_thrus
 
 @dataclass(frozen=True)
 class Distribution:
-    """A distribution over levels (hashable: pass as a static argument). `*_chance` are probabilities.
+    """A distribution over levels (hashable: pass as a static argument).
+
+    `*_chance` are probabilities, `*_weight` are in proportion to one another.
 
     Raises:
         ValueError: a value out of its range; the message starts with the field's name.
     """
 
     # The floor's role; plain otherwise
-    floor_green_chance: float = 0.0  # [floor_prob_green]
-    floor_blue_chance: float = 0.02  # [floor_prob_blue]
-    floor_red_chance: float = 0.08  # [floor_prob_red]
+    floor_green_chance: float = 0.0  # the floor is green [floor_prob_green]
+    floor_blue_chance: float = 0.02  # the floor is blue [floor_prob_blue]
+    floor_red_chance: float = 0.08  # the floor is red [floor_prob_red]
 
     # Shapes
     max_size: float = 1.0  # m, across a shape before lengthening [max_shape_size]
@@ -33,57 +35,56 @@ class Distribution:
     min_radius: float = 0.1  # m, of a circle (util.sample_dimensions)
     circle_size_factor: float = 0.8  # times max_size for circles [circle_max_size_coeff]
     long_side_chance: float = 0.3  # one side of a rectangle is lengthened [large_rect_dim_chance]
-    long_side_factor: float = 2.0  # [large_rect_dim_scale]
+    long_side_factor: float = 2.0  # how many times as long that side is [large_rect_dim_scale]
 
     # Free bodies
-    opposite_sides_chance: float = (
-        0.5  # green starts in the left half, blue in the right [goal_body_opposide_side_chance]
-    )
-    fixed_chance: float = 0.02  # of a weightless body [fixate_chance_min]
-    fixed_chance_per_mass: float = 4.0  # 1/kg, added: big bodies rather are fixed [fixate_chance_scale]
-    max_fixed_chance: float = 1.0  # [fixate_chance_max]
+    opposite_sides_chance: float = 0.5  # green starts left, blue right [goal_body_opposide_side_chance]
+    fixed_chance: float = 0.02  # a weightless body is fixed [fixate_chance_min]
+    fixed_chance_per_mass: float = 4.0  # 1/kg, added to fixed_chance: big bodies rather are fixed [fixate_chance_scale]
+    max_fixed_chance: float = 1.0  # a body is fixed, however heavy it is [fixate_chance_max]
     lowered_chance: float = 0.0  # a fixed body of the upper half moves to the lower [fixate_shape_bottom_bias]
     goal_lowered_chance: float = 0.6  # added for green, blue, red [fixate_shape_bottom_bias_special_role]
     red_weight: float = 1 / 3  # of a new red body, while there is none, against 1 of a plain one (util.get_role)
 
     # What must act, in proportion; what a size has no room for is left out (distributions.sample_kinetix_level)
-    motor_only_weight: float = 1.0
-    thruster_only_weight: float = 1.0
-    motor_and_thruster_weight: float = 1.0
+    motor_only_weight: float = 1.0  # of levels that motors alone act in
+    thruster_only_weight: float = 1.0  # of levels that thrusters alone act in
+    motor_and_thruster_weight: float = 1.0  # of levels that both act in
 
     # Connected bodies
-    connected_circle_chance: float = 0.5  # rather than a rectangle, if there is room for both (as above)
+    connected_circle_chance: float = 0.5  # a circle, not a rectangle, if there is room for both (as above)
     fixed_target_weight: float = 0.05  # of a fixed body as the one to connect to [connect_to_fixated_prob_coeff]
     polygon_connections: int = 2  # more joints only if all polygons have these (mutators.mutate_add_connected_shape)
-    min_revolute_joints: int = 2  # the first ones are revolute [min_rjoints_bias]
-    fixed_joint_chance: float = 0.5  # of each later one (mutators.mutate_add_connected_shape)
-    visible_margin: float = 0.05  # m a body must reach beyond its partner as they turn [connect_visibility_min]
+    min_revolute_joints: int = 2  # so many joints, the first ones, are revolute [min_rjoints_bias]
+    fixed_joint_chance: float = 0.5  # a later joint is fixed (mutators.mutate_add_connected_shape)
+    visible_margin: float = 0.05  # m, a body must reach beyond its partner as they turn [connect_visibility_min]
     hidden_penalty: float = 10.0  # contacts that a proposal counts as, if it does not [connect_no_visibility_bias]
 
     # Motors
     motor_chance: float = 0.8  # a revolute joint's motor is on [motor_on_chance]
-    min_motor_speed: float = 0.4  # of the engine's Params.motor_speed [motor_min_speed]
-    max_motor_speed: float = 3.0  # [motor_max_speed]
-    min_motor_power: float = 1.0  # of the engine's Params.motor_power [motor_min_power]
-    max_motor_power: float = 3.0  # [motor_max_power]
-    max_wheel_power: float = 1.0  # where a circle is joined: strong wheels upset the engine [wheel_max_power]
+    min_motor_speed: float = 0.4  # slowest, of task.physics.motor_speed [motor_min_speed]
+    max_motor_speed: float = 3.0  # fastest, of task.physics.motor_speed [motor_max_speed]
+    min_motor_power: float = 1.0  # weakest, of task.physics.motor_power [motor_min_power]
+    max_motor_power: float = 3.0  # strongest, of task.physics.motor_power [motor_max_power]
+    max_wheel_power: float = 1.0  # strongest where a circle is joined: strong wheels upset the engine [wheel_max_power]
     limit_chance: float = 0.4  # a revolute joint of two polygons has limits [joint_limit_chance]
-    max_limit: float = math.pi  # rad, to either side [joint_limit_max]
+    max_limit: float = math.pi  # rad, widest limit of a joint, to either side [joint_limit_max]
 
     # Thrusters
-    extra_thruster_chance: float = 0.3  # of each one after the first [add_thruster_chance]
-    aligned_chance: float = 0.8  # points along the line through the centre [thruster_align_com_prob]
-    min_thruster_power: float = 0.5  # per unit of mass (mutators.mutate_add_thruster)
-    max_thruster_power: float = 2.0
-    thruster_power_factor: float = 2.0  # times that [thruster_power_multiplier]
+    extra_thruster_chance: float = 0.3  # a thruster after the first is added [add_thruster_chance]
+    aligned_chance: float = 0.8  # a thruster points along the line through its body's centre [thruster_align_com_prob]
+    min_thruster_power: float = 0.5  # weakest, per unit of mass (mutators.mutate_add_thruster)
+    max_thruster_power: float = 2.0  # strongest, per unit of mass (mutators.mutate_add_thruster)
+    thruster_power_factor: float = 2.0  # times the power that is drawn between these two [thruster_power_multiplier]
 
     # The places left after green, blue and the third body
-    connected_weight: float = 0.35  # [add_connected_shape_chance]
-    free_weight: float = 0.35  # [add_shape_chance]
-    empty_weight: float = 0.3  # [add_no_shape_chance]
-    proposals: int = 8  # of each body, the one that touches least is kept [add_shape_n_proposals]
+    connected_weight: float = 0.35  # of a body that a joint holds to another one [add_connected_shape_chance]
+    free_weight: float = 0.35  # of a body without a joint [add_shape_chance]
+    empty_weight: float = 0.3  # of no body [add_no_shape_chance]
+    proposals: int = 8  # places tried for each body; the one that touches least is kept [add_shape_n_proposals]
     small_world: int = 7  # bodies; up to this many: one proposal, no fixed bodies (distributions.sample_kinetix_level)
 
+    # Last
     swap_chance: float = 0.5  # green and blue change roles if the floor is plain (distributions.sample_kinetix_level)
 
     def __post_init__(self) -> None:

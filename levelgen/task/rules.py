@@ -28,7 +28,7 @@ class TaskParams:
     frame_skip: int = 2  # physics steps per env step, with the same action
     max_timesteps: int = 256  # env steps after which an episode ends
     dense_reward_scale: float = 0.1  # 1/m; reward for each metre that green and blue come closer; 0: none
-    physics: Params = field(default_factory=Params)
+    physics: Params = field(default_factory=Params)  # constants of the engine
 
     def __post_init__(self) -> None:
         for name in ("frame_skip", "max_timesteps"):
