@@ -20,6 +20,7 @@ from configs.convert import typed
 from levelgen.sampling.distribution import Distribution
 from pipeline.errors import UserError
 from pipeline.look import duplicates
+from pipeline.store.layout import data_path
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.schema import RECORD_STEPS
 from pipeline.store.shard import stored_bytes
@@ -35,7 +36,7 @@ def inspect(split: Path, where: str | None, rows: int, as_json: bool, against: S
 
     Raises:
         UserError: no split, a condition that DuckDB cannot use, or nothing to look in.
-        Failure: a fragment is damaged.
+        Failure: a fragment is damaged, or names data that is not in the split.
     """
     facts = survey(split, where, rows, against)
     if as_json:
@@ -51,7 +52,7 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
     chosen = select(manifest.table, where)
     solved, tried = (select(chosen, f"label IN ({names})") for names in ("'solved'", "'solved', 'unsolved'"))
     levels, shown = duplicates.compared(chosen), max(rows, 0)
-    stored = sum(stored_bytes(split / shard) for shard in manifest.shards)
+    stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards)
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
     return {
         "split": str(split),

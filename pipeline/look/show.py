@@ -26,7 +26,7 @@ from pipeline.read.levels import find_row, is_level_file, level_file, level_of
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
-from pipeline.store.shard import Shard
+from pipeline.store.shard import open_shard
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures a second
 LAST_SECONDS = 1.5  # how long a film rests on its last picture
@@ -88,7 +88,7 @@ def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
 
 def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
     """The first successful episode of a solved level's record."""
-    arrays = Shard(manifest.split / row["shard"]).read([row["row"]])
+    arrays = open_shard(manifest.split, row["shard"], row["size"]).read([row["row"]])
     level = tree_of(Level, _below(arrays, "level/"))
     states = tree_of(State, _below(arrays, "record/state/"))
     done, goal, action = (arrays[f"record/{name}"][..., 0] for name in ("done", "goal", "action"))

@@ -14,7 +14,7 @@ from pipeline.errors import UserError
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest
-from pipeline.store.shard import Shard
+from pipeline.store.shard import open_shard
 
 
 def find_row(manifest: Manifest, level_id: int) -> dict[str, Any]:
@@ -39,7 +39,7 @@ def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
         Failure: the shard is damaged.
     """
     if row["shard"]:
-        return tree_of(Level, Shard(manifest.split / row["shard"]).read([row["row"]]), "level/")
+        return tree_of(Level, open_shard(manifest.split, row["shard"], row["size"]).read([row["row"]]), "level/")
     prepare_jax()
     distribution = typed(Distribution, (manifest.config or {})["distribution"])
     return sample_levels(jnp.array([row["level_id"]], jnp.int32), size_of(row["size"]), distribution)

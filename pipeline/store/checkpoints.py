@@ -18,6 +18,7 @@ from experts.slots import begin
 from levelgen.level import size_of
 from levelgen.sampling.sampler import sample_levels
 from pipeline.errors import Failure, UserError
+from pipeline.store.layout import data_path
 from pipeline.store.manifest import differences, read_manifest, require_manifest, told
 
 ORBAX = Lock()  # it numbers its operations by process: two at once wait for each other's files, for ever
@@ -95,7 +96,7 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
             paths.setdefault(path, set()).add(level_id)
     found: dict[int, Kept] = {}
     for path, ids in paths.items():
-        experts = load_experts(source / path, job)
+        experts = load_experts(data_path(source, path), job)
         found |= {level_id: experts[level_id] for level_id in ids}
     return found
 

@@ -8,12 +8,18 @@ job.json                                            what the last command wanted
 .writer.lock, .commit.lock                          see pipeline/store/locks.py
 """
 
+import re
 import secrets
 from pathlib import Path
+
+from pipeline.errors import Failure
 
 MANIFEST, SHARDS, EXPERTS, QUARANTINE = "manifest", "shards", "experts", "quarantine"
 WRITER_LOCK, COMMIT_LOCK, JOB = ".writer.lock", ".commit.lock", "job.json"
 DIGITS = 12  # of a level id in file names, so that names sort as ids do
+UNIT = rf"(\d{{{DIGITS}}})-(\d{{{DIGITS}}})"
+ATTEMPT = rf"{UNIT}-[0-9a-f]{{8}}"
+DATA = re.compile(rf"{SHARDS}/{ATTEMPT}\.zarr|{EXPERTS}/{ATTEMPT}")
 
 
 def split_path(out: str, budget: str, size: str) -> Path:
@@ -33,6 +39,29 @@ def attempt_paths(split: Path, unit: str) -> tuple[Path, Path]:
     """New paths for a shard and for experts, used by no other attempt at this unit."""
     name = f"{unit}-{secrets.token_hex(4)}"
     return split / SHARDS / f"{name}.zarr", split / EXPERTS / name
+
+
+def data_path(split: Path, name: str) -> Path:
+    """Where the shard or the experts lie that a manifest names so.
+
+    Raises:
+        Failure: that is no name of either, or links lead elsewhere from there.
+    """
+    path = split / name
+    if not DATA.fullmatch(name):
+        raise Failure(
+            f"The manifest of {split} names {name[:80]!r}, which can be neither a shard nor experts of this split: "
+            "it was damaged or meant to do harm, so get the split again from where it came."
+        )
+    if path.resolve() != split.resolve() / name:
+        raise Failure(f"The path {path} is a link to another place: put the data itself there.")
+    return path
+
+
+def ids_of(fragment: Path) -> tuple[int, int] | None:
+    """The lowest and the highest level id in a fragment, by its name; None where the name does not tell."""
+    found = re.fullmatch(rf"{UNIT}\.parquet", fragment.name)
+    return (int(found[1]), int(found[2])) if found else None
 
 
 def fragment_of(shard: Path) -> Path:

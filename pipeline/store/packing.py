@@ -27,7 +27,11 @@ def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldPlace]) -> dict[
 
 
 def unpack(packed: Mapping[str, np.ndarray], table: Sequence[FieldPlace]) -> dict[str, np.ndarray]:
-    """The inverse of `pack`, with the arrays that `packed` has."""
+    """The inverse of `pack`, with the arrays that `packed` has.
+
+    Raises:
+        ValueError: a flag is neither 0 nor 1.
+    """
     arrays = {}
     for place in table:
         if place.array not in packed:
@@ -53,4 +57,6 @@ def _unsigned(values: np.ndarray, place: FieldPlace) -> np.ndarray:
 
 def _original(values: np.ndarray, place: FieldPlace) -> np.ndarray:
     dtype = np.dtype(place.dtype)
+    if dtype.kind == "b" and values.size and values.max() > 1:  # no bool for numpy, XLA and kernels
+        raise ValueError(f"{place.name} has flags that are neither 0 nor 1")
     return values.view(dtype) if dtype.itemsize == values.dtype.itemsize else values.astype(dtype)

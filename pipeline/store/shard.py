@@ -12,21 +12,24 @@ CRC-32C. The group's attributes hold the field table. Measurements: docs/storage
 """
 
 import os
-import zlib
+import stat
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import zarr
-from zarr.codecs import BloscCodec, Crc32cCodec
+from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 
+from levelgen.level import name_of
 from pipeline.errors import Failure
-from pipeline.store.layout import fragment_of
+from pipeline.store.contents import ContentsError, check_level_ids, check_numbers, size_in, table_for
+from pipeline.store.layout import data_path, fragment_of
 from pipeline.store.packing import pack, unpack
-from pipeline.store.schema import SHARD_VERSION, FieldPlace, field_table
+from pipeline.store.schema import ALONG_TIME, PACKED, RECORD_STEPS, SHARD_VERSION, FieldPlace, field_table
 
 FORMAT = "levelproof.shard"
 LEVEL = 5  # of zstd; 9 saves 2% and encodes at 3 MB/s
+CODECS = [BytesCodec, BloscCodec, Crc32cCodec]
 
 
 def write_shard(path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.ndarray]) -> None:
@@ -61,29 +64,32 @@ def write_shard(path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.nd
 
 
 class Shard:
-    """One shard on disk, opened lazily for reading."""
+    """One shard on disk, opened lazily for reading. What it says is checked before anything of it is given out."""
 
     def __init__(self, path: Path) -> None:
         """Open the group at `path`.
 
         Raises:
-            Failure: it is missing, damaged, or of another version.
+            Failure: it is missing, damaged, no shard of any size, or of another version.
         """
         self.path = path
         try:
-            self._group = zarr.open_group(path, mode="r")
+            self._require_file("zarr.json")
+            self._group = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
             attributes = self._group.attrs.asdict()
             version = attributes.get("version")
             if attributes.get("format") != FORMAT or version != SHARD_VERSION:
                 raise Failure(
-                    f"The shard {path} has version {version}, this program reads {SHARD_VERSION}: "
+                    f"The shard {path} has version {str(version)[:20]}, this program reads {SHARD_VERSION}: "
                     "use the levelproof that wrote it."
                 )
+            self.size = size_in([FieldPlace.from_json(entry) for entry in attributes["fields"]])  # type: ignore[union-attr, arg-type]
+            self.table = table_for(self.size)
+            check_level_ids(attributes["level_ids"])
             self.level_ids: list[int] = list(attributes["level_ids"])  # type: ignore[arg-type]
-            self.table = [FieldPlace.from_json(entry) for entry in attributes["fields"]]  # type: ignore[union-attr, arg-type]
         except Failure:
             raise
-        except Exception as error:
+        except Exception as error:  # zarr raises many kinds
             raise self._damaged(error) from error
 
     def read(self, rows: Iterable[int] | None = None, fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
@@ -94,36 +100,71 @@ class Shard:
             fields: names to return (default: all); arrays without any of them are not read.
 
         Raises:
-            Failure: a chunk is missing or damaged.
+            Failure: a chunk is missing or damaged, or holds what a level or a record of this size cannot.
         """
         wanted = None if fields is None else set(fields)
         table = [place for place in self.table if wanted is None or place.name in wanted]
         index = list(range(len(self.level_ids))) if rows is None else [int(row) for row in rows]
-        packed = {name: self._array(name, index) for name in dict.fromkeys(place.array for place in table)}
-        return unpack(packed, table)
+        try:
+            if not all(0 <= row < len(self.level_ids) for row in index):
+                raise ContentsError(f"it has {len(self.level_ids)} rows, and others were asked for")
+            packed = {name: self._array(name, index) for name in dict.fromkeys(place.array for place in table)}
+            arrays = unpack(packed, table)
+            check_numbers(arrays, self.size)
+        except Exception as error:  # zarr and its codecs raise many kinds
+            raise self._damaged(error) from error
+        return arrays
 
     def _array(self, name: str, rows: list[int]) -> np.ndarray:
-        try:
-            array = self._group[name]
-            assert isinstance(array, zarr.Array)
-            # zarr reads a missing file as zeros
-            if array.size and not (self.path / name / "c" / "/".join("0" * array.ndim)).is_file():
-                raise FileNotFoundError(f"no file for {name}")
-            index = slice(None) if rows == list(range(array.shape[0])) else np.asarray(rows, np.intp)
-            return np.asarray(array.oindex[index])
-        except (OSError, RuntimeError, ValueError, KeyError, AssertionError, zlib.error) as error:
-            raise self._damaged(error) from error
+        self._require_file(f"{name}/zarr.json")
+        array, dtype = self._group[name], np.dtype(f"u{PACKED[name] // 8}")
+        components = sum(place.count for place in self.table if place.array == name)
+        shape = (len(self.level_ids), components, *((RECORD_STEPS,) if name in ALONG_TIME else ()))
+        if not isinstance(array, zarr.Array) or (array.shape, array.dtype) != (shape, dtype):
+            raise ContentsError(f"its array {name} has not the shape and type that its fields need")
+        kinds = [type(codec) for codec in (*array.filters, array.serializer, *array.compressors)]
+        if (array.chunks, array.shards) != ((1, *shape[1:]), shape) or kinds != CODECS:
+            raise ContentsError(f"its array {name} is not stored as this program stores it")
+        if array.size:
+            self._require_file(f"{name}/c/{'/'.join('0' * array.ndim)}")
+        index = slice(None) if rows == list(range(shape[0])) else np.asarray(rows, np.intp)
+        return np.asarray(array.oindex[index])
+
+    def _require_file(self, name: str) -> None:
+        """An ordinary file, here and nowhere else. Of a missing one zarr makes zeros; a pipe never ends."""
+        path = self.path / name
+        if path.resolve() != self.path.resolve() / name:
+            raise ContentsError("it has links to other places")
+        if not path.is_file():
+            raise FileNotFoundError(path)
 
     def _damaged(self, error: Exception) -> Failure:
+        reason = str(error) if isinstance(error, ContentsError) else type(error).__name__
         return Failure(
-            f"The shard {self.path} is missing or damaged ({type(error).__name__}): "
+            f"The shard {self.path} is missing or damaged ({reason}): "
             f"delete {fragment_of(self.path)} and run the same `levelproof generate` again to remake its levels."
         )
 
 
+def open_shard(split: Path, name: str, size: str) -> Shard:
+    """The shard that a row of the manifest of `split` names, which is to hold levels of `size`.
+
+    Raises:
+        Failure: it is missing, damaged, of another size, or not in the split.
+    """
+    shard = Shard(data_path(split, name))
+    if name_of(shard.size) != size:
+        raise Failure(
+            f"The shard {shard.path} has levels of size {name_of(shard.size)}, and its row says {size}: "
+            f"delete {fragment_of(shard.path)} and run the same `levelproof generate` again to remake its levels."
+        )
+    return shard
+
+
 def stored_bytes(path: Path) -> int:
-    """Bytes of all files of a shard."""
-    return sum(entry.stat().st_size for entry in path.rglob("*") if entry.is_file())
+    """Bytes of all files of a shard; what links lead to is not its own."""
+    about = (entry.lstat() for entry in path.rglob("*"))
+    return sum(file.st_size for file in about if stat.S_ISREG(file.st_mode))
 
 
 def _flush(path: Path) -> None:

@@ -5,7 +5,7 @@ And a real split without training.
 
 import dataclasses
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,12 @@ from physics.pairs import pairs_of
 from physics.types import MAX_VERTICES, Size
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
+from pipeline.store.contents import highest
+from pipeline.store.fields import arrays_of, tree_of
 from pipeline.store.layout import split_path
 from pipeline.store.schema import RECORD_STEPS
 
+T = TypeVar("T")
 PLAYED = 64  # levels of `played_split`
 SPENT = Spent(0, 0, 0)
 
@@ -32,7 +35,7 @@ SPENT = Spent(0, 0, 0)
 def made(kind: type, size: Size, count: int, rng: np.random.Generator, *, time: bool = False) -> Any:
     """An instance of a dataclass of arrays for `count` levels, by the shapes in its annotations.
 
-    Floats have any bits: NaN, infinities, -0.0 and denormals included. Integers are 0 to 255.
+    Floats have any bits: NaN, infinities, -0.0 and denormals included. Integers are at most 255.
     """
     counts = {"body": size.bodies, "polygon": size.polygons, "circle": size.circles, "joint": size.joints}
     counts |= {"thruster": size.thrusters, "vertex": MAX_VERTICES, "contact": pairs_of(size).contacts}
@@ -58,11 +61,24 @@ def _random(dtypes: str, shape: tuple[int, ...], rng: np.random.Generator) -> np
 
 
 def made_level(size: str = "s", count: int = 3, seed: int = 0) -> Level:
-    return made(Level, SIZES[size], count, np.random.default_rng(seed))
+    return _possible(made(Level, SIZES[size], count, np.random.default_rng(seed)), size, "level/")
 
 
 def made_record(size: str = "s", count: int = 3, seed: int = 0) -> Record:
-    return made(Record, SIZES[size], count, np.random.default_rng(seed))
+    return _possible(made(Record, SIZES[size], count, np.random.default_rng(seed)), size, "record/")
+
+
+def made_fields(size: str = "s", count: int = 3, seed: int = 0) -> dict[str, np.ndarray]:
+    """What a shard holds of them."""
+    return arrays_of(made_level(size, count, seed), "level/") | arrays_of(made_record(size, count, seed), "record/")
+
+
+def _possible(tree: T, size: str, path: str) -> T:
+    """The same with integers that a size can have."""
+    most = highest(SIZES[size])
+    arrays = arrays_of(tree, path)
+    arrays |= {name: np.minimum(x, most[name]).astype(x.dtype) for name, x in arrays.items() if name in most}
+    return tree_of(type(tree), arrays, path)
 
 
 def made_verdict(label: Label = Label.SOLVED, **changes: Any) -> Verdict:

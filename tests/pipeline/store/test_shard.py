@@ -15,14 +15,9 @@ from pipeline.store.fields import arrays_of, same_bits, tree_of
 from pipeline.store.packing import pack, unpack
 from pipeline.store.schema import ALONG_TIME, RECORD_STEPS, FieldPlace, field_table
 from pipeline.store.shard import Shard, stored_bytes, write_shard
-from tests.pipeline.made import made_level, made_record
+from tests.pipeline.made import made_fields, made_level, made_record
 
 LEVELS = [5, 9, 12]
-
-
-def fields_of(size: str, seed: int = 0) -> dict[str, np.ndarray]:
-    count = len(LEVELS)
-    return arrays_of(made_level(size, count, seed), "level/") | arrays_of(made_record(size, count, seed), "record/")
 
 
 def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
@@ -34,7 +29,7 @@ def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -
 
 @pytest.fixture(scope="module")
 def fields() -> dict[str, np.ndarray]:
-    return fields_of("s")
+    return made_fields("s", len(LEVELS))
 
 
 @pytest.fixture
@@ -47,7 +42,7 @@ def shard(tmp_path: Path, fields: dict[str, np.ndarray]) -> Path:
 @settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(size=st.sampled_from(sorted(SIZES)), seed=st.integers(0, 2**32))
 def test_every_bit_of_every_field_comes_back(tmp_path: Path, size: str, seed: int) -> None:
-    fields = fields_of(size, seed)
+    fields = made_fields(size, len(LEVELS), seed)
     path = tmp_path / f"{size}-{seed}.zarr"
     if not path.exists():
         write_shard(path, LEVELS, fields)
@@ -59,7 +54,7 @@ def test_every_bit_of_every_field_comes_back(tmp_path: Path, size: str, seed: in
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from(sorted(SIZES)), st.integers(0, 2**32))
 def test_packing_is_undone_by_unpacking(size: str, seed: int) -> None:
-    fields = fields_of(size, seed)
+    fields = made_fields(size, len(LEVELS), seed)
     table = field_table(fields)
     assert_same(unpack(pack(fields, table), table), fields)
 

@@ -1,0 +1,96 @@
+"""What a shard of one size holds: its fields, where each lies, and the whole numbers that may stand in them.
+
+Told by the annotations of `Level` and `Record` alone, so that a shard can be refused before anything of it is used:
+engines and pictures look things up by these numbers and check no bounds.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+
+import numpy as np
+
+from experts.witness import Record
+from levelgen.identity.keys import MAX_LEVEL_ID
+from levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
+from levelgen.task.actions import CHOICES
+from physics.pairs import pairs_of
+from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
+from pipeline.store.fields import annotated
+from pipeline.store.schema import RECORD_STEPS, FieldPlace, field_table
+
+COUNTED = {  # fields with one entry for each thing of a kind
+    "polygons": "level/model/n_vertices",
+    "circles": "level/model/radius",
+    "joints": "level/model/joint_active",
+    "thrusters": "level/model/thruster_active",
+}
+FEWEST = Size(FIXED_POLYGONS, 0, 0, 0)
+
+
+class ContentsError(ValueError):
+    """A shard does not hold what it should; the message is the end of a sentence."""
+
+
+@cache
+def table_for(size: Size) -> tuple[FieldPlace, ...]:
+    """The field table of a shard of this size."""
+    counts = {"body": size.bodies, "polygon": size.polygons, "circle": size.circles, "joint": size.joints}
+    counts |= {"thruster": size.thrusters, "vertex": MAX_VERTICES, "contact": pairs_of(size).contacts}
+    counts |= {"lane": 0, "level": 0}
+    level, record = annotated(Level, counts, "level/"), annotated(Record, counts, "record/")
+    for name in ("record/state/", "record/manifold/"):  # of the engine, which knows one moment only
+        record |= {of: np.stack([x] * RECORD_STEPS) for of, x in record.items() if of.startswith(name)}
+    return tuple(field_table(level | record))
+
+
+def size_in(table: Sequence[FieldPlace]) -> Size:
+    """The size of which a shard with this table is, the whole of which has to be that size's.
+
+    Raises:
+        ContentsError: it is of none.
+    """
+    shapes = {place.name: place.shape for place in table}
+    try:
+        size = Size(*(shapes[name][0] for name in COUNTED.values()))
+    except (KeyError, IndexError):
+        raise ContentsError("its fields are those of no size") from None
+    if not all(type(n) is int and low <= n <= MOST_THINGS for low, n in zip(FEWEST, size, strict=True)):
+        raise ContentsError("its fields are those of no size")
+    for place, expected in zip(table, table_for(size), strict=False):
+        if place != expected:
+            raise ContentsError(f"its field {expected.name} is not as size {name_of(size)} has it")
+    if len(table) != len(table_for(size)):
+        raise ContentsError(f"it has not the fields of size {name_of(size)}")
+    return size
+
+
+def check_level_ids(level_ids: object) -> None:
+    """Raises ContentsError where these are not the ascending ids of one or more levels."""
+    good = isinstance(level_ids, list) and len(level_ids) > 0 and all(type(x) is int for x in level_ids)
+    if not good or level_ids[0] < 0 or level_ids[-1] > MAX_LEVEL_ID or level_ids != sorted(set(level_ids)):
+        raise ContentsError("its level ids are not ascending ids of levels")
+
+
+def check_numbers(arrays: Mapping[str, np.ndarray], size: Size) -> None:
+    """Raises ContentsError where a whole number is one that a level or a record of this size cannot have."""
+    for name, most in highest(size).items():
+        if name in arrays and not ((arrays[name] >= 0) & (arrays[name] <= most)).all():
+            raise ContentsError(f"its field {name} has numbers that size {name_of(size)} cannot have")
+
+
+@cache
+def highest(size: Size) -> dict[str, np.ndarray]:
+    """The largest number that may stand in each field of integers; the smallest is 0."""
+    numbers = {
+        "record/timestep": np.iinfo(np.int32).max,
+        "record/action": np.array(CHOICES)[:, None] - 1,
+        "level/role": max(Role),
+        "level/motor_binding": MOTOR_BINDINGS - 1,
+        "level/thruster_binding": THRUSTER_BINDINGS - 1,
+        "level/model/n_vertices": MAX_VERTICES,
+        "level/model/collision_mode": 2,
+        "level/model/joint_a": size.bodies - 1,
+        "level/model/joint_b": size.bodies - 1,
+        "level/model/thruster_body": size.bodies - 1,
+    }
+    return {name: np.asarray(number) for name, number in numbers.items()}

@@ -1,0 +1,275 @@
+"""Shards that nobody vouches for: each is refused in one sentence before anything of it is used."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from zarr.codecs import GzipCodec
+
+from pipeline.errors import Failure
+from pipeline.store.contents import table_for
+from pipeline.store.layout import data_path
+from pipeline.store.schema import RECORD_STEPS
+from pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
+from tests.pipeline.made import made_fields
+
+LEVELS = [5, 9, 12]
+NAME = "shards/000000000005-000000000012-0123abcd.zarr"
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("good") / NAME
+    write_shard(path, LEVELS, made_fields("s", len(LEVELS)))
+    return path
+
+
+@pytest.fixture
+def shard(good: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(good, tmp_path / NAME))
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(Failure) as raised:
+        Shard(path).read()
+    sentence = str(raised.value)
+    assert sentence.startswith("The shard ")
+    assert "\n" not in sentence
+    assert len(sentence) < 600
+    return sentence
+
+
+def field(table: list[dict[str, Any]], name: str) -> dict[str, Any]:
+    return next(entry for entry in table if entry["name"] == name)
+
+
+FIELDS: dict[str, Callable[[list[dict[str, Any]]], Any]] = {
+    "type": lambda table: field(table, "level/role").update(dtype="float64"),
+    "no type": lambda table: field(table, "level/role").update(dtype="object"),
+    "larger": lambda table: field(table, "record/state/position").update(shape=[200, 2]),
+    "huge": lambda table: field(table, "record/state/position").update(shape=[2**40, 2**40]),
+    "negative": lambda table: field(table, "record/state/position").update(shape=[-7, -2]),
+    "flat": lambda table: field(table, "level/model/vertices").update(shape=[40]),
+    "no list": lambda table: field(table, "level/model/vertices").update(shape=7),
+    "behind the end": lambda table: field(table, "record/reward").update(first=10**9),
+    "before the start": lambda table: field(table, "record/reward").update(first=-1),
+    "another array": lambda table: field(table, "level/role").update(array="lvl32"),
+    "no array": lambda table: field(table, "level/role").update(array="../../secret"),
+    "another name": lambda table: field(table, "level/role").update(name="level/rule"),
+    "unknown key": lambda table: field(table, "level/role").update(colour="red"),
+    "missing": lambda table: table.pop(),
+    "twice": lambda table: table.append(table[-1]),
+    "one too many": lambda table: table.append(table[-1] | {"name": "record/extra"}),
+    "a thousand bodies": lambda table: field(table, "level/model/radius").update(shape=[1000]),
+    "no scenery": lambda table: field(table, "level/model/n_vertices").update(shape=[2]),
+    "one circle more": lambda table: field(table, "level/model/radius").update(shape=[3]),
+    "none": lambda table: table.clear(),
+    "no table": lambda table: table.insert(0, 7),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_fields_that_are_not_those_of_a_size(shard: Path, name: str) -> None:
+    document = json.loads((shard / "zarr.json").read_text())
+    FIELDS[name](document["attributes"]["fields"])
+    (shard / "zarr.json").write_text(json.dumps(document))
+    refused(shard)
+
+
+@pytest.mark.parametrize(
+    "level_ids",
+    [
+        [],
+        [5, 9],
+        [5, 9, 12, 13],
+        [9, 5, 12],
+        [5, 9, 1e300],
+        [5, 5, 12],
+        [-1, 5, 9],
+        [5, 9, 2**31],
+        [5, 9, "12"],
+        [5, 9, [12]],
+        [False, True, 12],
+        3,
+        None,
+    ],
+)
+def test_level_ids_that_are_none(shard: Path, level_ids: Any) -> None:
+    document = json.loads((shard / "zarr.json").read_text())
+    document["attributes"]["level_ids"] = level_ids
+    (shard / "zarr.json").write_text(json.dumps(document))
+    refused(shard)
+
+
+ARRAYS: dict[str, Callable[[np.ndarray], dict[str, Any]]] = {
+    "a component less": lambda x: {"data": x[:, :-1]},
+    "a level more": lambda x: {"data": np.concatenate([x, x])},
+    "one axis": lambda x: {"data": x.reshape(-1), "chunks": (x.size,)},
+    "another type": lambda x: {"data": x.astype(np.float64)},
+    "signed": lambda x: {"data": x.view(np.int32)},
+    "one chunk": lambda x: {"data": x, "chunks": x.shape},
+    "another codec": lambda x: {"data": x, "compressors": [GzipCodec()]},
+    "not sharded": lambda x: {"data": x, "shards": None},
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_arrays_that_do_not_have_what_the_fields_need(shard: Path, name: str) -> None:
+    group = zarr.open_group(shard, mode="r+")
+    old = group["dyn32"]
+    assert isinstance(old, zarr.Array)
+    change = ARRAYS[name](np.asarray(old[:]))
+    shape = change["data"].shape
+    settings = {"chunks": (1, *shape[1:]), "shards": shape, "compressors": old.compressors} | change
+    group.create_array("dyn32", **settings, overwrite=True)
+    refused(shard)
+
+
+def test_a_group_in_place_of_an_array(shard: Path) -> None:
+    zarr.open_group(shard, mode="r+").create_group("dyn32", overwrite=True)
+    refused(shard)
+
+
+NUMBERS = {
+    "level/model/joint_a": 7,
+    "level/model/joint_b": 255,
+    "level/model/thruster_body": 7,
+    "level/model/n_vertices": 5,
+    "level/model/collision_mode": 3,
+    "level/role": 4,
+    "level/motor_binding": 4,
+    "level/thruster_binding": 2,
+    "record/action": 3,
+    "record/timestep": -1,
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_that_a_kernel_would_look_up(tmp_path: Path, name: str) -> None:
+    fields = made_fields("s", len(LEVELS))
+    fields[name][..., -1] = NUMBERS[name]
+    path = tmp_path / NAME
+    write_shard(path, LEVELS, fields)
+    assert f"its field {name} has numbers that size s cannot have" in refused(path)
+    Shard(path).read(fields=["level/density"])
+
+
+def test_what_numbers_may_be_depends_on_the_binding(tmp_path: Path) -> None:
+    """A motor's entry of an action has a third choice, a thruster's has not."""
+    for row, good in ((0, True), (4, False)):
+        fields = made_fields("s", len(LEVELS))
+        fields["record/action"][:, row] = 2
+        path = tmp_path / str(row) / NAME
+        write_shard(path, LEVELS, fields)
+        if good:
+            Shard(path).read()
+        else:
+            refused(path)
+
+
+@pytest.mark.parametrize("name", ["record/done", "level/model/active"])
+def test_flags_are_0_or_1(tmp_path: Path, name: str) -> None:
+    fields = made_fields("s", len(LEVELS))
+    fields[name].view(np.uint8)[..., 0] = 2
+    write_shard(tmp_path / NAME, LEVELS, fields)
+    refused(tmp_path / NAME)
+
+
+@pytest.mark.parametrize("row", [-1, len(LEVELS), 2**40])
+def test_rows_that_it_does_not_have(shard: Path, row: int) -> None:
+    with pytest.raises(Failure, match="it has 3 rows, and others were asked for"):
+        Shard(shard).read([row])
+
+
+@pytest.mark.parametrize("inside", ["zarr.json", "dyn32", "dyn32/zarr.json", "dyn32/c", "dyn32/c/0/0/0"])
+def test_links_are_not_followed(shard: Path, tmp_path: Path, inside: str) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    (shard / inside).rename(elsewhere)
+    before = stored_bytes(shard)
+    (shard / inside).symlink_to(elsewhere)
+    assert "it has links to other places" in refused(shard)
+    assert stored_bytes(shard) == before
+
+
+@pytest.mark.parametrize("inside", ["zarr.json", "dyn32/zarr.json", "dyn32/c/0/0/0"])
+def test_a_pipe_is_not_waited_for(shard: Path, inside: str) -> None:
+    (shard / inside).unlink()
+    os.mkfifo(shard / inside)
+    refused(shard)
+
+
+def test_metadata_that_hides_in_the_group_is_not_looked_at(shard: Path) -> None:
+    """Zarr's consolidated metadata would describe arrays that are not there."""
+    zarr.consolidate_metadata(shard)
+    (shard / "dyn8/zarr.json").write_text("{}")
+    refused(shard)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{" * 100_000, '{"zarr_format": 2}', "\0"])
+def test_a_group_that_is_none(shard: Path, text: str) -> None:
+    (shard / "zarr.json").write_text(text)
+    refused(shard)
+
+
+def test_another_size_than_its_row_says(shard: Path) -> None:
+    assert open_shard(shard.parents[1], NAME, "s").size == Shard(shard).size
+    with pytest.raises(Failure, match=r"has levels of size s, and its row says m: delete .*\.parquet and run"):
+        open_shard(shard.parents[1], NAME, "m")
+
+
+def test_the_table_is_that_of_the_dataclasses(shard: Path) -> None:
+    table = {place.name: place for place in table_for(Shard(shard).size)}
+    assert table["record/state/position"].shape == (7, 2)
+    assert table["level/model/vertices"].shape == (5, 4, 2)
+    assert (table["record/action"].array, table["record/action"].shape) == ("act", (6,))
+    assert RECORD_STEPS not in {n for place in table.values() for n in place.shape}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "/etc",
+        "../other/s",
+        "shards/../../x",
+        "shards",
+        "",
+        ".",
+        "shards/a.zarr",
+        f"{NAME}/",
+        f"{NAME}/dyn32",
+        f"./{NAME}",
+        f"x/{NAME}",
+        NAME.upper(),
+        NAME.removesuffix(".zarr"),
+        "experts/../" + NAME,
+        f"{NAME}\n",
+        "manifest/" + NAME[7:],
+    ],
+)
+def test_names_that_lead_elsewhere(tmp_path: Path, name: str) -> None:
+    with pytest.raises(Failure, match=r"which can be neither a shard nor experts of this split") as raised:
+        data_path(tmp_path, name)
+    assert "\n" not in str(raised.value)
+
+
+def test_names_of_data_and_links_on_the_way(tmp_path: Path) -> None:
+    split, experts = tmp_path / "s", NAME.removesuffix(".zarr").replace("shards", "experts")
+    split.mkdir()
+    assert data_path(split, NAME) == split / NAME
+    assert data_path(split, experts) == split / experts
+    (tmp_path / "link").symlink_to(split)
+    assert data_path(tmp_path / "link", NAME) == tmp_path / "link" / NAME  # the user's own
+    (tmp_path / "elsewhere").mkdir()
+    (split / "shards").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(Failure, match="is a link to another place"):
+        data_path(split, NAME)
+    (split / "experts").mkdir()
+    (split / experts).symlink_to("/etc")
+    with pytest.raises(Failure, match="is a link to another place"):
+        data_path(split, experts)
