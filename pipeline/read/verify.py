@@ -23,7 +23,7 @@ from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import require_manifest
 from pipeline.store.provenance import device, versions
-from pipeline.store.shard import Shard
+from pipeline.store.shard import Shard, open_shard
 
 
 @dataclass
@@ -74,17 +74,16 @@ def examine(split: Path) -> Findings:
             by_shard.setdefault(row["shard"], []).append(row)
     for name, rows in by_shard.items():
         try:
-            _examine_shard(split / name, rows, task, findings)
+            _examine_shard(open_shard(split, name, rows[0]["size"]), rows, task, findings)
         except Failure as failure:
             findings.wrong.append(str(failure))
     return findings
 
 
-def _examine_shard(path: Path, rows: list[dict[str, Any]], task: TaskParams, findings: Findings) -> None:
-    shard = Shard(path)
+def _examine_shard(shard: Shard, rows: list[dict[str, Any]], task: TaskParams, findings: Findings) -> None:
     claimed = {row["row"]: row["level_id"] for row in rows}
     if claimed != dict(enumerate(shard.level_ids)):
-        raise Failure(f"The shard {path} holds levels {shard.level_ids}, the manifest says {claimed}.")
+        raise Failure(f"The shard {shard.path} holds levels {shard.level_ids}, the manifest says {claimed}.")
     arrays = shard.read()
     level, record = tree_of(Level, arrays, "level/"), tree_of(Record, arrays, "record/")
     again = replay(level, record.action, task)
