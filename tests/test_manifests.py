@@ -25,6 +25,12 @@ def test_it_describes_the_default_dataset() -> None:
     assert {row["label"] for row in ROWS} == {"solved", "unsolved", "trivial", "unsolvable"}
 
 
+def test_it_has_null_where_there_is_no_number() -> None:
+    assert [row for row in ROWS if row["label"] == "trivial" and row["best_return"] is not None] == []
+    numbers = [x for row in ROWS for x in [*row.values(), *row["learning_curve"]] if isinstance(x, float)]
+    assert np.isfinite(numbers).all()
+
+
 def test_every_level_starts_as_it_did() -> None:
     for name, values in arrays_of(sample_levels(IDS, SIZES["s"])).items():
         np.testing.assert_allclose(values, WORLDS[name], rtol=1e-5, atol=1e-6, err_msg=name)

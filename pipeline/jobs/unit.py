@@ -4,6 +4,7 @@ Idempotent: an attempt that dies anywhere leaves at most a shard that no fragmen
 """
 
 import errno
+import math
 import traceback
 from collections.abc import Callable
 from dataclasses import asdict
@@ -147,8 +148,9 @@ def shard_arrays(levels: Level, record: Record, kept: list[int]) -> dict[str, np
 
 
 def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, Any]:
-    """A level's row, without its identity and without a shard."""
-    return asdict(verdict) | {
+    """A level's row, without its identity and without a shard. Null where a verdict has no number."""
+    known = {name: _finite_or_null(value) for name, value in asdict(verdict).items()}
+    return known | {
         "level_id": level_id,
         "size": job.size,
         "budget": job.budget,
@@ -160,3 +162,10 @@ def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, A
         "device": device(),
         "command": f"{again(job)} first_level={level_id} levels=1",
     }
+
+
+def _finite_or_null(value: Any) -> Any:
+    """NaN and infinities say that nothing was counted; in a manifest, null says so."""
+    if isinstance(value, list):
+        return [_finite_or_null(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

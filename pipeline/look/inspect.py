@@ -72,7 +72,7 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
         "env_steps_unsolved": total(select(chosen, "label = 'unsolved'"), "env_steps"),
         "split_bytes": stored,  # of all the split's shards, whatever the condition
         "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
-        "rows": [_plain(row) for row in chosen.slice(0, shown).to_pylist()],
+        "rows": chosen.slice(0, shown).to_pylist(),
     }
 
 
@@ -121,15 +121,6 @@ def _quantiles(table: pa.Table, column: str) -> dict[str, float] | None:
         return None
     found = np.quantile(values, QUANTILES, method="nearest").tolist()
     return {f"{quantile:.0%}": value for quantile, value in zip(QUANTILES, found, strict=True)}
-
-
-def _plain(value: Any) -> Any:
-    """JSON has no NaN and no infinity: null."""
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_plain(entry) for entry in value]
-    return value if not isinstance(value, float) or abs(value) < float("inf") else None
 
 
 def _print(facts: dict[str, Any], console: Console) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-MANIFEST_VERSION = 3
+MANIFEST_VERSION = 4
 SHARD_VERSION = 1
 RECORD_STEPS = 256  # of a record, with automatic reset inside
 
@@ -30,18 +30,18 @@ COLUMNS = pa.schema(
         pa.field("label_reason", pa.string(), nullable=False),
         pa.field("failed_by_noop", pa.bool_(), nullable=False),  # doing nothing lets green touch red
         pa.field("witness", pa.string()),  # most probable, sampled, exploration, nothing; null: there is none
-        # of the last evaluation; NaN: no episode ended, or there was none
-        pa.field("success_rate", pa.float32(), nullable=False),  # of sampled attempts
+        # of the last evaluation; null: no episode ended, or there was none (SQL has NaN above every number)
+        pa.field("success_rate", pa.float32()),  # of sampled attempts
         pa.field("most_probable_succeeds", pa.bool_(), nullable=False),
-        pa.field("sticky_success_rate", pa.float32(), nullable=False),
-        pa.field("moved_success_rate", pa.float32(), nullable=False),
+        pa.field("sticky_success_rate", pa.float32()),
+        pa.field("moved_success_rate", pa.float32()),
         pa.field("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: none
         pa.field("steps_to_first_success", pa.int64()),  # env steps of training; null: never
         pa.field("env_steps", pa.int64(), nullable=False),  # used of the budget
         pa.field(
             "learning_curve", pa.list_(pa.float32()), nullable=False
-        ),  # success rate per update, NaN: no episode ended
-        pa.field("best_return", pa.float32(), nullable=False),
+        ),  # success rate per update, null: no episode ended
+        pa.field("best_return", pa.float32()),  # null: no episode of training ended
         pa.field("episodes", pa.int64(), nullable=False),
         pa.field("shard", pa.string()),  # path below the split; null: no witness
         pa.field("row", pa.int32()),  # of the shard

@@ -4,6 +4,7 @@ And a real split without training.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -132,4 +133,16 @@ def played_split(folder: Path) -> Path:
         WorkUnit(tuple(int(i) for i in ids)),
         UnitResult(ids.astype(np.int64), levels, record, verdicts, SPENT),
     )
+    return path
+
+
+def made_split(folder: Path, units: Sequence[Sequence[Label]], *words: str) -> Path:
+    """A split of units with these labels, level ids one after another; random bits in every level and record."""
+    job = made_job(str(folder), "size=s", *words)
+    path, first = split_path(job.out, job.budget, job.size), 0
+    path.mkdir(parents=True)
+    for labels in units:
+        ids = list(range(first, first + len(labels)))
+        commit(job, path, WorkUnit(tuple(ids)), made_result(ids, list(labels)))
+        first += len(labels)
     return path
