@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib.resources import files
-from threading import RLock
 from typing import Any
 
 from hydra import compose, initialize_config_module
@@ -24,7 +23,6 @@ from levelgen.sampling.distribution import Distribution
 from levelgen.task.rules import TaskParams
 
 JOB = "generate"
-HYDRA = RLock()  # its state is one for the process, and a worker's units run in threads
 BY_HAND = frozenset({"size", "budget", "sampler_version"})  # results that are not settings, or have their own word
 WORDS = frozenset({"size", "levels", "budget", "out", "continue_from"})  # kept as typed: 007 stays 007
 
@@ -40,10 +38,9 @@ def compose_job(overrides: Sequence[str]) -> JobConfig:
 
 def settings(overrides: Sequence[str]) -> dict[str, Any]:
     """The composed settings as nested plain mappings, not yet checked."""
-    with HYDRA:
-        parsed = [_parsed(text) for text in overrides]
-        _check_keys(parsed, flat(_composed([])))
-        return _composed([override.input_line or "" for override in parsed])
+    parsed = [_parsed(text) for text in overrides]
+    _check_keys(parsed, flat(_composed([])))
+    return _composed([override.input_line or "" for override in parsed])
 
 
 def listing() -> str:

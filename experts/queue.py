@@ -1,4 +1,4 @@
-"""The queue before the slots: levels enter it in blocks, with experts that have seen nothing or that go on."""
+"""The queue before the slots: levels enter it in groups, with experts that have seen nothing or that go on."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -14,7 +14,7 @@ from experts.slots import Begun, Queue, begin
 from experts.witness import take
 from levelgen.level import Level
 
-BLOCK = 16  # levels that enter at once
+GROUP = 16  # levels that enter at once
 NO_EXPERTS: Mapping[int, Begun] = MappingProxyType({})
 
 
@@ -45,16 +45,16 @@ def enter(
     begun: Mapping[int, Begun] = NO_EXPERTS,
 ) -> Queue:
     """The queue (used up) with more levels. `begun` has the experts that go on, by place among these levels."""
-    for first in range(0, len(level_ids), BLOCK):
-        some = range(first, min(first + BLOCK, len(level_ids)))
-        fill = np.minimum(np.arange(first, first + BLOCK), some[-1])
+    for first in range(0, len(level_ids), GROUP):
+        some = range(first, min(first + GROUP, len(level_ids)))
+        fill = np.minimum(np.arange(first, first + GROUP), some[-1])
         block, ids = take(levels, fill), np.asarray(level_ids, np.int32)[fill]
         experts = begin(block, ids, config)
         if mine := {i - first: begun[i] for i in some if i in begun}:
             experts = jax.tree.map(np.array, experts)
             for i, expert in mine.items():
                 jax.tree.map(partial(_put_row, i), experts, expert)
-        nowhere = [queue.capacity] * (BLOCK - len(some))
+        nowhere = [queue.capacity] * (GROUP - len(some))
         queue = _put(queue, block, ids, experts, np.array(next_places(queue, len(some)) + nowhere))
         queue = queue._replace(count=np.int32(int(queue.count) + len(some)))
     return queue

@@ -3,22 +3,28 @@
 Levels that need no expert (`experts.before`) get none, and use nothing of their budget.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from experts.before import decide
+from experts.before import Before, decide
 from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
 from experts.judge import Kept, judge
 from experts.labels import WITNESSED, Label, Verdict
-from experts.pool import NOTHING_BEGUN, Pool, Spent, Tell, quiet
+from experts.pool import NOTHING_BEGUN, Pool, Spent, Submission, Totals
 from experts.witness import Record, replay, take
 from levelgen.level import ACTIONS, Level
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
 DEFAULT_STOP = StopConfig()
+Tell = Callable[[int, float, int], None]  # totals so far: env steps, levels (parts count), solved levels
+
+
+def quiet(env_steps: int, levels: float, solved: int) -> None:
+    """Tells nobody."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,16 @@ class UnitResult:
     experts: dict[int, Kept] = field(default_factory=dict)  # by level id, where they are kept
 
 
+class TrainingRun(NamedTuple):
+    """Levels of which each has its verdict or is in a pool."""
+
+    level_ids: np.ndarray
+    levels: Level
+    before: Before
+    left: np.ndarray  # indices of the levels that need an expert
+    submission: Submission  # of those
+
+
 def train_levels(
     levels: Level,
     level_ids: np.ndarray,
@@ -44,7 +60,7 @@ def train_levels(
     begun: Mapping[int, Kept] = NOTHING_BEGUN,
     keep: bool = False,
 ) -> UnitResult:
-    """`train_in` a pool of their own.
+    """Label the levels; train an expert for each that needs one, in a pool of their own.
 
     Args:
         levels: the levels, as their ids rebuild them.
@@ -53,45 +69,57 @@ def train_levels(
         config: what an expert is.
         stopping: when a level leaves its slot.
         rules: of the task; records hold its rewards, training shapes with the configuration's.
-        tell: as for `train_in`.
-        begun: as for `train_in`.
-        keep: as for `train_in`.
+        tell: called after each rollout with env steps, levels and solved levels so far.
+        begun: as for `begin`.
+        keep: as for `begin`.
 
     Raises:
         ValueError: the budget does not suffice for one update.
     """
-    return train_in(new_pool(budget, config, stopping, rules), levels, level_ids, tell, begun, keep)
+    pool = new_pool(budget, config, stopping, rules)
+    run = begin(pool, levels, level_ids, begun, keep)
+    while not pool.step():
+        tell(*totals(pool, run))
+    result = finish(pool, run)
+    solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
+    tell(result.spent.trained, len(result.verdicts), solved)
+    return result
 
 
-def train_in(
+def begin(
     pool: Pool,
     levels: Level,
     level_ids: np.ndarray,
-    tell: Tell = quiet,
     begun: Mapping[int, Kept] = NOTHING_BEGUN,
     keep: bool = False,
-) -> UnitResult:
-    """Label the levels; train an expert for each that needs one.
+) -> TrainingRun:
+    """Submit to the pool those levels that need an expert.
 
     Args:
-        pool: where experts train, perhaps beside those of other threads.
+        pool: where experts train, perhaps beside those of other runs.
         levels: the levels, as their ids rebuild them.
         level_ids: their ids; the seeds of all randomness.
-        tell: called now and then with totals over all these levels.
         begun: by level id, experts that go on with what they have left of the budget; the others begin.
         keep: whether the result has the experts.
-
-    Raises:
-        RuntimeError: another thread failed while it advanced the pool.
     """
     level_ids = np.asarray(level_ids)
     levels = jax.tree.map(np.asarray, levels)
-    before, failed = decide(levels, pool.rules)
-    left = np.array([i for i, verdict in enumerate(before) if verdict is None], int)
-    known_before = len(before) - len(left)
-    tell_all = lambda env_steps, through, solved: tell(env_steps, known_before + through, solved)
-    mine = {place: begun[level_id] for place, level_id in enumerate(level_ids[left].tolist()) if level_id in begun}
-    trained, spent = pool.train(take(levels, left), level_ids[left], tell_all, mine, keep)
+    before = decide(levels, pool.rules)
+    left = np.array([i for i, verdict in enumerate(before.verdicts) if verdict is None], int)
+    mine = {index: begun[level_id] for index, level_id in enumerate(level_ids[left].tolist()) if level_id in begun}
+    return TrainingRun(level_ids, levels, before, left, pool.submit(take(levels, left), level_ids[left], mine, keep))
+
+
+def totals(pool: Pool, run: TrainingRun) -> Totals:
+    """How far all levels of a run are, those that need no expert included."""
+    now = pool.totals(run.submission)
+    return now._replace(levels=len(run.level_ids) - len(run.left) + now.levels)
+
+
+def finish(pool: Pool, run: TrainingRun) -> UnitResult:
+    """Choose witnesses and give verdicts, once the run's submission has finished."""
+    level_ids, levels, (before, failed), left, submission = run
+    trained = submission.trained()
     actions = np.zeros((RECORD_STEPS, ACTIONS, len(level_ids)), np.int32)  # doing nothing, where none are found
     for i, of in zip(left, trained, strict=True):
         if of.witness is not None:
@@ -102,10 +130,9 @@ def train_in(
     known = [verdict or verdicts[i] for i, verdict in enumerate(before)]
     witnessed = np.array([verdict.label in WITNESSED for verdict in known])
     record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
-    tell(spent.trained, len(known), sum(verdict.label is Label.SOLVED for verdict in known))
     ended = zip(level_ids[left].tolist(), trained, strict=True)
     experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
-    return UnitResult(level_ids.astype(np.int64), levels, record, known, spent, experts)
+    return UnitResult(level_ids.astype(np.int64), levels, record, known, submission.spent(pool.config), experts)
 
 
 def new_pool(

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from pipeline.quota import cpu_quota
+
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
 # One process per core, each with one thread, is twice as fast as one process with XLA's own threads; and a sum
 # that is split over threads would make a level's bits depend on the machine's number of cores.
@@ -65,7 +67,22 @@ def interruptible() -> Iterator[None]:
 
 
 def own_cores() -> list[int]:
-    """The CPU cores this process may use."""
+    """The CPU cores that this process may keep busy: a container's quota may be smaller than their number."""
+    cores = _allowed_cores()
+    quota = cpu_quota()
+    return cores if quota is None else cores[: max(1, int(quota))]
+
+
+def cores_for(workers: int) -> list[int | None]:
+    """The core that each worker stays on, for at most `workers` of them (0: one for each core).
+
+    None leaves that to the system, where not every core has a worker: two runs side by side would choose the same.
+    """
+    cores = own_cores()[: workers or None]
+    return [*cores] if cores == _allowed_cores() else [None] * len(cores)
+
+
+def _allowed_cores() -> list[int]:
     if sys.platform == "linux":
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))

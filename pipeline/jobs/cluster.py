@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 os.environ |= {
@@ -28,66 +27,60 @@ from ray.exceptions import ActorDiedError, RayError
 from configs.schema import JobConfig
 from pipeline.errors import Failure, UserError
 from pipeline.jobs.progress import Board
-from pipeline.jobs.schedule import COMPANY, Outcome, Queue, WorkUnit
-from pipeline.runtime import interruptible, own_cores, prepare_jax
+from pipeline.jobs.schedule import ROUND, Assignment, Outcome, Queue, Round, WorkUnit
+from pipeline.runtime import cores_for, interruptible, own_cores, prepare_jax
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
-POLL = 0.25  # s between looks at the workers
+POLL = 0.25  # s after which people see progress, whether a worker has reported or not
 REACH = 5.0  # s in which a cluster has to answer
-ROOM = 60.0  # s without any worker after which people are told why
-STARTS = 3  # workers in a row that do not start, after which a place is given up
+RESCAN = 5.0  # s between looks at how many workers a cluster has room for
+PATIENCE = 60.0  # s without any worker after which people are told why
+STARTS = 3  # workers in a row that do not start, after which no further one is tried with these resources
 
 
-class Worker:
-    """An actor that attempts units, all in one pool of slots, and tells how far it is meanwhile."""
+@dataclass(frozen=True)
+class Resources:
+    """What one worker occupies."""
+
+    core: int | None = None  # that it stays on; None: the system or the cluster chooses
+    gpus: int = 0
+
+
+class WorkerActor:
+    """A worker in a process of its own. Calls are short (see `schedule.ROUND`), so that one thread suffices."""
 
     def __init__(self, job: JobConfig, split: Path, core: int | None) -> None:
         prepare_jax(core)
-        self._job, self._split, self._pool = job, split, None
-        self._totals: dict[str, tuple[int, float, int] | None] = {}  # by unit; None: its levels are not in the pool yet
-        self._making = Lock()
+        from pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
-    def attempt(self, unit: WorkUnit) -> Outcome:
-        from pipeline.jobs.unit import attempt, pool_for  # imports what reads the settings made in __init__
+        self._worker = Worker(job, split)
 
-        def report(env_steps: int, levels: float, solved: int) -> None:
-            self._totals[unit.name] = env_steps, levels, solved
+    def ready(self) -> None:
+        """Answers once the process is there."""
 
-        self._totals[unit.name] = None
-        with self._making:
-            if self._pool is None or self._pool.error:
-                self._pool = pool_for(self._job)
-            pool = self._pool
-        return attempt(self._job, self._split, unit, report, pool)
-
-    def progress(self, names: list[str]) -> tuple[dict[str, tuple[int, float, int]], int]:
-        """Of these units under way env steps, levels and solved levels; and how many levels more there is room for."""
-        totals = {name: now for name in names if (now := self._totals.get(name)) is not None}
-        return totals, self._pool.wants if self._pool and len(totals) == len(names) else 0
+    def work(self, units: list[WorkUnit]) -> Round:
+        return self._worker.work(units, ROUND)
 
 
 @dataclass
-class Slot:
-    """A place for one worker: what it occupies, who is in it and what it does."""
+class WorkerHandle:
+    """A worker as the driver sees it: what it occupies, what it does, and whether there is one now."""
 
     job: JobConfig
     split: Path
-    core: int | None
-    gpus: int
+    resources: Resources
     actor: Any = None
     starting: Any = None  # reference to the new worker's first answer
     failed_starts: int = 0  # in a row
     why: str = ""  # of the last of them
-    running: dict[Any, WorkUnit] = field(default_factory=dict)  # by reference to the coming Outcome
-    wants: int = 1  # levels it has room for
-    look: Any = None  # reference to the coming progress
+    assignment: Assignment = field(default_factory=Assignment)
+    round: Any = None  # reference to the coming Round
 
     def start(self) -> None:
         """Ask for a worker. It gets no unit before it answers: a cluster may have no room for it now, or ever."""
-        # one thread for each unit, and one that answers `progress`
-        options = {"num_cpus": 1, "num_gpus": self.gpus, "max_concurrency": max(COMPANY) + 1, "max_restarts": 0}
-        self.actor = ray.remote(Worker).options(**options).remote(self.job, self.split, self.core)
-        self.starting, self.look, self.wants = self.actor.progress.remote([]), None, 1
+        options = {"num_cpus": 1, "num_gpus": self.resources.gpus, "max_restarts": 0}
+        self.actor = ray.remote(WorkerActor).options(**options).remote(self.job, self.split, self.resources.core)
+        self.starting = self.actor.ready.remote()
 
     def started(self) -> None:
         """The new worker has answered, or died."""
@@ -99,42 +92,31 @@ class Slot:
             self.failed_starts = 0
         self.starting = None
 
-    def take(self, queue: Queue) -> bool:
-        """Give the worker the queue's next unit, if it has room for it."""
-        if self.actor is None or self.starting is not None or (self.running and self.wants <= 0):
-            return False
-        unit = queue.take(self.running.values())
-        if unit is None:
-            return False
-        self.running[self.actor.attempt.remote(unit)] = unit
-        self.wants -= len(unit.level_ids)
-        self.look = None  # the last one did not see this unit
-        return True
+    def stop(self) -> None:
+        """Withdraw the request for a worker that has not started."""
+        if self.actor is not None:
+            ray.kill(self.actor)
+        self.actor = self.starting = None
 
-    def outcome(self, result: Any) -> Outcome:
-        """The finished attempt; a worker that died leaves its place to a new one."""
-        unit = self.running.pop(result)
+    @property
+    def free(self) -> bool:
+        """Whether it can be told of units now."""
+        return self.actor is not None and self.starting is None and self.round is None
+
+    def go_on(self) -> None:
+        """Let the worker train for a while, with what it was assigned meanwhile."""
+        self.round = self.actor.work.remote(self.assignment.hand_over())
+
+    def report(self) -> tuple[list[Outcome], dict[WorkUnit, tuple[int, float, int]]]:
+        """Outcomes and progress of the round that is over; a worker that died leaves its resources to a new one."""
+        done, self.round = self.round, None
         try:
-            return ray.get(result)
+            round = ray.get(done)
         except RayError as error:
             self.actor = None
-            return Outcome(unit, reason=f"{error}\n\n{_told(error)}")
-
-    def watch(self, board: Board) -> None:
-        """Fetch the worker's progress when it is there, without waiting."""
-        if self.actor is None or not self.running:
-            return
-        units = {unit.name: unit for unit in self.running.values()}
-        if self.look is not None:
-            if not ray.wait([self.look], timeout=0)[0]:
-                return
-            try:
-                totals, self.wants = ray.get(self.look)
-            except RayError:  # its attempts fail, too, and are dealt with there
-                return
-            for name in totals.keys() & units.keys():
-                board.tally.progress(units[name], *totals[name])
-        self.look = self.actor.progress.remote(list(units))
+            return self.assignment.lose(f"{error}\n\n{_told(error)}"), {}
+        self.assignment.account(round)
+        return round.outcomes, round.totals
 
 
 def _told(error: RayError) -> str:
@@ -153,53 +135,110 @@ def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Sequence[Ou
         Failure: no worker can start.
     """
     with connected():
-        slots = [Slot(job, split.absolute(), *of) for of in _places()[: job.workers or None]]
-        notice_at = time.monotonic() + ROOM
+        crew = Crew(job, split.absolute(), board)
         while True:
-            _start_workers(slots, len(queue.waiting))
-            while sum(slot.take(queue) for slot in slots):
-                pass
-            busy = {result: slot for slot in slots for result in slot.running}
-            if not busy and not queue.waiting:
+            crew.follow_cluster()
+            crew.start_workers(len(queue.waiting))
+            crew.assign(queue)
+            if not (crew.busy or queue.waiting):
                 return
-            starting = {slot.starting: slot for slot in slots if slot.starting is not None}
-            both = [*busy, *starting]
-            ended = ray.wait(both, num_returns=len(both), timeout=POLL)[0]
-            for result in starting.keys() & set(ended):
-                starting[result].started()
-            slots = _usable(slots, board)
-            settle([busy[result].outcome(result) for result in ended if result in busy])
-            for slot in slots:
-                slot.watch(board)
+            settle(crew.wait())
             board.refresh()
-            if busy:
-                notice_at = time.monotonic() + ROOM
-            elif time.monotonic() > notice_at:
-                board.say("No worker has started yet: `ray status` tells what the cluster has free.")
-                notice_at = float("inf")
 
 
-def _usable(slots: list[Slot], board: Board) -> list[Slot]:
-    """Those where workers start.
+class Crew:
+    """All workers of a job."""
 
-    Raises:
-        Failure: there are none.
-    """
-    usable = [slot for slot in slots if slot.failed_starts < STARTS]
-    for slot in slots:
-        if not usable:
-            raise Failure(f"No worker can start ({slot.why}): executor=inline may tell more.")
-        if slot not in usable:
-            board.say(f"A worker cannot start ({slot.why}): its place is given up, {len(usable)} left.")
-    return usable
+    def __init__(self, job: JobConfig, split: Path, board: Board) -> None:
+        self._job, self._split, self._board = job, split, board
+        self._gpus = _on_gpus()
+        self._handles = [self._handle(each) for each in _room(self._gpus, job.workers)]
+        self._given_up = 0  # workers that cannot start
+        self._rescan_at = time.monotonic() + RESCAN
+        self._notice_at = time.monotonic() + PATIENCE
 
+    def _handle(self, resources: Resources) -> WorkerHandle:
+        return WorkerHandle(self._job, self._split, resources)
 
-def _start_workers(slots: Sequence[Slot], waiting: int) -> None:
-    """Where there is none, and more units wait than workers are starting."""
-    starting = sum(slot.starting is not None for slot in slots)
-    free = [slot for slot in slots if slot.actor is None and not slot.running]
-    for slot in free[: max(0, waiting - starting)]:
-        slot.start()
+    @property
+    def busy(self) -> bool:
+        return any(handle.assignment.units for handle in self._handles)
+
+    def follow_cluster(self) -> None:
+        """As many workers as a cluster has room for now; one on this machine has always the same."""
+        if not _existing() or time.monotonic() < self._rescan_at:
+            return
+        self._rescan_at = time.monotonic() + RESCAN
+        room = _room(self._gpus, self._job.workers)
+        surplus = len(self._handles) + self._given_up - len(room)
+        self._handles += [self._handle(each) for each in room[: max(0, -surplus)]]
+        gone = [handle for handle in self._handles if handle.actor is None or handle.starting is not None]
+        for handle in gone[: max(0, min(surplus, len(self._handles) - 1))]:
+            handle.stop()
+            self._handles.remove(handle)
+
+    def start_workers(self, waiting: int) -> None:
+        """Where there is none, and more units wait than workers are starting."""
+        starting = sum(handle.starting is not None for handle in self._handles)
+        without = [handle for handle in self._handles if handle.actor is None]
+        for handle in without[: max(0, waiting - starting)]:
+            handle.start()
+
+    def assign(self, queue: Queue) -> None:
+        """Give units to the workers that have reported, and let them go on. Each gets one before any gets two."""
+        free = [handle for handle in self._handles if handle.free]
+        starting = sum(handle.starting is not None for handle in self._handles)
+        while any(
+            handle.assignment.take(queue)
+            for handle in free
+            if not handle.assignment.units or len(queue.waiting) > starting
+        ):
+            pass
+        for handle in free:
+            if handle.assignment.units:
+                handle.go_on()
+
+    def wait(self) -> list[Outcome]:
+        """Outcomes of the rounds that are over, if any ends in a moment."""
+        starting = {handle.starting: handle for handle in self._handles if handle.starting is not None}
+        rounds = {handle.round: handle for handle in self._handles if handle.round is not None}
+        both = [*starting, *rounds]
+        ray.wait(both, timeout=POLL)  # for the first
+        ended = ray.wait(both, num_returns=len(both), timeout=0)[0]
+        for reference in starting.keys() & set(ended):
+            starting[reference].started()
+        self._give_up()
+        self._notice_silence(bool(rounds))
+        outcomes: list[Outcome] = []
+        for reference in ended:
+            if reference in rounds:
+                more, totals = rounds[reference].report()
+                outcomes += more
+                self._board.tally.running.update(totals)
+        return outcomes
+
+    def _give_up(self) -> None:
+        """Leave out workers that do not start.
+
+        Raises:
+            Failure: there are no others.
+        """
+        usable = [handle for handle in self._handles if handle.failed_starts < STARTS]
+        for handle in self._handles:
+            if not usable:
+                raise Failure(f"No worker can start ({handle.why}): executor=inline may tell more.")
+            if handle not in usable:
+                self._given_up += 1
+                self._board.say(f"A worker cannot start ({handle.why}): it is given up, {len(usable)} left.")
+        self._handles = usable
+
+    def _notice_silence(self, working: bool) -> None:
+        """Say once why nothing happens."""
+        if working:
+            self._notice_at = time.monotonic() + PATIENCE
+        elif time.monotonic() > self._notice_at:
+            self._board.say("No worker has started yet: `ray status` tells what the cluster has free.")
+            self._notice_at = float("inf")
 
 
 @contextmanager
@@ -233,9 +272,9 @@ def _require_reachable(address: str) -> None:
     Raises:
         UserError: nobody listens there.
     """
-    if place := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
+    if found := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
         try:
-            socket.create_connection((place[1].strip("[]"), int(place[2])), REACH).close()
+            socket.create_connection((found[1].strip("[]"), int(found[2])), REACH).close()
         except (OSError, OverflowError) as error:
             raise _no_cluster(getattr(error, "strerror", None) or str(error)) from error
 
@@ -252,16 +291,23 @@ def _existing() -> bool:
     return bool(os.environ.get("RAY_ADDRESS"))
 
 
-def _places() -> list[tuple[int | None, int]]:
-    """Core and GPUs of each worker: one worker per GPU where JAX can use them, else one per core."""
-    resources = ray.cluster_resources()
-    if gpus := int(resources.get("GPU", 0)):
-        probe = ray.remote(num_gpus=1, max_calls=1)(_jax_sees_a_gpu)
-        if ray.get(probe.remote()):
-            return [(None, 1)] * gpus
-    if _existing():  # which cores its machines have is theirs to know
-        return [(None, 0)] * int(resources["CPU"])
-    return [(core, 0) for core in own_cores()]
+def _on_gpus() -> bool:
+    """Whether each worker gets a GPU: where there are some, and JAX can use them."""
+    if not ray.cluster_resources().get("GPU"):
+        return False
+    return ray.get(ray.remote(num_gpus=1, max_calls=1)(_jax_sees_a_gpu).remote())
+
+
+def _room(gpus: bool, workers: int) -> list[Resources]:
+    """What each worker occupies now: one for each GPU, or else each core, and at most `workers` of them, if any."""
+    now = ray.cluster_resources()
+    if gpus:
+        room = [Resources(gpus=1)] * int(now.get("GPU", 0))
+    elif _existing():  # which cores its machines have is theirs to know
+        room = [Resources()] * int(now.get("CPU", 0))
+    else:
+        return [Resources(core) for core in cores_for(workers)]
+    return (room or [Resources(gpus=int(gpus))])[: workers or None]  # one that waits: more machines may join
 
 
 def _jax_sees_a_gpu() -> bool:

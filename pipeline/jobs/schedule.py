@@ -1,4 +1,4 @@
-"""What is left to do: work units, their attempts and their quarantine. Knows nothing of workers or files."""
+"""What is left to do: work units, who has them, their attempts and their quarantine. Knows nothing of files."""
 
 from collections import deque
 from collections.abc import Collection, Iterable, Sequence
@@ -11,6 +11,7 @@ from pipeline.store.layout import unit_name
 # How many units a worker may have at once, those included that failed as often: a unit that kills its worker takes
 # fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.
 COMPANY = (64, 8, 1)
+ROUND = 1.0  # s that a worker trains between reports; a step that is compiled takes longer
 TOLD = 4  # runs of levels in a message
 
 
@@ -58,6 +59,15 @@ class Outcome:
     fatal: str = ""  # a sentence, where no further attempt can succeed
 
 
+@dataclass(frozen=True)
+class Round:
+    """What a worker reports of some time at work."""
+
+    outcomes: list[Outcome]  # of the units that ended
+    totals: dict[WorkUnit, tuple[int, float, int]]  # of the others: env steps, levels, solved levels so far
+    wants: int  # levels more for which it has room
+
+
 @dataclass
 class Queue:
     """Units waiting, each with the attempts it has had."""
@@ -89,6 +99,43 @@ class Queue:
             return False
         self.quarantined.append(unit)
         return True
+
+
+@dataclass
+class Assignment:
+    """The units that one worker has."""
+
+    units: list[WorkUnit] = field(default_factory=list)
+    new: list[WorkUnit] = field(default_factory=list)  # those of them that it has not been told of
+    wants: int = 1  # levels more for which it has room
+
+    def take(self, queue: Queue) -> bool:
+        """Another unit from the queue, if there is room for one and one may join these."""
+        if self.units and self.wants <= 0:
+            return False
+        unit = queue.take(self.units)
+        if unit is None:
+            return False
+        self.units.append(unit)
+        self.new.append(unit)
+        self.wants -= len(unit.level_ids)
+        return True
+
+    def hand_over(self) -> list[WorkUnit]:
+        """The units that the worker is now told of."""
+        new, self.new = self.new, []
+        return new
+
+    def account(self, round: Round) -> None:
+        """Follow the worker's report."""
+        ended = {outcome.unit for outcome in round.outcomes}
+        self.units = [unit for unit in self.units if unit not in ended]
+        self.wants = round.wants
+
+    def lose(self, reason: str) -> list[Outcome]:
+        """The worker died, and its units failed."""
+        units, self.units, self.new, self.wants = self.units, [], [], 1
+        return [Outcome(unit, reason=reason) for unit in units]
 
 
 def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:

@@ -6,7 +6,6 @@ Idempotent: an attempt that dies anywhere leaves at most a shard that no fragmen
 import errno
 import math
 import traceback
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from configs.compose import again
 from configs.schema import JobConfig
 from experts.labels import WITNESSED, Label, Verdict
 from experts.pool import Pool
-from experts.train import UnitResult, new_pool, train_in
+from experts.train import TrainingRun, UnitResult, begin, finish, new_pool
 from experts.witness import Record, replay, succeeds
 from levelgen.identity.content import content_hashes
 from levelgen.identity.signature import signatures
@@ -35,7 +34,6 @@ from pipeline.store.manifest import write_fragment
 from pipeline.store.provenance import device, versions
 from pipeline.store.shard import write_shard
 
-Report = Callable[[int, float, int], None]  # so far: env steps, levels, solved levels
 # The disk refuses: the next attempt would train for nothing.
 FATAL = {
     errno.ENOSPC: "the disk is full: free some space",
@@ -47,39 +45,44 @@ FATAL = {
 }
 
 
-def attempt(job: JobConfig, split: Path, unit: WorkUnit, report: Report, pool: Pool) -> Outcome:
-    """One attempt at a unit, with its failure as a value: exceptions do not travel between processes."""
-    try:
-        return Outcome(unit, run_unit(job, split, unit, report, pool))
-    except LockRefused as refused:
-        return Outcome(unit, reason=traceback.format_exc(), fatal=str(refused))
-    except OSError as error:
-        fatal = FATAL.get(error.errno or 0, "")
-        sentence = fatal and f"Cannot write to {split}, {fatal}, then run the same command again."
-        return Outcome(unit, reason=traceback.format_exc(), fatal=sentence)
-    except Exception:
-        return Outcome(unit, reason=traceback.format_exc())
-
-
 def pool_for(job: JobConfig) -> Pool:
     """Where a job's experts train, those of several units side by side."""
     return new_pool(job.env_steps, job.expert, job.stop, job.task)
 
 
-def run_unit(job: JobConfig, split: Path, unit: WorkUnit, report: Report, pool: Pool) -> Summary:
-    """Make and commit one unit.
+def begin_unit(job: JobConfig, unit: WorkUnit, pool: Pool) -> TrainingRun:
+    """Sample a unit's levels and submit to the pool those that need an expert.
+
+    Raises:
+        Failure: the experts that should go on cannot be read.
+    """
+    ids = np.asarray(unit.level_ids, np.int32)
+    levels = sample_levels(jnp.asarray(ids), size_of(job.size), job.distribution)
+    return begin(pool, levels, ids, experts_for(job, unit.level_ids), job.keep_experts)
+
+
+def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool, run: TrainingRun) -> Summary:
+    """Judge and commit a unit whose levels have left the pool.
 
     Raises:
         Failure: a witness does not replay.
         OSError: the disk refuses; nothing is committed.
     """
-    ids = np.asarray(unit.level_ids, np.int32)
-    levels = sample_levels(jnp.asarray(ids), size_of(job.size), job.distribution)
-    result = train_in(pool, levels, ids, report, experts_for(job, unit.level_ids), job.keep_experts)
+    result = finish(pool, run)
     check_witnesses(result, job.task)
     commit(job, split, unit, result)
     labels = [verdict.label for verdict in result.verdicts]
     return Summary(len(labels), labels.count(Label.SOLVED), *result.spent)
+
+
+def failure(split: Path, unit: WorkUnit, error: Exception) -> Outcome:
+    """A failed attempt as a value: exceptions do not travel between processes."""
+    reason, fatal = "".join(traceback.format_exception(error)), ""
+    if isinstance(error, LockRefused):
+        fatal = str(error)
+    elif isinstance(error, OSError) and (what := FATAL.get(error.errno or 0)):
+        fatal = f"Cannot write to {split}, {what}, then run the same command again."
+    return Outcome(unit, reason=reason, fatal=fatal)
 
 
 def check_witnesses(result: UnitResult, task: TaskParams) -> None:

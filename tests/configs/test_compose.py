@@ -2,9 +2,7 @@
 
 import dataclasses
 import shlex
-from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
-from threading import Barrier
 
 import pytest
 from hypothesis import given, settings
@@ -185,14 +183,3 @@ def test_the_listing_can_be_typed_back() -> None:
     lines = [line.strip() for line in listing().splitlines()]
     assert compose_job(lines) == compose_job([])
     assert {line.partition("=")[0] for line in lines} > set(flat({"expert": dataclasses.asdict(ExpertConfig())}))
-
-
-def test_units_in_threads_may_all_ask_at_once() -> None:
-    together = Barrier(8)
-
-    def levels(count: int) -> str:
-        together.wait()
-        return compose_job([f"levels={count}"]).levels
-
-    with ThreadPoolExecutor(8) as threads:
-        assert list(threads.map(levels, range(1, 9))) == [str(count) for count in range(1, 9)]

@@ -1,16 +1,11 @@
-"""Threads that share a pool: each gets what it would have got alone, and none waits for ever."""
-
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from threading import Event
+"""Submissions that share a pool: each gets what it would have got alone, whenever it came."""
 
 import jax
 import numpy as np
 import pytest
 
-from experts import pool as pool_module
 from experts.judge import Trained
-from experts.pool import Pool, capacity_of
+from experts.pool import Pool, Submission, capacity_of
 from experts.queue import empty_queue, enter, next_places
 from experts.witness import take
 from levelgen.level import SIZES, Level
@@ -29,7 +24,9 @@ def levels() -> Level:
 
 @pytest.fixture(scope="module")
 def alone(levels: Level) -> list[Trained]:
-    return new_pool().train(levels, IDS)[0]
+    pool = new_pool()
+    (submission,) = finished(pool, pool.submit(levels, IDS))
+    return submission.trained()
 
 
 def new_pool() -> Pool:
@@ -40,83 +37,65 @@ def part(levels: Level, at: range) -> tuple[Level, np.ndarray]:
     return take(levels, np.array(at, int)), IDS[np.array(at, int)]
 
 
-def test_threads_get_what_each_would_get_alone(levels: Level, alone: list[Trained]) -> None:
-    """More levels come than the queue has places, so places are used again."""
+def finished(pool: Pool, *submissions: Submission) -> list[Submission]:
+    """Those of the pool in the order in which they finish, once all of these have."""
+    done: list[Submission] = []
+    while not set(submissions) <= set(done):
+        done += pool.step()
+    return done
+
+
+def test_each_gets_what_it_would_get_alone(levels: Level, alone: list[Trained]) -> None:
+    """More levels come than the queue has room for, so its entries are used again."""
     assert capacity_of(CONFIG) < len(IDS)
     pool, parts = new_pool(), [range(20), range(20, 23), range(23, 36), range(0)]
-    with ThreadPoolExecutor(len(parts)) as threads:
-        found = list(threads.map(lambda at: pool.train(*part(levels, at)), parts))
-    trained = [of for some, _ in found for of in some]
+    submissions = [pool.submit(*part(levels, at)) for at in parts]
+    order = finished(pool, *submissions)
+    assert order[0] is submissions[3]  # without levels
+    assert len(order) == len(parts)
+    trained = [of for submission in submissions for of in submission.trained()]
     assert len(trained) == len(IDS)
     same(trained, alone)
-    for (some, spent), at in zip(found, parts, strict=True):
-        assert len(some) == len(at)
-        assert spent.trained == sum(len(of.curve) for of in some) * CONFIG.steps_per_update
+    for submission in submissions:
+        curves = sum(len(of.curve) for of in submission.trained())
+        assert submission.spent(CONFIG).trained == curves * CONFIG.steps_per_update
 
 
 def test_levels_that_come_later_take_the_slots_that_are_empty(levels: Level) -> None:
-    """One level keeps one slot busy; those of a second thread come while it trains, into the other."""
-    pool, second = new_pool(), []
-
-    def add(env_steps: int, through: float, solved: int) -> None:
-        if not second:
-            second.append(threads.submit(lambda: pool.train(*part(levels, range(1, 4)))))
-            while pool.wants:  # until they wait
-                pass
-
-    with ThreadPoolExecutor(1) as threads:
-        _, first = pool.train(*part(levels, range(1)), tell=add)
-        second[0].result()
-    assert first.idle == CONFIG.steps_per_update  # of the first rollout alone
+    """One level keeps one slot busy; others come while it trains, into the other."""
+    pool = new_pool()
+    first = pool.submit(*part(levels, range(1)))
+    assert pool.step() == []
+    second = pool.submit(*part(levels, range(1, 4)))
+    finished(pool, first, second)
+    assert first.spent(CONFIG).idle == CONFIG.steps_per_update  # of the first rollout alone
 
 
-def test_what_is_told_grows_to_the_whole(levels: Level) -> None:
-    seen: list[tuple[int, float, int]] = []
-    trained, spent = new_pool().train(*part(levels, range(5)), tell=lambda *now: seen.append(now))
-    for totals in zip(*seen, strict=True):
-        assert list(totals) == sorted(totals)
-    assert seen[-1][:2] == (spent.trained, 5)
-    assert len(trained) == 5
-
-
-def test_a_failure_reaches_every_thread(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
-    pool, calls, together = new_pool(), [], Event()
-
-    def fails(work: Callable) -> Callable:
-        def advance(*args: object) -> object:
-            calls.append(1)
-            together.wait(timeout=30)  # until the second thread has come
-            if len(calls) == 3:
-                raise MemoryError("no room on the device")
-            return work(*args)
-
-        return advance
-
-    monkeypatch.setattr(pool_module, "advance", fails(pool_module.advance))
-    with ThreadPoolExecutor(2) as threads:
-        first = threads.submit(lambda: pool.train(*part(levels, range(4))))
-        second = threads.submit(lambda: pool.train(*part(levels, range(4, 8))))
-        while pool.wants or len(pool._batches) < 2:
-            pass
-        together.set()
-        errors = [future.exception(timeout=60) for future in (first, second)]
-    assert sorted(type(error).__name__ for error in errors) == ["MemoryError", "RuntimeError"]
-    assert "no room on the device" in str(errors)
-    with pytest.raises(RuntimeError, match="no room on the device"):
-        pool.train(*part(levels, range(1)))
+def test_totals_grow_to_the_whole(levels: Level) -> None:
+    pool = new_pool()
+    submission, seen = pool.submit(*part(levels, range(5))), []
+    while not pool.step():
+        seen.append(pool.totals(submission))
+    seen.append(pool.totals(submission))
+    for numbers in zip(*seen, strict=True):
+        assert list(numbers) == sorted(numbers)
+    assert seen[-1][:2] == (submission.spent(CONFIG).trained, 5)
 
 
 def test_a_pool_wants_levels_while_fewer_wait_than_there_are_slots(levels: Level) -> None:
     pool = new_pool()
     assert pool.wants == 2
+    pool.submit(*part(levels, range(5)))
+    assert pool.wants == 0
     wanted: list[int] = []
-    pool.train(*part(levels, range(5)), tell=lambda *now: wanted.append(pool.wants))
+    while not pool.step():
+        wanted.append(pool.wants)
     assert wanted[0] == 0  # three wait
     assert wanted == sorted(wanted)
     assert pool.wants == 2
 
 
-def test_places_of_a_queue_go_round(levels: Level) -> None:
+def test_entries_of_a_queue_go_round(levels: Level) -> None:
     queue = empty_queue(levels, 20, 1, CONFIG)
     for at in (range(12), range(12, 24)):
         some, ids = part(levels, at)

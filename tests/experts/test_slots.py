@@ -32,7 +32,11 @@ UPDATES = 24  # 12,288 env steps
 def train(
     levels: Level, level_ids: np.ndarray, updates: int, config: ExpertConfig, stopping: StopConfig, **how: Any
 ) -> tuple[list[Trained], Spent]:
-    return Pool(updates, config, stopping, DEFAULT_RULES).train(levels, level_ids, **how)
+    pool = Pool(updates, config, stopping, DEFAULT_RULES)
+    submission = pool.submit(levels, level_ids, **how)
+    while not pool.step():
+        pass
+    return submission.trained(), submission.spent(config)
 
 
 def queue_of(levels: Level, updates: int) -> Queue:

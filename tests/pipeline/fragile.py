@@ -5,18 +5,15 @@ Of level -1 they die before they have started.
 
 import os
 import sys
-import time
 from pathlib import Path
 
 from configs.schema import JobConfig
 from pipeline.cli import main as cli
 from pipeline.jobs import cluster
-from pipeline.jobs.schedule import Outcome, WorkUnit
-
-MOMENT = 1.0  # s, in which the worker gets other units
+from pipeline.jobs.schedule import Round, WorkUnit
 
 
-class Fragile(cluster.Worker):
+class Fragile(cluster.WorkerActor):
     """A worker as it is, but for one level that kills its process, as a fault in native code does."""
 
     deadly = int(sys.argv[1])
@@ -26,13 +23,12 @@ class Fragile(cluster.Worker):
             os._exit(1)
         super().__init__(job, split, core)
 
-    def attempt(self, unit: WorkUnit) -> Outcome:
-        if self.deadly in unit.level_ids:
-            time.sleep(MOMENT)
-            os._exit(1)
-        return super().attempt(unit)
+    def work(self, units: list[WorkUnit]) -> Round:
+        if any(self.deadly in unit.level_ids for unit in units):
+            os._exit(1)  # and with it die the units that it has from earlier rounds
+        return super().work(units)
 
 
 if __name__ == "__main__":
-    cluster.Worker = Fragile  # type: ignore[misc]
+    cluster.WorkerActor = Fragile  # type: ignore[misc]
     sys.exit(cli.main(sys.argv[2:]))

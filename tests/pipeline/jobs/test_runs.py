@@ -69,8 +69,8 @@ def _status(pid: int) -> list[str] | None:
 
 
 def workers(process: subprocess.Popen[str]) -> list[int]:
-    """Ray's workers that are attempting a unit now."""
-    return sorted(pid for pid in descendants(process) if _title(pid).startswith("ray::Worker.attempt"))
+    """Ray's workers that have units now."""
+    return sorted(pid for pid in descendants(process) if _title(pid).startswith("ray::WorkerActor.work"))
 
 
 def _title(pid: int) -> str:

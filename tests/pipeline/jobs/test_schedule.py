@@ -5,7 +5,7 @@ from collections.abc import Collection
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.jobs.schedule import COMPANY, Queue, WorkUnit, levels_text, plan_units, runs
+from pipeline.jobs.schedule import COMPANY, Assignment, Outcome, Queue, Round, WorkUnit, levels_text, plan_units, runs
 
 
 @given(st.integers(0, 200), st.integers(1, 100), st.sets(st.integers(0, 300)), st.integers(1, 40))
@@ -39,21 +39,22 @@ def test_names_of_what_is_left_are_new(count: int, unit: int, committed: set[int
 def drain(queue: Queue, workers: int, kills: Collection[int]) -> tuple[list[int], int]:
     """Levels that got done, and how many workers died, where some levels kill the worker that has them."""
     done, deaths = [], 0
-    places: list[list[WorkUnit]] = [[] for _ in range(workers)]
+    assignments = [Assignment(wants=1000) for _ in range(workers)]
     while True:
-        for running in places:
-            while unit := queue.take(running):
-                running.append(unit)
-        if not any(places):
+        for assignment in assignments:
+            while assignment.take(queue):
+                pass
+        if not any(assignment.units for assignment in assignments):
             return sorted(done), deaths
-        for running in places:
+        for assignment in assignments:
+            running = assignment.hand_over()
             if any(level_id in kills for unit in running for level_id in unit.level_ids):
                 deaths += 1
-                for unit in running:
-                    queue.failed(unit)
+                for outcome in assignment.lose("died"):
+                    queue.failed(outcome.unit)
             else:
                 done += [level_id for unit in running for level_id in unit.level_ids]
-            running.clear()
+                assignment.account(Round([Outcome(unit) for unit in running], {}, wants=1000))
 
 
 @given(st.integers(1, 400), st.integers(1, 3), st.integers(1, 4), st.sets(st.integers(0, 400), max_size=5))
@@ -81,6 +82,22 @@ def test_company() -> None:
     assert queue.take([fresh]) not in running  # what has failed joins only what has failed as often
     assert queue.take([running[0]]) == running[0]
     assert queue.take(running[: COMPANY[1]]) is None
+
+
+def test_a_worker_gets_units_while_it_has_room() -> None:
+    queue, assignment = Queue.of(plan_units(range(12), set(), 4)), Assignment()
+    assert assignment.take(queue)  # however little room there is
+    assert not assignment.take(queue)
+    (first,) = assignment.hand_over()
+    assert assignment.hand_over() == []
+    assignment.account(Round([], {first: (0, 0.0, 0)}, wants=2))
+    assert assignment.take(queue)
+    assert not assignment.take(queue)
+    (second,) = assignment.hand_over()
+    assignment.account(Round([Outcome(first)], {}, wants=0))
+    assert assignment.units == [second]
+    assert [outcome.unit for outcome in assignment.lose("died")] == [second]
+    assert assignment.take(queue)  # the next worker with these resources begins anew
 
 
 def test_a_unit_that_fails_waits_behind_the_others_until_it_is_given_up() -> None:

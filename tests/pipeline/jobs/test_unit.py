@@ -1,4 +1,4 @@
-"""One work unit on real levels: the commit gate, the commit, the failure as a value."""
+"""One work unit on real levels: the commit gate and the commit."""
 
 import dataclasses
 from pathlib import Path
@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from configs.schema import JobConfig
-from experts.labels import WITNESSED, Label
+from experts.labels import Label
 from experts.train import UnitResult, train_levels
 from experts.witness import Record, replay
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from pipeline.errors import Failure
-from pipeline.jobs.schedule import Summary, WorkUnit
-from pipeline.jobs.unit import attempt, check_witnesses, commit, pool_for, run_unit
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.jobs.unit import check_witnesses, commit
 from pipeline.store.fields import arrays_of, same_bits, tree_of
 from pipeline.store.manifest import read_manifest
 from pipeline.store.shard import Shard
@@ -84,32 +84,6 @@ def test_a_trivial_level_whose_witness_does_something_does_not_pass(job: JobConf
         check_witnesses(dataclasses.replace(result, verdicts=called), job.task)
 
 
-def test_a_unit_is_committed_with_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
-    seen: list[tuple[int, float, int]] = []
-    summary = run_unit(job, tmp_path, UNIT, lambda *totals: seen.append(totals), pool_for(job))
-    manifest = read_manifest(tmp_path)
-    assert manifest.level_ids.tolist() == list(UNIT.level_ids)
-    solved, trained = manifest.labels.tolist().count("solved"), sum(manifest.table["env_steps"].to_pylist())
-    assert summary == Summary(4, solved, trained, summary.evaluated, summary.idle)
-    assert summary.evaluated >= 256
-    assert seen == sorted(seen)
-    for row in manifest.table.to_pylist():
-        assert (row["label"] in WITNESSED) == (row["shard"] is not None)
-        if row["shard"]:
-            assert Shard(tmp_path / row["shard"]).level_ids[row["row"]] == row["level_id"]
-
-
-def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: JobConfig, result: UnitResult) -> None:
-    commit(job, tmp_path, UNIT, result)
-    first = read_manifest(tmp_path)
-    run_unit(job, tmp_path, UNIT, lambda steps, levels, solved: None, pool_for(job))
-    second = read_manifest(tmp_path)
-    assert repr(first.table.drop(["shard"]).to_pylist()) == repr(second.table.drop(["shard"]).to_pylist())
-    (old,), (new,) = first.shards, second.shards
-    a, b = Shard(tmp_path / old).read(), Shard(tmp_path / new).read()
-    assert all(same_bits(values, b[name]).all() for name, values in a.items())
-
-
 def test_a_shard_holds_what_was_trained(tmp_path: Path, job: JobConfig) -> None:
     result = made_result([4, 5, 7], [Label.UNSOLVED, Label.SOLVED, Label.SOLVED])
     commit(job, tmp_path, WorkUnit((4, 5, 7)), result)
@@ -128,11 +102,3 @@ def test_a_unit_without_solved_levels_has_no_shard(tmp_path: Path, job: JobConfi
     assert manifest.labels.tolist() == ["unsolved"]
     assert not manifest.shards
     assert not (tmp_path / "shards").exists()
-
-
-def test_a_failed_attempt_is_a_value(tmp_path: Path) -> None:
-    broken = made_job("data", "budget=5k", "task.max_timesteps=3000000000")  # no 32-bit counter reaches it
-    outcome = attempt(broken, tmp_path, UNIT, lambda steps, levels, solved: None, pool_for(broken))
-    assert outcome.summary is None
-    assert "Traceback" in outcome.reason
-    assert not list(tmp_path.rglob("*.parquet"))

@@ -1,0 +1,130 @@
+"""A worker's loop on real units: what it commits, what it reports, and whom a failure reaches."""
+
+import errno
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from configs.schema import JobConfig
+from experts import pool as pool_module
+from experts.labels import WITNESSED
+from pipeline.jobs import worker as worker_module
+from pipeline.jobs.schedule import Outcome, Round, WorkUnit
+from pipeline.jobs.worker import Worker
+from pipeline.store.fields import same_bits
+from pipeline.store.manifest import read_manifest
+from pipeline.store.shard import Shard
+from tests.pipeline.made import made_job
+
+UNITS = [WorkUnit((0, 1, 2)), WorkUnit((3,)), WorkUnit((4, 5))]
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def job() -> JobConfig:
+    return made_job("data", "budget=5k")
+
+
+def outcomes(worker: Worker, units: list[WorkUnit]) -> dict[WorkUnit, Outcome]:
+    """Of these units, all given at once."""
+    found: dict[WorkUnit, Outcome] = {}
+    round = worker.work(units, 0.1)
+    while True:
+        found |= {outcome.unit: outcome for outcome in round.outcomes}
+        if not round.totals:
+            return found
+        round = worker.work([], 0.1)
+
+
+def failing(work: Any, error: Exception, unit: WorkUnit | None = None, after: int = 0) -> Any:
+    """The function `work`, which fails with this unit, or in every call after so many."""
+    calls: list[int] = []
+
+    def maybe(*args: Any) -> Any:
+        calls.append(1)
+        if unit in args if unit else len(calls) > after:
+            raise error
+        return work(*args)
+
+    return maybe
+
+
+def test_units_are_committed_with_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
+    worker = Worker(job, tmp_path)
+    rounds = [worker.work(UNITS, 0.0)]
+    while rounds[-1].totals:
+        rounds.append(worker.work([], 0.1))
+    ended = [outcome for round in rounds for outcome in round.outcomes]
+    assert {outcome.unit for outcome in ended} == set(UNITS)
+    summaries = [outcome.summary for outcome in ended if outcome.summary]
+    manifest = read_manifest(tmp_path)
+    assert manifest.level_ids.tolist() == list(range(6))
+    assert sum(summary.levels for summary in summaries) == 6
+    assert sum(summary.solved for summary in summaries) == manifest.labels.tolist().count("solved")
+    assert sum(summary.env_steps for summary in summaries) == sum(manifest.table["env_steps"].to_pylist())
+    assert sum(summary.evaluated for summary in summaries) >= 256
+    for row in manifest.table.to_pylist():
+        assert (row["label"] in WITNESSED) == (row["shard"] is not None)
+        if row["shard"]:
+            assert Shard(tmp_path / row["shard"]).level_ids[row["row"]] == row["level_id"]
+    for unit in UNITS:
+        totals = [round.totals[unit] for round in rounds if unit in round.totals]
+        assert totals == sorted(totals)
+    assert [round.wants for round in rounds[-1:]] == [Worker(job, tmp_path).work([], 0.0).wants]
+
+
+def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: JobConfig) -> None:
+    """Beside others and by itself."""
+    outcomes(Worker(job, tmp_path / "beside"), UNITS)
+    outcomes(Worker(job, tmp_path / "alone"), UNITS[:1])
+    ids = len(UNITS[0].level_ids)
+    beside, alone = (read_manifest(tmp_path / name).table.to_pylist()[:ids] for name in ("beside", "alone"))
+    for one, two in zip(beside, alone, strict=True):
+        assert repr(one | {"shard": ""}) == repr(two | {"shard": ""})
+        if one["shard"]:
+            a = Shard(tmp_path / "beside" / one["shard"]).read([one["row"]])
+            b = Shard(tmp_path / "alone" / two["shard"]).read([two["row"]])
+            assert all(same_bits(values, b[name]).all() for name, values in a.items())
+
+
+@pytest.mark.parametrize("phase", ["begin_unit", "finish_unit"])
+def test_a_unit_that_fails_fails_alone(
+    tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch, phase: str
+) -> None:
+    works = getattr(worker_module, phase)
+    monkeypatch.setattr(worker_module, phase, failing(works, ValueError("of this one"), UNITS[1]))
+    found = outcomes(Worker(job, tmp_path), UNITS)
+    assert {unit for unit in UNITS if found[unit].summary} == {UNITS[0], UNITS[2]}
+    assert found[UNITS[1]].reason.startswith("Traceback")
+    assert found[UNITS[1]].reason.endswith("ValueError: of this one\n")
+    assert not found[UNITS[1]].fatal
+    assert read_manifest(tmp_path).level_ids.tolist() == [0, 1, 2, 4, 5]
+
+
+def test_a_disk_that_refuses_is_fatal(tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(worker_module, "finish_unit", failing(None, full))
+    found = outcomes(Worker(job, tmp_path), UNITS[1:2])
+    assert found[UNITS[1]].fatal.startswith(f"Cannot write to {tmp_path}, the disk is full")
+
+
+def test_a_step_that_fails_fails_all_that_share_it_and_no_later_one(
+    tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    advance, worker = pool_module.advance, Worker(job, tmp_path)
+    monkeypatch.setattr(pool_module, "advance", failing(advance, MemoryError("no room on the device"), after=2))
+    found = outcomes(worker, UNITS)
+    assert found.keys() == set(UNITS)
+    assert all(of.reason.endswith("MemoryError: no room on the device\n") for of in found.values())
+    assert not list(tmp_path.rglob("*.parquet"))
+    monkeypatch.setattr(pool_module, "advance", advance)
+    assert outcomes(worker, UNITS[1:2])[UNITS[1]].summary
+    assert read_manifest(tmp_path).level_ids.tolist() == [3]
+
+
+def test_a_worker_without_units_has_nothing_to_report(tmp_path: Path, job: JobConfig) -> None:
+    nothing = Worker(job, tmp_path).work([], 60.0)
+    assert nothing == Round([], {}, nothing.wants)
+    assert nothing.wants > 0
