@@ -109,9 +109,9 @@ class WorkerHandle:
 
     def report(self) -> tuple[list[Outcome], dict[WorkUnit, tuple[int, float, int]]]:
         """Outcomes and progress of the round that is over; a worker that died leaves its resources to a new one."""
-        done, self.round = self.round, None
+        over, self.round = self.round, None
         try:
-            round = ray.get(done)
+            round: Round = ray.get(over)  # pyright: ignore[reportAssignmentType] - one reference, one value
         except RayError as error:
             self.actor = None
             return self.assignment.lose(f"{error}\n\n{_told(error)}"), {}

@@ -30,8 +30,11 @@ class Worker:
         outcomes = [outcome for unit in units if (outcome := self._begin(unit))]
         while self._runs and not outcomes and time.monotonic() < until:
             outcomes = self._step()
-        now = {unit: tuple(totals(self._pool, run)) for unit, run in self._runs.items()}
-        return Round(outcomes, now, self._pool.wants)
+        return Round(outcomes, {unit: self._totals(run) for unit, run in self._runs.items()}, self._pool.wants)
+
+    def _totals(self, run: TrainingRun) -> tuple[int, float, int]:
+        now = totals(self._pool, run)
+        return now.env_steps, now.levels, now.solved  # plain: who reads it may not have JAX imported
 
     def _begin(self, unit: WorkUnit) -> Outcome | None:
         try:

@@ -15,7 +15,7 @@ import pytest
 
 from pipeline.errors import Exit, UserError
 from pipeline.jobs.schedule import Outcome, WorkUnit
-from pipeline.jobs.unit import attempt
+from pipeline.jobs.worker import Worker
 from pipeline.store import locks
 from pipeline.store.layout import COMMIT_LOCK
 from pipeline.store.locks import Locked, LockRefused, committing, is_written, nobody_commits, only_writer
@@ -99,9 +99,9 @@ def test_a_worker_whose_file_system_has_no_locks_stops_the_run(tmp_path: Path, m
     def refuse(*_: Any) -> None:
         raise LockRefused("no locks here")
 
-    monkeypatch.setattr("pipeline.jobs.unit.run_unit", refuse)
+    monkeypatch.setattr("pipeline.jobs.worker.begin_unit", refuse)
     unit = WorkUnit((0,))
-    ended = attempt(made_job(), tmp_path, unit, lambda *_: None, None)  # type: ignore[arg-type]
+    (ended,) = Worker(made_job(), tmp_path).work([unit], 1.0).outcomes
     assert ended == Outcome(unit, reason=ended.reason, fatal="no locks here")
 
 
