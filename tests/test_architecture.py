@@ -46,7 +46,7 @@ ARROWS_TO_TURN = {
     ("pipeline/read/verify.py", "pipeline.jobs"),
     ("pipeline/store/split.py", "pipeline.jobs"),
 }
-NAMES_TO_PART = {"Batch", "Box", "Kernel", "Outcome", "Polygons", "Queue", "Shape", "Slot", "Trunk"}
+NAMES_TO_PART = {"Box", "Kernel", "Polygons", "Shape", "Trunk"}
 
 
 def python_files(*folders: str) -> list[Path]:

@@ -9,7 +9,7 @@ import os
 import re
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,7 +27,7 @@ from ray.exceptions import ActorDiedError, RayError
 from configs.schema import JobConfig
 from pipeline.errors import Failure, UserError
 from pipeline.jobs.progress import Board
-from pipeline.jobs.schedule import ROUND, Assignment, Outcome, Queue, Round, WorkUnit
+from pipeline.jobs.schedule import ROUND, Assignment, Round, Settle, UnitOutcome, UnitQueue, WorkUnit
 from pipeline.runtime import cores_for, interruptible, own_cores, prepare_jax
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
@@ -107,7 +107,7 @@ class WorkerHandle:
         """Let the worker train for a while, with what it was assigned meanwhile."""
         self.round = self.actor.work.remote(self.assignment.hand_over())
 
-    def report(self) -> tuple[list[Outcome], dict[WorkUnit, tuple[int, float, int]]]:
+    def report(self) -> tuple[list[UnitOutcome], dict[WorkUnit, tuple[int, float, int]]]:
         """Outcomes and progress of the round that is over; a worker that died leaves its resources to a new one."""
         over, self.round = self.round, None
         try:
@@ -127,7 +127,7 @@ def _told(error: RayError) -> str:
     return f"The worker died: {lines[0].rstrip('.')}"
 
 
-def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Sequence[Outcome]], None], board: Board) -> None:
+def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Board) -> None:
     """Work on the queue until it is empty.
 
     Raises:
@@ -184,7 +184,7 @@ class Crew:
         for handle in without[: max(0, waiting - starting)]:
             handle.start()
 
-    def assign(self, queue: Queue) -> None:
+    def assign(self, queue: UnitQueue) -> None:
         """Give units to the workers that have reported, and let them go on. Each gets one before any gets two."""
         free = [handle for handle in self._handles if handle.free]
         starting = sum(handle.starting is not None for handle in self._handles)
@@ -198,7 +198,7 @@ class Crew:
             if handle.assignment.units:
                 handle.go_on()
 
-    def wait(self) -> list[Outcome]:
+    def wait(self) -> list[UnitOutcome]:
         """Outcomes of the rounds that are over, if any ends in a moment."""
         starting = {handle.starting: handle for handle in self._handles if handle.starting is not None}
         rounds = {handle.round: handle for handle in self._handles if handle.round is not None}
@@ -209,7 +209,7 @@ class Crew:
             starting[reference].started()
         self._give_up()
         self._notice_silence(bool(rounds))
-        outcomes: list[Outcome] = []
+        outcomes: list[UnitOutcome] = []
         for reference in ended:
             if reference in rounds:
                 more, totals = rounds[reference].report()

@@ -12,7 +12,7 @@ from rich.console import Console
 from configs.schema import JobConfig
 from pipeline.errors import Exit, Failure
 from pipeline.jobs.progress import Board, Tally, say
-from pipeline.jobs.schedule import Outcome, Queue, WorkUnit, levels_text, plan_units
+from pipeline.jobs.schedule import UnitOutcome, UnitQueue, WorkUnit, levels_text, plan_units
 from pipeline.store.checkpoints import require_same_experts
 from pipeline.store.layout import quarantine_path
 from pipeline.store.manifest import Manifest, read_manifest
@@ -36,7 +36,7 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
     with writing(job, partial(say, console)) as (split, manifest):
         wanted = set(job.level_ids if level_ids is None else map(int, level_ids))
         done = wanted.intersection(manifest.level_ids.tolist())
-        queue = Queue.of(plan_units(sorted(wanted), done, job.levels_per_unit))
+        queue = UnitQueue.of(plan_units(sorted(wanted), done, job.levels_per_unit))
         note_job(split, job, command, sorted(wanted))
         if queue.waiting:
             solved = _labels(manifest, wanted)["solved"]
@@ -59,8 +59,8 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
     return Exit.QUARANTINED if queue.quarantined else Exit.DONE
 
 
-def _work(job: JobConfig, split: Path, queue: Queue, board: Board) -> None:
-    def settle(outcomes: Sequence[Outcome]) -> None:
+def _work(job: JobConfig, split: Path, queue: UnitQueue, board: Board) -> None:
+    def settle(outcomes: Sequence[UnitOutcome]) -> None:
         """Account for attempts that ended together."""
         failed: dict[tuple[str, bool], list[WorkUnit]] = {}  # by cause, and whether they are given up
         for outcome in outcomes:
@@ -114,7 +114,7 @@ def _spent(manifest: Manifest, made: Collection[int], tally: Tally) -> str:
     return f"{total:,} env steps: {told}. Decided nothing (after the first success, or empty): {nothing:.0%}."
 
 
-def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: Queue, spent: str) -> None:
+def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: UnitQueue, spent: str) -> None:
     """Where it is, what came of it, and what to type next. On stdout."""
     labels, folder = _labels(manifest, wanted), shlex.quote(str(split))
     total = sum(labels.values())

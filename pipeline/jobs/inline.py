@@ -1,15 +1,14 @@
 """The executor without Ray: one worker in this process, for debugging."""
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from configs.schema import JobConfig
 from pipeline.jobs.progress import Board
-from pipeline.jobs.schedule import ROUND, Assignment, Outcome, Queue
+from pipeline.jobs.schedule import ROUND, Assignment, Settle, UnitQueue
 from pipeline.runtime import interruptible, prepare_jax
 
 
-def run(job: JobConfig, split: Path, queue: Queue, settle: Callable[[Sequence[Outcome]], None], board: Board) -> None:
+def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Board) -> None:
     """Work on the queue until it is empty."""
     prepare_jax()
     from pipeline.jobs.worker import Worker  # imports what reads the settings just made

@@ -1,7 +1,7 @@
 """What is left to do: work units, who has them, their attempts and their quarantine. Knows nothing of files."""
 
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -50,7 +50,7 @@ class Summary:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class UnitOutcome:
     """How one attempt at a unit ended."""
 
     unit: WorkUnit
@@ -59,17 +59,20 @@ class Outcome:
     fatal: str = ""  # a sentence, where no further attempt can succeed
 
 
+Settle = Callable[[Sequence[UnitOutcome]], None]  # takes note of attempts that ended together
+
+
 @dataclass(frozen=True)
 class Round:
     """What a worker reports of some time at work."""
 
-    outcomes: list[Outcome]  # of the units that ended
+    outcomes: list[UnitOutcome]  # of the units that ended
     totals: dict[WorkUnit, tuple[int, float, int]]  # of the others: env steps, levels, solved levels so far
     wants: int  # levels more for which it has room
 
 
 @dataclass
-class Queue:
+class UnitQueue:
     """Units waiting, each with the attempts it has had."""
 
     waiting: deque[WorkUnit]
@@ -77,7 +80,7 @@ class Queue:
     quarantined: list[WorkUnit] = field(default_factory=list)
 
     @classmethod
-    def of(cls, units: Iterable[WorkUnit]) -> "Queue":
+    def of(cls, units: Iterable[WorkUnit]) -> "UnitQueue":
         return cls(deque(units))
 
     def take(self, running: Collection[WorkUnit] = ()) -> WorkUnit | None:
@@ -109,7 +112,7 @@ class Assignment:
     new: list[WorkUnit] = field(default_factory=list)  # those of them that it has not been told of
     wants: int = 1  # levels more for which it has room
 
-    def take(self, queue: Queue) -> bool:
+    def take(self, queue: UnitQueue) -> bool:
         """Another unit from the queue, if there is room for one and one may join these."""
         if self.units and self.wants <= 0:
             return False
@@ -132,10 +135,10 @@ class Assignment:
         self.units = [unit for unit in self.units if unit not in ended]
         self.wants = round.wants
 
-    def lose(self, reason: str) -> list[Outcome]:
+    def lose(self, reason: str) -> list[UnitOutcome]:
         """The worker died, and its units failed."""
         units, self.units, self.new, self.wants = self.units, [], [], 1
-        return [Outcome(unit, reason=reason) for unit in units]
+        return [UnitOutcome(unit, reason=reason) for unit in units]
 
 
 def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:

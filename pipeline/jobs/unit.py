@@ -25,7 +25,7 @@ from levelgen.level import Level, size_of
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import TaskParams
 from pipeline.errors import Failure
-from pipeline.jobs.schedule import Outcome, Summary, WorkUnit
+from pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
 from pipeline.store.checkpoints import experts_for, save_experts
 from pipeline.store.fields import arrays_of, map_arrays, same_bits
 from pipeline.store.layout import attempt_paths, fragment_path
@@ -75,14 +75,14 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool, run: Tr
     return Summary(len(labels), labels.count(Label.SOLVED), *result.spent)
 
 
-def failure(split: Path, unit: WorkUnit, error: Exception) -> Outcome:
+def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     """A failed attempt as a value: exceptions do not travel between processes."""
     reason, fatal = "".join(traceback.format_exception(error)), ""
     if isinstance(error, LockRefused):
         fatal = str(error)
     elif isinstance(error, OSError) and (what := FATAL.get(error.errno or 0)):
         fatal = f"Cannot write to {split}, {what}, then run the same command again."
-    return Outcome(unit, reason=reason, fatal=fatal)
+    return UnitOutcome(unit, reason=reason, fatal=fatal)
 
 
 def check_witnesses(result: UnitResult, task: TaskParams) -> None:

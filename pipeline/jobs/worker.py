@@ -9,7 +9,7 @@ from pathlib import Path
 
 from configs.schema import JobConfig
 from experts.train import TrainingRun, totals
-from pipeline.jobs.schedule import Outcome, Round, WorkUnit
+from pipeline.jobs.schedule import Round, UnitOutcome, WorkUnit
 from pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
 
 
@@ -36,14 +36,14 @@ class Worker:
         now = totals(self._pool, run)
         return now.env_steps, now.levels, now.solved  # plain: who reads it may not have JAX imported
 
-    def _begin(self, unit: WorkUnit) -> Outcome | None:
+    def _begin(self, unit: WorkUnit) -> UnitOutcome | None:
         try:
             self._runs[unit] = begin_unit(self._job, unit, self._pool)
         except Exception as error:
             return failure(self._split, unit, error)
         return None
 
-    def _step(self) -> list[Outcome]:
+    def _step(self) -> list[UnitOutcome]:
         """A rollout of every expert; the outcomes of the units that it finished."""
         try:
             finished = self._pool.step()
@@ -54,9 +54,9 @@ class Worker:
         ended = [unit for unit, run in self._runs.items() if run.submission in finished]
         return [self._finish(unit) for unit in ended]
 
-    def _finish(self, unit: WorkUnit) -> Outcome:
+    def _finish(self, unit: WorkUnit) -> UnitOutcome:
         run = self._runs.pop(unit)
         try:
-            return Outcome(unit, finish_unit(self._job, self._split, unit, self._pool, run))
+            return UnitOutcome(unit, finish_unit(self._job, self._split, unit, self._pool, run))
         except Exception as error:
             return failure(self._split, unit, error)

@@ -5,7 +5,17 @@ from collections.abc import Collection
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.jobs.schedule import COMPANY, Assignment, Outcome, Queue, Round, WorkUnit, levels_text, plan_units, runs
+from pipeline.jobs.schedule import (
+    COMPANY,
+    Assignment,
+    Round,
+    UnitOutcome,
+    UnitQueue,
+    WorkUnit,
+    levels_text,
+    plan_units,
+    runs,
+)
 
 
 @given(st.integers(0, 200), st.integers(1, 100), st.sets(st.integers(0, 300)), st.integers(1, 40))
@@ -36,7 +46,7 @@ def test_names_of_what_is_left_are_new(count: int, unit: int, committed: set[int
     assert not {work.name for work in kept} & {work.name for work in plan_units(range(count), done, unit)}
 
 
-def drain(queue: Queue, workers: int, kills: Collection[int]) -> tuple[list[int], int]:
+def drain(queue: UnitQueue, workers: int, kills: Collection[int]) -> tuple[list[int], int]:
     """Levels that got done, and how many workers died, where some levels kill the worker that has them."""
     done, deaths = [], 0
     assignments = [Assignment(wants=1000) for _ in range(workers)]
@@ -54,14 +64,14 @@ def drain(queue: Queue, workers: int, kills: Collection[int]) -> tuple[list[int]
                     queue.failed(outcome.unit)
             else:
                 done += [level_id for unit in running for level_id in unit.level_ids]
-                assignment.account(Round([Outcome(unit) for unit in running], {}, wants=1000))
+                assignment.account(Round([UnitOutcome(unit) for unit in running], {}, wants=1000))
 
 
 @given(st.integers(1, 400), st.integers(1, 3), st.integers(1, 4), st.sets(st.integers(0, 400), max_size=5))
 def test_units_that_kill_their_worker_are_given_up_and_no_other(
     levels: int, unit: int, workers: int, kills: set[int]
 ) -> None:
-    queue = Queue.of(plan_units(range(levels), set(), unit))
+    queue = UnitQueue.of(plan_units(range(levels), set(), unit))
     done, deaths = drain(queue, workers, kills)
     given_up = {level_id for unit in queue.quarantined for level_id in unit.level_ids}
     assert all(kills.intersection(unit.level_ids) for unit in queue.quarantined)
@@ -71,7 +81,7 @@ def test_units_that_kill_their_worker_are_given_up_and_no_other(
 
 
 def test_company() -> None:
-    queue = Queue.of(plan_units(range(100), set(), 1))
+    queue = UnitQueue.of(plan_units(range(100), set(), 1))
     running = [unit for _ in range(COMPANY[0]) if (unit := queue.take([]))]
     assert queue.take(running) is None
     fresh = queue.take(running[1:])
@@ -85,7 +95,7 @@ def test_company() -> None:
 
 
 def test_a_worker_gets_units_while_it_has_room() -> None:
-    queue, assignment = Queue.of(plan_units(range(12), set(), 4)), Assignment()
+    queue, assignment = UnitQueue.of(plan_units(range(12), set(), 4)), Assignment()
     assert assignment.take(queue)  # however little room there is
     assert not assignment.take(queue)
     (first,) = assignment.hand_over()
@@ -94,14 +104,14 @@ def test_a_worker_gets_units_while_it_has_room() -> None:
     assert assignment.take(queue)
     assert not assignment.take(queue)
     (second,) = assignment.hand_over()
-    assignment.account(Round([Outcome(first)], {}, wants=0))
+    assignment.account(Round([UnitOutcome(first)], {}, wants=0))
     assert assignment.units == [second]
     assert [outcome.unit for outcome in assignment.lose("died")] == [second]
     assert assignment.take(queue)  # the next worker with these resources begins anew
 
 
 def test_a_unit_that_fails_waits_behind_the_others_until_it_is_given_up() -> None:
-    queue = Queue.of(plan_units(range(4), set(), 2))
+    queue = UnitQueue.of(plan_units(range(4), set(), 2))
     bad = queue.take()
     assert bad is not None
     assert not queue.failed(bad)

@@ -10,7 +10,7 @@ from configs.schema import JobConfig
 from experts import pool as pool_module
 from experts.labels import WITNESSED
 from pipeline.jobs import worker as worker_module
-from pipeline.jobs.schedule import Outcome, Round, WorkUnit
+from pipeline.jobs.schedule import Round, UnitOutcome, WorkUnit
 from pipeline.jobs.worker import Worker
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import read_manifest
@@ -27,9 +27,9 @@ def job() -> JobConfig:
     return made_job("data", "budget=5k")
 
 
-def outcomes(worker: Worker, units: list[WorkUnit]) -> dict[WorkUnit, Outcome]:
+def outcomes(worker: Worker, units: list[WorkUnit]) -> dict[WorkUnit, UnitOutcome]:
     """Of these units, all given at once."""
-    found: dict[WorkUnit, Outcome] = {}
+    found: dict[WorkUnit, UnitOutcome] = {}
     round = worker.work(units, 0.1)
     while True:
         found |= {outcome.unit: outcome for outcome in round.outcomes}

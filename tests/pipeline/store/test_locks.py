@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from pipeline.errors import Exit, UserError
-from pipeline.jobs.schedule import Outcome, WorkUnit
+from pipeline.jobs.schedule import UnitOutcome, WorkUnit
 from pipeline.jobs.worker import Worker
 from pipeline.store import locks
 from pipeline.store.layout import COMMIT_LOCK
@@ -102,7 +102,7 @@ def test_a_worker_whose_file_system_has_no_locks_stops_the_run(tmp_path: Path, m
     monkeypatch.setattr("pipeline.jobs.worker.begin_unit", refuse)
     unit = WorkUnit((0,))
     (ended,) = Worker(made_job(), tmp_path).work([unit], 1.0).outcomes
-    assert ended == Outcome(unit, reason=ended.reason, fatal="no locks here")
+    assert ended == UnitOutcome(unit, reason=ended.reason, fatal="no locks here")
 
 
 def test_waiting_for_a_worker_of_an_earlier_run_is_told_and_can_be_stopped(tmp_path: Path) -> None:
