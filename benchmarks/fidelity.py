@@ -1,62 +1,35 @@
 """Are our random levels the reference's? Statistic by statistic, from as many levels of each.
 
-    python -m benchmarks.fidelity [SIZE ...] [--levels 20000] [--keep FOLDER] [--write docs/levels.md]
-
 Statistics with many values are compared by the two-sample test of Kolmogorov and Smirnov, the others by a chi-square
 test of counts; p is corrected for the number of statistics of a size (Holm). Doing nothing is played on our engine for
-both, so that only the levels can differ. Exits with 1 where a statistic differs.
-
-The reference samples in a process of its own; its levels stay in the cache folder for the next time, or in the folder
-that `--keep` names.
+both, so that only the levels can differ. Fails where a statistic differs.
 """
 
 import argparse
-import subprocess
-import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import jax
 import numpy as np
 from scipy import stats
 
-from benchmarks.document import between_marks
-from benchmarks.oracle import environment, oracle_python, tell
+from benchmarks import oracle
 from benchmarks.reference.level_statistics import statistics
+from benchmarks.report import Report, Table
+from benchmarks.statistics import holm
 from experts.before import facts_of
 from levelgen.files.kinetix import level_from_kinetix, state_to_kinetix
 from levelgen.level import SIZES, Level
 from levelgen.proofs import Proof
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
-from pipeline.runtime import cache_folder
+from pipeline.runtime import prepare_jax
 
 SIGNIFICANT = 1e-3
 COUNTED = 40  # statistics with at most so many different values are compared by their counts
 RARE = 10  # values seen less often, in both samples together, are counted as one
 CODES = ("role", "roles", "kinds", "place", "binding")  # last words of statistics whose numbers are names
-MARK = "fidelity"
-
-REFERENCE = """
-import dataclasses, sys
-import jax, numpy as np
-from kinetix.environment import EnvParams, static_env_params_from_size
-from kinetix.environment.ued.ued import make_reset_fn_sample_kinetix_level
-path, size, (count, seed, batch) = sys.argv[1], sys.argv[2], map(int, sys.argv[3:])
-def flatten(state, prefix=""):
-    fields = {}
-    for field in dataclasses.fields(state):
-        value, name = getattr(state, field.name), prefix + field.name
-        fields |= flatten(value, name + "/") if dataclasses.is_dataclass(value) else {name: np.asarray(value)}
-    return fields
-sample = jax.jit(jax.vmap(make_reset_fn_sample_kinetix_level(EnvParams(), static_env_params_from_size(size))))
-keys = jax.random.split(jax.random.PRNGKey(seed), -(-count // batch) * batch).reshape(-1, batch, 2)
-parts = [flatten(sample(some)) for some in keys]
-np.savez_compressed(path, **{name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]})
-"""
-BATCH = 500  # of the reference: its memory grows with the batch
 
 
 @dataclass(frozen=True)
@@ -80,17 +53,9 @@ class SizeReport:
         return [name for name, c in self.statistics.items() if c.corrected is not None and c.corrected < SIGNIFICANT]
 
 
-def reference_levels(folder: Path, size: str, count: int, seed: int) -> Level:
-    """Levels of the reference's sampler, from `folder` if they are there."""
-    path = folder / f"levels-{size}-{count}-{seed}.npz"
-    if not path.is_file():
-        tell(f"Sampling {count} levels of size {size} with the reference ...")
-        folder.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(f"unfinished-{path.name}")
-        words = map(str, (oracle_python(), "-c", REFERENCE, unfinished, size, count, seed, BATCH))
-        subprocess.run(list(words), env=environment(), check=True)
-        unfinished.replace(path)
-    with np.load(path) as file:
+def reference_levels(size: str, count: int, seed: int) -> Level:
+    """Levels of the reference's sampler, from the cache folder if they are there."""
+    with np.load(oracle.sampled_levels(oracle.oracle_python(), size, count, seed)) as file:
         return level_from_kinetix({name: file[name] for name in file.files})
 
 
@@ -125,15 +90,6 @@ def p_value(ours: np.ndarray, theirs: np.ndarray) -> float | None:
     return float(stats.chi2_contingency(table)[1])
 
 
-def holm(p: Sequence[float]) -> list[float]:
-    """Corrected p, in the given order: below a bound where Holm's procedure rejects at that bound."""
-    order, corrected, worst = np.argsort(p), [0.0] * len(p), 0.0
-    for rank, i in enumerate(order):
-        worst = max(worst, min(1.0, (len(p) - rank) * p[i]))
-        corrected[i] = worst
-    return corrected
-
-
 def compare(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, Compared]:
     """Statistic by statistic; what neither side ever has is left out."""
     names = [name for name in theirs if len(ours[name]) or len(theirs[name])]
@@ -155,64 +111,72 @@ def told(name: str, values: np.ndarray) -> str:
     return f"{values.mean():.2%}" if values.dtype == bool else f"{values.mean():.4g}"
 
 
-def report(size: str, count: int, seed: int, keep: Path) -> SizeReport:
-    theirs = reference_levels(keep, size, count, seed)
+def measured(size: str, count: int, seed: int) -> SizeReport:
+    theirs = reference_levels(size, count, seed)
     ours = jax.tree.map(np.asarray, sample_levels(np.arange(count), SIZES[size]))
     return SizeReport(size, count, compare(samples(ours), samples(theirs)))
 
 
-def summary(reports: Sequence[SizeReport]) -> str:
+def summary(reports: Sequence[SizeReport]) -> Table:
     """What it comes to, a column a size."""
-    p = [[c for c in r.statistics.values() if c.corrected is not None] for r in reports]
-    lines: dict[str, list[Any]] = {
+    tested = [[c for c in r.statistics.values() if c.p is not None and c.corrected is not None] for r in reports]
+    rows: dict[str, list[Any]] = {
         "levels of each": [f"{r.levels:,}" for r in reports],
         "statistics": [len(r.statistics) for r in reports],
         "of them the same number in every level": [
-            len(r.statistics) - len(of) for r, of in zip(reports, p, strict=True)
+            len(r.statistics) - len(of) for r, of in zip(reports, tested, strict=True)
         ],
-        "smallest p": [f"{min(c.p for c in of):.2g}" for of in p],  # type: ignore[type-var]
-        "smallest corrected p": [f"{min(c.corrected for c in of):.2g}" for of in p],  # type: ignore[type-var]
+        "smallest p": [smallest(c.p for c in of) for of in tested],
+        "smallest corrected p": [smallest(c.corrected for c in of) for of in tested],
         f"differ (corrected p < {SIGNIFICANT:g})": [len(r.differ) for r in reports],
     }
-    head = f"| | {' | '.join(r.size for r in reports)} |\n|---{'|---' * len(reports)}|\n"
-    return head + "".join(f"| {name} | {' | '.join(map(str, values))} |\n" for name, values in lines.items())
+    return Table(("", *(r.size for r in reports)), [[name, *map(str, cells)] for name, cells in rows.items()])
 
 
-def table(reports: Sequence[SizeReport]) -> str:
+def smallest(p: Iterable[float | None]) -> str:
+    return f"{min(x for x in p if x is not None):.2g}"
+
+
+def table(reports: Sequence[SizeReport]) -> Table:
     """Every statistic: ours, the reference's and p of each size, and the verdict."""
-    names = list(dict.fromkeys(name for r in reports for name in r.statistics))
-    head = "".join(f" {r.size}: ours | reference | p |" for r in reports)
-    lines = [f"| statistic |{head} verdict |", f"|---{'|---|---|---' * len(reports)}|---|"]
-    for name in names:
-        cells = "".join(_cells(r.statistics.get(name)) for r in reports)
+    rows = []
+    for name in dict.fromkeys(name for r in reports for name in r.statistics):
+        cells = [cell for r in reports for cell in _cells(r.statistics.get(name))]
         off = [r.size for r in reports if name in r.differ]
-        lines.append(f"| {name} |{cells} {'differs: ' + ', '.join(off) if off else 'same'} |")
-    return "\n".join(lines) + "\n"
+        rows.append([name, *cells, f"differs: {', '.join(off)}" if off else "same"])
+    head = [word for r in reports for word in (f"{r.size}: ours", "reference", "p")]
+    return Table(("statistic", *head, "verdict"), rows)
 
 
-def _cells(c: Compared | None) -> str:
-    if c is None:
-        return " | | |"
-    return f" {c.ours} | {c.theirs} | {'' if c.p is None else f'{c.p:.2g}'} |"
+def _cells(c: Compared | None) -> tuple[str, str, str]:
+    return ("", "", "") if c is None else (c.ours, c.theirs, "" if c.p is None else f"{c.p:.2g}")
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.fidelity", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("size", nargs="*", default=list(SIZES), help="s, m or l (default: all)")
-    parser.add_argument("--levels", type=int, default=20_000, help="levels of each sampler (default: 20,000)")
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
+    parser.add_argument("--levels", type=int, default=20_000, help="of each sampler (default: 20,000)")
     parser.add_argument("--seed", type=int, default=0, help="of the reference's sampler (default: 0)")
-    parser.add_argument("--keep", type=Path, default=cache_folder() / "fidelity", help="folder for its levels")
-    parser.add_argument("--write", type=Path, help="document to put the tables into, between its marks")
-    given = parser.parse_args()
-    reports = [report(size, given.levels, given.seed, given.keep) for size in given.size]
-    made = f"{summary(reports)}\n{table(reports)}"
-    print(made)
-    if given.write:
-        given.write.write_text(between_marks(given.write.read_text(), MARK, made))
-    for r in reports:
-        print(f"{r.size}: {len(r.differ)} of {len(r.statistics)} statistics differ {r.differ or ''}", file=sys.stderr)
-    return int(any(r.differ for r in reports))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def run(given: argparse.Namespace) -> Report:
+    prepare_jax()
+    reports = [measured(size, given.levels, given.seed) for size in given.size]
+    off = [f"{name} of {r.size}" for r in reports for name in r.differ]
+    return Report(
+        title="Random levels, ours and the reference's",
+        results=[
+            {"size": r.size, "levels": r.levels, "differ": r.differ, "statistics": plain(r.statistics)} for r in reports
+        ],
+        tables=[summary(reports), table(reports)],
+        notes=[
+            "Means, shares of what is true; of a name or a place the most frequent one and its share. "
+            "No p: every level of both has the same value."
+        ],
+        reference=oracle.versions(oracle.oracle_python()),
+        fault=f"Other than the reference's: {', '.join(off)}." if off else "",
+    )
+
+
+def plain(statistics: dict[str, Compared]) -> dict[str, dict]:
+    names = {"ours": "ours", "theirs": "reference", "p": "p", "corrected": "corrected_p"}
+    return {name: {names[key]: value for key, value in asdict(c).items()} for name, c in statistics.items()}

@@ -1,30 +1,25 @@
 """What a physics step costs, stage by stage, and how far it is from its arithmetic.
 
-    python -m benchmarks.floor [SIZE ...]
-
 Times: the machine code of the first 1, 2, ... stages (physics/engine.py) over sampled levels in mid-episode, one core;
 a stage costs what it adds. Work: the same blocks through an interpreter of the kernel's jaxpr that counts vector
 operations, loads and stores of rows. Floor: vector operations at VECTORS_PER_CYCLE, and at CLOCK, the core's own.
 """
 
-import os
-import sys
+import argparse
 import time
 from collections import Counter
-
-os.environ.update(dict.fromkeys(("NPROC", "OMP_NUM_THREADS"), "1"))
-if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
+from benchmarks.report import Report, Table
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task import rules as task
-from levelgen.task.actions import controls
+from levelgen.task.actions import CHOICES, controls
 from physics.codegen.primitives import ELEMENTWISE
 from physics.engine import STAGES, Block, Given, step_block
 from physics.lanes import LANES
@@ -32,6 +27,7 @@ from physics.pairs import table_of
 from physics.rooms import is_room, scratch_rooms
 from physics.step import as_machine_code
 from physics.types import DEFAULT_PARAMS
+from pipeline.runtime import own_cores, prepare_jax
 
 LEVELS, COUNTED = 1024, 64  # lanes timed, lanes counted
 STEPS = 32  # env steps under random actions before the measurement
@@ -43,7 +39,7 @@ CUTS = (*((stage,) for stage in STAGES[:-2]), STAGES[-2:])  # the last is too sh
 def worlds(size: str) -> Given:
     """Levels some way into their episodes, and controls."""
     level = sample_levels(np.arange(LEVELS), SIZES[size])
-    choices = jnp.array([3, 3, 3, 3, 2, 2])[:, None]
+    choices = jnp.array(CHOICES)[:, None]
 
     def act(now, key):
         action = jax.random.randint(key, (6, LEVELS), 0, choices)
@@ -83,7 +79,7 @@ def count(given: Given, stages: tuple) -> Counter:
         mine = jax.tree.map(lambda x, at=first: np.array(x[..., at : at + LANES]), given)
         handed = mine, table, jax.tree.map(np.zeros_like, mine.before), scratch
         closed = jax.make_jaxpr(kernel)(*handed)
-        run(closed.jaxpr, [np.array(x) for x in (*closed.consts, *jax.tree.leaves(handed))], total)
+        interpret(closed.jaxpr, [np.array(x) for x in (*closed.consts, *jax.tree.leaves(handed))], total)
     return Counter({what: n * LANES // COUNTED for what, n in total.items()})
 
 
@@ -91,7 +87,7 @@ def rows(shape: tuple[int, ...]) -> int:
     return int(np.prod(shape[:-1])) if shape and shape[-1] == LANES else 0
 
 
-def run(jaxpr: core.Jaxpr, arguments: list, total: Counter) -> list:
+def interpret(jaxpr: core.Jaxpr, arguments: list, total: Counter) -> list:
     """Interpret a kernel, references being NumPy arrays, and count."""
     known = dict(zip(jaxpr.invars, arguments, strict=True))
     read = lambda x: x.val if isinstance(x, core.Literal) else known[x]
@@ -110,18 +106,18 @@ def one(equation, operands: list, total: Counter) -> list:
     if name == "while":
         n, m = params["cond_nconsts"], params["body_nconsts"]
         of_test, of_body, values = operands[:n], operands[n : n + m], operands[n + m :]
-        while run(params["cond_jaxpr"].jaxpr, [*of_test, *values], total)[0]:
-            values = run(params["body_jaxpr"].jaxpr, [*of_body, *values], total)
+        while interpret(params["cond_jaxpr"].jaxpr, [*of_test, *values], total)[0]:
+            values = interpret(params["body_jaxpr"].jaxpr, [*of_body, *values], total)
         return values
     if name == "scan":
         constants, values = operands[: params["num_consts"]], operands[params["num_consts"] :]
         for _ in range(params["length"]):
-            values = run(params["jaxpr"].jaxpr, [*constants, *values], total)
+            values = interpret(params["jaxpr"].jaxpr, [*constants, *values], total)
         return values
     if name == "cond":
-        return run(params["branches"][int(operands[0])].jaxpr, operands[1:], total)
+        return interpret(params["branches"][int(operands[0])].jaxpr, operands[1:], total)
     if name == "jit":
-        return run(params["jaxpr"].jaxpr, operands, total)
+        return interpret(params["jaxpr"].jaxpr, operands, total)
     results = equation.primitive.bind(*map(jnp.asarray, operands), **params)
     results = results if equation.primitive.multiple_results else [results]
     if name in ELEMENTWISE or name in ("integer_pow", "convert_element_type"):
@@ -184,30 +180,43 @@ def clock() -> float:
     return rounds * 32 / best
 
 
-def main() -> None:
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
+
+
+def run(given: argparse.Namespace) -> Report:
+    prepare_jax(min(own_cores()))
     cycles = clock()
-    print(f"clock {cycles / 1e9:.2f} GHz; microseconds of a block of {LANES} lanes, one physics step\n")
-    print("| size | stage | us | vector operations | loads | stores | operations at the floor, us |")
-    print("|---|---|---|---|---|---|---|")
-    for size in sys.argv[1:] or "sml":
-        given, before, counted = worlds(size), 0.0, Counter()
-        for stages in CUTS:
-            done = STAGES[: STAGES.index(stages[-1]) + 1]
-            now, work = seconds(given, done), count(given, done)
-            row(size, ", ".join(stage.__name__ for stage in stages), now - before, work - counted, cycles)
-            before, counted = now, work
-        row(size, "all", before, counted, cycles)
-
-
-def row(size: str, name: str, took: float, work: Counter, cycles: float) -> None:
-    floor = work["operations"] / VECTORS_PER_CYCLE / cycles
-    cells = (
-        f"{took * 1e6:.2f}",
-        *(f"{work[what]:,}" for what in ("operations", "loads", "stores")),
-        f"{floor * 1e6:.2f}",
+    results = [measured(size, cycles) for size in given.size]
+    groups = list(results[0]["stages"])
+    rows = []
+    for of in results:
+        took = [f"{of['stages'][name]['microseconds']:.2g}" for name in groups]
+        moved = of["loads"] + of["stores"]
+        work = f"{of['operations']:,}", f"{moved:,}", f"{of['floor']:.2f}", f"{of['microseconds'] / of['floor']:.1f}"
+        rows.append([of["size"], *took, f"{of['microseconds']:.2g}", *work])
+    head = ("size", *groups, "all", "vector operations", "loads and stores", "floor", "times the floor")
+    title = f"Microseconds of one core for a block of {LANES} lanes and one physics step"
+    return Report(
+        title="What a physics step costs",
+        results=results,
+        tables=[Table(head, rows, title)],
+        notes=[f"The core's clock: {cycles / 1e9:.2f} GHz. Floor: {VECTORS_PER_CYCLE} vector operations a cycle."],
     )
-    print("|", " | ".join((size, name, *cells)), "|", flush=True)
 
 
-if __name__ == "__main__":
-    main()
+def measured(size: str, cycles: float) -> dict[str, Any]:
+    """Microseconds and work of each group of stages, and of all."""
+    given, before, counted, stages = worlds(size), 0.0, Counter(), {}
+    for group in CUTS:
+        done = STAGES[: STAGES.index(group[-1]) + 1]
+        now, work = seconds(given, done), count(given, done)
+        stages[", ".join(stage.__name__ for stage in group)] = told(now - before, work - counted, cycles)
+        before, counted = now, work
+    return {"size": size, **told(before, counted, cycles), "clock": cycles, "stages": stages}
+
+
+def told(took: float, work: Counter, cycles: float) -> dict[str, float]:
+    floor = work["operations"] / VECTORS_PER_CYCLE / cycles
+    parts = {what: work[what] for what in ("operations", "loads", "stores")}
+    return {"microseconds": took * 1e6, **parts, "floor": floor * 1e6}

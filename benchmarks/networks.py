@@ -1,20 +1,18 @@
 """What networks cost: multiply-adds of one env step, and env steps/s of experts in training.
 
-python -m benchmarks.networks [--write docs/experts.md]
-
 The transformer is counted, not built: tokens are the floor, movable polygons, circles, joints and thrusters; policy
 and value function share none, as in the others.
 """
 
 import argparse
 import time
-from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
-from benchmarks.document import between_marks
 from benchmarks.endless import endless_queue, go_on
+from benchmarks.report import Report, Table
 from experts.config import ExpertConfig, Network
 from experts.networks.entity import KINDS
 from experts.networks.layers import LOGITS
@@ -85,26 +83,30 @@ def rates(size: Size) -> dict[str, float]:
     return {name: SLOTS * UPDATES * CONFIGS[name].steps_per_update / np.median(s) for name, s in seconds.items()}
 
 
-def tables() -> str:
-    counts = ["| size | flat | entity | transformer | with its updates |", "|---|---|---|---|---|"]
-    speeds = ["| size | flat | entity |", "|---|---|---|"]
-    for name, size in SIZES.items():
-        adds = [multiply_adds(network, size) for network in ("flat", "entity", "transformer")]
-        counts.append(f"| {name} | {' | '.join(f'{n:,}' for n in adds)} | {(1 + STEPS_OF_UPDATES) * adds[-1]:,} |")
-        speeds.append(f"| {name} | {' | '.join(f'{rate:,.0f}' for rate in rates(size).values())} |")
-    return "\n".join(("Multiply-adds:", "", *counts, "", "Env steps per second of a core, training:", "", *speeds))
+def register(_: argparse.ArgumentParser) -> None:
+    """No words of its own."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--write", type=Path, help="document whose tables to renew")
-    given = parser.parse_args()
+def run(_: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
-    made = tables()
-    print(made)
-    if given.write:
-        given.write.write_text(between_marks(given.write.read_text(), "networks", made))
+    results = [result(name, size) for name, size in SIZES.items()]
+    names = ("flat", "entity", "transformer")
+    counts = [[*(f"{of['multiply_adds'][n]:,}" for n in names), f"{of['with_updates']:,}"] for of in results]
+    speeds = [[f"{rate:,.0f}" for rate in of["env_steps_per_second"].values()] for of in results]
+    sizes = [of["size"] for of in results]
+    rows = lambda cells: [[size, *of] for size, of in zip(sizes, cells, strict=True)]
+    return Report(
+        title="Networks",
+        results=results,
+        tables=[
+            Table(("size", *names, "transformer with its updates"), rows(counts), "Multiply-adds of one env step"),
+            Table(("size", *CONFIGS), rows(speeds), "Env steps per second of a core, training"),
+        ],
+        notes=["The transformer is counted, not built."],
+    )
 
 
-if __name__ == "__main__":
-    main()
+def result(name: str, size: Size) -> dict[str, Any]:
+    adds = {network: multiply_adds(network, size) for network in ("flat", "entity", "transformer")}
+    updates = (1 + STEPS_OF_UPDATES) * adds["transformer"]
+    return {"size": name, "multiply_adds": adds, "with_updates": updates, "env_steps_per_second": rates(size)}

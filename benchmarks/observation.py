@@ -1,26 +1,23 @@
-"""What the symbolic-flat observation of every step costs beside the step: env steps/s of one core without and with it.
+"""What the symbolic-flat observation of every step costs beside the step: env steps/s without and with it."""
 
-python -m benchmarks.observation [SIZE ...]
-"""
-
-import os
-import sys
-import time
-
-os.environ.update(dict.fromkeys(("NPROC", "OMP_NUM_THREADS"), "1"))
-if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import argparse
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.scaling import LANES, sticky
+from benchmarks.reference.actions import sticky_actions
+from benchmarks.reference.serve import timed
+from benchmarks.report import Report, Table
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task import rules as task
 from levelgen.task.observe.flat import level_features, symbolic_flat
+from pipeline.runtime import own_cores, prepare_jax
 
+LANES = 128  # stepped together
 STEPS = 64
 REPEATS = 60
 
@@ -39,23 +36,30 @@ def rollout(level, now, actions, observed: bool):
     return jax.lax.scan(act, (now, start), actions)
 
 
-def main() -> None:
-    print("| size | without | with | slower by |\n|---|---|---|---|")
-    for size in sys.argv[1:] or SIZES:
-        level = jax.tree.map(jnp.asarray, sample_levels(np.arange(LANES), SIZES[size]))
-        given = level, task.reset(level), jnp.asarray(sticky(STEPS, LANES, 0))
-        ways = {
-            seen: jax.jit(lambda *g, seen=seen: rollout(*g, seen)).lower(*given).compile() for seen in (False, True)
-        }
-        best = dict.fromkeys(ways, np.inf)
-        for _ in range(REPEATS):  # in turns
-            for seen, compiled in ways.items():
-                start = time.perf_counter()
-                jax.block_until_ready(compiled(*given))
-                best[seen] = min(best[seen], time.perf_counter() - start)
-        rates = [f"{STEPS * LANES / best[seen]:,.0f}" for seen in (False, True)]
-        print("|", " | ".join((size, *rates, f"{1 - best[False] / best[True]:.0%}")), "|", flush=True)
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
 
 
-if __name__ == "__main__":
-    main()
+def run(given: argparse.Namespace) -> Report:
+    prepare_jax(min(own_cores()))
+    results = [measured(size) for size in given.size]
+    rows = [
+        [of["size"], f"{of['without']:,.0f}", f"{of['with']:,.0f}", f"{1 - of['with'] / of['without']:.0%}"]
+        for of in results
+    ]
+    table = Table(("size", "without", "with", "slower by"), rows, "Env steps/s of one core")
+    return Report("The symbolic-flat observation", results, [table])
+
+
+def measured(size: str) -> dict[str, Any]:
+    """Env steps/s, the best of REPEATS in turns."""
+    level = jax.tree.map(jnp.asarray, sample_levels(np.arange(LANES), SIZES[size]))
+    given = level, task.reset(level), jnp.asarray(sticky_actions(STEPS, LANES))
+    ways = {seen: jax.jit(partial(rollout, observed=seen)).lower(*given).compile() for seen in (False, True)}
+    best = dict.fromkeys(ways, np.inf)
+    for _ in range(REPEATS):
+        for seen, compiled in ways.items():
+            seconds, _ = timed(lambda compiled=compiled: jax.block_until_ready(compiled(*given)))
+            best[seen] = min(best[seen], seconds)
+    rate = {seen: STEPS * LANES / seconds for seen, seconds in best.items()}
+    return {"size": size, "unit": "env steps/s of one core", "without": rate[False], "with": rate[True]}

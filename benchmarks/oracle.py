@@ -16,6 +16,7 @@ PYTHON_VARIABLE = "LEVELPROOF_ORACLE_PYTHON"  # a Python that has the reference 
 REQUIREMENTS = ("kinetix-env==3.0.2", "jax2d==1.0.1", "jax[cpu]==0.9.0")
 LEVELS = 1024  # sampled per size and kept; more lanes go round
 SEED = 0
+ROOT = Path(__file__).parent.parent
 SCRIPTS = Path(__file__).parent / "reference"
 
 
@@ -32,32 +33,50 @@ def oracle_python() -> Path:
         return Path(chosen)
     folder = cache_folder() / "reference"
     python, ready = folder / "bin" / "python", folder / "ready"
-    with _alone(cache_folder() / "reference.lock"):
+    with alone(cache_folder() / "reference.lock"):
         if not ready.is_file() or ready.read_text() != "\n".join(REQUIREMENTS):
             _make(folder)
             ready.write_text("\n".join(REQUIREMENTS))
     return python
 
 
-def sampled_levels(python: Path, size: str) -> Path:
-    """A file of LEVELS levels that the reference sampled, made on first use (minutes: it compiles slowly)."""
-    path = cache_folder() / "bench" / f"levels-{size}-{LEVELS}-{SEED}.npz"
-    with _alone(cache_folder() / "bench.lock"):
+def sampled_levels(python: Path, size: str, count: int = LEVELS, seed: int = SEED) -> Path:
+    """A file of levels that the reference sampled, made on first use (minutes: it compiles slowly)."""
+    path = cache_folder() / "bench" / f"levels-{size}-{count}-{seed}.npz"
+    with alone(cache_folder() / "bench.lock"):
         if not path.is_file():
-            tell(f"Sampling {LEVELS} levels of size {size} with the reference (once, one to three minutes) ...")
+            tell(f"Sampling {count} levels of size {size} with the reference (once, one to three minutes) ...")
             path.parent.mkdir(parents=True, exist_ok=True)
             unfinished = path.with_name(f"unfinished-{path.name}")
-            words = [unfinished, "--size", size, "--count", LEVELS, "--seed", SEED]
-            _run([python, SCRIPTS / "world.py", *words], "sample levels with the reference")
+            words = [unfinished, "--size", size, "--count", count, "--seed", seed]
+            run_script(python, "world", words, "sample levels with the reference")
             unfinished.replace(path)
     return path
+
+
+def run_script(python: Path, script: str, words: Sequence[object], what: str) -> str:
+    """What a script of benchmarks/reference prints in the reference's interpreter.
+
+    Raises:
+        Failure: it fails; `what` says at what.
+    """
+    return _run([python, SCRIPTS / f"{script}.py", *words], what, environment())
+
+
+def run_ours(script: str, words: Sequence[object]) -> str:
+    """What a script of benchmarks/ours prints, in a process of its own.
+
+    Raises:
+        Failure: it fails.
+    """
+    return _run([sys.executable, "-m", f"benchmarks.ours.{script}", *words], f"run our {script}", our_environment())
 
 
 def versions(python: Path) -> dict[str, str]:
     """Versions of the reference and of what it runs on."""
     names = ("kinetix-env", "jax2d", "jax", "jaxlib")
     code = f"from importlib.metadata import version; print(*(version(name) for name in {names!r}))"
-    told = _run([python, "-c", code], "ask the reference for its version").split()
+    told = _run([python, "-c", code], "ask the reference for its version", environment()).split()
     return dict(zip(names, told, strict=True))
 
 
@@ -65,6 +84,12 @@ def environment() -> Mapping[str, str]:
     """Of the reference's processes: nothing of ours, no compiled code kept."""
     ours = ("PYTHONPATH", "PYTHONHOME", "JAX_COMPILATION_CACHE_DIR", "XLA_FLAGS")
     return {name: value for name, value in os.environ.items() if name not in ours} | {"JAX_PLATFORMS": "cpu"}
+
+
+def our_environment() -> Mapping[str, str]:
+    """Of our processes: they find the packages wherever they were imported from."""
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    return dict(os.environ) | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
 
 
 def tell(text: str) -> None:
@@ -75,15 +100,15 @@ def tell(text: str) -> None:
 def _make(folder: Path) -> None:
     tell(f"Making the reference's environment in {folder} (once, about two minutes) ...")
     shutil.rmtree(folder, ignore_errors=True)
-    _run([sys.executable, "-m", "venv", folder], "make an environment for the reference")
+    _run([sys.executable, "-m", "venv", folder], "make an environment for the reference", environment())
     pip = [folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     hint = f"check the network, or set {PYTHON_VARIABLE} to a Python that has {REQUIREMENTS[0]}"
-    _run([*pip, *REQUIREMENTS], f"install {REQUIREMENTS[0]}", hint)
+    _run([*pip, *REQUIREMENTS], f"install {REQUIREMENTS[0]}", environment(), hint)
 
 
-def _run(command: Sequence[object], what: str, hint: str = "") -> str:
+def _run(command: Sequence[object], what: str, environment: Mapping[str, str], hint: str = "") -> str:
     words = [str(word) for word in command]
-    done = subprocess.run(words, env=environment(), capture_output=True, text=True, check=False)
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise Failure(f"Cannot {what} ({reason})" + (f": {hint}." if hint else "."))
@@ -91,7 +116,7 @@ def _run(command: Sequence[object], what: str, hint: str = "") -> str:
 
 
 @contextmanager
-def _alone(path: Path) -> Iterator[None]:
+def alone(path: Path) -> Iterator[None]:
     """One process at a time; the others wait."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,4 @@
-"""Env steps a second against what touches, and against the number of bodies: the plot of docs/physics.md.
-
-    python -m benchmarks.scaling [FILE.svg]
+"""Env steps a second against what touches, and against the number of bodies.
 
 One core, blocks of lanes as a job has them. Left: levels of s, m, l in mid-episode, sorted by their active contacts
 and shared out into groups; each group is stepped by itself, under sticky random actions.
@@ -8,23 +6,22 @@ Right: custom sizes of 8 to 32 bodies, sampled levels; the dashed line is what a
 touching or not, would leave of the first point.
 """
 
-import os
-import sys
+import argparse
 import time
-
-os.environ.update(dict.fromkeys(("NPROC", "OMP_NUM_THREADS"), "1"))
-if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.reference.actions import sticky_actions
+from benchmarks.report import Report, Table
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task import rules as task
 from physics.pairs import pairs_of
 from physics.types import FIXED_POLYGONS, Size
+from pipeline.runtime import own_cores, prepare_jax
 
 LEVELS, LANES = 4096, 128  # sampled, and stepped together
 SETTLING = 32  # env steps under random actions before the measurement
@@ -32,23 +29,12 @@ STEPS = 32  # env steps of a measurement
 GROUPS = 8
 REPEATS = 15
 BODIES = (8, 12, 16, 20, 24, 28, 32)
-CHOICES = np.array([3, 3, 3, 3, 2, 2])[:, None]
+PLOT = "scaling.svg"
 COLOURS = {"s": "#0072b2", "m": "#d55e00", "l": "#009e73"}  # Okabe and Ito
 
 
 def take(tree, lanes):
     return jax.tree.map(lambda x: x[..., lanes], tree)
-
-
-def sticky(steps: int, lanes: int, seed: int) -> np.ndarray:
-    """Random actions, (step, 6, lane), each kept for ten steps on average."""
-    rng = np.random.default_rng(seed)
-    action, actions = np.zeros((len(CHOICES), lanes), np.int32), []
-    for _ in range(steps):
-        fresh = rng.integers(0, CHOICES, action.shape, dtype=np.int32)
-        action = np.where(rng.random(action.shape) < 0.1, fresh, action)
-        actions.append(action)
-    return np.array(actions)
 
 
 @jax.jit
@@ -71,7 +57,7 @@ def in_blocks(level: Level, now: task.TaskState, actions: np.ndarray):
 
 def rate(level: Level, now: task.TaskState) -> tuple[float, float]:
     """Env steps a second of one core, and active contacts of a lane, on average."""
-    actions = jnp.asarray(sticky(STEPS, LANES, 1))
+    actions = jnp.asarray(sticky_actions(STEPS, LANES, 1))
     contacts = jax.block_until_ready(play(level, now, actions))[1]
     best = np.inf
     for _ in range(REPEATS):
@@ -84,7 +70,7 @@ def rate(level: Level, now: task.TaskState) -> tuple[float, float]:
 def by_contacts(size: str) -> list[tuple[float, float]]:
     """(active contacts, env steps a second) of groups of levels."""
     level = sample_levels(np.arange(LEVELS), SIZES[size])
-    now, contacts = in_blocks(level, task.reset(level), sticky(SETTLING, LEVELS, 0))
+    now, contacts = in_blocks(level, task.reset(level), sticky_actions(SETTLING, LEVELS))
     order = np.argsort(contacts[-1], kind="stable")
     points = []
     for quantile in (np.arange(GROUPS) + 0.5) / GROUPS:
@@ -102,22 +88,45 @@ def by_bodies(bodies: int) -> tuple[float, float, int]:
     circles = movable // 3
     size = Size(bodies - circles, circles, joints=max(1, movable // 3), thrusters=2)
     level = sample_levels(np.arange(LANES), size)
-    now, _ = in_blocks(level, task.reset(level), sticky(SETTLING, LANES, 0))
+    now, _ = in_blocks(level, task.reset(level), sticky_actions(SETTLING, LANES))
     return *rate(level, now), pairs_of(size).contacts
 
 
-def main() -> None:
+def register(_: argparse.ArgumentParser) -> None:
+    """No words of its own."""
+
+
+def run(_: argparse.Namespace) -> Report:
+    prepare_jax(min(own_cores()))
     touching = {size: by_contacts(size) for size in SIZES}
-    for size, points in touching.items():
-        print(size, *(f"{active:.1f} contacts: {speed:,.0f}" for active, speed in points), sep=" | ")
     grown = [by_bodies(bodies) for bodies in BODIES]
-    for bodies, (speed, active, every) in zip(BODIES, grown, strict=True):
-        print(f"{bodies} bodies | {speed:,.0f} env steps/s | {active:.1f} of {every} contacts active")
-    if sys.argv[1:]:
-        draw(touching, grown, sys.argv[1])
+    results = [
+        {"size": size, "contacts": active, "env_steps_per_second": speed}
+        for size, points in touching.items()
+        for active, speed in points
+    ]
+    results += [
+        {"bodies": bodies, "contacts": active, "all_contacts": every, "env_steps_per_second": speed}
+        for bodies, (speed, active, every) in zip(BODIES, grown, strict=True)
+    ]
+    left = [[size, f"{active:.1f}", f"{speed:,.0f}"] for size, points in touching.items() for active, speed in points]
+    right = [
+        [str(bodies), f"{active:.1f}", str(every), f"{speed:,.0f}"]
+        for bodies, (speed, active, every) in zip(BODIES, grown, strict=True)
+    ]
+    return Report(
+        title="Env steps/s against contacts and bodies",
+        results=results,
+        tables=[
+            Table(("size", "active contacts", "env steps/s"), left, "Levels in groups by what touches in them"),
+            Table(("bodies", "active contacts", "contacts of all pairs", "env steps/s"), right, "Custom sizes"),
+        ],
+        notes=[f"![Env steps a second against active contacts, and against bodies]({PLOT})"],
+        plots={PLOT: lambda path: draw(touching, grown, path)},
+    )
 
 
-def draw(touching: dict, grown: list, file: str) -> None:
+def draw(touching: dict, grown: list, file: Path) -> None:
     import matplotlib
 
     matplotlib.use("svg")
@@ -140,7 +149,3 @@ def draw(touching: dict, grown: list, file: str) -> None:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25, linewidth=0.5)
     figure.savefig(file, metadata={"Date": None})
-
-
-if __name__ == "__main__":
-    main()

@@ -1,9 +1,9 @@
 """Where training's time goes: rollout and update of one core alone, and the program that does both in slots.
 
-python -m benchmarks.training [SIZE ...]
+Levels stay in their slots, without evaluations.
 """
 
-import sys
+import argparse
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.endless import endless_queue, go_on
+from benchmarks.report import Report, Table
 from experts import ppo
 from experts.config import ExpertConfig
 from experts.policy import network_of
@@ -30,16 +31,22 @@ from pipeline.runtime import own_cores, prepare_jax
 REPEATS = 30
 
 
-def main() -> None:
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
+
+
+def run(given: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
-    config = ExpertConfig()
-    print("env steps/s of one core\n\n| size | rollout | update | both, in slots |\n|---|---|---|---|")
-    for size in sys.argv[1:] or SIZES:
-        experts = slot_count(config)
-        steps = experts * config.steps_per_update
+    config, parts = ExpertConfig(), ("rollout", "update", "both")
+    experts = slot_count(config)
+    results = []
+    for size in given.size:
         levels = jax.device_get(sample_levels(jnp.arange(experts), SIZES[size]))
-        rates = [f"{steps / seconds(call):,.0f}" for call in calls(levels, config)]
-        print("|", " | ".join((size, *rates)), "|", flush=True)
+        rates = [experts * config.steps_per_update / seconds(call) for call in calls(levels, config)]
+        results.append({"size": size, "unit": "env steps/s of one core", **dict(zip(parts, rates, strict=True))})
+    rows = [[of["size"], *(f"{of[name]:,.0f}" for name in parts)] for of in results]
+    table = Table(("size", "rollout", "update", "both, in slots"), rows, "Env steps/s of one core, the defaults")
+    return Report("Rollout and update apart", results, [table])
 
 
 def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
@@ -88,7 +95,3 @@ def seconds(call: Callable[[], Any]) -> float:
         jax.block_until_ready(call())
         taken.append(time.perf_counter() - begin)
     return float(np.median(taken))
-
-
-if __name__ == "__main__":
-    main()

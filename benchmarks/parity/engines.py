@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from benchmarks import oracle
+from benchmarks.contest import Process
 from benchmarks.parity.worlds import record_from_kinetix
-from benchmarks.race.contest import Process
 from levelgen.files.kinetix import MANIFOLDS, level_from_kinetix, state_from_kinetix, state_to_kinetix
 from levelgen.level import Level
 from levelgen.task import rules as task

@@ -7,7 +7,6 @@ One run trains fresh experts (ppo.py) for a number of updates. What they solve i
 import argparse
 
 import numpy as np
-from ppo import programs
 from serve import serve, timed
 from world import load_levels, stay_on
 
@@ -26,14 +25,15 @@ def main() -> None:
     stay_on(given.core)
 
     import jax
+    from ppo import Trainer
 
     levels = load_levels(given.levels, given.size, given.first, given.count)
-    start, update, _ = programs(given.size, given.environments, given.horizon)
+    trainer = Trainer.of(given.size, given.environments, given.horizon)
     keys = jax.random.split(jax.random.PRNGKey(given.first), given.count)
 
     def compile_both():
-        first = jax.jit(jax.vmap(start)).lower(keys, levels).compile()
-        return first, jax.jit(jax.vmap(update)).lower(first(keys, levels), levels).compile()
+        first = jax.jit(jax.vmap(trainer.start)).lower(keys, levels).compile()
+        return first, jax.jit(jax.vmap(trainer.update)).lower(first(keys, levels), levels).compile()
 
     seconds, (first, compiled) = timed(compile_both)
     jax.block_until_ready(compiled(first(keys, levels), levels))  # the first run touches memory

@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false
-"""The reference opens level files and plays them. Runs inside its own environment; of ours, only `flatten`.
+"""The reference opens level files and plays them. Runs inside its own environment.
 
     python benchmarks/reference/levels.py OUT.npz STEPS FILE...
 
@@ -13,21 +13,11 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+from actions import sticky_actions
 from kinetix.environment.env import make_kinetix_env
 from kinetix.environment.spaces import ActionType, ObservationType
 from kinetix.util.saving import load_from_json_file
 from world import flatten
-
-CHOICES = np.array([3, 3, 3, 3, 2, 2])
-STICKINESS = 0.9  # chance that an action entry stays as it was
-
-
-def sticky_actions(steps, levels):
-    rng = np.random.default_rng(0)
-    action = rng.integers(0, CHOICES, (max(steps, 1), levels, len(CHOICES)))
-    for step in range(1, steps):
-        action[step] = np.where(rng.random(action[step].shape) < STICKINESS, action[step - 1], action[step])
-    return action[:steps]
 
 
 def play(env, params, state, actions):
@@ -47,7 +37,7 @@ def main(out, steps, *files):
     state = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(value) for value in x]), *[world for world, _, _ in opened])
     _, static, params = opened[0]
     assert all(others[1:] == (static, params) for others in opened)
-    actions = sticky_actions(int(steps), len(files))
+    actions = np.moveaxis(sticky_actions(int(steps), len(files)), 1, 2)  # (step, level, 6)
     if len(actions):
         env = make_kinetix_env(ActionType.MULTI_DISCRETE, ObservationType.SYMBOLIC_FLAT, None, params, static, False)
         states, outcome = play(env, params, state, jnp.asarray(actions))

@@ -1,18 +1,17 @@
 # pyright: reportMissingImports=false
-"""The reference's side of `python -m benchmarks.solved run --variant original`, inside its own environment.
+"""The reference's side of `python -m benchmarks solved --variant original`, inside its own environment.
 
 Trains and evaluates the experts of ppo.py. Answers requests (see serve.py):
     begin     fresh experts for the levels of the file `levels`, with their `level_id`
     update    one update of all of them
     evaluate  writes to the file `out` what training and then an evaluation showed, level axis first, and answers with
-              the seconds since `begin`
+              the core-seconds since `begin`
 """
 
 import argparse
 import time
 
 import numpy as np
-from ppo import programs
 from serve import answer
 from world import load_levels, stay_on
 
@@ -41,14 +40,15 @@ class Batch:
 
     def __init__(self, given: argparse.Namespace) -> None:
         import jax
+        from ppo import Trainer
 
         def evaluate(learner, level, key):
-            return of_one.evaluate(learner, level, key, given.attempts, given.steps)
+            return trainer.evaluate(learner, level, key, given.attempts, given.steps)
 
-        of_one = programs(given.size, given.environments, given.horizon)
+        trainer = Trainer.of(given.size, given.environments, given.horizon)
         self.given, self.compiled = given, False
         self.start_all, self.update_all, self.evaluate_all = (
-            jax.jit(jax.vmap(program)) for program in (of_one.start, of_one.update, evaluate)
+            jax.jit(jax.vmap(program)) for program in (trainer.start, trainer.update, evaluate)
         )
 
     def answer(self, request: dict) -> dict:
@@ -64,14 +64,13 @@ class Batch:
                 self.update()
             case "evaluate":
                 np.savez(request["out"], **self.results())  # pyright: ignore[reportArgumentType]
-                wall, cpu = self.since
-                return {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
+                return {"core_seconds": time.process_time() - self.since}
         return {}
 
     def begin(self, path: str) -> None:
         import jax
 
-        self.since = time.perf_counter(), time.process_time()
+        self.since = time.process_time()
         with np.load(path) as file:
             ids = file["level_id"]
         self.count = len(ids)

@@ -15,6 +15,7 @@ import numpy as np
 # As ours runs (pipeline/runtime.py), so that neither side has an advantage
 SINGLE_THREAD = "--xla_cpu_multi_thread_eigen=false --xla_cpu_prefer_vector_width=512"
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+BATCH = 512  # levels sampled at a time: the memory of the sampler grows with them
 
 
 def stay_on(core: int | None) -> None:
@@ -74,15 +75,27 @@ def load_levels(path: str, size: str, first: int, count: int):
     return jax.tree.map(jnp.asarray, fill(empty))
 
 
-def sample_levels(path: Path, size: str, count: int, seed: int) -> None:
-    """Write `count` levels of the reference's random distribution."""
+def sampler(size: str):
+    """The reference's random distribution: a compiled function of keys (level, 2) to levels, level axis first."""
     import jax
     from kinetix.environment import EnvParams, static_env_params_from_size
     from kinetix.environment.ued.ued import make_reset_fn_sample_kinetix_level
 
-    sample = jax.jit(jax.vmap(make_reset_fn_sample_kinetix_level(EnvParams(), static_env_params_from_size(size))))
-    fields = flatten(sample(jax.random.split(jax.random.PRNGKey(seed), count)))
-    np.savez_compressed(path, **fields)  # pyright: ignore[reportArgumentType]
+    return jax.jit(jax.vmap(make_reset_fn_sample_kinetix_level(EnvParams(), static_env_params_from_size(size))))
+
+
+def keys_of(seed: int, count: int):
+    """Keys of at least so many levels, (batch, BATCH, 2)."""
+    import jax
+
+    return jax.random.split(jax.random.PRNGKey(seed), -(-count // BATCH) * BATCH).reshape(-1, BATCH, 2)
+
+
+def sample_levels(size: str, count: int, seed: int) -> dict[str, np.ndarray]:
+    """Levels of the reference's random distribution, as {path: array}."""
+    sample = sampler(size)
+    parts = [flatten(sample(keys)) for keys in keys_of(seed, count)]
+    return {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
 
 
 def main() -> None:
@@ -92,7 +105,8 @@ def main() -> None:
     parser.add_argument("--count", type=int, required=True)
     parser.add_argument("--seed", type=int, required=True)
     given = parser.parse_args()
-    sample_levels(given.out, given.size, given.count, given.seed)
+    fields = sample_levels(given.size, given.count, given.seed)
+    np.savez_compressed(given.out, **fields)  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":

@@ -1,34 +1,32 @@
-"""Training the levels of a benchmark: one process per core, each pinned, and a line per level in a file."""
+"""Training the levels of a benchmark: one process per core, each pinned, and a line per level."""
 
+import hashlib
 import json
 import math
 import multiprocessing
 import queue
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from benchmarks.solved.results import Header, header_of, read
+from benchmarks.solved.results import FILE, OF_LEVEL, Header, Results, merge, read
 from benchmarks.solved.variants import Variant
 from experts.labels import Label, Verdict
 from pipeline.errors import Failure, LevelproofError, UserError
 from pipeline.jobs.progress import Board, Tally
 from pipeline.jobs.schedule import Summary, WorkUnit, plan_units
-from pipeline.runtime import interruptible, own_cores, prepare_jax
+from pipeline.runtime import cache_folder, interruptible, own_cores, prepare_jax
 from pipeline.store.provenance import device, versions
 
 UNIT = 32  # levels that a process trains at a time
 POLL = 0.5  # s between looks at the processes
 DIGITS = 4  # of a share or of seconds in a file
-FIELDS = (
-    "label", "witness", "env_steps", "steps_to_first_success", "success_rate", "most_probable_succeeds",
-    "sticky_success_rate", "moved_success_rate", "steps_to_goal", "episodes",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -50,22 +48,53 @@ class Trained:
     device: str
 
 
-def measure(header: Header, variant: Variant, wanted: range, out: Path, jobs: int, worker: Callable[..., None]) -> None:
-    """Train the wanted levels that are not in the file; append each unit when it is done.
+def measure(
+    header: Header,
+    variant: Variant,
+    wanted: range,
+    jobs: int,
+    worker: Callable[..., None],
+    again: bool = False,
+    file: Path = FILE,
+) -> None:
+    """Train the wanted levels that are not known yet. What is done waits in the cache folder and joins the others last.
 
     Args:
-        header: of the file.
+        header: of the levels.
         variant: how to train.
         wanted: level ids.
-        out: the file.
         jobs: processes; 0: one per core.
         worker: what each does, as `work`.
+        again: results under other settings go.
+        file: the results.
 
     Raises:
-        UserError: the file is of another benchmark, or there are not as many cores as jobs.
+        UserError: there are results under other settings, or not as many cores as jobs.
         LevelproofError: what a process tells, or that it died.
     """
-    there = rows_there(out, header)
+    known = {results.header.name: results for results in read(file)}.get(header.name, Results(header, {}))
+    if known.header != header and not again:
+        raise UserError(
+            f"There are results of {header.name} under other settings: --again puts new ones in their place."
+        )
+    scratch = scratch_of(header)
+    there = (known.rows if known.header == header else {}) | rows_in(scratch)
+    train_all(header, variant, wanted, there, jobs, worker, scratch)
+    if rows := rows_in(scratch):
+        merge(Results(header, rows), file)
+        scratch.unlink()
+
+
+def train_all(
+    header: Header,
+    variant: Variant,
+    wanted: range,
+    there: Mapping[int, Mapping[str, Any]],
+    jobs: int,
+    worker: Callable[..., None],
+    scratch: Path,
+) -> None:
+    """The wanted levels that are not there, in processes; a unit's lines when it is done."""
     units = plan_units(wanted, there, UNIT)
     cores = own_cores()
     if not 0 <= jobs <= len(cores):
@@ -85,14 +114,14 @@ def measure(header: Header, variant: Variant, wanted: range, out: Path, jobs: in
         with interruptible(), board.shown():
             for process in processes:
                 process.start()
-            follow(len(units), told, processes, board, header, out)
+            follow(len(units), told, processes, board, scratch)
     finally:
         for process in processes:
             if process.is_alive():
                 process.terminate()
 
 
-def follow(units: int, told: Any, processes: list, board: Board, header: Header, out: Path) -> None:
+def follow(units: int, told: Any, processes: list, board: Board, scratch: Path) -> None:
     """Write and show what the processes tell, until all units are done.
 
     Raises:
@@ -104,43 +133,40 @@ def follow(units: int, told: Any, processes: list, board: Board, header: Header,
             now = told.get(timeout=POLL)
         except queue.Empty:
             if any(process.exitcode for process in processes):
-                raise Failure(f"A process died; run the same command again to go on with {out}.") from None
+                raise Failure("A process died; run the same command again to go on.") from None
             continue
         if isinstance(now, LevelproofError):
             raise now
         if isinstance(now, Trained):
-            append(out, now, header)
+            append(scratch, now)
             board.ended(now.unit, now.summary)
             units -= 1
         else:
             board.tally.progress(now.unit, *now.totals)
 
 
-def append(out: Path, trained: Trained, header: Header) -> None:
-    """A unit's lines, after the header in a new file."""
-    lines = trained.rows if out.exists() else [header_of(header, trained.versions, trained.device), *trained.rows]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with out.open("a") as file:
-        file.write("".join(json.dumps(line) + "\n" for line in lines))
+def scratch_of(header: Header) -> Path:
+    """Where a run keeps its lines until it is through; other settings, another file."""
+    settings = hashlib.sha256(json.dumps(header.config, sort_keys=True).encode()).hexdigest()[:12]
+    return cache_folder() / "solved" / f"{header.name}-{settings}.jsonl"
 
 
-def rows_there(out: Path, header: Header) -> dict[int, dict[str, Any]]:
-    """Rows by level id of a file that is to go on; a line that was cut off is removed from it.
+def append(scratch: Path, trained: Trained) -> None:
+    """A unit's lines."""
+    run = {"versions": json.dumps(trained.versions), "device": trained.device, "date": f"{datetime.now(UTC):%Y-%m-%d}"}
+    scratch.parent.mkdir(parents=True, exist_ok=True)
+    with scratch.open("a") as file:
+        file.write("".join(json.dumps(row | run) + "\n" for row in trained.rows))
 
-    Raises:
-        UserError: the file is of another benchmark.
-    """
-    if not out.exists():
+
+def rows_in(scratch: Path) -> dict[int, dict[str, Any]]:
+    """By level id; a line that was cut off is removed from the file."""
+    if not scratch.exists():
         return {}
-    whole, newline, _ = out.read_bytes().rpartition(b"\n")
-    if not newline:
-        out.unlink()
-        return {}
-    out.write_bytes(whole + newline)
-    before = read(out)
-    if before.header != header:
-        raise UserError(f"{out} holds {before.header.text} under other settings: choose another --out, or remove it.")
-    return before.rows
+    whole, newline, _ = scratch.read_bytes().rpartition(b"\n")
+    scratch.write_bytes(whole + newline)
+    rows = [json.loads(line) for line in whole.splitlines()]
+    return {row.pop("level_id"): row for row in rows}
 
 
 def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> None:
@@ -166,18 +192,18 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
         if not warm:
             train_levels(levels, ids, variant.expert.steps_per_update, variant.expert, variant.stop)
             warm = True
-        wall, cpu = time.perf_counter(), time.process_time()
+        before = time.process_time()
         result = train_levels(levels, ids, header.budget, variant.expert, variant.stop, tell=report)
-        spent = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
-        rows = [row_of(int(i), v, spent, len(ids)) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
+        seconds = (time.process_time() - before) / len(ids)
+        rows = [row_of(int(i), v, seconds) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
         solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
         told.put(Trained(unit, rows, Summary(len(ids), solved, *result.spent), versions(), device()))
 
 
-def row_of(level_id: int, verdict: Verdict, spent: dict[str, float], levels: int) -> dict[str, Any]:
-    """A level's line. Its seconds are its part of what its unit took."""
-    values = {name: getattr(verdict, name) for name in FIELDS} | {key: s / levels for key, s in spent.items()}
-    return {"level_id": level_id} | {name: short(value) for name, value in values.items()}
+def row_of(level_id: int, verdict: Verdict, seconds: float) -> dict[str, Any]:
+    """A level's line. Its core-seconds are its part of what its unit took."""
+    values = {name: getattr(verdict, name) for name in OF_LEVEL if name != "core_seconds"}
+    return {"level_id": level_id} | {name: short(x) for name, x in (values | {"core_seconds": seconds}).items()}
 
 
 def short(value: Any) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from benchmarks import oracle
-from benchmarks.race.contest import Process
+from benchmarks.contest import Process
 from benchmarks.solved.measure import Progress, Trained, row_of
 from benchmarks.solved.results import Header
 from benchmarks.solved.variants import Variant
@@ -30,7 +30,6 @@ from pipeline.runtime import cache_folder, prepare_jax
 from pipeline.store.provenance import device, versions
 
 WIDTH = 8  # levels that the reference trains side by side; empty places of a last batch are not charged
-NOTHING_SPENT = {"cpu_s": 0.0, "wall_s": 0.0}
 
 
 def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> None:
@@ -98,7 +97,7 @@ def train(
     levels = sample_levels(jnp.asarray(ids), size_of(header.size))
     before, failed = decide(levels, DEFAULT_RULES)
     left = np.array([i for i, verdict in enumerate(before) if verdict is None], int)
-    rows = [row_of(int(i), verdict, NOTHING_SPENT, 1) for i, verdict in zip(ids, before, strict=True) if verdict]
+    rows = [row_of(int(i), verdict, 0.0) for i, verdict in zip(ids, before, strict=True) if verdict]
     known_before, solved = len(rows), 0
     for first in range(0, len(left), WIDTH):
         batch = left[first : first + WIDTH]
@@ -110,7 +109,7 @@ def train(
 
         seconds, seen = train_batch(reference, take(levels, batch), ids[batch], updates, report)
         verdicts = [judged(of, config, bool(failed[i])) for i, of in zip(batch, seen, strict=True)]
-        rows += [row_of(int(ids[i]), verdict, seconds, WIDTH) for i, verdict in zip(batch, verdicts, strict=True)]
+        rows += [row_of(int(ids[i]), verdict, seconds / WIDTH) for i, verdict in zip(batch, verdicts, strict=True)]
         solved += sum(verdict.label is Label.SOLVED for verdict in verdicts)
     steps, evaluated = updates * config.steps_per_update, config.attempts * RECORD_STEPS
     summary = Summary(len(ids), solved, len(left) * steps, len(left) * evaluated, 0)
@@ -123,8 +122,8 @@ def train_batch(
     level_ids: Int[np.ndarray, " level"],
     updates: int,
     report: Callable[[float], None],
-) -> tuple[dict[str, float], list[dict[str, np.ndarray]]]:
-    """Seconds of the batch, and what the reference's process shows of each level (see `judged`).
+) -> tuple[float, list[dict[str, np.ndarray]]]:
+    """Core-seconds of the batch, and what the reference's process shows of each level (see `judged`).
 
     Raises:
         Failure: it ended.
@@ -139,7 +138,7 @@ def train_batch(
     for update in range(updates):
         reference.ask(do="update")
         report((update + 1) / updates)
-    seconds = reference.ask(do="evaluate", out=str(out))
+    seconds = reference.ask(do="evaluate", out=str(out))["core_seconds"]
     with np.load(out) as file:
         seen = {name: file[name] for name in file.files}
     return seconds, [{name: x[i] for name, x in seen.items()} for i in range(count)]

@@ -6,14 +6,15 @@ few levels more than that: its experts are evaluated when their budget ends, how
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from benchmarks.solved.results import Results, count, share, wilson
-from benchmarks.solved.tables import markdown, order
-from pipeline.errors import UserError
+from benchmarks.report import Table
+from benchmarks.solved.results import Results, count, share
+from benchmarks.solved.tables import order
+from benchmarks.statistics import wilson
 
-MARK = "unsolved-by-budget"
 FROM = 4_000  # env steps where the axis begins
 POINTS = 120  # of a curve; more would not show
 MARKS = (64_000, 256_000, 1_000_000, 4_000_000)
@@ -22,20 +23,12 @@ COLOURS = ("#2a85c7", "#d55e00", "#009e73", "#b3679b", "#b8860b")  # all show on
 GREY = "#7d8590"  # of axes and text: so does it
 
 
-def checked(results: Sequence[Results]) -> list[Results]:
-    """What can be drawn, in order.
+def tells(results: Results) -> bool:
+    """Whether it has a curve: not where every level had its whole budget, nor where the budget ends before the axis."""
+    return results.header.stops_early and bool(results.trained) and results.header.budget > FROM
 
-    Raises:
-        UserError: some file cannot.
-    """
-    for each in results:
-        if not each.header.stops_early:
-            raise UserError(
-                f"{each.header.text} gave every level its whole budget, so it does not tell when one was solved: "
-                "give files of variants that stop early."
-            )
-        if not each.trained or each.header.budget <= FROM:
-            raise UserError(f"{each.header.text} has nothing beyond {count(FROM)} env steps to show: leave it out.")
+
+def ordered(results: Sequence[Results]) -> list[Results]:
     return sorted(results, key=order)
 
 
@@ -63,17 +56,16 @@ def names(results: Sequence[Results]) -> list[str]:
     ]
 
 
-def table(results: Sequence[Results]) -> str:
-    """Markdown: the unsolved share at the marks and at the end."""
+def table(results: Sequence[Results]) -> Table:
+    """The unsolved share at the marks and at the end."""
     marks = sorted({mark for each in results for mark in (*MARKS, each.header.budget) if mark <= each.header.budget})
     rows = []
     for name, each in zip(names(results), results, strict=True):
         levels = len(each.trained)
         cells = [share(unsolved(each, mark), levels) if mark <= each.header.budget else "-" for mark in marks]
         rows.append([name, str(levels), *cells])
-    return markdown(
-        ("", "levels with an expert", *(f"unsolved at {count(mark)} (95% interval)" for mark in marks)), rows
-    )
+    head = ("", "levels with an expert", *(f"unsolved at {count(mark)} (95% interval)" for mark in marks))
+    return Table(head, rows, "**The unsolved share by budget**")
 
 
 def draw(results: Sequence[Results], out: Path) -> None:
@@ -91,13 +83,7 @@ def draw(results: Sequence[Results], out: Path) -> None:
 
     figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
     for i, (name, each) in enumerate(zip(names(results), results, strict=True)):
-        colour, levels = COLOURS[i % len(COLOURS)], len(each.trained)
-        steps, left = curve(each)
-        low, high = zip(*(wilson(k, levels) for k in left), strict=True)
-        axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
-        axes.plot(steps, [k / levels for k in left], color=colour, linewidth=1.6, label=name)
-        marks = [mark for mark in MARKS if mark <= each.header.budget]
-        axes.plot(marks, [unsolved(each, x) / levels for x in marks], "o", color=colour, markersize=4)
+        draw_curve(axes, each, name, COLOURS[i % len(COLOURS)])
     end = max(each.header.budget for each in results)
     axes.set(xscale="log", xlim=(FROM, end * 1.05), ylim=(0, None))
     axes.set(xlabel="training env steps of a level", ylabel="levels not yet solved")
@@ -111,3 +97,13 @@ def draw(results: Sequence[Results], out: Path) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, transparent=True, metadata={"Date": None})
     plt.close(figure)
+
+
+def draw_curve(axes: Any, results: Results, name: str, colour: str) -> None:
+    """The unsolved share of a variant, its interval, and its marks."""
+    levels, (steps, left) = len(results.trained), curve(results)
+    low, high = zip(*(wilson(k, levels) for k in left), strict=True)
+    axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
+    axes.plot(steps, [k / levels for k in left], color=colour, linewidth=1.6, label=name)
+    marks = [mark for mark in MARKS if mark <= results.header.budget]
+    axes.plot(marks, [unsolved(results, x) / levels for x in marks], "o", color=colour, markersize=4)

@@ -1,23 +1,49 @@
-"""Files of results, and statistics of them."""
+"""What is known of each level: a row for each size, budget, variant and level, in one parquet file."""
 
 import json
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from benchmarks.oracle import alone
+from benchmarks.statistics import wilson
 from experts.config import Rule
 from experts.labels import Label
 from pipeline.errors import UserError
 
-Z = 1.959964  # of a normal distribution: 95% lie within
+FILE = Path(__file__).parents[1] / "results" / "solved.parquet"
 EXPERT = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels of levels that get an expert
+SIZES = ("s", "m", "l")  # in this order; others follow
+WORD = pa.dictionary(pa.int32(), pa.string())
+SCHEMA = pa.schema(
+    [
+        ("size", WORD),
+        ("budget", pa.int64()),
+        ("variant", WORD),
+        ("level_id", pa.int64()),
+        ("label", WORD),
+        ("env_steps", pa.int64()),  # of training
+        ("success_rate", pa.float64()),  # of the last evaluation's sampled episodes; null: none ended
+        ("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: no witness
+        ("core_seconds", pa.float64()),  # the level's part of what its unit took
+        ("settings", WORD),  # of the expert and of stopping, as JSON
+        ("versions", WORD),  # as JSON
+        ("device", WORD),
+        ("date", WORD),
+    ]
+)
+OF_LEVEL = ("label", "env_steps", "success_rate", "steps_to_goal", "core_seconds")
+OF_RUN = ("versions", "device", "date")
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a file's levels have in common and what their results depend on."""
+    """What the levels of a variant, size and budget have in common and what their results depend on."""
 
     variant: str
     size: str
@@ -25,8 +51,9 @@ class Header:
     config: dict[str, Any]  # settings of the expert and of stopping
 
     @property
-    def text(self) -> str:
-        return f"{self.variant}, size {self.size}, {count(self.budget)}"
+    def name(self) -> str:
+        """`s-64k-ours`."""
+        return f"{self.size}-{count(self.budget)}-{self.variant}"
 
     @property
     def stops_early(self) -> bool:
@@ -36,10 +63,10 @@ class Header:
 
 @dataclass(frozen=True)
 class Results:
-    """A file."""
+    """The levels of one header."""
 
     header: Header
-    rows: dict[int, dict[str, Any]]  # by level id
+    rows: dict[int, dict[str, Any]]  # OF_LEVEL and OF_RUN, by level id
 
     @property
     def trained(self) -> dict[int, dict[str, Any]]:
@@ -52,57 +79,70 @@ class Results:
         return {level_id for level_id, row in rows if row["label"] == Label.SOLVED and row["env_steps"] <= within}
 
 
-def header_of(header: Header, versions: dict[str, Any], device: str) -> dict[str, Any]:
-    """A file's first line."""
-    return asdict(header) | {"versions": versions, "device": device}
-
-
-def read(file: Path) -> Results:
-    """A file's results.
+def read(file: Path = FILE) -> list[Results]:
+    """All that is known; nothing where there is no file.
 
     Raises:
-        UserError: it is not there, or none of ours.
+        UserError: the file is none of ours.
     """
+    if not file.exists():
+        return []
     try:
-        head, *rows = [json.loads(line) for line in file.read_text().splitlines()]
-        header = Header(**{name: head[name] for name in ("variant", "size", "budget", "config")})
-        return Results(header, {row["level_id"]: row for row in rows})
-    except OSError as error:
-        raise UserError(f"{file} cannot be read: {error.strerror}.") from None
-    except (ValueError, KeyError, TypeError):
-        raise UserError(f"{file} is not a file that `python -m benchmarks.solved run` has written.") from None
-
-
-def read_all(files: Iterable[Path]) -> list[Results]:
-    """Several files; those of one variant, size and budget as one.
-
-    Raises:
-        UserError: one cannot be read, or two of the same name have different settings.
-    """
-    found: dict[tuple[str, str, int], Results] = {}
-    for file in files:
-        new = read(file)
-        old = found.setdefault((new.header.variant, new.header.size, new.header.budget), new)
-        if old.header != new.header:
-            raise UserError(f"{file} has other settings than another file of {new.header.text}: give one of them.")
-        old.rows.update(new.rows)
+        lines = pq.read_table(file, schema=SCHEMA).to_pylist()
+    except (OSError, pa.ArrowException) as error:
+        raise UserError(f"{file} is not a file that `python -m benchmarks solved` has written ({error}).") from None
+    found: dict[tuple[str, int, str], Results] = {}
+    for line in lines:
+        key = line["size"], line["budget"], line["variant"]
+        if key not in found:
+            found[key] = Results(Header(key[2], key[0], key[1], json.loads(line["settings"])), {})
+        found[key].rows[line["level_id"]] = {name: line[name] for name in (*OF_LEVEL, *OF_RUN)}
     return list(found.values())
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """A 95% interval of a share (Wilson 1927)."""
-    if not trials:
-        return 0.0, 1.0
-    share, z2 = successes / trials, Z * Z / trials
-    middle = (share + z2 / 2) / (1 + z2)
-    half = Z * math.sqrt(share * (1 - share) / trials + z2 / trials / 4) / (1 + z2)
-    return max(0.0, middle - half), min(1.0, middle + half)
+def merge(new: Results, file: Path = FILE) -> None:
+    """Put levels in, in the place of what was known of them; other settings take the place of the whole header's."""
+    with alone(file.with_suffix(".lock")):
+        known = {results.header.name: results for results in read(file)}
+        old = known.get(new.header.name)
+        kept = old.rows if old and old.header == new.header else {}
+        known[new.header.name] = Results(new.header, kept | new.rows)
+        write(known.values(), file)
 
 
-def mcnemar(only_one: int, only_other: int) -> float:
-    """Exact two-sided p of levels that only one of two variants solved (McNemar 1947): a fair coin decides each."""
-    flips, fewer = only_one + only_other, min(only_one, only_other)
-    return min(1.0, 2 * sum(math.comb(flips, k) for k in range(fewer + 1)) / 2**flips)
+def write(results: Iterable[Results], file: Path) -> None:
+    """All that is known, in an order of its own: the same results are the same file."""
+    lines = [
+        {"size": h.size, "budget": h.budget, "variant": h.variant, "level_id": level_id}
+        | {"settings": json.dumps(h.config), **row}
+        for h, rows in ((each.header, each.rows) for each in results)
+        for level_id, row in rows.items()
+    ]
+    lines.sort(key=lambda line: (by_size(line["size"]), line["budget"], line["variant"], line["level_id"]))
+    unfinished = file.with_suffix(".unfinished")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.Table.from_pylist(lines, SCHEMA), unfinished, compression="zstd", compression_level=19)
+    unfinished.replace(file)
+
+
+def by_size(size: str) -> tuple[int, str]:
+    return SIZES.index(size) if size in SIZES else len(SIZES), size
+
+
+def made(results: Sequence[Results]) -> str:
+    """When and on what, in a sentence."""
+    told: dict[str, Mapping[str, None]] = {
+        name: dict.fromkeys(row[name] for each in results for row in each.rows.values()) for name in OF_RUN
+    }
+    stacks: dict[str, dict[str, None]] = {}
+    for stack in map(json.loads, told["versions"]):
+        reference = {f"reference: {name}": x for name, x in stack.pop("reference", {}).items()}
+        for name, x in (stack | reference).items():
+            stacks.setdefault(name, {})[str(x)] = None
+    dates = sorted(told["date"])
+    when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}" if dates else ""
+    stack = ", ".join(f"{name} {' and '.join(x)}" for name, x in stacks.items())
+    return f"{when}, on {', '.join(told['device'])}; {stack}"
 
 
 def mean(values: Sequence[float | None]) -> float | None:

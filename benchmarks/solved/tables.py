@@ -3,12 +3,12 @@
 import statistics
 from collections.abc import Sequence
 
-from benchmarks.solved.results import Results, count, mcnemar, mean, share
+from benchmarks.report import Table
+from benchmarks.solved.results import Results, by_size, count, mean, share
 from benchmarks.solved.variants import VARIANTS
+from benchmarks.statistics import mcnemar
 
-MARK = "solved"
 QUARTER = "ours"  # the variant whose quarter of the budget is compared with the reference's whole
-SIZES = ("s", "m", "l")  # in this order; others follow
 HEAD = (
     "variant", "levels with an expert", "solved (95% interval)", "at a quarter of the budget", "env steps a level",
     "core-seconds a solved level", "success rate", "steps to goal",
@@ -16,28 +16,30 @@ HEAD = (
 PAIRED_HEAD = ("variant", "against", "levels of both", "only the first solves", "only the other solves", "p")
 
 
-def tables(results: Sequence[Results]) -> str:
-    """Markdown: for each size and budget the variants, and the pairs of them."""
+def tables(results: Sequence[Results]) -> list[Table]:
+    """For each size and budget the variants, and the pairs of them."""
     groups: dict[tuple[str, int], list[Results]] = {}
     for each in sorted(results, key=order):
         groups.setdefault((each.header.size, each.header.budget), []).append(each)
-    parts = []
+    made = []
     for (size, budget), group in groups.items():
-        parts.append(f"**Size {size}, {count(budget)} env steps**, {ids_of(group)}:")
-        parts.append(markdown(HEAD, [line(each) for each in group]))
+        title = f"**Size {size}, {count(budget)} env steps**, {ids_of(group)}"
+        made.append(Table(HEAD, [line(each) for each in group], title))
         if pairs := paired(group):
-            parts.append("Level by level:")
-            parts.append(markdown(PAIRED_HEAD, pairs))
+            made.append(Table(PAIRED_HEAD, pairs, "Level by level"))
+    return made
+
+
+def variants_of(results: Sequence[Results]) -> str:
+    """What they are, as a list."""
     names = {each.header.variant for each in results}
-    parts.append("\n".join(f"- `{name}`: {each.text}" for name, each in VARIANTS.items() if name in names))
-    return "\n\n".join(parts)
+    return "\n".join(f"- `{name}`: {each.text}" for name, each in VARIANTS.items() if name in names)
 
 
 def order(results: Results) -> tuple:
     header, names = results.header, list(VARIANTS)
-    size = SIZES.index(header.size) if header.size in SIZES else len(SIZES)
     variant = names.index(header.variant) if header.variant in names else len(names)
-    return size, header.size, header.budget, variant
+    return by_size(header.size), header.budget, variant
 
 
 def ids_of(group: Sequence[Results]) -> str:
@@ -49,7 +51,7 @@ def line(results: Results) -> list[str]:
     """A variant's row."""
     header, trained, solved = results.header, results.trained, results.solved()
     rows = [trained[level_id] for level_id in solved]
-    seconds = sum(row["cpu_s"] for row in results.rows.values())
+    seconds = sum(row["core_seconds"] for row in results.rows.values())
     quarter = len(results.solved(header.budget / 4))
     rate = mean([row["success_rate"] for row in rows])
     return [
@@ -84,8 +86,3 @@ def discordant(one: Results, other: Results, solved: set[int]) -> list[str]:
     solved, theirs = solved & both, other.solved() & both
     p = mcnemar(len(solved - theirs), len(theirs - solved))
     return [str(len(both)), str(len(solved - theirs)), str(len(theirs - solved)), f"{p:.2g}"]
-
-
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

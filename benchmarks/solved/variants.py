@@ -4,29 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from benchmarks.reference.hyperparameters import PPO
 from experts.config import Choice, ExpertConfig, Network, Rule, StopConfig
 
-# Each one is written out: other defaults of ours do not change the reference. Its evaluation is ours, so that both are
-# judged alike.
-REFERENCE = ExpertConfig(
-    width=64,
-    depth=2,
-    environments=32,
-    horizon=64,
-    dense_reward_scale=0.2,
-    rehearsals=0,
-    persistence=0.0,
-    epochs=4,
-    minibatches=4,
-    learning_rate=3e-4,
-    adam_epsilon=1e-5,
-    max_gradient_norm=1.0,
-    discount=0.995,
-    gae_lambda=0.9,
-    clip=0.2,
-    value_weight=0.5,
-    entropy_weight=0.01,
-)
+# Other defaults of ours do not change the reference. Its evaluation is ours, so that both are judged alike.
+REFERENCE = ExpertConfig(**PPO._asdict(), rehearsals=0, persistence=0.0)
 
 
 @dataclass(frozen=True)

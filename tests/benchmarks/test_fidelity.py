@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from benchmarks.document import between_marks
-from benchmarks.fidelity import MARK, compare, holm, p_value, told
+from benchmarks.fidelity import SizeReport, compare, p_value, summary, table, told
+from benchmarks.statistics import holm
 
 RNG = np.random.default_rng(0)
 Draw = Callable[[int], np.ndarray]
@@ -24,6 +24,7 @@ OTHER: list[Draw] = [
 ]
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("draw", SAME)
 def test_p_is_rarely_small_where_nothing_differs(draw: Draw) -> None:
     p = np.array([p_value(draw(2000), draw(2000)) for _ in range(300)], float)
@@ -68,10 +69,12 @@ def test_told() -> None:
     assert told("joint fixed", np.array([])) == "none"
 
 
-def test_marks() -> None:
-    text = f"a\n<!-- {MARK} -->\nold\n<!-- end of {MARK} -->\nb\n"
-    new = between_marks(text, MARK, "new\n")
-    assert new == f"a\n<!-- {MARK} -->\n\nnew\n\n<!-- end of {MARK} -->\nb\n"
-    assert between_marks(new, MARK, "new") == new
-    with pytest.raises(SystemExit, match="has no lines"):
-        between_marks("a", MARK, "new")
+def test_tables() -> None:
+    ours = {"level role": np.repeat([0, 1], 500), "only here": np.arange(50.0)}
+    report = SizeReport("s", 1000, compare(ours, {**ours, "level role": np.repeat([0, 1], (400, 600))}))
+    rows = {row[0]: row[1:] for row in table([report, SizeReport("m", 9, {})]).rows}
+    assert rows["only here"][-1] == "same"
+    assert rows["only here"][3:6] == ["", "", ""]
+    assert rows["level role"][:2] == ["0: 50.0%", "1: 60.0%"]
+    assert rows["level role"][-1] == "differs: s"
+    assert ["differ (corrected p < 0.001)", "1"] in summary([report]).rows

@@ -1,9 +1,9 @@
-"""`python -m benchmarks parity`: scenes, distances, causes and tables on golden states; a small campaign for real."""
+"""Parity: scenes, distances, causes and tables on golden states; a small campaign for real."""
 
 import dataclasses
-import io
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,16 +13,17 @@ import numpy as np
 import pytest
 
 from benchmarks import oracle
+from benchmarks.__main__ import main
 from benchmarks.parity import causes, episodes, scenes
 from benchmarks.parity.campaign import SizeReport
 from benchmarks.parity.distance import distances, gap
 from benchmarks.parity.engines import Played, Stepped, play_ours, step_ours
 from benchmarks.parity.onestep import Pool, distinct, one_step, picked
-from benchmarks.parity.report import Report, tables
+from benchmarks.parity.report import report_of
 from benchmarks.parity.worlds import BLOCK, blocks, contact_bodies, lanes_of, nudged
-from benchmarks.race.command import main
+from benchmarks.report import Report
 from physics.types import FIXED_POLYGONS, Params
-from pipeline.errors import Exit, Failure, UserError
+from pipeline.errors import Exit
 from tests.golden.load import HERE, load
 
 ROOT = Path(__file__).parent.parent.parent
@@ -275,7 +276,7 @@ class TestEpisodes:
 
 
 @pytest.fixture(scope="module")
-def report(pool, reference_after) -> Report:
+def sizes(pool, reference_after) -> list[SizeReport]:
     """Of golden states and what the reference made of them, and an episode."""
     ticks: list[str] = []
     found = one_step(pool, lambda *_: reference_after, ticks.append)
@@ -291,12 +292,17 @@ def report(pool, reference_after) -> Report:
         parted=[episodes.Parted("sampled", "level 3", "goal at 3", "goal at 4", [2, None], True, 5, 1e-5, "chance")],
         reasons={"chance": 1},
     )
-    return Report.of([SizeReport("s", found, pairs, ["one"])], {"states": 40}, {"jax2d": "1.0.1"})
+    return [SizeReport("s", found, pairs, ["one"])]
+
+
+@pytest.fixture(scope="module")
+def report(sizes) -> Report:
+    return report_of(sizes, {"states": 40}, {"jax2d": "1.0.1"})
 
 
 class TestReport:
-    def test_golden_states_agree_or_are_explained(self, report) -> None:
-        found = report.sizes[0].one_step
+    def test_golden_states_agree_or_are_explained(self, sizes, report) -> None:
+        found = sizes[0].one_step
         assert found.states == BLOCK
         motion = found.scenes[-1]
         assert (motion.scene, motion.states) == ("all", BLOCK)
@@ -304,38 +310,33 @@ class TestReport:
         assert sum(row.states for row in found.scenes[:-1]) == BLOCK
         assert [row.field for row in found.fields][:2] == ["position", "rotation"]
         assert found.defect.differ[0] >= found.defect.differ[1] > 0
-        report.check()
+        assert not report.fault
 
-    def test_another_engine_is_told(self, pool, report) -> None:
+    def test_another_engine_is_told(self, pool) -> None:
         """Ours with another constant: contacts are pushed apart a quarter faster."""
         params = Params(contact_bias=0.25)
         found = one_step(pool.lanes(np.arange(40)), lambda *given: step_ours(*given, params), lambda _: None)
         wrong = [state for state in found.off if not state.explained]
         assert len(wrong) > 5
-        told = dataclasses.replace(report, sizes=[SizeReport("s", found, None, [])])
-        with pytest.raises(Failure, match=rf"does not explain {len(wrong)} differences.*size s, golden.*--json"):
-            told.check()
+        told = report_of([SizeReport("s", found, None, [])], {}, {})
+        assert re.search(rf"does not explain {len(wrong)} differences.*size s, golden.*--json", told.fault)
+        assert len(told.notes) == len(wrong)
 
-    def test_tables_and_json(self, report, capsys) -> None:
-        for _, head, rows in tables(report):
-            assert all(len(row) == len(head) for row in rows)
-        report.write_tables()
-        shown = capsys.readouterr().out
-        assert "75.0%" in shown
-        assert "NOT EXPLAINED" not in shown
-        file = io.StringIO()
-        report.write_json(file)
-        told = json.loads(file.getvalue())
-        assert told["bench"] == "parity"
+    def test_tables_and_json(self, report) -> None:
+        for table in report.tables:
+            assert all(len(row) == len(table.head) for row in table.rows)
+        played = next(table for table in report.tables if table.title.startswith("Whole episodes"))
+        assert "75.0%" in played.rows[0]
+        (told,) = report.results
         assert told["sizes"][0]["episodes"]["same"] == 0.75
         assert told["sizes"][0]["one_step"]["fields"][0]["largest"] < 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_small_campaign_for_real(reference, level_file, tmp_path) -> None:
     """As a user types it. Handmade levels, scenes, episodes: all that differs is rounding."""
     words = ["--size", "s", "--states", "120", "--episodes", "12", "--level-file", str(level_file), "--json"]
-    code = "import sys; from benchmarks.race.command import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from benchmarks.__main__ import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "parity", *words]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
     keep = ["--keep", str(tmp_path / "kept")]
@@ -357,12 +358,12 @@ def test_a_small_campaign_for_real(reference, level_file, tmp_path) -> None:
 
 
 class TestInput:
-    def test_levels_of_another_size(self, level_file, monkeypatch) -> None:
+    def test_levels_of_another_size(self, level_file, monkeypatch, capsys) -> None:
         monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
-        with pytest.raises(UserError, match=r"are of size s: --size is m\.$"):
-            main(["parity", "--size", "m", "--level-file", str(level_file)])
-        with pytest.raises(UserError, match="levels of one size"):
-            main(["parity", "--level-file", str(level_file)])
+        assert main(["parity", "--size", "m", "--level-file", str(level_file)]) == Exit.INPUT
+        assert "are of size s: --size is m." in capsys.readouterr().err
+        assert main(["parity", "--level-file", str(level_file)]) == Exit.INPUT
+        assert "levels of one size" in capsys.readouterr().err
 
     @pytest.mark.parametrize(
         ("size", "sentence"),

@@ -1,8 +1,9 @@
-"""The bench: its arithmetic, its processes, and both benches run for real at tiny sizes."""
+"""Races: their arithmetic, their processes, and both run for real at tiny sizes."""
 
-import io
+import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import oracle
+from benchmarks import oracle, race
+from benchmarks.__main__ import main
+from benchmarks.contest import Entry, Score, compete
 from benchmarks.levels import load_levels
-from benchmarks.race.command import OURS, main, share
-from benchmarks.race.contest import Entry, Score, compete
-from benchmarks.race.report import summary, write_json, write_table
+from benchmarks.race import OURS, shares, summary
+from benchmarks.reference import actions
 from benchmarks.reference.actions import sticky_actions
 from levelgen.task.actions import CHOICES
 from pipeline.errors import Exit, Failure, UserError
@@ -26,15 +28,16 @@ ROOT = Path(__file__).parent.parent.parent
 class TestArithmetic:
     @pytest.mark.parametrize(("count", "cores"), [(1024, 2), (5, 4), (1, 8), (7, 1), (64, 16)])
     def test_shares_are_even_and_complete(self, count, cores) -> None:
-        places = share(count, range(cores))
-        assert [first for _, first, _ in places] == list(np.cumsum([0, *(n for _, _, n in places)])[:-1])
-        sizes = [n for _, _, n in places]
+        split = shares(count, range(cores))
+        sizes = [share.count for share in split]
+        assert [share.first for share in split] == list(np.cumsum([0, *sizes])[:-1])
         assert sum(sizes) == count
         assert max(sizes) - min(sizes) <= 1
-        assert len(places) == min(count, cores)
-        assert len({core for core, _, _ in places}) == len(places)
+        assert len(split) == min(count, cores)
+        assert len({share.core for share in split}) == len(split)
 
     def test_actions_are_sticky_and_cover_their_choices(self) -> None:
+        assert actions.CHOICES == CHOICES, "what the reference's scripts think"
         action = sticky_actions(200, 50)
         assert action.shape == (200, 6, 50)
         for entry, choices in enumerate(CHOICES):
@@ -58,28 +61,26 @@ class TestArithmetic:
         return [score(OURS, [90, 110, 100], 5), score("slow", [3, 4, 9], 20), score("fast", [10, 11, 9], 30)]
 
     def test_the_reference_counts_at_its_best(self) -> None:
-        result = summary("physics", "s", {"lanes": 8}, self.scores(), {"jax": "0"})
+        result = summary("s", {"lanes": 8}, self.scores())
         assert (result.ours, result.reference, result.ratio) == (100, 10, 10)
         assert result.reference_way == "fast"
         assert result.spread[OURS] == [90, 110]
         assert result.compile_ratio == 0.25
         assert result.goal_share == {OURS: 0.75, "slow": 0.75, "fast": 0.75}
 
-    def test_json_and_table(self, capsys) -> None:
-        result = summary("physics", "s", {"lanes": 8}, self.scores(), {"jax": "0"})
-        file = io.StringIO()
-        write_json(result, file)
-        told = json.loads(file.getvalue())
-        for name in ("ours", "reference", "ratio", "spread", "machine", "versions", "date", "compile_seconds"):
-            assert name in told
-        write_table(result)
-        shown = capsys.readouterr().out
-        assert "ratio 10.0" in shown
-        assert "not finite" not in shown
+    def test_tables(self) -> None:
+        results = [summary("s", {"lanes": 8}, self.scores())]
+        assert race.rates(results).rows == [["s", "100", "4", "25", "10", "10"]]
+        assert race.details(results).rows[0] == ["s", OURS, "90 to 110", "5.0", "75.0%"]
+
+    def test_what_is_not_finite_is_a_fault(self, monkeypatch) -> None:
         scores = self.scores()
         scores[0].finite = False
-        write_table(summary("physics", "s", {}, scores, {}))
-        assert "not finite" in capsys.readouterr().out
+        monkeypatch.setattr(race, "compete", lambda *_: scores)
+        monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
+        monkeypatch.setattr(oracle, "versions", lambda _: {"jax": "0"})
+        given = argparse.Namespace(size=["s"], repeats=1)
+        assert "of size s is not finite" in race.run("A race", given, lambda _: [], {}).fault
 
 
 class TestProcesses:
@@ -122,9 +123,9 @@ class TestInput:
     @pytest.mark.parametrize(
         "words", [["physics", "--lanes", "0"], ["experts", "--levels", "-1"], ["physics", "--repeats", "0"]]
     )
-    def test_counts_start_at_one(self, words) -> None:
-        with pytest.raises(UserError, match=r"^--\w+ is -?\d: it has to be at least 1\.$"):
-            main(words)
+    def test_counts_start_at_one(self, words, capsys) -> None:
+        assert main(words) == Exit.INPUT
+        assert re.search(r"--\w+ is -?\d: it has to be at least 1\.$", capsys.readouterr().err)
 
     @pytest.mark.parametrize("words", [[], ["storage"], ["physics", "--size", "xl"], ["physics", "--lanes", "many"]])
     def test_unknown_words(self, words) -> None:
@@ -132,9 +133,9 @@ class TestInput:
             main(words)
         assert error.value.code == Exit.INPUT
 
-    def test_a_level_file_that_is_not_there(self) -> None:
-        with pytest.raises(UserError, match=r"^There is no file nowhere\.npz"):
-            main(["physics", "--level-file", "nowhere.npz"])
+    def test_a_level_file_that_is_not_there(self, capsys) -> None:
+        assert main(["physics", "--level-file", "nowhere.npz"]) == Exit.INPUT
+        assert "There is no file nowhere.npz" in capsys.readouterr().err
 
     def test_a_python_that_is_not_there(self, monkeypatch) -> None:
         monkeypatch.setenv(oracle.PYTHON_VARIABLE, "/nowhere/python")
@@ -165,7 +166,7 @@ class TestInput:
         assert not (tmp_path / "reference" / "ready").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     "words",
     [
@@ -177,7 +178,7 @@ class TestInput:
 def test_a_tiny_bench_for_real(reference, level_file, words) -> None:
     """As a user types it, on one core where the system can, so that the reference has one way to run."""
     pin = f"hasattr(os, 'sched_setaffinity') and os.sched_setaffinity(0, {{{own_cores()[0]}}})"
-    code = f"import os, sys; {pin}; from benchmarks.race.command import main; sys.exit(main(sys.argv[1:]))"
+    code = f"import os, sys; {pin}; from benchmarks.__main__ import main; sys.exit(main())"
     command = [sys.executable, "-c", code, *words, "--repeats", "2", "--level-file", str(level_file), "--json"]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)

@@ -1,6 +1,5 @@
-"""The benchmark of solved levels: statistics, files that go on, tables and plots of made-up files, and a real run."""
+"""The benchmark of solved levels: the file, tables and plots of made-up results, and a real run."""
 
-import importlib
 import json
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -10,19 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
 
 from benchmarks import oracle
-from benchmarks.solved import __main__ as command
+from benchmarks.__main__ import main
+from benchmarks.solved import measure as measuring
 from benchmarks.solved import original, plot, tables
-from benchmarks.solved.measure import measure, rows_there, work
-from benchmarks.solved.results import Header, count, header_of, mcnemar, read, read_all, share, wilson
-from benchmarks.solved.variants import REFERENCE, VARIANTS, Variant
+from benchmarks.solved.measure import measure, rows_in, work
+from benchmarks.solved.results import Header, Results, count, made, merge, read, share
+from benchmarks.solved.variants import VARIANTS, Variant
+from benchmarks.statistics import mcnemar
 from configs.convert import plain
 from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.labels import Label, Source
 from levelgen.task.actions import CHOICES
-from pipeline.errors import UserError
+from pipeline.errors import Exit, UserError
 
 SMALL = ExpertConfig(
     environments=16, width=16, rehearsals=4, attempts=4, sticky_attempts=4, moved_attempts=4, slots=4
@@ -35,30 +35,24 @@ def header(name: str = "ours", size: str = "s", budget: int = 64_000) -> Header:
     return Header(name, size, budget, {"expert": plain(variant.expert), "stop": plain(variant.stop)})
 
 
-def row(level_id: int, label: str, env_steps: int, steps: int | None = None) -> dict[str, Any]:
+def row(level_id: int, label: str, env_steps: int, steps: int | None = None) -> tuple[int, dict[str, Any]]:
     rate = 0.5 if label == "solved" else None
-    return {"level_id": level_id, "label": label, "env_steps": env_steps, "success_rate": rate, "steps_to_goal": steps,
-            "cpu_s": 1.5, "wall_s": 2.0}  # fmt: skip
-
-
-def made_up(file: Path, of: Header, rows: list[dict[str, Any]]) -> Path:
-    lines = [header_of(of, {"python": "3"}, "cpu: none"), *rows]
-    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    return file
+    values = {"label": label, "env_steps": env_steps, "success_rate": rate, "steps_to_goal": steps, "core_seconds": 1.5}
+    return level_id, values | {"versions": '{"python": "3"}', "device": "cpu: none", "date": "2026-01-01"}
 
 
 @pytest.fixture
-def ours(tmp_path: Path) -> Path:
+def ours() -> Results:
     """Ten levels: a trivial one, one left of the axis' begin, five solved soon or late, three never."""
     steps = (2_000, 5_000, 16_000, 16_001, 40_000, 64_000)
     rows = [row(FIRST, "trivial", 0, 3)]
     rows += [row(FIRST + i, "solved", x, 10 * i) for i, x in enumerate(steps, 1)]
     rows += [row(FIRST + i, "unsolved", 64_000) for i in (7, 8, 9)]
-    return made_up(tmp_path / "ours.jsonl", header(), rows)
+    return Results(header(), dict(rows))
 
 
 @pytest.fixture
-def reference(tmp_path: Path) -> Path:
+def theirs() -> Results:
     """The same levels; one solved that ours did not solve, four not solved that ours did."""
     labels = [
         "trivial",
@@ -72,7 +66,7 @@ def reference(tmp_path: Path) -> Path:
         *["unsolved"] * 2,
     ]
     rows = [row(FIRST + i, label, 63_488, 7 if label == "solved" else None) for i, label in enumerate(labels)]
-    return made_up(tmp_path / "reference.jsonl", header("reference"), rows)
+    return Results(header("reference"), dict(rows))
 
 
 def cells(text: str, start: str) -> list[str]:
@@ -81,24 +75,11 @@ def cells(text: str, start: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-@pytest.mark.parametrize(("k", "n"), [(0, 10), (10, 10), (3, 7), (211, 512), (1, 1)])
-def test_wilson_is_scipys(k: int, n: int) -> None:
-    assert wilson(k, n) == pytest.approx(tuple(binomtest(k, n).proportion_ci(method="wilson")), abs=1e-6)
-
-
-def test_wilson_of_nothing_says_nothing() -> None:
-    assert wilson(0, 0) == (0, 1)
+def test_shares() -> None:
     assert share(0, 0) == "-"
     assert share(1, 2) == "50.0% (9.5 to 90.5)"
-
-
-@pytest.mark.parametrize(("one", "other"), [(1, 0), (3, 3), (4, 1), (0, 12), (60, 31)])
-def test_mcnemar_is_an_exact_binomial_test(one: int, other: int) -> None:
-    assert mcnemar(one, other) == pytest.approx(binomtest(one, one + other).pvalue)
-
-
-def test_mcnemar_without_a_difference() -> None:
     assert mcnemar(0, 0) == 1
+    assert mcnemar(4, 1) == mcnemar(1, 4) == pytest.approx(0.375)
 
 
 def test_counts() -> None:
@@ -119,32 +100,18 @@ def test_an_ablation_changes_one_thing() -> None:
     assert reference.stop.rule == Rule.BUDGET
 
 
-def test_the_reference_has_the_hyperparameters_of_its_users(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(oracle.SCRIPTS)
-    theirs = importlib.import_module("ppo")
-    names = {
-        "WIDTH": "width",
-        "EPOCHS": "epochs",
-        "MINIBATCHES": "minibatches",
-        "RATE": "learning_rate",
-        "ADAM_EPSILON": "adam_epsilon",
-        "MAX_NORM": "max_gradient_norm",
-        "DISCOUNT": "discount",
-        "LAMBDA": "gae_lambda",
-        "CLIP": "clip",
-        "VALUE_WEIGHT": "value_weight",
-        "ENTROPY_WEIGHT": "entropy_weight",
-        "DENSE_REWARD": "dense_reward_scale",
-    }
-    assert {name: getattr(theirs, name) for name in names} == {name: getattr(REFERENCE, x) for name, x in names.items()}
-    assert theirs.CHOICES == CHOICES
+def test_the_original_is_judged_as_its_reimplementation() -> None:
     there, here = VARIANTS["original"], VARIANTS["reference"]
     assert replace(there.expert, sticky_attempts=8, moved_attempts=8) == here.expert
     assert there.stop == here.stop
 
 
-def test_table(ours: Path, reference: Path) -> None:
-    text = tables.tables(read_all([reference, ours]))
+def text_of(results: list[Results]) -> str:
+    return "\n\n".join(table.markdown() for table in tables.tables(results))
+
+
+def test_table(ours: Results, theirs: Results) -> None:
+    text = text_of([theirs, ours])
     assert "**Size s, 64k env steps**, levels 1,000,000 to 1,000,009:" in text
     mean_steps = (2_000 + 5_000 + 16_000 + 16_001 + 40_000 + 4 * 64_000) / 9
     of_ours = ["`ours`", "9 of 10", share(6, 9), share(3, 9), f"{mean_steps:,.0f}", "2.5", "0.500", "35"]
@@ -153,127 +120,158 @@ def test_table(ours: Path, reference: Path) -> None:
     assert cells(solved, "`reference`")[1:4] == ["9 of 10", share(3, 9), "-"]
     assert cells(paired, "`ours`")[1:] == ["`reference`", "9", "4", "1", "0.38"]
     assert cells(paired, "`ours`, a quarter of the budget")[1:] == ["`reference`", "9", "3", "3", "1"]
-    assert f"- `ours`: {VARIANTS['ours'].text}" in text
+    assert f"- `ours`: {VARIANTS['ours'].text}" in tables.variants_of([ours])
     assert text.index("| `reference` |") < text.index("| `ours` |")
 
 
-def test_a_variant_is_compared_with_several(tmp_path: Path, ours: Path, reference: Path) -> None:
+def test_a_variant_is_compared_with_several(ours: Results, theirs: Results) -> None:
     rows = [row(FIRST + 1, "solved", 63_488, 5), row(FIRST + 9, "unsolved", 63_488)]
-    there = made_up(tmp_path / "original.jsonl", header("original"), rows)
-    paired = tables.tables(read_all([ours, reference, there])).split("Level by level:")[1]
+    there = Results(header("original"), dict(rows))
+    paired = text_of([ours, theirs, there]).split("Level by level:")[1]
     assert cells(paired, "`original` | `reference`")[2:] == ["2", "1", "0", "1"]
     assert cells(paired, "`ours` | `original`")[2:] == ["2", "0", "0", "1"]
     assert cells(paired, "`ours` | `reference`")[2:] == ["9", "4", "1", "0.38"]
     assert cells(paired, "`ours`, a quarter of the budget | `original`")[2:] == ["2", "0", "0", "1"]
 
 
-def test_pairs_are_of_the_levels_that_both_tried(tmp_path: Path, ours: Path) -> None:
-    other = made_up(tmp_path / "o.jsonl", header("width_32"), [row(FIRST + 1, "unsolved", 64_000)])
-    text = tables.tables(read_all([ours, other]))
+def test_pairs_are_of_the_levels_that_both_tried(ours: Results) -> None:
+    text = text_of([ours, Results(header("width_32"), dict([row(FIRST + 1, "unsolved", 64_000)]))])
     assert cells(text.split("Level by level:")[1], "`width_32`")[1:] == ["`ours`", "1", "0", "1", "1"]
 
 
-def test_files_of_one_variant_are_one(tmp_path: Path, ours: Path) -> None:
-    more = made_up(tmp_path / "more.jsonl", header(), [row(FIRST + 20, "solved", 1_024, 5)])
-    (both,) = read_all([ours, more])
-    assert len(both.rows) == 11
-    settings = header().config | {"stop": {"rule": "halving"}}
-    other = made_up(tmp_path / "other.jsonl", replace(header(), config=settings), [])
-    with pytest.raises(UserError, match="has other settings"):
-        read_all([ours, other])
+class TestFile:
+    def test_levels_join_those_that_are_there(self, tmp_path: Path, ours: Results, theirs: Results) -> None:
+        file = tmp_path / "solved.parquet"
+        assert read(file) == []
+        merge(theirs, file)
+        merge(Results(ours.header, dict([*ours.rows.items()][3:])), file)
+        first = file.read_bytes()
+        merge(Results(ours.header, dict([*ours.rows.items()][:5])), file)
+        assert {each.header.name: each for each in read(file)} == {"s-64k-ours": ours, "s-64k-reference": theirs}
+        merge(ours, file)
+        again = file.read_bytes()
+        merge(ours, file)
+        assert file.read_bytes() == again != first, "the same results are the same file"
+
+    def test_other_settings_take_the_place_of_all(self, tmp_path: Path, ours: Results) -> None:
+        file = tmp_path / "solved.parquet"
+        merge(ours, file)
+        settings = ours.header.config | {"stop": {"rule": "halving"}}
+        other = Results(replace(ours.header, config=settings), dict([row(FIRST + 20, "solved", 1_024, 5)]))
+        merge(other, file)
+        assert read(file) == [other]
+
+    def test_something_else_is_told(self, tmp_path: Path) -> None:
+        file = tmp_path / "solved.parquet"
+        file.write_text("no parquet")
+        with pytest.raises(UserError, match="is not a file that"):
+            read(file)
+
+    def test_the_committed_results_are_all_there(self) -> None:
+        results = read()
+        assert len(results) == 51
+        assert sum(len(each.rows) for each in results) == 12_496
+        assert made(results).startswith("2026-11-21, on cpu: AMD EPYC; levelproof")
 
 
-def test_unsolved_falls_with_budget(ours: Path) -> None:
-    (results,) = plot.checked(read_all([ours]))
-    steps, left = plot.curve(results)
+def test_unsolved_falls_with_budget(ours: Results, theirs: Results) -> None:
+    steps, left = plot.curve(ours)
     assert (steps[0], left[0]) == (4_000, 8)
     assert (steps[-1], left[-1]) == (64_000, 3)
     assert steps == sorted(set(steps))
     assert left == sorted(left, reverse=True)
-    assert [plot.unsolved(results, x) for x in (1_999, 2_000, 15_999, 16_000, 63_999)] == [9, 8, 7, 6, 4]
-    assert cells(plot.table([results]), "size s")[1:] == ["9", share(3, 9)]
+    assert [plot.unsolved(ours, x) for x in (1_999, 2_000, 15_999, 16_000, 63_999)] == [9, 8, 7, 6, 4]
+    assert cells(plot.table([ours]).markdown(), "size s")[1:] == ["9", share(3, 9)]
+    assert plot.tells(ours)
+    assert not plot.tells(theirs), "the whole budget for every level tells no curve"
 
 
-def test_names_tell_curves_apart(ours: Path, tmp_path: Path) -> None:
-    rows = [row(FIRST, "unsolved", 64_000)]
-    halving = made_up(tmp_path / "h.jsonl", header("halving"), rows)
-    long = made_up(tmp_path / "l.jsonl", header(budget=1_000_000), rows)
-    assert plot.names(read_all([ours, halving])) == ["size s, ours", "size s, halving"]
-    assert plot.names(read_all([ours, long])) == ["size s, 64k", "size s, 1M"]
+def test_names_tell_curves_apart(ours: Results) -> None:
+    halving, long = (replace(ours, header=h) for h in (header("halving"), header(budget=1_000_000)))
+    assert plot.names([ours, halving]) == ["size s, ours", "size s, halving"]
+    assert plot.names([ours, long]) == ["size s, 64k", "size s, 1M"]
 
 
-def test_plot(ours: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out, document = tmp_path / "unsolved.svg", tmp_path / "experts.md"
-    document.write_text(f"a\n<!-- {plot.MARK} -->\nold\n<!-- end of {plot.MARK} -->\nb\n")
-    monkeypatch.setattr(sys, "argv", ["solved", "plot", str(ours), "--out", str(out), "--write", str(document)])
-    assert command.main() == 0
-    again = out.read_bytes()
-    assert len(again) < 40_000
+def test_plot(ours: Results, tmp_path: Path) -> None:
+    out, again = tmp_path / "one.svg", tmp_path / "two.svg"
+    plot.draw([ours], out)
+    plot.draw([ours], again)
+    assert out.read_bytes() == again.read_bytes(), "the same results give the same plot"
+    assert out.stat().st_size < 40_000
     texts = {
-        "".join(text.itertext()) for text in ElementTree.fromstring(again).iter("{http://www.w3.org/2000/svg}text")
+        "".join(text.itertext()) for text in ElementTree.parse(out).getroot().iter("{http://www.w3.org/2000/svg}text")
     }
     assert {"4k", "16k", "64k", "size s"} <= texts
-    assert "| size s | 9 |" in document.read_text()
-    assert command.main() == 0
-    assert out.read_bytes() == again, "the same files give the same plot"
-
-
-def test_a_whole_budget_tells_no_curve(reference: Path) -> None:
-    with pytest.raises(UserError, match="does not tell when"):
-        plot.checked(read_all([reference]))
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["run", "--size", "q"], "choose one of s, m, l"),
-        (["run", "--budget", "5x"], "write a whole number"),
-        (["run", "--budget", "500"], "one update takes 1024 env steps"),
-        (["run", "--first", "-1"], "level ids are 0 and above"),
-        (["run", "--jobs", "4000", "--out", "none.jsonl"], "cores"),
-        (["table", "none.jsonl"], "cannot be read"),
-        (["table", __file__], "is not a file that"),
+        (["--size", "q"], "choose one of s, m, l"),
+        (["--budget", "5x"], "write a whole number"),
+        (["--budget", "500"], "one update takes 1024 env steps"),
+        (["--first", "-1"], "level ids are 0 and above"),
+        (["--jobs", "4000"], "cores"),
     ],
 )
 def test_a_mistake_gets_a_sentence(
-    arguments: list[str], sentence: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["solved", *arguments])
-    assert command.main() == 2
+    words = ["solved", "--variant", "ours", *arguments, "--results", str(tmp_path / "none.parquet")]
+    assert main(words) == Exit.INPUT
     assert sentence in capsys.readouterr().err
 
 
-def test_a_line_that_was_cut_off_is_done_again(ours: Path) -> None:
-    text = ours.read_text()
-    ours.write_text(text[:-9])
-    assert sorted(rows_there(ours, header())) == list(range(FIRST, FIRST + 9))
-    assert ours.read_text() == text[: text.rindex("\n", 0, -1) + 1]
+def test_results_that_are_not_there(tmp_path: Path, ours: Results, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "solved.parquet"
+    assert main(["solved", "--results", str(file)]) == Exit.INPUT
+    merge(ours, file)
+    assert main(["solved", "s-64k-theirs", "--results", str(file)]) == Exit.INPUT
+    assert "no results of s-64k-theirs" in capsys.readouterr().err
+    assert main(["solved", "s-64k-ours", "--results", str(file), "--json"]) == Exit.DONE
+    (group,) = json.loads(capsys.readouterr().out)["groups"]
+    assert (group["with_expert"], group["solved"], group["core_seconds"]) == (9, 6, 15)
 
 
-def test_a_file_of_something_else_is_left_alone(ours: Path) -> None:
-    with pytest.raises(UserError, match="under other settings"):
-        rows_there(ours, header(budget=128_000))
+def test_a_line_that_was_cut_off_is_done_again(tmp_path: Path) -> None:
+    scratch = tmp_path / "scratch.jsonl"
+    lines = [json.dumps({"level_id": i, "label": "solved"}) + "\n" for i in (4, 7)]
+    scratch.write_text("".join(lines)[:-9])
+    assert rows_in(scratch) == {4: {"label": "solved"}}
+    assert scratch.read_text() == lines[0]
+    assert rows_in(tmp_path / "none.jsonl") == {}
+
+
+def test_results_under_other_settings_are_left_alone(tmp_path: Path, ours: Results) -> None:
+    file = tmp_path / "solved.parquet"
+    merge(ours, file)
+    other = replace(ours.header, config={"expert": {}, "stop": {"rule": "solved"}})
+    with pytest.raises(UserError, match="--again"):
+        measure(other, VARIANTS["ours"], range(0), 1, work, file=file)
 
 
 @pytest.mark.slow
-def test_a_run_goes_on(tmp_path: Path) -> None:
-    variant = Variant("small", SMALL)
+def test_a_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process dies, which leaves the lines of units that were done; the next run trains the others only."""
+    variant, file, scratch = Variant("small", SMALL), tmp_path / "solved.parquet", tmp_path / "scratch.jsonl"
     of = Header("small", "s", 4_096, {"expert": plain(variant.expert), "stop": plain(variant.stop)})
-    out = tmp_path / "folder" / "small.jsonl"
-    measure(of, variant, range(FIRST, FIRST + 2), out, 1, work)
-    before = out.read_text()
-    measure(of, variant, range(FIRST, FIRST + 4), out, 1, work)
-    assert out.read_text().startswith(before)
-    results = read(out)
+    monkeypatch.setattr(measuring, "scratch_of", lambda _: scratch)
+    level_id, before = row(FIRST, "solved", 7, 7)
+    scratch.write_text(json.dumps({"level_id": level_id} | before) + "\n")
+    measure(of, variant, range(FIRST, FIRST + 4), 1, work, file=file)
+    (results,) = read(file)
     assert results.header == of
     assert list(results.rows) == list(range(FIRST, FIRST + 4))
-    for row in results.rows.values():
-        assert row["label"] in {"solved", "unsolved", "trivial", "unsolvable"}
-        assert row["env_steps"] <= 4_096
-        assert min(row["cpu_s"], row["wall_s"]) > 0
+    assert results.rows[FIRST] == before
+    assert not scratch.exists()
+    for level_id in range(FIRST + 1, FIRST + 4):
+        trained = results.rows[level_id]
+        assert trained["label"] in {"solved", "unsolved", "trivial", "unsolvable"}
+        assert trained["env_steps"] <= 4_096
+        assert trained["core_seconds"] > 0
     assert results.trained, "some of these levels should get an expert"
-    measure(of, variant, range(FIRST, FIRST + 4), out, 1, work)  # nothing left to do
-    assert read(out) == results
+    measure(of, variant, range(FIRST, FIRST + 4), 1, work, file=file)  # nothing left to do
+    assert read(file) == [results]
 
 
 def shown(ends: dict[int, list[tuple[int, bool]]], first_goal: tuple[int, int] | None) -> dict[str, np.ndarray]:
@@ -320,42 +318,33 @@ def test_without_the_reference_there_is_a_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
-    out = tmp_path / "original.jsonl"
-    words = ["run", "--variant", "original", "--levels", "2", "--jobs", "1", "--out", str(out)]
-    monkeypatch.setattr(sys, "argv", ["solved", *words])
-    assert command.main() == 1
+    file = tmp_path / "solved.parquet"
+    words = ["solved", "--variant", "original", "--levels", "2", "--jobs", "1", "--results", str(file)]
+    assert main(words) == Exit.FAILED
     assert "Cannot ask the reference for its version" in capsys.readouterr().err
-    assert not out.exists()
+    assert not file.exists()
 
 
-@pytest.mark.slow
-def test_the_original_runs(tmp_path: Path, reference: Path) -> None:
+@pytest.mark.campaign
+def test_the_original_runs(tmp_path: Path, reference: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two updates of a level that gets an expert; its neighbour needs none."""
-    variant = VARIANTS["original"]
+    variant, file = VARIANTS["original"], tmp_path / "solved.parquet"
+    monkeypatch.setattr(measuring, "scratch_of", lambda _: tmp_path / "scratch.jsonl")
     of = Header("original", "s", 2 * 2_048, {"expert": plain(variant.expert), "stop": plain(variant.stop)})
-    out = tmp_path / "original.jsonl"
     wanted = range(FIRST + 9, FIRST + 11)
-    measure(of, variant, wanted, out, 1, original.work)
-    head = json.loads(out.read_text().splitlines()[0])
-    assert head["versions"]["reference"]["kinetix-env"] == "3.0.2"
-    results, ours = read(out), read(command.RESULTS / "s-64k-reference.jsonl")
+    measure(of, variant, wanted, 1, original.work, file=file)
+    (results,) = read(file)
+    ours = next(each for each in read() if each.header.name == "s-64k-reference")
     assert list(results.rows) == list(wanted)
     assert results.trained.keys() == ours.trained.keys() & set(wanted)
     assert 0 < len(results.trained) < len(wanted), "one of these levels should get an expert, and one none"
-    for level_id, row in results.rows.items():
-        known = ours.rows[level_id]
-        assert list(row) == list(known), "the same fields in the same order"
+    for level_id, found in results.rows.items():
+        assert json.loads(found["versions"])["reference"]["kinetix-env"] == "3.0.2"
         if level_id not in results.trained:
-            spent = {"cpu_s": 0.0, "wall_s": 0.0}
-            assert row == known | spent
+            assert found["label"] == ours.rows[level_id]["label"]
+            assert found["core_seconds"] == 0
             continue
-        assert row["env_steps"] == 2 * 2_048
-        assert (row["label"] == "solved") == (row["witness"] is not None) == (row["steps_to_goal"] is not None)
-        assert (row["steps_to_goal"] or 1) <= RECORD_STEPS
-        assert (row["steps_to_first_success"] or 1) <= row["env_steps"]
-        assert row["witness"] != "most probable" or row["most_probable_succeeds"]
-        assert row["sticky_success_rate"] is row["moved_success_rate"] is None
-        assert min(row["cpu_s"], row["wall_s"]) > 0
-    before = out.read_text()
-    measure(of, variant, wanted, out, 1, original.work)  # nothing left to do
-    assert out.read_text() == before
+        assert found["env_steps"] == 2 * 2_048
+        assert (found["label"] == "solved") == (found["steps_to_goal"] is not None)
+        assert (found["steps_to_goal"] or 1) <= RECORD_STEPS
+        assert found["core_seconds"] > 0

@@ -12,7 +12,7 @@ from experts.slots import Mode
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.campaign
 CONFIG = ExpertConfig(
     environments=8, horizon=8, width=8, encoding=8, attempts=1, sticky_attempts=0, moved_attempts=0, rehearsals=0
 )

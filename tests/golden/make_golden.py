@@ -1,9 +1,9 @@
 """Golden states: what the reference does in one physics step and in one environment step.
 
-This script runs inside the reference's own environment and imports nothing of ours:
+This script runs inside the reference's own environment, with what benchmarks/reference has for it:
 
     python -m venv REF && REF/bin/pip install kinetix-env==3.0.2 "jax[cpu]"
-    REF/bin/python tests/golden/make_golden.py tests/golden
+    PYTHONPATH=benchmarks/reference REF/bin/python tests/golden/make_golden.py tests/golden
 
 and writes s.npz, m.npz and l.npz there (`load.py` reads them). It samples levels, changes five eighths of them into
 harder scenes (see SCENES), plays sticky random actions in 256-step episodes with automatic reset, and keeps from
@@ -19,7 +19,6 @@ Arrays have the lane axis first and the reference's own names:
 """
 
 import argparse
-import dataclasses
 import json
 from importlib.metadata import version
 from pathlib import Path
@@ -27,16 +26,15 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from actions import CHOICES, STICKINESS
 from jax2d.engine import recalculate_mass_and_inertia
 from kinetix.data.bc_utils import get_valid_action_mask_np
 from kinetix.environment import EnvParams, static_env_params_from_size
 from kinetix.environment.env import make_kinetix_env
 from kinetix.environment.spaces import ActionType, ObservationType
-from kinetix.environment.ued.ued import make_reset_fn_sample_kinetix_level
+from world import flatten, sampler
 
 EPISODE = 256  # env steps
-STICKINESS = 0.9  # chance that an action entry stays as it was
-CHOICES = np.array([3, 3, 3, 3, 2, 2])
 SCENES = ("sampled", "sampled", "sampled", "inside", "limits", "fixed", "fast", "triangles")  # one lane in eight each
 EARLY = 12  # env steps; circles inside polygons are pushed out soon, so these scenes are kept early
 DYNAMIC = ("position", "rotation", "velocity", "angular_velocity")
@@ -50,18 +48,6 @@ DERIVED = {f"{kind}/{name}" for kind in MANIFOLDS for name in ("normal", "penetr
 DERIVED |= {f"{kind}/restitution_velocity_target" for kind in MANIFOLDS}
 DERIVED |= {"joint/global_position", "thruster/global_position"}
 DERIVED |= {"polygon/radius", "circle/vertices", "circle/n_vertices", "polygon_highlighted", "circle_highlighted"}
-
-
-def flatten(state, prefix=""):
-    """A state as {path: array}."""
-    fields = {}
-    for field in dataclasses.fields(state):
-        value = getattr(state, field.name)
-        if dataclasses.is_dataclass(value):
-            fields |= flatten(value, f"{prefix}{field.name}/")
-        else:
-            fields[prefix + field.name] = np.asarray(value)
-    return fields
 
 
 def movable(state):
@@ -302,10 +288,9 @@ def gather(state, result):
 
 def make_size(size, lanes, slots, seed, obs_lanes):
     params, static = EnvParams(), static_env_params_from_size(size)
-    sample = make_reset_fn_sample_kinetix_level(params, static)
-    env = make_kinetix_env(ActionType.MULTI_DISCRETE, ObservationType.SYMBOLIC_FLAT, sample, params, static)
+    env = make_kinetix_env(ActionType.MULTI_DISCRETE, ObservationType.SYMBOLIC_FLAT, None, params, static)
     keys = jax.random.split(jax.random.PRNGKey(seed), lanes + 1)
-    levels, scene = make_scenes(jax.jit(jax.vmap(sample))(keys[1:]), static, seed)
+    levels, scene = make_scenes(sampler(size)(keys[1:]), static, seed)
     rng = np.random.default_rng(seed + 1)
     times = rng.integers(0, EPISODE, (slots, lanes))
     times = np.where(np.array(SCENES)[scene] == "inside", times % EARLY, times)

@@ -1,6 +1,6 @@
 """Statistics of the reference's random levels, for tests/levelgen/test_sampler.py.
 
-This script runs inside the reference's own environment and imports nothing of ours:
+This script runs inside the reference's own environment, with what benchmarks/reference has for it:
 
     python -m venv REF && REF/bin/pip install kinetix-env==3.0.2 "jax[cpu]"
     PYTHONPATH=benchmarks/reference REF/bin/python tests/golden/make_level_statistics.py \
@@ -18,10 +18,8 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from kinetix.environment import EnvParams, static_env_params_from_size
-from kinetix.environment.ued.ued import make_reset_fn_sample_kinetix_level
 from level_statistics import statistics
-from make_golden import flatten
+from world import flatten, sampler
 
 QUANTILES = 256
 COUNTED = 40  # statistics with at most so many different values are kept as counts
@@ -30,11 +28,10 @@ BATCH = 1000
 
 
 def sample(size, count, seed):
-    sampler = jax.jit(jax.vmap(make_reset_fn_sample_kinetix_level(EnvParams(), static_env_params_from_size(size))))
-    parts = []
+    draw, parts = sampler(size), []
     for start in range(0, count, BATCH):
         key = jax.random.fold_in(jax.random.PRNGKey(seed), start)
-        parts.append(flatten(sampler(jax.random.split(key, BATCH))))
+        parts.append(flatten(draw(jax.random.split(key, BATCH))))
     return {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
 
 

@@ -1,0 +1,36 @@
+"""Env steps a second of both programs in training one expert per level, with the reference's hyperparameters."""
+
+import argparse
+
+from benchmarks import oracle, race
+from benchmarks.contest import Entry
+from benchmarks.reference.hyperparameters import PPO
+from benchmarks.report import Report
+
+COUNTS = ("levels", "environments", "horizon", "updates")
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    race.register(parser)
+    parser.add_argument("--levels", type=int, default=32, help="levels, one expert each (default: 32)")
+    for name, text in (("environments", "lanes of an expert"), ("horizon", "env steps in each lane between updates")):
+        default = getattr(PPO, name)
+        parser.add_argument(f"--{name}", type=int, default=default, help=f"{text} (default: {default})")
+    parser.add_argument("--updates", type=int, default=4, help="updates of a run (default: 4)")
+
+
+def run(given: argparse.Namespace) -> Report:
+    race.check(given, ("repeats", *COUNTS))
+    python, settings = oracle.oracle_python(), {name: getattr(given, name) for name in COUNTS}
+    shape = [word for name in COUNTS[1:] for word in (f"--{name}", settings[name])]
+    steps = given.levels * given.environments * given.horizon * given.updates
+
+    def entries(size: str) -> list[Entry]:
+        levels = given.level_file or oracle.sampled_levels(python, size)
+
+        def words(share: race.Share) -> list[object]:
+            return ["--levels", levels, *shape, "--first", share.first, "--count", share.count]
+
+        return race.contestants("experts", given.levels, steps, words, lambda share: [*words(share), "--size", size])
+
+    return race.run("Training, beside the reference", given, entries, settings)

@@ -1,0 +1,1 @@
+"""Our side of benchmarks, as the reference's side is: processes of their own."""

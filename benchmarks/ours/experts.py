@@ -1,0 +1,72 @@
+"""Our side of `python -m benchmarks experts`: one process of it. Experts train as in `levelproof generate`."""
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.reference.serve import serve, timed
+from pipeline.runtime import prepare_jax
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--levels", required=True, help="file of levels, as the reference has them")
+    parser.add_argument("--first", type=int, required=True, help="first level of this process")
+    parser.add_argument("--count", type=int, required=True, help="levels of this process")
+    parser.add_argument("--environments", type=int, required=True)
+    parser.add_argument("--horizon", type=int, required=True)
+    parser.add_argument("--updates", type=int, required=True)
+    parser.add_argument("--core", type=int)
+    given = parser.parse_args()
+    prepare_jax(given.core)
+
+    import jax
+
+    from benchmarks.endless import endless_queue, go_on
+    from benchmarks.levels import load_levels
+    from benchmarks.solved.variants import REFERENCE
+    from experts.pool import slot_count
+    from experts.slots import Queue, Training, empty_slots
+    from experts.witness import take
+    from levelgen.task.rules import TaskParams
+
+    jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
+    no_evaluation = {"attempts": 1, "sticky_attempts": 0, "moved_attempts": 0}
+    config = replace(REFERENCE, environments=given.environments, horizon=given.horizon, **no_evaluation)
+    rules = TaskParams(dense_reward_scale=config.dense_reward_scale)
+    levels = load_levels(given.levels, given.first, given.count)
+    slots = min(slot_count(config), given.count)
+    batches = [np.minimum(np.arange(i, i + slots), given.count - 1) for i in range(0, given.count, slots)]
+
+    def train(updates: int, batches: list[np.ndarray]) -> list[tuple[Training, float]]:
+        """Fresh experts, a batch of them after another: what they have become, and their goals."""
+        everyone = jax.device_get(endless_queue(levels, config))
+        return [train_batch(of_batch(everyone, batch), updates) for batch in batches]
+
+    def of_batch(queue: Queue, batch: np.ndarray) -> Queue:
+        begun, count = jax.tree.map(lambda x: x[batch], queue.begun), np.int32(len(batch))
+        return jax.device_put(Queue(take(queue.levels, batch), queue.level_ids[batch], count, queue.updates, begun))
+
+    def train_batch(queue: Queue, updates: int) -> tuple[Training, float]:
+        now, goals, ended = empty_slots(slots, queue, config), 0.0, np.zeros(slots)
+        for _ in range(updates):
+            now, seen = go_on(now, queue, config, rules)
+            before, ended = ended, np.asarray(now.slot.training.progress.episodes)
+            goals += float((np.nan_to_num(np.asarray(seen.share)) * (ended - before)).sum())
+        return now.slot.training, goals
+
+    cold, _ = timed(lambda: train(1, batches[:1]))
+    warm, _ = timed(lambda: train(1, batches[:1]))
+
+    def run() -> dict:
+        seconds, out = timed(lambda: train(given.updates, batches))
+        finite = all(np.isfinite(np.asarray(x)).all() for training, _ in out for x in jax.tree.leaves(training.expert))
+        episodes = sum(float(np.asarray(training.progress.episodes).sum()) for training, _ in out)
+        return {"seconds": seconds, "done": episodes, "goal": sum(goals for _, goals in out), "finite": bool(finite)}
+
+    serve({"compile_seconds": cold - warm}, run)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,28 @@
+"""Our side of `python -m benchmarks sampler`: its first call, and its rate afterwards."""
+
+import argparse
+import json
+
+import jax
+import numpy as np
+
+from benchmarks.reference.serve import timed
+from levelgen.level import SIZES
+from levelgen.sampling.sampler import sample_levels
+
+FIRST = 256  # levels of the first call: one block
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--size", required=True)
+    parser.add_argument("--levels", type=int, required=True)
+    given = parser.parse_args()
+    sample = lambda count: jax.block_until_ready(sample_levels(np.arange(count), SIZES[given.size]))
+    first, _ = timed(lambda: sample(FIRST))
+    seconds, _ = timed(lambda: sample(given.levels))
+    print(json.dumps({"first": first, "rate": given.levels / seconds}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""Env steps a second of both engines: the engine and the task's rules, without observations."""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import oracle, race
+from benchmarks.contest import Entry
+from benchmarks.reference.actions import STICKINESS, sticky_actions
+from benchmarks.report import Report
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    race.register(parser)
+    parser.add_argument("--lanes", type=int, default=1024, help="worlds stepped side by side (default: 1024)")
+    parser.add_argument("--steps", type=int, default=64, help="env steps of a run in each lane (default: 64)")
+    parser.add_argument("--block", type=int, default=128, help="lanes our engine is given at a time (default: 128)")
+    parser.add_argument("--reference-block", type=int, help="the same for the reference (default: all of a process)")
+
+
+def run(given: argparse.Namespace) -> Report:
+    race.check(given, ("repeats", "lanes", "steps", "block", "reference_block"))
+    python, their_block = oracle.oracle_python(), given.reference_block or given.lanes
+    settings = {"lanes": given.lanes, "steps": given.steps, "block": given.block}
+    settings |= {"reference_block": their_block, "stickiness": STICKINESS}
+    with tempfile.TemporaryDirectory() as folder:
+        actions = Path(folder) / "actions.npy"
+        np.save(actions, sticky_actions(given.steps, given.lanes))
+
+        def entries(size: str) -> list[Entry]:
+            levels = given.level_file or oracle.sampled_levels(python, size)
+
+            def words(share: race.Share) -> list[object]:
+                return ["--levels", levels, "--actions", actions, "--first", share.first, "--lanes", share.count]
+
+            return race.contestants(
+                "physics",
+                given.lanes,
+                given.lanes * given.steps,
+                lambda share: [*words(share), "--block", given.block],
+                lambda share: [*words(share), "--block", their_block, "--size", size],
+            )
+
+        return race.run("Physics, beside the reference", given, entries, settings)

@@ -1,0 +1,29 @@
+# pyright: reportMissingImports=false
+"""The reference's side of `python -m benchmarks sampler`: its first call, and its rate afterwards."""
+
+import argparse
+import json
+
+from serve import timed
+from world import BATCH, keys_of, sampler
+
+FEW = 2  # batches where the sampler is slow
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--size", required=True)
+    parser.add_argument("--levels", type=int, required=True)
+    given = parser.parse_args()
+
+    import jax
+
+    sample, keys = sampler(given.size), keys_of(0, given.levels)
+    first, _ = timed(lambda: jax.block_until_ready(sample(keys[0])))
+    keys = keys if given.size == "s" else keys[:FEW]
+    seconds, _ = timed(lambda: [jax.block_until_ready(sample(some)) for some in keys])
+    print(json.dumps({"first": first, "rate": len(keys) * BATCH / seconds}))
+
+
+if __name__ == "__main__":
+    main()

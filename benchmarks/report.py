@@ -1,0 +1,105 @@
+"""What a benchmark found, and the one way to show it: as text, as JSON, and as its page in docs/results."""
+
+import json
+import math
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pipeline.runtime import own_cores
+from pipeline.store.provenance import device, versions
+
+RESULTS = Path(__file__).parent.parent / "docs" / "results"
+DIGITS = 5  # of a number in JSON
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as people read them."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    title: str = ""
+
+    def markdown(self) -> str:
+        lines = [self.head, ["---"] * len(self.head), *self.rows]
+        text = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+        return f"{self.title}:\n\n{text}" if self.title else text
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a benchmark found."""
+
+    title: str  # of its page
+    results: Sequence[Mapping[str, Any]]  # a JSON document each; beside the reference: `ours`, `reference`, `ratio`
+    tables: Sequence[Table]
+    notes: Sequence[str] = ()  # sentences below the tables
+    plots: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)  # file name: draws it
+    reference: Mapping[str, str] = field(default_factory=dict)  # versions of the reference, where it took part
+    fault: str = ""  # what makes the command fail
+    made: str = ""  # when and where, if that is not now and here
+
+
+@dataclass(frozen=True)
+class Run:
+    """When and where a benchmark ran, and on what."""
+
+    benchmark: str
+    command: str
+    date: str
+    machine: Mapping[str, Any]
+    versions: Mapping[str, Mapping[str, Any]]
+
+    @staticmethod
+    def now(benchmark: str, words: Sequence[str], report: Report) -> "Run":
+        return Run(
+            benchmark=benchmark,
+            command=" ".join(("python -m benchmarks", *words)),
+            date=datetime.now(UTC).isoformat(timespec="seconds"),
+            machine={"device": device(), "cores": len(own_cores()), "system": platform.platform()},
+            versions={"ours": versions(), **({"reference": report.reference} if report.reference else {})},
+        )
+
+    @property
+    def made(self) -> str:
+        """In a sentence."""
+        machine = "{device}, {cores} cores, {system}".format_map(self.machine)
+        sides = [f"{side}: {', '.join(f'{name} {x}' for name, x in of.items())}" for side, of in self.versions.items()]
+        return f"{self.date}, on {machine}; {'; '.join(sides)}"
+
+
+def as_text(report: Report, run: Run) -> str:
+    """For a terminal."""
+    tables = [table.markdown() for table in report.tables]
+    return "\n\n".join((*tables, *report.notes, report.made or f"{run.made}."))
+
+
+def as_page(report: Report, run: Run) -> str:
+    """For docs/results; its benchmark writes it whole, and nobody else."""
+    tables = [table.markdown() for table in report.tables]
+    made = f"Written by `{run.command}`. Measured: {report.made or run.made}."
+    return "\n\n".join((f"# {report.title}", made, *tables, *report.notes)) + "\n"
+
+
+def as_json(report: Report, run: Run) -> str:
+    """A document for each result, one after another."""
+    about = {"date": run.date, "machine": run.machine, "versions": run.versions}
+    documents = [{"bench": run.benchmark, **result, **about} for result in report.results]
+    return "\n".join(json.dumps(rounded(document), indent=2, allow_nan=False) for document in documents)
+
+
+def rounded(value: Any) -> Any:
+    """As JSON has it: few digits; null where there is no number, infinity as a word."""
+    if isinstance(value, Mapping):
+        return {name: rounded(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(item) for item in value]
+    if not isinstance(value, float):
+        return value
+    if not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return float(f"{value:.{DIGITS}g}")

@@ -1,0 +1,102 @@
+"""The words of `python -m benchmarks solved`.
+
+Levels below 1,000,000 are for tuning, those above for reports.
+"""
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from benchmarks.report import Report
+from benchmarks.solved import measure, original, plot, tables
+from benchmarks.solved.results import FILE, Header, Results, made, read
+from benchmarks.solved.variants import VARIANTS
+from benchmarks.statistics import wilson
+from configs.convert import plain
+from configs.numbers import parse_count
+from levelgen.level import size_of
+from pipeline.errors import UserError
+
+DRAWN = ("s-1M-ours", "s-4M-ours", "m-1M-ours", "m-4M-ours", "l-4M-ours")  # curves, unless others are named
+PLOT = "solved.svg"
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    names = "\n".join(f"  {name:16}{variant.text}" for name, variant in VARIANTS.items())
+    parser.description = "Tables of the levels that variants solve. With --variant it trains first what is not known."
+    parser.epilog = f"variants:\n{names}\n\nexample: python -m benchmarks solved --variant ours --size s --budget 64k"
+    parser.add_argument("groups", nargs="*", metavar="SIZE-BUDGET-VARIANT", help="to show, such as s-64k-ours")
+    parser.add_argument("--variant", choices=list(VARIANTS), metavar="NAME", help="to train; see below")
+    parser.add_argument("--size", default="s", help="of the levels to train (default: s)")
+    parser.add_argument("--budget", default="64k", help="env steps of an expert (default: 64k)")
+    parser.add_argument("--levels", default="512", help="how many to train (default: 512)")
+    parser.add_argument("--first", type=int, default=1_000_000, help="id of the first (default: 1000000)")
+    parser.add_argument("--jobs", type=int, default=0, help="processes, a core each (default: one per core)")
+    parser.add_argument("--again", action="store_true", help="in the place of results under other settings")
+    parser.add_argument("--results", type=Path, default=FILE, help="file (default: benchmarks/results/solved.parquet)")
+
+
+def run(given: argparse.Namespace) -> Report:
+    trained = train(given) if given.variant else None
+    results = read(given.results)
+    named = {each.header.name: each for each in results}
+    if missing := [name for name in given.groups if name not in named]:
+        raise UserError(f"There are no results of {', '.join(missing)} in {given.results}: train them, with --variant.")
+    if given.groups:
+        results = [named[name] for name in given.groups]
+    elif trained:
+        results = [each for each in results if (each.header.size, each.header.budget) == (trained.size, trained.budget)]
+    if not results:
+        raise UserError(f"There are no results in {given.results}: train some, with --variant.")
+    return report_of(results, whole=not (given.groups or trained))
+
+
+def train(given: argparse.Namespace) -> Header:
+    """What is not known of the variant yet.
+
+    Raises:
+        UserError: a number or the size will not do, or there are results under other settings.
+    """
+    budget, levels = parse_count(given.budget, "--budget"), parse_count(given.levels, "--levels")
+    variant = VARIANTS[given.variant]
+    if budget < variant.expert.steps_per_update:
+        raise UserError(f"--budget is {budget}: one update takes {variant.expert.steps_per_update} env steps.")
+    if given.first < 0:
+        raise UserError(f"--first is {given.first}: level ids are 0 and above.")
+    try:
+        size_of(given.size)
+    except ValueError as error:
+        raise UserError(f"--{error}.") from None
+    settings = {"expert": plain(variant.expert), "stop": plain(variant.stop)}
+    header = Header(given.variant, given.size, budget, settings)
+    worker = original.work if variant.original else measure.work
+    wanted = range(given.first, given.first + levels)
+    measure.measure(header, variant, wanted, given.jobs, worker, given.again, given.results)
+    return header
+
+
+def report_of(results: list[Results], whole: bool) -> Report:
+    """Of all that is known with the plot of DRAWN, or of some of it with a plot of what tells a curve."""
+    drawn = [each for each in results if (each.header.name in DRAWN if whole else plot.tells(each))]
+    curves = plot.ordered(drawn)
+    return Report(
+        title="How many levels are solved",
+        results=[{"groups": [told(each) for each in results]}],
+        tables=[*tables.tables(results), *([plot.table(curves)] if curves else [])],
+        notes=[
+            *([f"![How the unsolved share falls with budget]({PLOT})"] if curves else []),
+            tables.variants_of(results),
+        ],
+        plots={PLOT: lambda path: plot.draw(curves, path)} if curves else {},
+        made=made(results),
+    )
+
+
+def told(each: Results) -> dict:
+    """As JSON has it."""
+    trained, solved = len(each.trained), len(each.solved())
+    header = {name: x for name, x in asdict(each.header).items() if name != "config"}
+    seconds = sum(row["core_seconds"] for row in each.rows.values())
+    share = {"share": solved / trained if trained else None, "interval": wilson(solved, trained)}
+    counts = {"levels": len(each.rows), "with_expert": trained, "solved": solved, "core_seconds": seconds}
+    return header | counts | share
