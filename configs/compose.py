@@ -18,11 +18,10 @@ from omegaconf.errors import OmegaConfBaseException
 from configs.convert import flat, plain, typed
 from configs.errors import ConfigError, suggestion
 from configs.schema import JobConfig, hash_of
-from experts.config import ExpertConfig, StopConfig
 from levelgen.sampling.distribution import Distribution
-from levelgen.task.rules import TaskParams
 
 JOB = "generate"
+ConfigStore.instance().store(name="code", node=plain(JobConfig()))  # where configs/generate.yaml has defaults from
 BY_HAND = frozenset({"size", "budget", "sampler_version"})  # results that are not settings, or have their own word
 WORDS = frozenset({"size", "levels", "budget", "out", "continue_from"})  # kept as typed: 007 stays 007
 
@@ -43,9 +42,19 @@ def settings(overrides: Sequence[str]) -> dict[str, Any]:
     return _composed([override.input_line or "" for override in parsed])
 
 
-def listing() -> str:
-    """Every setting and its default, a line each, as one would type them."""
-    return "\n".join(f"  {key}={_hydra(value)}" for key, value in flat(settings([])).items())
+def chosen() -> dict[str, str]:
+    """The preset that each folder of configs/ stands for where no other is chosen."""
+    with initialize_config_module("configs", version_base="1.3"):
+        choices = compose(JOB, return_hydra_config=True).hydra.runtime.choices
+    return {name: str(choices[name]) for name in presets()}
+
+
+def presets() -> dict[str, list[str]]:
+    """The files to choose from in each folder of configs/."""
+    folders = [entry for entry in files("configs").iterdir() if entry.is_dir() and not entry.name.startswith("_")]
+    return {
+        f.name: sorted(e.name.removesuffix(".yaml") for e in f.iterdir() if e.name.endswith(".yaml")) for f in folders
+    }
 
 
 def again(job: JobConfig) -> str:
@@ -56,9 +65,7 @@ def again(job: JobConfig) -> str:
     for name, preset in distributions().items():
         named = [] if preset == default.distribution else [f"distribution={name}"]
         start = flat(replace(default, distribution=preset).results)
-        changed = [
-            f"{key}={_hydra(value)}" for key, value in wanted.items() if key not in BY_HAND and start[key] != value
-        ]
+        changed = [typed_as(key, value) for key, value in wanted.items() if key not in BY_HAND and start[key] != value]
         commands.append(shlex.join(["levelproof", "generate", *fixed, *named, *changed]))
     return min(commands, key=len)
 
@@ -68,7 +75,12 @@ def words_for(results: Mapping[str, Any]) -> list[str]:
     default, known = flat(replace(_default(), size=results["size"]).results), flat(results)
     changed = [name for name in known if name not in BY_HAND and known[name] != default.get(name, known[name])]
     unknown = [name for name in known if name not in default]
-    return [f"size={results['size']}", *(f"{name}={_hydra(known[name])}" for name in [*changed, *unknown])]
+    return [f"size={results['size']}", *(typed_as(name, known[name]) for name in [*changed, *unknown])]
+
+
+def typed_as(name: str, value: Any) -> str:
+    """A setting as people type it: the inverse of what `compose_job` reads."""
+    return f"{name}={value if name in WORDS else _in_grammar(value)}"
 
 
 @cache
@@ -79,7 +91,7 @@ def _default() -> JobConfig:
 @cache
 def distributions() -> dict[str, Distribution]:
     """The presets in configs/distribution/ by name."""
-    return {name: compose_job([f"distribution={name}"]).distribution for name in _choices()["distribution"]}
+    return {name: compose_job([f"distribution={name}"]).distribution for name in presets()["distribution"]}
 
 
 def identified(distribution: Distribution) -> tuple[str | None, str]:
@@ -93,9 +105,6 @@ def identified(distribution: Distribution) -> tuple[str | None, str]:
 
 
 def _composed(overrides: list[str]) -> dict[str, Any]:
-    classes = {"distribution": Distribution, "task": TaskParams, "expert": ExpertConfig, "stop": StopConfig}
-    code = {name: plain(of()) for name, of in classes.items()}
-    ConfigStore.instance().store(name="code", node=code)
     try:
         with initialize_config_module("configs", version_base="1.3"):
             composed = OmegaConf.to_container(compose(JOB, overrides), resolve=True)
@@ -125,17 +134,9 @@ def _parsed(text: str) -> Override:
     return override
 
 
-def _choices() -> dict[str, list[str]]:
-    """The files to choose from in each folder of configs/."""
-    folders = [entry for entry in files("configs").iterdir() if entry.is_dir() and not entry.name.startswith("_")]
-    return {
-        f.name: sorted(e.name.removesuffix(".yaml") for e in f.iterdir() if e.name.endswith(".yaml")) for f in folders
-    }
-
-
 def _check_keys(overrides: Sequence[Override], known: Mapping[str, Any]) -> None:
     parents = {key.rpartition(".")[0] for key in known}
-    choices = _choices()
+    choices = presets()
     for override in overrides:
         key, value = override.key_or_group, override.value()
         if key in choices and not isinstance(value, Mapping):
@@ -143,17 +144,21 @@ def _check_keys(overrides: Sequence[Override], known: Mapping[str, Any]) -> None
                 hint = suggestion(str(value), choices[key])
                 raise ConfigError(f"there is no {key} {value!s}{hint}: choose one of {', '.join(choices[key])}.")
         elif key not in known and not any(parent == key or parent.startswith(f"{key}.") for parent in parents):
-            raise ConfigError(
-                f"there is no setting {key}{suggestion(key, known)}: `levelproof generate --help` lists them."
-            )
+            raise ConfigError(f"there is no setting {key}{suggestion(key, known)}: `levelproof settings` lists them.")
 
 
-def _hydra(value: Any) -> str:
-    """A value in Hydra's override grammar."""
+def _in_grammar(value: Any) -> str:
+    """A value in the grammar of Hydra's overrides; words that mean themselves without quotes."""
     if value is None:
         return "null"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list):
-        return f"[{','.join(map(_hydra, value))}]"
-    return QuotedString(value, Quote.single).with_quotes() if isinstance(value, str) else repr(value)
+        return f"[{','.join(map(_in_grammar, value))}]"
+    if not isinstance(value, str):
+        return repr(value)
+    return value if value.isidentifier() and _means_itself(value) else QuotedString(value, Quote.single).with_quotes()
+
+
+def _means_itself(word: str) -> bool:
+    return OverridesParser.create().parse_override(f"name={word}").value() == word

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from configs.convert import plain
@@ -31,20 +31,20 @@ WITHOUT_EFFECT = frozenset(
 class JobConfig:
     """What `levelproof generate` makes."""
 
-    size: str  # as `levelgen.level.size_of` reads it
-    levels: str  # how many, as typed
-    first_level: int
-    budget: str  # as typed: it names the folder
-    out: str
-    unit: int | None  # levels per work unit; None: by the size
-    executor: Literal["ray", "inline"]
-    workers: int  # 0: one per core or GPU
-    keep_experts: bool
-    continue_from: str  # a split that has kept its experts; empty: none
-    distribution: Distribution
-    task: TaskParams
-    expert: ExpertConfig
-    stop: StopConfig
+    size: str = "s"  # s, m, l, or how many polygons (4 are scenery), circles, joints, thrusters, as in 8-8-8-4
+    levels: str = "64"  # how many, with consecutive ids
+    first_level: int = 0  # id of the first of them
+    budget: str = "128k"  # environment steps an expert may use; names the folder
+    out: str = "data"  # folder; the split is written to {out}/{budget}/{size}
+    unit: int | None = None  # levels per work unit, lost when its worker dies; null: 32 to 4, the larger the fewer
+    executor: Literal["ray", "inline"] = "ray"  # ray: a worker per core or GPU; inline: this process, for debugging
+    workers: int = 0  # at most so many; 0: one per core, or one per GPU where JAX can use them
+    keep_experts: bool = False  # keep experts, too, so that a larger budget can go on with them
+    continue_from: str = ""  # a split made with keep_experts=true, whose experts go on; empty: none
+    distribution: Distribution = field(default_factory=Distribution)  # what random levels are like
+    task: TaskParams = field(default_factory=TaskParams)  # what a level asks for
+    expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
+    stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot
 
     def __post_init__(self) -> None:
         self._check_size()

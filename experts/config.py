@@ -17,8 +17,8 @@ class Rule(StrEnum):
     """When a level leaves its slot."""
 
     BUDGET = "budget"  # every expert gets its whole budget
-    SOLVED = "solved"  # or until its evaluation succeeds
-    HALVING = "halving"  # or until, at a rung, its learning does not move
+    SOLVED = "solved"  # until its evaluation succeeds
+    HALVING = "halving"  # until its evaluation succeeds or, at a rung, its learning does not move
 
 
 class Choice(StrEnum):

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
-EXITS = "exit codes: 0 done, 1 failed, 2 something to change in the command, 3 done but for quarantined units"
+EXITS = "exit codes: 0 done, 1 failed, 2 change the command, 3 some units quarantined"
 SPLIT = "folder of a split, such as data/128k/s"
 
 
@@ -48,5 +48,5 @@ def add_split(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("split", type=Path, metavar="SPLIT", help=SPLIT)
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
+def add_json(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -1,0 +1,82 @@
+"""`levelproof settings`: every setting with its meaning, unit and default."""
+
+import argparse
+import json
+import shutil
+import textwrap
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+from pipeline.cli.command import Commands, add_command, add_json
+from pipeline.errors import Exit, UserError
+
+if TYPE_CHECKING:
+    from configs.meanings import Setting
+
+INDENT = 34  # where meanings start
+INTRODUCTION = """# Settings
+
+Every setting of `levelproof generate`, with its default, as one types it: `levelproof generate size=m stop=budget`. \
+`levelproof settings WORD` finds them on the command line. Names in brackets and parentheses are where the reference, \
+Kinetix 3.0.2, has the number. This page is written by `levelproof settings --markdown`, from the comments beside the \
+fields of the dataclasses.
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands,
+        "settings",
+        run,
+        "list settings with their meanings, units and defaults",
+        "levelproof settings thruster",
+    )
+    parser.add_argument("word", nargs="?", default="", metavar="WORD", help="only settings that have this word")
+    shape = parser.add_mutually_exclusive_group()
+    add_json(shape)
+    shape.add_argument("--markdown", action="store_true", help="print the page docs/settings.md")
+
+
+def run(arguments: argparse.Namespace) -> Exit:
+    from configs.meanings import every_setting
+
+    has_word = lambda text: arguments.word.lower() in text.lower()
+    found = [setting for setting in every_setting() if has_word(f"{setting.word} {setting.text} {setting.group}")]
+    if not found:
+        raise UserError(f"No setting has the word {arguments.word!r}: levelproof settings, without a word, lists all.")
+    if arguments.json:
+        print(json.dumps([asdict(setting) for setting in found], indent=2))
+    elif arguments.markdown:
+        print(as_markdown(found), end="")
+    else:
+        print(as_text(found, shutil.get_terminal_size().columns))
+    return Exit.DONE
+
+
+def as_text(settings: Iterable["Setting"], columns: int) -> str:
+    """The settings in two columns, group after group."""
+    groups = groupby(settings, lambda setting: setting.group)
+    return "\n\n".join("\n".join([group, *rows(members, columns, INDENT)]) for group, members in groups)
+
+
+def rows(settings: Iterable["Setting"], columns: int, indent: int) -> Iterator[str]:
+    """Each setting and, from column `indent` on, what it means, in lines that are at most `columns` wide."""
+    for setting in settings:
+        first = f"  {setting.word}  "
+        lines = textwrap.wrap(setting.text, max(columns - indent, indent))
+        if len(first) > indent:
+            yield first.rstrip()
+        else:
+            yield f"{first:{indent}}{lines.pop(0)}"
+        yield from (" " * indent + line for line in lines)
+
+
+def as_markdown(settings: Iterable["Setting"]) -> str:
+    """The page docs/settings.md."""
+    parts = [INTRODUCTION]
+    for group, members in groupby(settings, lambda setting: setting.group):
+        lines = [f"| `{setting.word}` | {setting.text} |" for setting in members]
+        parts.append("\n".join([f"## {group}", "", "| setting and default | meaning |", "|---|---|", *lines, ""]))
+    return "\n".join(parts)

@@ -1,0 +1,73 @@
+"""What settings mean, read from beside their defaults."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import pytest
+
+from configs.compose import compose_job, presets, settings
+from configs.convert import flat
+from configs.meanings import Comment, Setting, comments_in, every_setting
+
+SETTINGS = every_setting()
+
+
+@dataclass(frozen=True)
+class Sample:
+    """With a # in its docstring."""
+
+    bare: int = 0
+    # a heading
+    # of two lines
+    one: str = "#"  # m; of a "#"
+    far: float = (
+        1.0  # in a line
+        + 2.0  # or two
+    )
+
+    # another one
+    last: int = 1
+
+    def method(self) -> int:
+        inside: int = 1  # no setting
+        return inside
+
+
+class Kind(StrEnum):
+    """Members have comments, too."""
+
+    A = "a"  # the first
+    B = "b"
+
+
+def test_comments_are_those_beside_and_above() -> None:
+    assert comments_in(Sample) == {
+        "bare": Comment("", ""),
+        "one": Comment("a heading of two lines", 'm; of a "#"'),
+        "far": Comment("a heading of two lines", "in a line or two"),
+        "last": Comment("another one", ""),
+    }
+    assert comments_in(Kind) == {"A": Comment("", "the first"), "B": Comment("", "")}
+
+
+@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: setting.name)
+def test_every_setting_says_what_it_means(setting: Setting) -> None:
+    assert len(setting.meaning) > 8
+    assert not setting.choices or str(setting.default) in setting.choices
+
+
+def test_all_settings_are_there_once() -> None:
+    names = [setting.name for setting in SETTINGS]
+    assert len(names) == len(set(names))
+    assert set(names) == {*flat(settings([])), *presets()}
+
+
+def test_all_can_be_typed_back() -> None:
+    assert compose_job([setting.word for setting in SETTINGS]) == compose_job([])
+
+
+def test_choices_are_explained_where_the_meaning_does_not() -> None:
+    text = {setting.name: setting.text for setting in SETTINGS}
+    assert "flat: all features side by side; entity: " in text["expert.network"]
+    assert text["stop"].endswith("(budget, halving, solved)")
+    assert "(ray, inline)" not in text["executor"]
