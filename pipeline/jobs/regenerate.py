@@ -9,7 +9,7 @@ from configs.compose import compose_job, words_for
 from levelgen.identity.keys import SAMPLER_VERSION
 from pipeline.errors import Exit, UserError
 from pipeline.jobs.generate import generate
-from pipeline.look.inspect import select
+from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import require_manifest
 
 OWN = ("manifest", "where", "continue")  # words that are not settings of a job
@@ -30,7 +30,7 @@ def regenerate(words: Sequence[str], console: Console) -> Exit:
     """
     own, settings = split_words(words)
     source = Path(own["manifest"]).expanduser()
-    manifest = require_manifest(source)
+    manifest = require_manifest(source, columns_in(own.get("where")))
     config = manifest.config or {}
     if config["sampler_version"] != SAMPLER_VERSION:
         raise UserError(

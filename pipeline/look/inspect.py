@@ -18,14 +18,18 @@ from rich.table import Table
 from configs.compose import identified
 from configs.convert import typed
 from levelgen.sampling.distribution import Distribution
-from pipeline.errors import UserError
 from pipeline.look import duplicates
+from pipeline.read.select import columns_in, select
 from pipeline.store.layout import data_path
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.schema import RECORD_STEPS
 from pipeline.store.shard import stored_bytes
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+READ = (  # columns that the facts are from
+    "label", "label_reason", "failed_by_noop", "steps_to_goal", "steps_to_first_success", "env_steps", "shard",
+    *duplicates.COMPARED,
+)  # fmt: skip
 SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps")
 
 
@@ -48,7 +52,7 @@ def inspect(split: Path, where: str | None, rows: int, as_json: bool, against: S
 
 def survey(split: Path, where: str | None = None, rows: int = 10, against: Sequence[Path] = ()) -> dict[str, Any]:
     """The facts that `inspect` prints, as JSON's types."""
-    manifest = require_manifest(split)
+    manifest = require_manifest(split, [*READ, *columns_in(where)])
     chosen = select(manifest.table, where)
     solved, tried = (select(chosen, f"label IN ({names})") for names in ("'solved'", "'solved', 'unsolved'"))
     levels, shown = duplicates.compared(chosen), max(rows, 0)
@@ -61,7 +65,7 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
         "levels": chosen.num_rows,
         "labels": _counts(chosen, "label"),
         "unsolvable": _counts(select(chosen, "label = 'unsolvable'"), "label_reason"),
-        "failed_by_noop": sum(chosen.column("failed_by_noop").to_pylist()),
+        "failed_by_noop": int(np.sum(chosen.column("failed_by_noop").to_numpy())),
         "solve_rate": solved.num_rows / tried.num_rows if tried.num_rows else None,  # of the levels with an expert
         "steps_to_goal": _quantiles(solved, "steps_to_goal"),
         "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
@@ -72,33 +76,17 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
         "env_steps_unsolved": total(select(chosen, "label = 'unsolved'"), "env_steps"),
         "split_bytes": stored,  # of all the split's shards, whatever the condition
         "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
-        "rows": chosen.slice(0, shown).to_pylist(),
+        "rows": _rows(split, chosen.column("level_id").slice(0, shown).to_pylist()),
     }
+
+
+def _rows(split: Path, level_ids: list[int]) -> list[dict[str, Any]]:
+    """All columns of a few levels."""
+    return require_manifest(split, level_ids=level_ids).table.to_pylist() if level_ids else []
 
 
 def _distribution(manifest: Manifest) -> tuple[str | None, str]:
     return identified(typed(Distribution, (manifest.config or {})["distribution"], "distribution"))
-
-
-def select(table: pa.Table, where: str | None) -> pa.Table:
-    """The manifest's rows for which the SQL condition holds, sorted by level id.
-
-    Raises:
-        UserError: DuckDB cannot use the condition.
-    """
-    if where is None:
-        return table
-    with duckdb.connect() as connection:
-        connection.register("manifest", table)
-        connection.execute("SET enable_external_access = false")  # a condition reads the manifest, no other file
-        try:
-            return connection.sql(f"SELECT * FROM manifest WHERE ({where}\n) ORDER BY level_id").to_arrow_table()
-        except duckdb.Error as error:
-            reason = str(error).strip().splitlines()[0]
-            columns = ", ".join(table.column_names)
-            raise UserError(
-                f"Cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
-            ) from None
 
 
 def total(table: pa.Table, expression: str) -> int:

@@ -22,7 +22,7 @@ from levelgen.pictures.svg import write_svg
 from levelgen.task.rules import Outcome, TaskParams, TaskState, advance, has_nan, reset
 from physics.types import State
 from pipeline.errors import Failure, UserError
-from pipeline.read.levels import find_row, is_level_file, level_file, level_of
+from pipeline.read.levels import find_level, is_level_file, level_file, level_of
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
@@ -79,10 +79,9 @@ def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
         if level_id is not None:
             raise UserError(f"{source} is a level file, which has one level: leave out the id {level_id}.")
         return file_film(source, plays)
-    manifest = require_manifest(source)
     if level_id is None:
-        raise UserError(f"Which level of {source}? Add its id, such as {manifest.level_ids[0]}.")
-    row = find_row(manifest, level_id)
+        raise UserError(f"Which level of {source}? Add its id, such as {require_manifest(source, []).level_ids[0]}.")
+    manifest, row = find_level(source, level_id)
     return witness_film(manifest, row) if row["shard"] else row_film(manifest, row, plays)
 
 

@@ -5,6 +5,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipeline.errors import UserError
 from pipeline.store.layout import JOB, QUARANTINE
 from pipeline.store.locks import is_written
@@ -36,22 +38,29 @@ def look(split: Path) -> dict[str, Any]:
     """The facts that `status` prints."""
     try:
         job = json.loads((split / JOB).read_text())
-        wanted = [(int(first), int(last)) for first, last in job["level_ids"]]
+        wanted = np.array(sorted(job["level_ids"]), np.int64).reshape(-1, 2)  # first and last of each run of ids
     except FileNotFoundError:
         raise UserError(
             f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
         ) from None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError):
         raise UserError(f"The file {split / JOB} is damaged: run `levelproof generate` for this split again.") from None
     manifest = read_manifest(split, ["label"])
-    labels = dict(zip(manifest.level_ids.tolist(), manifest.table.column("label").to_pylist(), strict=True))
-    inside = [label for level_id, label in labels.items() if any(a <= level_id <= b for a, b in wanted)]
+    labels = manifest.labels[inside(manifest.level_ids, wanted)]
     return {
         "split": str(split),
-        "wanted": sum(last - first + 1 for first, last in wanted),
-        "done": len(inside),
-        "labels": dict(sorted(Counter(inside).items())),
+        "wanted": int((wanted[:, 1] - wanted[:, 0] + 1).sum()),
+        "done": len(labels),
+        "labels": dict(sorted(Counter(labels.tolist()).items())),
         "quarantined": sorted(path.name for path in (split / QUARANTINE).glob("*.txt")),
         "running": is_written(split),
         "command": job["command"],
     }
+
+
+def inside(level_ids: np.ndarray, runs: np.ndarray) -> np.ndarray:
+    """Whether each id lies in one of the runs (first and last id of each, ascending and apart)."""
+    if not len(runs):
+        return np.zeros(len(level_ids), bool)
+    before = np.searchsorted(runs[:, 0], level_ids, side="right") - 1  # the last run that begins at or before an id
+    return (before >= 0) & (level_ids <= runs[before, 1])

@@ -6,8 +6,7 @@ from configs.convert import typed
 from levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
 from levelgen.task.rules import TaskParams
 from pipeline.errors import UserError
-from pipeline.read.levels import find_row, level_of
-from pipeline.store.manifest import require_manifest
+from pipeline.read.levels import find_level, level_of
 
 
 def export(split: Path, level_id: int, out: Path) -> None:
@@ -19,8 +18,7 @@ def export(split: Path, level_id: int, out: Path) -> None:
     """
     if out.suffix.lower() != ".json":
         raise UserError(f"Cannot export to {out}: its name has to end in .json.")
-    manifest = require_manifest(split)
-    row = find_row(manifest, level_id)
+    manifest, row = find_level(split, level_id)
     file = LevelFile(level_of(manifest, row), typed(TaskParams, (manifest.config or {})["task"], "task"))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from configs.convert import typed
 from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
@@ -13,23 +12,26 @@ from levelgen.sampling.sampler import Distribution, sample_levels
 from pipeline.errors import UserError
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
-from pipeline.store.manifest import Manifest
+from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.shard import open_shard
 
+COLUMNS = ("size", "label", "label_reason", "shard", "row")  # of a level that is drawn or exported
 
-def find_row(manifest: Manifest, level_id: int) -> dict[str, Any]:
-    """The manifest's row of a level.
+
+def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
+    """The manifest's row of a level, with as little as has to be read for it: COLUMNS, and the level's id.
 
     Raises:
-        UserError: it has none.
+        UserError: there is no split, or it has no such level.
+        Failure: a fragment is damaged.
     """
-    ids = manifest.level_ids
-    place = int(np.searchsorted(ids, level_id))
-    if place == len(ids) or ids[place] != level_id:
+    manifest = require_manifest(split, COLUMNS, [level_id])
+    if not manifest.table.num_rows:
+        ids = require_manifest(split, []).level_ids
         raise UserError(
-            f"There is no level {level_id} in {manifest.split}: it has {len(ids)} levels, from {ids[0]} to {ids[-1]}."
+            f"There is no level {level_id} in {split}: it has {len(ids)} levels, from {ids[0]} to {ids[-1]}."
         )
-    return manifest.table.slice(place, 1).to_pylist()[0]
+    return manifest, manifest.table.to_pylist()[0]
 
 
 def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:

@@ -1,7 +1,6 @@
 """Experts on the disk, so that a larger budget goes on instead of starting again: one Orbax checkpoint per unit."""
 
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -88,7 +87,7 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     if not job.continue_from:
         return {}
     source = Path(job.continue_from).expanduser()
-    rows = _kept_in(source)
+    rows = _kept_in(source, level_ids)
     paths: dict[str, set[int]] = {}
     for level_id in level_ids:
         label, path = rows.get(level_id, ("", None))
@@ -101,10 +100,9 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     return found
 
 
-@cache
-def _kept_in(source: Path) -> dict[int, tuple[str, str | None]]:
-    """Label and checkpoint of every level, read once in a worker: it asks for every unit."""
-    table = read_manifest(source, ["label", "experts"]).table
+def _kept_in(source: Path, level_ids: Sequence[int]) -> dict[int, tuple[str, str | None]]:
+    """Label and checkpoint of these levels: a worker asks for every unit, and reads the fragments of its levels."""
+    table = read_manifest(source, ["label", "experts"], level_ids).table
     columns = (table.column(name).to_pylist() for name in ("level_id", "label", "experts"))
     return {level_id: (label, path) for level_id, label, path in zip(*columns, strict=True)}
 
@@ -118,7 +116,7 @@ def require_same_experts(job: JobConfig) -> None:
     """
     if not job.continue_from:
         return
-    source = require_manifest(Path(job.continue_from).expanduser())
+    source = require_manifest(Path(job.continue_from).expanduser(), ["experts"])
     if source.table.column("experts").null_count == source.table.num_rows:
         raise UserError(
             f"{source.split} has kept no experts: make it with keep_experts=true, or leave out continue_from."

@@ -6,6 +6,7 @@ engines and pictures look things up by these numbers and check no bounds.
 
 from collections.abc import Mapping, Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def size_in(table: Sequence[FieldPlace]) -> Size:
     return size
 
 
-def check_level_ids(level_ids: object) -> None:
+def check_level_ids(level_ids: Any) -> None:
     """Raises ContentsError where these are not the ascending ids of one or more levels."""
     good = isinstance(level_ids, list) and len(level_ids) > 0 and all(type(x) is int for x in level_ids)
     if not good or level_ids[0] < 0 or level_ids[-1] > MAX_LEVEL_ID or level_ids != sorted(set(level_ids)):

@@ -6,7 +6,10 @@ A fragment is written last and appears at once or not at all; readers see only w
 import json
 import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +19,14 @@ import pyarrow.parquet as pq
 
 from configs.convert import flat
 from configs.schema import hash_of
+from levelgen.identity.keys import MAX_LEVEL_ID
 from pipeline.errors import Failure, UserError
-from pipeline.store.layout import MANIFEST
+from pipeline.store.layout import MANIFEST, ids_of
 from pipeline.store.schema import COLUMNS, CONFIG_KEY, HASH_KEY, MANIFEST_VERSION, VERSION_KEY
 
 SHOWN = 6  # differing settings that an error lists
+THREADS = 8  # fragments read at once: a shared folder takes its time for each
+DATA_COLUMNS = ("shard", "experts")  # name what lies beside the manifest
 
 
 @dataclass(frozen=True)
@@ -81,10 +87,11 @@ def read_fragment(path: Path, columns: Sequence[str] | None = None) -> tuple[Fra
                     f"The fragment {path} has manifest version {version}, this program reads {MANIFEST_VERSION}: "
                     "use the levelproof that wrote it."
                 )
-            fragment = Fragment(path, metadata[HASH_KEY].decode(), json.loads(metadata[CONFIG_KEY]))
-            if not file.schema_arrow.equals(COLUMNS) or hash_of(fragment.config) != fragment.config_hash:
+            config, true_hash = _config_in(metadata[CONFIG_KEY])
+            fragment = Fragment(path, metadata[HASH_KEY].decode(), config)
+            if not file.schema_arrow.equals(COLUMNS) or true_hash != fragment.config_hash:
                 raise ValueError("its footer has other columns or another configuration than were written")
-            table = file.read(columns=None if columns is None else list(columns))
+            table = file.read(columns=None if columns is None else list(columns), use_threads=False)
     except PermissionError:
         raise Failure(f"The fragment {path} cannot be read: check its permissions.") from None
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:
@@ -95,15 +102,21 @@ def read_fragment(path: Path, columns: Sequence[str] | None = None) -> tuple[Fra
     return fragment, table
 
 
+@lru_cache(maxsize=8)
+def _config_in(text: bytes) -> tuple[dict[str, Any], str]:
+    """A configuration and its hash: nearly always those of the fragment before."""
+    config = json.loads(text)
+    return config, hash_of(config)
+
+
 @dataclass(frozen=True)
 class Manifest:
-    """All committed rows of a split, sorted by level id; each level once."""
+    """Committed rows of a split, sorted by level id; each level once."""
 
     split: Path
-    fragments: tuple[Fragment, ...]
+    fragments: tuple[Fragment, ...]  # that were read
     table: pa.Table
-    shards: frozenset[str]  # that any fragment names; paths below the split
-    experts: frozenset[str]  # likewise
+    named: Mapping[str, frozenset[str]]  # by column (shard, experts), if it was read: what any fragment names
 
     @property
     def level_ids(self) -> np.ndarray:
@@ -111,7 +124,18 @@ class Manifest:
 
     @property
     def labels(self) -> np.ndarray:
-        return np.asarray(self.table.column("label").to_pylist(), dtype=str)
+        labels = self.table.column("label").combine_chunks().dictionary_encode()
+        return np.array(labels.dictionary.to_pylist(), dtype=str)[labels.indices.to_numpy()]
+
+    @property
+    def shards(self) -> frozenset[str]:
+        """Paths below the split. KeyError where the column was not read."""
+        return self.named["shard"]
+
+    @property
+    def experts(self) -> frozenset[str]:
+        """Likewise."""
+        return self.named["experts"]
 
     @property
     def config(self) -> dict[str, Any] | None:
@@ -123,18 +147,23 @@ class Manifest:
         return self.fragments[0].config_hash if self.fragments else None
 
 
-def read_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest:
+def read_manifest(
+    split: Path, columns: Sequence[str] | None = None, level_ids: Sequence[int] | None = None
+) -> Manifest:
     """The manifest of a split, one row for each level that was tried; empty where nothing is committed yet.
 
     Args:
         split: the folder `{out}/{budget}/{size}`.
-        columns: which to read (default: all); `level_id`, `shard` and `experts` are always among them.
+        columns: which to read (default: all); `level_id` is always among them.
+        level_ids: whose rows (default: all); fragments without any of them, by their names, are not opened.
 
     Raises:
         Failure: a fragment is damaged, or fragments of several configurations lie side by side.
     """
-    names = None if columns is None else list(dict.fromkeys(["level_id", "shard", "experts", *columns]))
-    read = [read_fragment(path, names) for path in fragment_paths(split)]
+    names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
+    paths = fragment_paths(split) if level_ids is None else _covering(fragment_paths(split), level_ids)
+    with ThreadPoolExecutor(THREADS) as threads:
+        read = list(threads.map(lambda path: read_fragment(path, names), paths))
     fragments = tuple(fragment for fragment, _ in read)
     for fragment in fragments[1:]:
         if fragment.config_hash != fragments[0].config_hash:
@@ -143,19 +172,31 @@ def read_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest
                 f"The split {split} mixes two configurations, {fragments[0].path.name} and {fragment.path.name} "
                 f"({changes}): move the fragments of one of them elsewhere."
             )
-    schema = COLUMNS if names is None else pa.schema([COLUMNS.field(name) for name in names])
+    schema = pa.schema([COLUMNS.field(name) for name in names])
     table = (
-        pa.concat_tables([part for _, part in read]).select(schema.names).cast(schema) if read else schema.empty_table()
-    )
+        pa.concat_tables([part for _, part in read]).select(names).cast(schema) if read else schema.empty_table()
+    ).replace_schema_metadata(None)
+    data = [name for name in DATA_COLUMNS if name in names]
+    named = {name: frozenset(path for path in table.column(name).unique().to_pylist() if path) for name in data}
+    if level_ids is not None:
+        table = table.filter(np.isin(table.column("level_id").to_numpy(), np.asarray(level_ids, np.int64)))
     _, first = np.unique(table.column("level_id").to_numpy(), return_index=True)  # sorts; a level counts once
-    shards, experts = (
-        frozenset(name for name in table.column(of).unique().to_pylist() if name) for of in ("shard", "experts")
-    )
-    return Manifest(split, fragments, table.take(first).replace_schema_metadata(None), shards, experts)
+    return Manifest(split, fragments, table.take(first), named)
 
 
-def require_manifest(split: Path, columns: Sequence[str] | None = None) -> Manifest:
-    """As `read_manifest`, for questions about a split that should be there.
+def _covering(fragments: Sequence[Path], level_ids: Sequence[int]) -> list[Path]:
+    """The fragments that, by their names, may have one of these levels."""
+    wanted = np.unique(np.asarray(level_ids, np.int64))
+    ranges = [ids_of(path) or (0, MAX_LEVEL_ID) for path in fragments]
+    first, last = np.array(ranges, np.int64).reshape(-1, 2).T
+    has = np.searchsorted(wanted, first) < np.searchsorted(wanted, last, side="right")
+    return list(compress(fragments, has))
+
+
+def require_manifest(
+    split: Path, columns: Sequence[str] | None = None, level_ids: Sequence[int] | None = None
+) -> Manifest:
+    """As `read_manifest`, for questions about a split that should be there; it may have none of the levels.
 
     Raises:
         UserError: there is no split here, or nothing is committed in it.
@@ -165,8 +206,8 @@ def require_manifest(split: Path, columns: Sequence[str] | None = None) -> Manif
         raise UserError(
             f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
         )
-    manifest = read_manifest(split, columns)
-    if not manifest.fragments:
+    manifest = read_manifest(split, columns, level_ids)
+    if not manifest.fragments and (level_ids is None or not fragment_paths(split)):
         raise UserError(
             f"Nothing is committed in {split} yet: give a folder such as data/128k/s that `levelproof generate` made."
         )

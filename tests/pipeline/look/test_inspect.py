@@ -1,11 +1,17 @@
 """Questions about a manifest: what a condition chooses, and that nothing more is read than it takes."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 
 from experts.labels import Label
 from pipeline.look.inspect import survey
+from pipeline.read.select import columns_in
+from pipeline.store import manifest
+from pipeline.store.manifest import Fragment, read_fragment
+from pipeline.store.schema import COLUMNS
 from tests.pipeline.made import made_split
 
 LABELS = [Label.SOLVED, Label.TRIVIAL, Label.UNSOLVED, Label.UNSOLVABLE]
@@ -28,3 +34,34 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_what_has_no_number_is_neither_above_nor_below_one(split: Path, condition: str, labels: dict) -> None:
     assert survey(split, condition)["labels"] == labels
+
+
+def test_only_the_columns_of_the_question_are_read(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And of the few rows that are shown, the fragments that have them."""
+    read: list[tuple[int, int]] = []
+
+    def counted(path: Path, columns: Sequence[str]) -> tuple[Fragment, pa.Table]:
+        fragment, table = read_fragment(path, columns)
+        read.append((table.num_rows, table.num_columns))
+        assert set(table.column_names) == set(columns)
+        return fragment, table
+
+    monkeypatch.setattr(manifest, "read_fragment", counted)
+    facts = survey(split, "env_steps > 0 AND level_id >= 4", rows=2)
+    assert [row["level_id"] for row in facts["rows"]] == [4, 5]
+    assert facts["rows"][0].keys() == set(COLUMNS.names)
+    assert sorted(read) == [(4, 10)] * 3 + [(4, len(COLUMNS))]
+
+
+@pytest.mark.parametrize(
+    ("where", "columns"),
+    [
+        (None, []),
+        ("level_id < 3", ["level_id"]),
+        ("\"Label\" = 'solved' AND versions.jax > env_steps", ["label", "env_steps", "versions"]),
+        ("COLUMNS(*) IS NOT NULL", COLUMNS.names),
+        ("env_steps = (SELECT max(x) FROM manifest AS m(x))", COLUMNS.names),
+    ],
+)
+def test_columns_of_a_condition(where: str | None, columns: list[str]) -> None:
+    assert columns_in(where) == columns

@@ -18,7 +18,7 @@ from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import TaskParams, advance, reset
 from pipeline.errors import Failure, UserError
 from pipeline.look.show import MOST_FRAMES, MOST_STEPS, do_nothing, first_success, show, witness_film
-from pipeline.read.levels import find_row
+from pipeline.read.levels import find_level
 from pipeline.store.manifest import require_manifest
 from tests.pipeline.made import PLAYED, made_job, played_split
 
@@ -122,8 +122,7 @@ def ends_late() -> int:
 
 def test_the_drawing_of_a_level_made_again_is_that_of_its_shard(split, tmp_path) -> None:
     """The first picture of a witness is the level that its id rebuilds."""
-    manifest = require_manifest(split)
-    row = find_row(manifest, level_with(split, "solved"))
+    manifest, row = find_level(split, level_with(split, "solved"))
     film = witness_film(manifest, row)
     again = sample_levels(jnp.array([row["level_id"]], jnp.int32), SIZES["s"], made_job().distribution)
     world = (0, 40, 480, 480)

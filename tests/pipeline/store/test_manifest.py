@@ -11,8 +11,17 @@ from configs.schema import JobConfig
 from experts.labels import Label
 from pipeline.errors import Failure, UserError
 from pipeline.jobs.unit import manifest_row
+from pipeline.store import manifest as manifest_file
 from pipeline.store.layout import fragment_path, unit_name
-from pipeline.store.manifest import differences, fragment_paths, read_manifest, require_manifest, told, write_fragment
+from pipeline.store.manifest import (
+    differences,
+    fragment_paths,
+    read_fragment,
+    read_manifest,
+    require_manifest,
+    told,
+    write_fragment,
+)
 from pipeline.store.schema import COLUMNS
 from tests.pipeline.made import made_job, made_verdict
 
@@ -64,7 +73,7 @@ def test_a_level_counts_once_and_all_its_shards_are_kept(tmp_path: Path, job: Jo
 
 def test_columns_asked_for_are_enough(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [0])
-    assert read_manifest(tmp_path, ["label"]).table.column_names == ["level_id", "shard", "experts", "label"]
+    assert read_manifest(tmp_path, ["label"]).table.column_names == ["level_id", "label"]
 
 
 def test_nothing_committed_is_an_empty_manifest(tmp_path: Path) -> None:
@@ -136,3 +145,30 @@ def test_differences_name_old_and_new() -> None:
 def test_units_have_names_that_sort_as_their_ids() -> None:
     names = [unit_name(first, first + 1) for first in (0, 9, 10, 999_999, 10**9)]
     assert all(a < b for a, b in itertools.pairwise(names))
+
+
+def test_rows_of_some_levels_take_the_fragments_that_cover_them(
+    tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = {tuple(ids): commit(tmp_path, job, list(ids)) for ids in ((0, 1, 2), (2, 5), (6, 7), (9, 20), (30,))}
+    opened: list[Path] = []
+
+    def noted(path: Path, columns: list[str]) -> object:
+        opened.append(path)
+        return read_fragment(path, columns)
+
+    monkeypatch.setattr(manifest_file, "read_fragment", noted)
+    for level_ids, rows, units in (
+        ([2], [2], [(0, 1, 2), (2, 5)]),
+        ([3, 12], [], [(2, 5), (9, 20)]),  # inside, and not there
+        ([7, 30], [7, 30], [(6, 7), (30,)]),
+        ([8, 31, -4], [], []),
+        ([], [], []),
+    ):
+        opened.clear()
+        found = read_manifest(tmp_path, ["label"], level_ids)
+        assert found.level_ids.tolist() == rows
+        assert sorted(opened) == sorted(paths[unit] for unit in units)
+    with pytest.raises(KeyError):
+        _ = found.shards  # not read: not known, and never empty
+    assert require_manifest(tmp_path, [], [8]).table.num_rows == 0

@@ -1,0 +1,41 @@
+"""Rows of a manifest for which an SQL condition holds, by DuckDB."""
+
+import re
+
+import duckdb
+import pyarrow as pa
+
+from pipeline.errors import UserError
+from pipeline.store.schema import COLUMNS
+
+TABLE = "manifest"  # its name in SQL
+ALL_OF_THEM = {TABLE, "columns"}  # words of conditions that can mean every column
+
+
+def columns_in(where: str | None) -> list[str]:
+    """The columns that a condition may ask for: those whose names are among its words."""
+    words = set(re.findall(r"\w+", (where or "").lower()))
+    return [name for name in COLUMNS.names if name in words or words & ALL_OF_THEM]
+
+
+def select(table: pa.Table, where: str | None) -> pa.Table:
+    """The manifest's rows for which the SQL condition holds, sorted by level id.
+
+    `table` has the columns of the condition (`columns_in`), and any others.
+
+    Raises:
+        UserError: DuckDB cannot use the condition.
+    """
+    if where is None:
+        return table
+    with duckdb.connect() as connection:
+        connection.register(TABLE, table)
+        connection.execute("SET enable_external_access = false")  # a condition reads the manifest, no other file
+        try:
+            return connection.sql(f"SELECT * FROM {TABLE} WHERE ({where}\n) ORDER BY level_id").to_arrow_table()
+        except duckdb.Error as error:
+            reason = str(error).strip().splitlines()[0]
+            columns = ", ".join(COLUMNS.names)
+            raise UserError(
+                f"Cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
+            ) from None
