@@ -9,17 +9,16 @@ from configs.convert import plain
 from configs.errors import ConfigError
 from configs.numbers import parse_count
 from experts.config import ExpertConfig, StopConfig
-from levelgen.identity.keys import SAMPLER_VERSION
+from levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION
 from levelgen.level import SIZES, size_of
 from levelgen.sampling.distribution import CONTROL_WEIGHTS, Distribution
-from levelgen.sampling.sampler import check_size, controls
+from levelgen.sampling.sampler import check_size, control_weights
 from levelgen.task.rules import TaskParams
 
 HASH_DIGITS = 16
 MOST_BODIES = 48  # the most that was tried; compiling takes minutes from there
 # Levels per work unit by the number of bodies: about as long to train, and multiples of the experts side by side
 UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MOST_BODIES, 4))
-MAX_LEVEL_ID = 2**31 - 1  # level ids are folded into random keys as 32-bit integers
 
 # Where, how many and by whom: these change neither a level nor its expert, so one split may mix them.
 WITHOUT_EFFECT = frozenset(
@@ -71,7 +70,7 @@ class JobConfig:
             raise ConfigError(f"{error}.") from None
         if size.bodies > MOST_BODIES:
             raise ConfigError(f"size is {self.size}: experts train among at most {MOST_BODIES} polygons and circles.")
-        if not controls(size, self.distribution):
+        if not control_weights(size, self.distribution):
             raise ConfigError(
                 f"size is {self.size}: it has no room for what must act, of which {', '.join(CONTROL_WEIGHTS)} in "
                 "distribution are the weights (a motor needs a joint and a third body beside the scenery)."

@@ -22,6 +22,7 @@ MOTOR_BINDINGS = 4  # entries of an action that motors obey
 THRUSTER_BINDINGS = 2  # entries that thrusters obey
 ACTIONS = MOTOR_BINDINGS + THRUSTER_BINDINGS
 WORLD_SIDE = 5.0  # m
+HALF_WORLD = WORLD_SIDE / 2
 
 
 class Role(IntEnum):

@@ -22,7 +22,7 @@ class LevelFileError(ValueError):
 
 @dataclass(frozen=True)
 class Entry:
-    """What may stand in one place of a file: a number, or numbers in nested objects with the keys "0", "1", ..."""
+    """What may stand at one point of a file: a number, or numbers in nested objects with the keys "0", "1", ..."""
 
     kind: type[float] | type[int] | type[bool]
     low: float = 0.0

@@ -128,7 +128,7 @@ def from_document(document: object) -> LevelFile:
             raise LevelFileError(f"static_env_params.{name} is {told(value)}, this engine has {told(needed)} only")
     size = Size(*(entry.read(static, name, "static_env_params") for name, entry in COUNTS.items()))
     if size.bodies == FIXED_POLYGONS:
-        raise LevelFileError("static_env_params has no place for a body besides the scenery")
+        raise LevelFileError("static_env_params has no room for a body besides the scenery")
     level = level_from_kinetix(_fields(world, size))
     _check(level)
     collides: Any = np.asarray(separate(level.model))
@@ -249,7 +249,7 @@ def _nested(values: Any) -> Any:
 
 
 def _with_points(level: Level) -> Fields:
-    """The reference's arrays, with the places of joints and thrusters that its first picture shows."""
+    """The reference's arrays, with the positions of joints and thrusters that its first picture shows."""
     model = level.model
     joint_point = _in_world(level, model.joint_a, model.joint_anchor_a)
     thruster_point = _in_world(level, model.thruster_body, model.thruster_position)
@@ -258,7 +258,7 @@ def _with_points(level: Level) -> Fields:
 
 
 def _in_world(level: Level, body: Any, anchor: Any) -> np.ndarray:
-    """Places, m, (thing, 2, 1), of points in the frames of bodies."""
+    """Positions, m, (thing, 2, 1), of points in the frames of bodies."""
     body, anchor = np.asarray(body)[:, 0], np.asarray(anchor)
     position, angle = np.asarray(level.state.position)[body], np.asarray(level.state.rotation)[body]
     cos, sin, x, y = np.cos(angle), np.sin(angle), anchor[:, 0], anchor[:, 1]

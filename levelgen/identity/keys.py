@@ -7,13 +7,14 @@ a level depends on its neighbours, its work unit or its worker.
 from enum import IntEnum
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int, Key
+from numpy.typing import ArrayLike
 
 SAMPLER_VERSION = 1  # raise it when the same id would give another level, or other random streams
 GENERATOR = "threefry2x32"  # named, not JAX's default: the same numbers everywhere
 ROOT_SEED = 0
-MAX_LEVEL_ID = 2**31 - 1
+MAX_LEVEL_ID = 2**31 - 1  # so that an id fits into 32 bits, with a sign and without
 
 
 class Stream(IntEnum):
@@ -24,13 +25,25 @@ class Stream(IntEnum):
     EVALUATION = 2  # the record that labels the level
 
 
+def level_id_array(level_ids: ArrayLike) -> Int[np.ndarray, " level"]:
+    """Level ids as every array of them has them: int32 on the host.
+
+    Raises:
+        ValueError: an id is not 0 .. MAX_LEVEL_ID.
+    """
+    ids = np.asarray(level_ids)
+    if len(ids) and not 0 <= ids.min() <= ids.max() <= MAX_LEVEL_ID:
+        raise ValueError(f"level ids {ids.min()} to {ids.max()} do not fit: they run from 0 to {MAX_LEVEL_ID}")
+    return ids.astype(np.int32)
+
+
 def level_key(level_id: Int[Array, ""] | int) -> Key[Array, ""]:
     """The key all of a level's streams derive from.
 
     `level_id` is 0 .. MAX_LEVEL_ID; it may be traced, and mapped with `jax.vmap`.
     """
     root = jax.random.key(ROOT_SEED, impl=GENERATOR)
-    return jax.random.fold_in(jax.random.fold_in(root, SAMPLER_VERSION), jnp.asarray(level_id, jnp.uint32))
+    return jax.random.fold_in(jax.random.fold_in(root, SAMPLER_VERSION), level_id)
 
 
 def key_for(level_id: Int[Array, ""] | int, stream: Stream) -> Key[Array, ""]:

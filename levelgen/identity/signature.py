@@ -16,7 +16,7 @@ from physics.types import FIXED_POLYGONS, MAX_VERTICES
 VERSION = 1  # of the rules; signatures of different versions never compare equal
 DIGITS = 16  # of each hash, hexadecimal
 GRIDS = 2
-PLACE = 0.5  # m; steps that are told apart
+POSITION = 0.5  # m; steps that are told apart
 LENGTH = 0.2  # m
 ANGLE = np.pi / 4  # rad
 FARTHEST = 2**31 - 1  # steps
@@ -51,7 +51,7 @@ def _of_grid(levels: Any, grid: int) -> list[str]:
 
 
 def _bodies(levels: Any, grid: int) -> np.ndarray:
-    """(level, body, word): kind, role, whether it can move, place, sides; a circle looks the same at every angle."""
+    """(level, body, word): kind, role, whether it can move, position, sides; a circle looks the same at every angle."""
     model, state = levels.model, levels.state
     count, polygons = model.n_vertices.shape
     number = np.arange(model.active.shape[1])
@@ -64,7 +64,7 @@ def _bodies(levels: Any, grid: int) -> np.ndarray:
         levels.role,
         model.inverse_mass != 0,
         np.concatenate([model.n_vertices, np.zeros_like(model.radius)], 1),
-        *np.moveaxis(_step(state.position, PLACE, grid), -1, 0),
+        *np.moveaxis(_step(state.position, POSITION, grid), -1, 0),
         np.where(kind == 2, 0, _step(state.rotation, ANGLE, grid)),
         *np.moveaxis(_step(sides, LENGTH, grid), -1, 0),
     ]

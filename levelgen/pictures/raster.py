@@ -18,7 +18,6 @@ from levelgen.pictures.scene import (
     HATCH_PITCH,
     HATCH_WIDTH,
     PAPER,
-    Box,
     Caption,
     Colour,
     Disc,
@@ -26,6 +25,7 @@ from levelgen.pictures.scene import (
     Part,
     Point,
     Polygon,
+    Rectangle,
     Scene,
     Shape,
     Text,
@@ -91,12 +91,12 @@ class _Canvas:
                 self._disc(shape, part)
             case Line(points, colour, width):
                 self._line(self._at(points, part), colour, width)
-            case Box(low, high, fill, corner):
+            case Rectangle(low, high, fill, corner):
                 (left, bottom), (right, top) = self._at((low, high), part)
                 self.pen.rounded_rectangle([left, top, right, bottom], corner * self.scale, fill)
-            case Text(place, words, colour, size, ends):
+            case Text(position, words, colour, size, ends):
                 anchor = "rm" if ends else "lm"
-                self.pen.text(self._at((place,), part)[0], words, colour, font(round(size * self.scale)), anchor)
+                self.pen.text(self._at((position,), part)[0], words, colour, font(round(size * self.scale)), anchor)
 
     def _at(self, points: Sequence[Point], part: Part) -> list[Point]:
         """Pixels of a part's points."""

@@ -5,7 +5,7 @@ a revolute joint, a crossed square a fixed one. A motor's ring has the colour of
 runs, a thruster is a nozzle with a flame while it fires; the row below shows the live entries of the action,
 M1 to M4 for motors and T1, T2 for thrusters.
 
-`render.py` makes pixels of a scene and `svg.py` makes vectors. All scenes of a level have the same parts in the same
+`raster.py` makes pixels of a scene and `svg.py` makes vectors. All scenes of a level have the same parts in the same
 order, so a film is what its parts do. Lengths are metres, y is upwards, angles are radians.
 """
 
@@ -89,7 +89,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Box:
+class Rectangle:
     """An upright rectangle without an edge."""
 
     low: Point
@@ -100,16 +100,16 @@ class Box:
 
 @dataclass(frozen=True)
 class Text:
-    """Words that begin or end at a place, half of their height above it."""
+    """Words that begin or end at a position, half of their height above it."""
 
-    place: Point
+    position: Point
     words: str
     colour: Colour
     size: float
-    ends: bool = False  # at the place; otherwise they begin there
+    ends: bool = False  # at the position; otherwise they begin there
 
 
-Shape = Polygon | Disc | Line | Box | Text
+Shape = Polygon | Disc | Line | Rectangle | Text
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,8 @@ class Part:
     """Shapes that move together, in a frame of their own. No shapes: the part does not show now."""
 
     shapes: tuple[Shape, ...]
-    place: Point = (0.0, 0.0)
-    angle: float = 0.0  # of parts without boxes and words
+    position: Point = (0.0, 0.0)
+    angle: float = 0.0  # of parts without rectangles and words
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def turned(points: Sequence[Point] | Host, angle: float) -> np.ndarray:
 
 def placed(points: Sequence[Point], part: Part) -> np.ndarray:
     """Points (point, 2) of a part's frame, in the world."""
-    return turned(points, part.angle) + np.asarray(part.place)
+    return turned(points, part.angle) + np.asarray(part.position)
 
 
 def live_entries(level: Level) -> list[int]:
@@ -229,8 +229,8 @@ def _room() -> tuple[Shape, ...]:
     """Walls, then the air with a grid of metres."""
     side = WORLD_SIDE
     shapes: list[Shape] = [
-        Box((-BORDER, 0), (side + BORDER, side + BORDER), FIXED_PLAIN),
-        Box((0, 0), (side, side), SKY),
+        Rectangle((-BORDER, 0), (side + BORDER, side + BORDER), FIXED_PLAIN),
+        Rectangle((0, 0), (side, side), SKY),
     ]
     for metre in range(1, int(side)):
         shapes += [Line(((metre, 0), (metre, side)), GRID, 0.01), Line(((0, metre), (side, metre)), GRID, 0.01)]
@@ -240,8 +240,8 @@ def _room() -> tuple[Shape, ...]:
 def _paper(footer: float) -> tuple[Shape, ...]:
     """What hides all that leaves the world upwards or downwards."""
     top, right = WORLD_SIDE + BORDER, WORLD_SIDE + BORDER
-    above = Box((-BORDER, top), (right, top + HEADER), PAPER)
-    return (above, Box((-BORDER, -footer), (right, 0), PAPER)) if footer else (above,)
+    above = Rectangle((-BORDER, top), (right, top + HEADER), PAPER)
+    return (above, Rectangle((-BORDER, -footer), (right, 0), PAPER)) if footer else (above,)
 
 
 def _body_colours(level: Level, body: int) -> tuple[Colour, Colour, bool]:
@@ -281,15 +281,15 @@ def _motor_turn(level: Level, joint: int, action: np.ndarray | None) -> int:
 def _joint(level: Level, state: State, joint: int, action: np.ndarray | None) -> list[Part]:
     """The joint, and the arrow of its motor."""
     model = level.model
-    place = _attachment(state, int(model.joint_a[joint]), model.joint_anchor_a[joint])
+    position = _attachment(state, int(model.joint_a[joint]), model.joint_anchor_a[joint])
     if model.joint_fixed[joint]:
         a, b, c, d = corners = _points(0.065 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]))
-        return [Part((Polygon(corners, PAPER, INK), Line((a, c), INK, EDGE), Line((b, d), INK, EDGE)), place)]
+        return [Part((Polygon(corners, PAPER, INK), Line((a, c), INK, EDGE), Line((b, d), INK, EDGE)), position)]
     motor = bool(model.motor_on[joint])
     colour = BINDING_COLOUR[int(level.motor_binding[joint])] if motor else PAPER
     ring = Disc((0.0, 0.0), 0.085 if motor else 0.07, colour, INK)
     axle = Disc((0.0, 0.0), 0.025, INK if level.motor_auto[joint] and motor else PAPER, INK)
-    return [Part((ring, axle), place), Part(_arrow(_motor_turn(level, joint, action), colour), place)]
+    return [Part((ring, axle), position), Part(_arrow(_motor_turn(level, joint, action), colour), position)]
 
 
 def _arrow(turn: int, colour: Colour) -> tuple[Shape, ...]:
@@ -309,10 +309,10 @@ def _thruster(level: Level, state: State, thruster: int, action: np.ndarray | No
     """The flame and the nozzle, which opens against the force on the body: that is along the thruster's rotation."""
     model, binding = level.model, MOTOR_BINDINGS + int(level.thruster_binding[thruster])
     body = int(model.thruster_body[thruster])
-    place = _attachment(state, body, model.thruster_position[thruster])
+    position = _attachment(state, body, model.thruster_position[thruster])
     angle = float(model.thruster_rotation[thruster] + state.rotation[body])
     flame = _flame() if action is not None and action[binding] else ()
-    return [Part(flame, place, angle), Part((Polygon(NOZZLE, BINDING_COLOUR[binding], INK),), place, angle)]
+    return [Part(flame, position, angle), Part((Polygon(NOZZLE, BINDING_COLOUR[binding], INK),), position, angle)]
 
 
 @cache
@@ -336,7 +336,7 @@ def _caption(caption: Caption) -> list[Part]:
         start = left + (text_width(title, size) + 0.2 if title else 0.09)
         end = start + text_width(outcome, size)
         colour = ROLE_COLOUR[Role.GREEN] if caption.good else ROLE_COLOUR[Role.RED]
-        box = Box((start - 0.09, middle - 0.12), (end + 0.09, middle + 0.12), colour, corner=0.1)
+        box = Rectangle((start - 0.09, middle - 0.12), (end + 0.09, middle + 0.12), colour, corner=0.1)
         shapes = (box, Text((start, middle), outcome, PAPER, size))
     of = lambda words, *rest: (Text(*rest),) if words else ()
     return [

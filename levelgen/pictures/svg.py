@@ -1,4 +1,4 @@
-"""Scenes as vectors: a picture or a film in one SVG file, with the shapes that `render.py` rasterises.
+"""Scenes as vectors: a picture or a film in one SVG file, with the shapes that `raster.py` rasterises.
 
 A film is one drawing whose parts move: what a part does becomes SMIL animations, which browsers play in a loop.
 Programs that do not play them show the first scene.
@@ -20,13 +20,13 @@ from levelgen.pictures.scene import (
     HATCH_PITCH,
     HATCH_WIDTH,
     PAPER,
-    Box,
     Colour,
     Disc,
     Line,
     Part,
     Point,
     Polygon,
+    Rectangle,
     Scene,
     Shape,
     Text,
@@ -39,7 +39,7 @@ WIDTH = 480  # user units, of a picture
 SCALE = WIDTH / (WORLD_SIDE + 2 * BORDER)  # units per metre
 FONTS = "Aileron, Helvetica, Arial, sans-serif"
 
-Place = Callable[[Sequence[Point]], np.ndarray]  # from a part's metres to units, (point, 2)
+ToPage = Callable[[Sequence[Point]], np.ndarray]  # from a part's metres to units, (point, 2)
 
 
 def write_svg(scenes: Sequence[Scene], path: Path, seconds: Sequence[float]) -> None:
@@ -103,15 +103,15 @@ class Clock:
 
 def _part(states: Sequence[Part], top: float, clock: Clock) -> str:
     """All that a part does: where it is in each scene, and which shapes it shows."""
-    poses = [(state.place, state.angle) for state in states]
+    poses = [(state.position, state.angle) for state in states]
     moves = len(set(poses)) > 1
-    place: Place = lambda points: np.array(points) * (SCALE, -SCALE)
+    to_page: ToPage = lambda points: np.array(points) * (SCALE, -SCALE)
     if not moves:
-        place = lambda points: _in_page(placed(points, states[0]), top)
+        to_page = lambda points: _in_page(placed(points, states[0]), top)
     looks = list(dict.fromkeys(state.shapes for state in states if state.shapes))
     drawn = []
     for look in looks:
-        shapes = "".join(_shape(shape, place) for shape in look)
+        shapes = "".join(_shape(shape, to_page) for shape in look)
         shown = ["visible" if state.shapes == look else "hidden" for state in states]
         if "hidden" in shown:
             timing = clock.animate('animate attributeName="visibility"', shown, smooth=False)
@@ -119,7 +119,7 @@ def _part(states: Sequence[Part], top: float, clock: Clock) -> str:
         drawn.append(shapes)
     if not moves or not drawn:
         return "".join(drawn)
-    spots = [f"{_number(x)},{_number(y)}" for x, y in _in_page([state.place for state in states], top)]
+    spots = [f"{_number(x)},{_number(y)}" for x, y in _in_page([state.position for state in states], top)]
     turns = [_number(-np.degrees(angle)) for _, angle in poses]
     path = clock.animate('animateTransform attributeName="transform" type="translate"', spots, smooth=True)
     turn = clock.animate('animateTransform attributeName="transform" type="rotate" additive="sum"', turns, smooth=True)
@@ -131,25 +131,25 @@ def _in_page(points: Sequence[Point] | np.ndarray, top: float) -> np.ndarray:
     return np.add(points, (BORDER, -top)) * (SCALE, -SCALE)
 
 
-def _shape(shape: Shape, place: Place) -> str:
+def _shape(shape: Shape, to_page: ToPage) -> str:
     match shape:
         case Polygon(points, fill, edge, width, hatched):
-            corners, line = _points(points, place), _stroke(edge, width)
+            corners, line = _points(points, to_page), _stroke(edge, width)
             return "".join(
                 f'<polygon points="{corners}" fill="{paint}"{line}/>' for paint in _paints(fill, edge, hatched)
             )
         case Disc(centre, radius, fill, edge, hatched):
-            x, y, r = map(_number, (*place([centre])[0], (radius - EDGE / 2) * SCALE))
+            x, y, r = map(_number, (*to_page([centre])[0], (radius - EDGE / 2) * SCALE))
             circle = f'<circle cx="{x}" cy="{y}" r="{r}"{_stroke(edge, EDGE)}'
             return "".join(f'{circle} fill="{paint}"/>' for paint in _paints(fill, edge, hatched))
         case Line(points, colour, width):
-            return f'<polyline points="{_points(points, place)}" fill="none"{_stroke(colour, width)}/>'
-        case Box(low, high, fill, corner):
-            (left, bottom), (right, upper) = place([low, high])
+            return f'<polyline points="{_points(points, to_page)}" fill="none"{_stroke(colour, width)}/>'
+        case Rectangle(low, high, fill, corner):
+            (left, bottom), (right, upper) = to_page([low, high])
             sides = f'width="{_number(right - left)}" height="{_number(bottom - upper)}" rx="{_number(corner * SCALE)}"'
             return f'<rect x="{_number(left)}" y="{_number(upper)}" {sides} fill="{_colour(fill)}"/>'
         case Text():
-            return _text(shape, place)
+            return _text(shape, to_page)
 
 
 def _paints(fill: Colour, edge: Colour | None, hatched: bool) -> list[str]:
@@ -157,9 +157,9 @@ def _paints(fill: Colour, edge: Colour | None, hatched: bool) -> list[str]:
     return [_colour(fill), f"url(#{_name(edge)})"] if edge and hatched else [_colour(fill)]
 
 
-def _text(text: Text, place: Place) -> str:
+def _text(text: Text, to_page: ToPage) -> str:
     """Words as wide as in the pictures, whatever letters the reader's machine has."""
-    x, y = place([text.place])[0]
+    x, y = to_page([text.position])[0]
     baseline = y + text_drop(text.size) * SCALE
     anchor = ' text-anchor="end"' if text.ends else ""
     width = _number(text_width(text.words, text.size) * SCALE)
@@ -184,8 +184,8 @@ def _stroke(colour: Colour | None, width: float) -> str:
     return f' stroke="{_colour(colour)}" stroke-width="{_number(width * SCALE)}"' if colour else ""
 
 
-def _points(points: Sequence[Point], place: Place) -> str:
-    return " ".join(f"{_number(x)},{_number(y)}" for x, y in place(points))
+def _points(points: Sequence[Point], to_page: ToPage) -> str:
+    return " ".join(f"{_number(x)},{_number(y)}" for x, y in to_page(points))
 
 
 def _name(colour: Colour) -> str:

@@ -7,8 +7,9 @@ The defaults are the reference's random-level distribution, Kinetix 3.0.2: names
 import math
 from dataclasses import dataclass, fields
 
-HALF_WORLD = 2.5  # m; green and blue bodies may be placed within one half of the world
-# Largest reach of a free body from its centre, so that it finds a place in half a world
+from levelgen.level import HALF_WORLD
+
+# m, largest reach of a free body from its centre: green and blue may have to fit into one half of the world
 MAX_REACH = HALF_WORLD / 2
 CONTROL_WEIGHTS = ("motor_only_weight", "thruster_only_weight", "motor_and_thruster_weight")
 
@@ -77,11 +78,11 @@ class Distribution:
     max_thruster_power: float = 2.0  # strongest, per unit of mass (mutators.mutate_add_thruster)
     thruster_power_factor: float = 2.0  # times the power that is drawn between these two [thruster_power_multiplier]
 
-    # The places left after green, blue and the third body
+    # What comes after green, blue and the third body
     connected_weight: float = 0.35  # of a body that a joint holds to another one [add_connected_shape_chance]
     free_weight: float = 0.35  # of a body without a joint [add_shape_chance]
     empty_weight: float = 0.3  # of no body [add_no_shape_chance]
-    proposals: int = 8  # places tried for each body; the one that touches least is kept [add_shape_n_proposals]
+    proposals: int = 8  # positions tried for each body; the one that touches least is kept [add_shape_n_proposals]
     small_world: int = 7  # bodies; up to this many: one proposal, no fixed bodies (distributions.sample_kinetix_level)
 
     # Last

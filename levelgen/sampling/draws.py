@@ -24,7 +24,7 @@ def deal(keys: Key[Array, " lane"], hands: Sequence[tuple[Any, tuple[int, ...]]]
 
 
 def pick(weights: Float[Array, "choice #lane"], u: Float[Array, " lane"]) -> Int[Array, " lane"]:
-    """A choice with chances in proportion to the weights; the first where all are zero."""
+    """A choice with probabilities in proportion to the weights; the first where all are zero."""
     upper = jnp.cumsum(weights, 0)
     return (upper < upper[-1] * (1 - u)).sum(0)
 
@@ -43,8 +43,8 @@ def between(u: Array, low: Array | float, high: Array | float) -> Array:
     return low + u * (high - low)
 
 
-def first_free(taken: Bool[Array, "place lane"]) -> Bool[Array, "place lane"]:
-    """One-hot first place not taken; nothing where all are."""
+def first_free(taken: Bool[Array, "row lane"]) -> Bool[Array, "row lane"]:
+    """One-hot first row not taken; nothing where all are."""
     return ~taken & (jnp.cumsum(~taken, 0) == 1)
 
 
@@ -56,7 +56,7 @@ def at(x: Array, chosen: Bool[Array, "row lane"]) -> Array:
     return jnp.where(spread, x, jnp.zeros((), x.dtype)).sum(0)
 
 
-def put(x: Array, place: Bool[Array, "row lane"], value: Array | float) -> Array:
+def put(x: Array, chosen: Bool[Array, "row lane"], value: Array | float) -> Array:
     """x [row, ..., lane] with `value` [..., lane] in the chosen row."""
-    spread = place.reshape(len(place), *[1] * (x.ndim - 2), place.shape[-1])
+    spread = chosen.reshape(len(chosen), *[1] * (x.ndim - 2), chosen.shape[-1])
     return jnp.where(spread, jnp.asarray(value, x.dtype), x)

@@ -11,16 +11,16 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role
-from levelgen.sampling.distribution import HALF_WORLD, Distribution
+from levelgen.level import HALF_WORLD, MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role
+from levelgen.sampling.distribution import Distribution
 from levelgen.sampling.draws import at, between, choose, first_free, first_of_two, put
 from levelgen.sampling.proposal import (
     BodyDraws,
+    BodyShape,
     Flag,
     Joint,
     Lane,
     Proposal,
-    Shape,
     draw_role,
     draw_shape,
     no_joint,
@@ -77,7 +77,7 @@ def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, dist: Distribut
     )
 
 
-def free_position(d: BodyDraws, shape: Shape, role: Int[Array, " lane"], dist: Distribution) -> Vec:
+def free_position(d: BodyDraws, shape: BodyShape, role: Int[Array, " lane"], dist: Distribution) -> Vec:
     """Within the world by the body's reach; green on the left and blue on the right where on opposite sides."""
     reach = jnp.maximum(jnp.maximum(shape.half.x, shape.half.y) * math.sqrt(2), shape.radius)
     opposite = d.opposite < dist.opposite_sides_chance
@@ -109,7 +109,7 @@ def propose_connected(level: Level, d: BodyDraws, revolute: Flag, dist: Distribu
     joint = draw_joint(level, d, target, is_polygon & target_is_polygon, revolute, dist)._replace(
         anchor=anchor, target_anchor=target_anchor
     )
-    partner = Shape(target_is_polygon, (high - low).scale(0.5), at(radii(level), target))
+    partner = BodyShape(target_is_polygon, (high - low).scale(0.5), at(radii(level), target))
     possible = (room_polygon | room_circle) & model.active[FIXED_POLYGONS:].any(0) & ~model.joint_active.all(0)
     return Proposal(
         possible=possible,
@@ -183,7 +183,7 @@ def draw_joint(
     )
 
 
-def both_show(new: Shape, target: Shape, anchor: Vec, target_anchor: Vec, dist: Distribution) -> Flag:
+def both_show(new: BodyShape, target: BodyShape, anchor: Vec, target_anchor: Vec, dist: Distribution) -> Flag:
     """Whether each of two joined bodies can be seen beside the other at some angle of their joint.
 
     As the reference has it: where it numbers the target as the joint's first body (always but for a new polygon on
@@ -195,7 +195,7 @@ def both_show(new: Shape, target: Shape, anchor: Vec, target_anchor: Vec, dist: 
     return _shows(new, target, new_anchor, other_anchor, margin) & _shows(target, new, other_anchor, new_anchor, margin)
 
 
-def _shows(small: Shape, big: Shape, small_anchor: Vec, big_anchor: Vec, margin: float) -> Flag:
+def _shows(small: BodyShape, big: BodyShape, small_anchor: Vec, big_anchor: Vec, margin: float) -> Flag:
     """Whether `small` reaches beyond `big`: by its farthest corner, or beyond the nearest side."""
     far_x, far_y = (half + jnp.abs(p) for half, p in zip(small.half, small_anchor, strict=True))
     farthest = Vec(far_x, far_y).norm()
@@ -220,19 +220,19 @@ def add_thruster(
     centred = (position.x == 0) & (position.y == 0)
     aligned = jnp.where(centred, 0.0, jnp.arctan2(outward.y, outward.x))
     power = between(d.power, dist.min_thruster_power, dist.max_thruster_power) * dist.thruster_power_factor
-    place = first_free(model.thruster_active) & wanted & candidates.any(0)
+    row = first_free(model.thruster_active) & wanted & candidates.any(0)
     model = replace(
         model,
-        thruster_active=model.thruster_active | place,
-        thruster_body=put(model.thruster_body, place, at(jnp.arange(level.size.bodies)[:, None], body)),
-        thruster_position=put(model.thruster_position, place, unvec(position)),
+        thruster_active=model.thruster_active | row,
+        thruster_body=put(model.thruster_body, row, at(jnp.arange(level.size.bodies)[:, None], body)),
+        thruster_position=put(model.thruster_position, row, unvec(position)),
         thruster_rotation=put(
-            model.thruster_rotation, place, jnp.where(d.aligned < dist.aligned_chance, aligned, d.angle * TURN)
+            model.thruster_rotation, row, jnp.where(d.aligned < dist.aligned_chance, aligned, d.angle * TURN)
         ),
-        thruster_power=put(model.thruster_power, place, power * inverse(at(model.inverse_mass, body))),
+        thruster_power=put(model.thruster_power, row, power * inverse(at(model.inverse_mass, body))),
     )
     binding = (d.binding * THRUSTER_BINDINGS).astype(jnp.int32)
-    return replace(level, model=model, thruster_binding=put(level.thruster_binding, place, binding))
+    return replace(level, model=model, thruster_binding=put(level.thruster_binding, row, binding))
 
 
 def room(level: Level) -> tuple[Flag, Flag]:

@@ -14,27 +14,31 @@ from physics.types import Model, State
 from physics.vector import Vec, nonzero, vec
 
 
-class Polygons(NamedTuple):
+class WorldPolygons(NamedTuple):
     """In the world, clockwise, all with four vertices."""
 
     vertex: Vec  # components [vertex, polygon, lane]
     normal: Vec  # outward unit normal of the face from a vertex to the next
 
 
-class Circles(NamedTuple):
+class WorldCircles(NamedTuple):
     centre: Vec  # components [circle, lane]
     radius: Float[Array, "circle lane"]
 
 
 def count_contacts(
-    model: Model, state: State, corners: Float[Array, "vertex 2 lane"], body: Circles, is_polygon: Bool[Array, " lane"]
+    model: Model,
+    state: State,
+    corners: Float[Array, "vertex 2 lane"],
+    body: WorldCircles,
+    is_polygon: Bool[Array, " lane"],
 ) -> Int[Array, " lane"]:
     """Contacts of a new body with the active bodies: a polygon with these corners in the world, or a circle `body`."""
     n = model.size.polygons
-    polygons = place(model, state)
+    polygons = polygons_in_world(model, state)
     new = with_normals(vec(corners).map(lambda x: x[:, None]))
     position = vec(state.position)
-    circles = Circles(position.map(lambda x: x[n:]), model.radius)
+    circles = WorldCircles(position.map(lambda x: x[n:]), model.radius)
     touching = jnp.where(
         is_polygon,
         jnp.concatenate([polygon_contacts(polygons, new), touch(new, circles).astype(jnp.int32)]),
@@ -43,7 +47,7 @@ def count_contacts(
     return jnp.where(model.active, touching, 0).sum(0)
 
 
-def place(model: Model, state: State) -> Polygons:
+def polygons_in_world(model: Model, state: State) -> WorldPolygons:
     """All polygons in the world."""
     n = model.size.polygons
     cos, sin = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n])
@@ -51,12 +55,12 @@ def place(model: Model, state: State) -> Polygons:
     return with_normals(local.rotate(cos, sin) + vec(state.position).map(lambda x: x[:n]))
 
 
-def with_normals(vertex: Vec) -> Polygons:
+def with_normals(vertex: Vec) -> WorldPolygons:
     edge = vertex.map(lambda x: jnp.roll(x, -1, 0)) - vertex
-    return Polygons(vertex, Vec(-edge.y, edge.x).scale(1 / nonzero(edge.norm())))
+    return WorldPolygons(vertex, Vec(-edge.y, edge.x).scale(1 / nonzero(edge.norm())))
 
 
-def polygon_contacts(a: Polygons, b: Polygons) -> Int[Array, "polygon lane"]:
+def polygon_contacts(a: WorldPolygons, b: WorldPolygons) -> Int[Array, "polygon lane"]:
     """0, 1 or 2 of each pair: the two deepest vertices beyond the face that separates most."""
     (first_a, second_a), (first_b, second_b) = deepest(a, b), deepest(b, a)
     second = jnp.where(first_a + FLIP_BIAS < first_b, second_b, second_a)
@@ -64,7 +68,7 @@ def polygon_contacts(a: Polygons, b: Polygons) -> Int[Array, "polygon lane"]:
     return touching.astype(jnp.int32) + (touching & (second < 0))
 
 
-def deepest(a: Polygons, b: Polygons) -> tuple[Float[Array, "polygon lane"], Float[Array, "polygon lane"]]:
+def deepest(a: WorldPolygons, b: WorldPolygons) -> tuple[Float[Array, "polygon lane"], Float[Array, "polygon lane"]]:
     """Distances of b's two deepest vertices from the face of a that separates most (negative: inside)."""
     reach = [
         a.normal.dot(Vec(b.vertex.x[k] - a.vertex.x, b.vertex.y[k] - a.vertex.y)) for k in range(4)
@@ -80,7 +84,7 @@ def deepest(a: Polygons, b: Polygons) -> tuple[Float[Array, "polygon lane"], Flo
     return best, runner_up
 
 
-def touch(polygons: Polygons, circles: Circles) -> Bool[Array, "pair lane"]:
+def touch(polygons: WorldPolygons, circles: WorldCircles) -> Bool[Array, "pair lane"]:
     """Whether the circle's centre is inside the polygon or within its radius of an edge."""
     vertex, normal = polygons
     edge = vertex.map(lambda x: jnp.roll(x, -1, 0)) - vertex
@@ -92,5 +96,5 @@ def touch(polygons: Polygons, circles: Circles) -> Bool[Array, "pair lane"]:
     return inside | ((offset - clipped).norm().min(0) <= circles.radius)
 
 
-def circles_touch(a: Circles, b: Circles) -> Bool[Array, "circle lane"]:
+def circles_touch(a: WorldCircles, b: WorldCircles) -> Bool[Array, "circle lane"]:
     return (a.centre - b.centre).norm() < a.radius + b.radius

@@ -58,7 +58,7 @@ class BodyDraws(NamedTuple):
     limit_max: Lane
 
 
-class Shape(NamedTuple):
+class BodyShape(NamedTuple):
     """A rectangle or a circle; what the other kind would need is at its minimum."""
 
     is_polygon: Flag
@@ -86,7 +86,7 @@ class Proposal(NamedTuple):
     """A body to add, with a joint where `joined`; nothing where not `possible`."""
 
     possible: Flag
-    shape: Shape
+    shape: BodyShape
     position: Vec
     rotation: Lane
     role: Int[Array, " lane"]
@@ -96,7 +96,7 @@ class Proposal(NamedTuple):
     hidden: Flag  # one of the joined bodies may lie within the other whatever the joint's angle
 
 
-def draw_shape(d: BodyDraws, is_polygon: Flag, size: Lane | float, dist: Distribution) -> Shape:
+def draw_shape(d: BodyDraws, is_polygon: Flag, size: Lane | float, dist: Distribution) -> BodyShape:
     """Uniform half sides or radius; one side of some rectangles is longer (util.sample_dimensions)."""
     longest = size / 2 / math.sqrt(2)
     half = [
@@ -105,7 +105,7 @@ def draw_shape(d: BodyDraws, is_polygon: Flag, size: Lane | float, dist: Distrib
     long, long_x = d.long < dist.long_side_chance, d.long_x < 0.5
     stretch = [jnp.where(long & side, dist.long_side_factor, 1.0) for side in (long_x, ~long_x)]
     radius = between(d.radius, dist.min_radius, size / 2 * dist.circle_size_factor)
-    return Shape(
+    return BodyShape(
         is_polygon, Vec(half[0] * stretch[0], half[1] * stretch[1]), jnp.where(is_polygon, dist.min_radius, radius)
     )
 
@@ -119,7 +119,7 @@ def corners_in_world(p: Proposal) -> Float[Array, "vertex 2 lane"]:
     return unvec(turned(vec(corners(p.shape.half)), p.rotation) + p.position)
 
 
-def shape_mass(shape: Shape) -> tuple[Lane, Lane]:
+def shape_mass(shape: BodyShape) -> tuple[Lane, Lane]:
     """kg and kg m^2 at the density of 1 kg/m^2 that all bodies have."""
     vertices, four = corners(shape.half)[None], jnp.full((1, *shape.radius.shape), MAX_VERTICES)
     mass = jnp.where(shape.is_polygon, polygon_area(vertices, four)[0], circle_area(shape.radius))
@@ -136,7 +136,7 @@ def draw_role(level: Level, u: Lane, red_allowed: Flag | bool, dist: Distributio
 
 
 def insert(level: Level, p: Proposal) -> Level:
-    """The level with the proposed body, and its joint, in the first free places."""
+    """The level with the proposed body, and its joint, in the first free rows."""
     polygons, model, state = level.size.polygons, level.model, level.state
     polygon = first_free(model.active[:polygons]) & p.shape.is_polygon & p.possible
     circle = first_free(model.active[polygons:]) & ~p.shape.is_polygon & p.possible
@@ -162,7 +162,7 @@ def insert(level: Level, p: Proposal) -> Level:
 def _insert_joint(level: Level, p: Proposal, body: Bool[Array, "body lane"]) -> Level:
     """The joint's first body is the one with the smaller number."""
     model, joint = level.model, p.joint
-    place = first_free(model.joint_active) & p.joined
+    row = first_free(model.joint_active) & p.joined
     numbers = jnp.arange(level.size.bodies)[:, None]
     own, target = at(numbers, body), at(numbers, joint.target)
     target_first = target < own
@@ -174,21 +174,21 @@ def _insert_joint(level: Level, p: Proposal, body: Bool[Array, "body lane"]) -> 
     rotation = jnp.where(joint.fixed, jnp.where(target_first, rotation, -rotation), 0.0)
     model = replace(
         model,
-        joint_active=model.joint_active | place,
-        joint_a=put(model.joint_a, place, jnp.minimum(own, target)),
-        joint_b=put(model.joint_b, place, jnp.maximum(own, target)),
-        joint_anchor_a=put(model.joint_anchor_a, place, unvec(first)),
-        joint_anchor_b=put(model.joint_anchor_b, place, unvec(second)),
-        joint_fixed=put(model.joint_fixed, place, joint.fixed),
-        joint_rotation=put(model.joint_rotation, place, rotation),
-        joint_limited=put(model.joint_limited, place, joint.limited),
-        joint_min=put(model.joint_min, place, joint.limit_min),
-        joint_max=put(model.joint_max, place, joint.limit_max),
-        motor_on=put(model.motor_on, place, joint.motor_on),
-        motor_speed=put(model.motor_speed, place, joint.motor_speed),
-        motor_power=put(model.motor_power, place, joint.motor_power),
+        joint_active=model.joint_active | row,
+        joint_a=put(model.joint_a, row, jnp.minimum(own, target)),
+        joint_b=put(model.joint_b, row, jnp.maximum(own, target)),
+        joint_anchor_a=put(model.joint_anchor_a, row, unvec(first)),
+        joint_anchor_b=put(model.joint_anchor_b, row, unvec(second)),
+        joint_fixed=put(model.joint_fixed, row, joint.fixed),
+        joint_rotation=put(model.joint_rotation, row, rotation),
+        joint_limited=put(model.joint_limited, row, joint.limited),
+        joint_min=put(model.joint_min, row, joint.limit_min),
+        joint_max=put(model.joint_max, row, joint.limit_max),
+        motor_on=put(model.motor_on, row, joint.motor_on),
+        motor_speed=put(model.motor_speed, row, joint.motor_speed),
+        motor_power=put(model.motor_power, row, joint.motor_power),
     )
-    return replace(level, model=model, motor_binding=put(level.motor_binding, place, joint.motor_binding))
+    return replace(level, model=model, motor_binding=put(level.motor_binding, row, joint.motor_binding))
 
 
 def no_joint(level: Level) -> Joint:

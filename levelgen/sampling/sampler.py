@@ -1,7 +1,7 @@
 """Random levels: from level ids, in the order of the reference's sampler.
 
 The floor's role; a green and a blue body; a third body or a thruster or both, so that something can act; more
-bodies and thrusters while there is room; green and blue swapped at random; every kind's places shuffled. What is
+bodies and thrusters while there is room; green and blue swapped at random; the rows of every kind shuffled. What is
 drawn at each step is in moves.py, every number in distribution.py.
 Facts: `kinetix.environment.ued.distributions.sample_kinetix_level` 3.0.2.
 """
@@ -15,27 +15,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
+from numpy.typing import ArrayLike
 
-from levelgen.identity.keys import MAX_LEVEL_ID, Stream, key_for
+from levelgen.identity.keys import Stream, key_for, level_id_array
 from levelgen.level import Level, Role, name_of
 from levelgen.sampling.distribution import Distribution
 from levelgen.sampling.draws import at, deal, pick
 from levelgen.sampling.moves import ThrusterDraws, add_thruster, propose_connected, propose_free
-from levelgen.sampling.overlap import Circles, count_contacts
+from levelgen.sampling.overlap import WorldCircles, count_contacts
 from levelgen.sampling.proposal import BodyDraws, Flag, Lane, Proposal, corners_in_world, insert
 from levelgen.sampling.scenery import empty_level
-from levelgen.sampling.shuffle import OrderDraws, places, shuffle
+from levelgen.sampling.shuffle import OrderDraws, shuffle, shuffled_rows
 from physics.types import FIXED_POLYGONS, Size
 
 __all__ = ["Distribution", "sample_levels"]
 
-BLOCK = 256  # levels sampled by one call of the compiled program, however many are asked for
+CHUNK = 256  # levels sampled by one call of the compiled program, however many are asked for
 GOAL_BODIES = 2  # green and blue come first
 DEFAULT = Distribution()
 
 
 class Filling(IntEnum):
-    """What comes to a place that green, blue and the third body have left."""
+    """What a row is filled with that green, blue and the third body have left."""
 
     CONNECTED = 0
     FREE = 1
@@ -51,7 +52,7 @@ class LevelDraws(NamedTuple):
     swap: Lane
 
 
-class PlaceDraws(NamedTuple):
+class FillingDraws(NamedTuple):
     kind: Lane
 
 
@@ -64,11 +65,16 @@ class Plan(NamedTuple):
     may_be_fixed: Flag
 
 
-def sample_levels(level_ids: Int[Array, " level"], size: Size, distribution: Distribution = DEFAULT) -> Level:
+def sample_levels(level_ids: ArrayLike, size: Size, distribution: Distribution = DEFAULT) -> Level:
     """The levels with these ids, as float32 and int32 arrays in SI units, level axis last.
 
-    A level depends on its id, the size, `identity.SAMPLER_VERSION` and the distribution alone: whatever the number
-    of ids, they go through one compiled program in blocks of BLOCK. So call it outside `jax.jit`.
+    A level depends on its id, the size, `SAMPLER_VERSION` and the distribution alone: whatever the number
+    of ids, they go through one compiled program in chunks of CHUNK. So call it outside `jax.jit`.
+
+    Args:
+        level_ids: whole numbers, [level].
+        size: of every level.
+        distribution: what random levels are like.
 
     Args:
         level_ids: whole numbers from 0 to MAX_LEVEL_ID, in any order.
@@ -79,12 +85,10 @@ def sample_levels(level_ids: Int[Array, " level"], size: Size, distribution: Dis
         ValueError: the size has no room for the scenery, a green and a blue body; an id is not 0 .. MAX_LEVEL_ID.
     """
     check_size(size)
-    ids = np.asarray(level_ids)
-    if len(ids) and not 0 <= ids.min() <= ids.max() <= MAX_LEVEL_ID:
-        raise ValueError(f"level ids {ids.min()} to {ids.max()} do not fit: they run from 0 to {MAX_LEVEL_ID}")
-    padded = np.resize(ids, (max(1, -(-len(ids) // BLOCK)), BLOCK)).astype(np.uint32)
-    blocks = [sample_block(block, size, distribution) for block in padded]
-    return jax.device_put(jax.tree.map(lambda *parts: np.concatenate(parts, -1)[..., : len(ids)], *blocks))
+    ids = level_id_array(level_ids)
+    padded = np.resize(ids, (max(1, -(-len(ids) // CHUNK)), CHUNK))
+    chunks = [sample_chunk(chunk, size, distribution) for chunk in padded]
+    return jax.device_put(jax.tree.map(lambda *parts: np.concatenate(parts, -1)[..., : len(ids)], *chunks))
 
 
 def check_size(size: Size) -> None:
@@ -97,8 +101,8 @@ def check_size(size: Size) -> None:
 
 
 @partial(jax.jit, static_argnames=("size", "distribution"))
-def sample_block(level_ids: Int[Array, " lane"], size: Size, distribution: Distribution) -> Level:
-    """One block of levels."""
+def sample_chunk(level_ids: Int[Array, " lane"], size: Size, distribution: Distribution) -> Level:
+    """One chunk of levels."""
     keys = jax.vmap(lambda level_id: key_for(level_id, Stream.LEVEL))(level_ids)
     once, kinds, bodies, thrusters, order = deal(keys, hands(size, distribution))
     level = set_floor(empty_level(size, len(level_ids)), once.floor, distribution)
@@ -114,15 +118,15 @@ def hands(size: Size, dist: Distribution) -> list[tuple[type, tuple[int, ...]]]:
     proposals = 1 if size.bodies <= dist.small_world else dist.proposals
     return [
         (LevelDraws, ()),
-        (PlaceDraws, (turns(size),)),
+        (FillingDraws, (turns(size),)),
         (BodyDraws, (turns(size), proposals)),
         (ThrusterDraws, (size.thrusters,)),
-        (OrderDraws, (places(size),)),
+        (OrderDraws, (shuffled_rows(size),)),
     ]
 
 
 def turns(size: Size) -> int:
-    """Bodies the sampler tries to add: one for every place."""
+    """Bodies the sampler tries to add: one for every row."""
     return size.bodies - FIXED_POLYGONS
 
 
@@ -132,7 +136,7 @@ def set_floor(level: Level, u: Lane, dist: Distribution) -> Level:
     return replace(level, role=level.role.at[0].set(pick(jnp.array(chances)[:, None], u)))
 
 
-def controls(size: Size, dist: Distribution) -> dict[tuple[bool, bool], float]:
+def control_weights(size: Size, dist: Distribution) -> dict[tuple[bool, bool], float]:
     """The weight of a motor, of a thruster and of both having to be there, as far as the size has room for them."""
     weights = {
         (False, True): dist.thruster_only_weight,
@@ -145,17 +149,17 @@ def controls(size: Size, dist: Distribution) -> dict[tuple[bool, bool], float]:
 
 def draw_control(u: Lane, size: Size, dist: Distribution) -> tuple[Flag, Flag]:
     """Whether there must be a motor and a thruster; neither where the size has no room for what the weights allow."""
-    kinds = controls(size, dist) or {(False, False): 1.0}
+    kinds = control_weights(size, dist) or {(False, False): 1.0}
     upper = np.cumsum(list(kinds.values()), dtype=np.float32)[:, None]
     motor, thruster = jnp.array(list(kinds))[(u * upper[-1] >= upper[:-1]).sum(0)].T
     return motor, thruster
 
 
-def plan_bodies(level: Level, first_moves: Lane, motor: Flag, places: PlaceDraws, dist: Distribution) -> Plan:
+def plan_bodies(level: Level, first_moves: Lane, motor: Flag, fillings: FillingDraws, dist: Distribution) -> Plan:
     """Two free bodies, of which one can move; a third, joined where a motor must be; then what comes."""
-    turn = jnp.arange(len(places.kind))[:, None]
+    turn = jnp.arange(len(fillings.kind))[:, None]
     weights = jnp.array([dist.connected_weight, dist.free_weight, dist.empty_weight])[:, None]
-    kind = jax.vmap(lambda u: pick(weights, u))(places.kind)
+    kind = jax.vmap(lambda u: pick(weights, u))(fillings.kind)
     later = turn > GOAL_BODIES
     # A floor that is a goal cannot move: then the first body, which becomes the other goal, must
     first = (first_moves < 0.5) | (level.role[0] == Role.GREEN) | (level.role[0] == Role.BLUE)
@@ -191,7 +195,7 @@ def propose(level: Level, plan: Plan, draws: BodyDraws, dist: Distribution) -> P
         return p._replace(possible=p.possible & plan.add, joined=p.joined & plan.connect & plan.add)
 
     def score(p: Proposal) -> Lane:
-        body = Circles(p.position.map(lambda x: x[None]), p.shape.radius[None])
+        body = WorldCircles(p.position.map(lambda x: x[None]), p.shape.radius[None])
         contacts = count_contacts(level.model, level.state, corners_in_world(p), body, p.shape.is_polygon)
         return contacts + jnp.where(p.hidden, dist.hidden_penalty, 0.0)
 

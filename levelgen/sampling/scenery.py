@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from levelgen.level import WORLD_SIDE, Level
+from levelgen.level import HALF_WORLD, WORLD_SIDE, Level
 from physics.pairs import pairs_of
 from physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, Size, initial_state
 
@@ -16,20 +16,19 @@ GRAVITY = (0.0, -9.81)  # m/s^2
 FLOOR_TOP = 0.4  # m above the lower edge of the world
 _OFFSET = FLOOR_TOP / 2
 _DEEP = WORLD_SIDE + _OFFSET
-_HALF = WORLD_SIDE / 2
 
-POSITION = ((_HALF, _OFFSET - WORLD_SIDE), (0.0, 0.0), (0.0, 0.0), (_HALF, 2 * WORLD_SIDE + _OFFSET))
+POSITION = ((HALF_WORLD, _OFFSET - WORLD_SIDE), (0.0, 0.0), (0.0, 0.0), (HALF_WORLD, 2 * WORLD_SIDE + _OFFSET))
 VERTICES = (
-    ((_HALF, _DEEP), (_HALF, -_DEEP), (-_HALF, -_DEEP), (-_HALF, _DEEP)),
+    ((HALF_WORLD, _DEEP), (HALF_WORLD, -_DEEP), (-HALF_WORLD, -_DEEP), (-HALF_WORLD, _DEEP)),
     ((-WORLD_SIDE, WORLD_SIDE), (0.0, WORLD_SIDE), (0.0, 0.0), (-WORLD_SIDE, 0.0)),
     ((WORLD_SIDE, WORLD_SIDE), (2 * WORLD_SIDE, WORLD_SIDE), (2 * WORLD_SIDE, 0.0), (WORLD_SIDE, 0.0)),
-    ((WORLD_SIDE, _DEEP), (_HALF, -_DEEP), (-_HALF, -_DEEP), (-_HALF, _DEEP)),
+    ((WORLD_SIDE, _DEEP), (HALF_WORLD, -_DEEP), (-HALF_WORLD, -_DEEP), (-HALF_WORLD, _DEEP)),
 )
 MEETS_ALL, NORMAL = 2, 1  # collision modes of the scenery and of other bodies
 
 
 def empty_level(size: Size, lanes: int) -> Level:
-    """Levels with the scenery only; every other place is free and holds zeros, as in the reference."""
+    """Levels with the scenery only; every other row is free and holds zeros, as in the reference."""
     bodies, joints, thrusters = size.bodies, size.joints, size.thrusters
 
     def full(*shape: int, value: float = 0.0) -> Array:

@@ -1,4 +1,4 @@
-"""Places of bodies, joints and thrusters exchanged at random, and which bodies may then collide.
+"""Rows of bodies, joints and thrusters exchanged at random, and which bodies may then collide.
 
 Facts: `kinetix.environment.utils.permute_state` 3.0.2 and `jax2d.engine.calculate_collision_matrix` 1.0.1.
 """
@@ -20,34 +20,34 @@ THRUSTER = ("thruster_active", "thruster_body", "thruster_position", "thruster_r
 
 
 class OrderDraws(NamedTuple):
-    """One number for each place of every kind."""
+    """One number for each row of every kind."""
 
-    order: Float[Array, "place lane"]
+    order: Float[Array, "row lane"]
 
 
 class Order(NamedTuple):
-    """For each place of a kind, the place its content comes from."""
+    """For each row of a kind, the row its content comes from."""
 
     bodies: Int[Array, "body lane"]
     joints: Int[Array, "joint lane"]
     thrusters: Int[Array, "thruster lane"]
 
 
-def places(size: Size) -> int:
-    """How many can change their place."""
-    return sum(_places(size))
+def shuffled_rows(size: Size) -> int:
+    """How many rows are shuffled."""
+    return sum(_rows_of_kinds(size))
 
 
 def shuffle(level: Level, draws: OrderDraws) -> Level:
     """Movable polygons, circles, joints and thrusters in a random order each; the scenery stays."""
     order = draw_order(level.size, draws.order)
-    place_of = jnp.argsort(order.bodies, 0)  # where each body went
+    row_of = jnp.argsort(order.bodies, 0)  # where each body went
     model, state, polygons = level.model, level.state, level.size.polygons
     model = replace(
         model,
-        joint_a=_take(place_of, model.joint_a),
-        joint_b=_take(place_of, model.joint_b),
-        thruster_body=_take(place_of, model.thruster_body),
+        joint_a=_take(row_of, model.joint_a),
+        joint_b=_take(row_of, model.joint_b),
+        thruster_body=_take(row_of, model.thruster_body),
     )
     moved = {name: _take(getattr(model, name), order.bodies) for name in BODY}
     moved |= {name: _take(getattr(model, name), order.joints) for name in JOINT}
@@ -65,9 +65,9 @@ def shuffle(level: Level, draws: OrderDraws) -> Level:
     )
 
 
-def draw_order(size: Size, numbers: Float[Array, "place lane"]) -> Order:
+def draw_order(size: Size, numbers: Float[Array, "row lane"]) -> Order:
     parts, start = [], 0
-    for count in _places(size):
+    for count in _rows_of_kinds(size):
         parts.append(jnp.argsort(numbers[start : start + count], 0).astype(jnp.int32))
         start += count
     polygons, circles, joints, thrusters = parts
@@ -77,7 +77,7 @@ def draw_order(size: Size, numbers: Float[Array, "place lane"]) -> Order:
     return Order(jnp.concatenate([scenery, polygons + FIXED_POLYGONS, circles + size.polygons]), joints, thrusters)
 
 
-def _places(size: Size) -> tuple[int, int, int, int]:
+def _rows_of_kinds(size: Size) -> tuple[int, int, int, int]:
     return size.polygons - FIXED_POLYGONS, size.circles, size.joints, size.thrusters
 
 
@@ -93,7 +93,7 @@ def separate(model: Model) -> Bool[Array, "body body lane"]:
     return ~joined
 
 
-def _take(x: Array, index: Int[Array, "place lane"]) -> Array:
+def _take(x: Array, index: Int[Array, "row lane"]) -> Array:
     """x [row, ..., lane] at the rows of each lane."""
     spread = index.reshape(len(index), *[1] * (x.ndim - 2), index.shape[-1])
     return jnp.take_along_axis(x, spread, 0)

@@ -233,8 +233,8 @@ class Environment:
 
     def _advance(self, state: EnvState, action: Array) -> tuple[EnvState, Array, Array, dict[str, Array]]:
         driven = CONTROLS[self.action_type](state.level, action)
-        now, outcome, distance = task.advance_driven(state.level, state.now, driven, self.rules)
-        return replace(state, now=now), outcome.reward, outcome.done, {"GoalR": outcome.goal, "distance": distance}
+        now, result, distance = task.advance_driven(state.level, state.now, driven, self.rules)
+        return replace(state, now=now), result.reward, result.done, {"GoalR": result.goal, "distance": distance}
 
     def _look(self, state: EnvState) -> Any:
         return LOOKS[self.observation_type](state.level, state.now.state)

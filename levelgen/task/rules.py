@@ -51,7 +51,7 @@ class TaskState:
     last_distance: Float[Array, " lane"]  # m, between green and blue; NO_DISTANCE at the start
 
 
-class Outcome(NamedTuple):
+class StepResult(NamedTuple):
     """What one env step gave."""
 
     reward: Float[Array, " lane"]
@@ -110,24 +110,24 @@ class Frame(NamedTuple):
 
 def advance(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
-) -> tuple[TaskState, Outcome]:
+) -> tuple[TaskState, StepResult]:
     """One env step without reset: the next state, and what the step gave."""
     return advance_driven(level, now, controls(level, action), params)[:2]
 
 
 def advance_driven(
     level: Level, now: TaskState, driven: Controls, params: TaskParams
-) -> tuple[TaskState, Outcome, Float[Array, " lane"]]:
+) -> tuple[TaskState, StepResult, Float[Array, " lane"]]:
     """The same under controls, whatever kind of action they come from; and the distance of the goal at the end, m."""
     return _advance(level, now, driven, params, lambda *given: (step_unseen(*given), None))[:3]
 
 
 def advance_seen(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
-) -> tuple[TaskState, Outcome, Manifold]:
+) -> tuple[TaskState, StepResult, Manifold]:
     """The same, and the contacts of the last physics step."""
-    after, outcome, _, seen = _advance(level, now, controls(level, action), params, physics_step)
-    return after, outcome, seen
+    after, result, _, seen = _advance(level, now, controls(level, action), params, physics_step)
+    return after, result, seen
 
 
 def _advance(level: Level, now: TaskState, driven: Controls, params: TaskParams, physics) -> tuple:
@@ -152,7 +152,7 @@ def _advance(level: Level, now: TaskState, driven: Controls, params: TaskParams,
     shaping = jnp.where(now.last_distance == NO_DISTANCE, 0.0, params.dense_reward_scale * closer)
     reward = goal.astype(jnp.float32) - select(frames.fail, first).astype(jnp.float32) + shaping
     after = TaskState(state, timestep, jnp.where(done, NO_DISTANCE, distance))
-    return after, Outcome(reward, done, goal), distance, jax.tree.map(lambda x: x[-1], frames.seen)
+    return after, StepResult(reward, done, goal), distance, jax.tree.map(lambda x: x[-1], frames.seen)
 
 
 def has_nan(state: State) -> Bool[Array, " lane"]:
@@ -168,7 +168,7 @@ def restart(level: Level, state: TaskState, done: Bool[Array, " lane"]) -> TaskS
 
 def step(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams = DEFAULT_RULES
-) -> tuple[TaskState, Outcome]:
+) -> tuple[TaskState, StepResult]:
     """One env step with automatic reset to the same level.
 
     Args:
@@ -177,5 +177,5 @@ def step(
         action: multi-discrete, one entry per binding (`levelgen.task.actions`).
         params: rules.
     """
-    after, outcome = advance(level, now, action, params)
-    return restart(level, after, outcome.done), outcome
+    after, result = advance(level, now, action, params)
+    return restart(level, after, result.done), result

@@ -19,7 +19,7 @@ from levelgen.level import ACTIONS, Level, name_of
 from levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
 from levelgen.pictures.scene import Caption, Scene, scene_of
 from levelgen.pictures.svg import write_svg
-from levelgen.task.rules import Outcome, TaskParams, TaskState, advance, has_nan, reset
+from levelgen.task.rules import StepResult, TaskParams, TaskState, advance, has_nan, reset
 from physics.types import State
 from pipeline.errors import Failure, UserError
 from pipeline.read.levels import find_level, is_level_file, level_file, level_of
@@ -165,7 +165,7 @@ def do_nothing(level: Level, rules: TaskParams) -> tuple[list[State], str]:
 
 
 @partial(jax.jit, static_argnames="frame")
-def _idle_frame(level: Level, now: TaskState, frame: TaskParams) -> tuple[TaskState, Outcome, Bool[Array, " lane"]]:
+def _idle_frame(level: Level, now: TaskState, frame: TaskParams) -> tuple[TaskState, StepResult, Bool[Array, " lane"]]:
     after, outcome = advance(level, now, jnp.zeros((ACTIONS, 1), jnp.int32), frame)
     return after, outcome, has_nan(after.state)
 

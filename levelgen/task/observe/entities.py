@@ -34,8 +34,8 @@ ATTENTION_MASKS = 4  # all to all, held together by joints, joined directly, in 
 
 def padded_shape(size: Size) -> tuple[int, int]:
     """Things and columns of `symbolic_padded`."""
-    blocks = blocks_of(size)
-    return sum(count for count, _ in blocks), max(rows for _, rows in blocks) + KINDS + 1
+    tables = tables_of(size)
+    return sum(count for count, _ in tables), max(rows for _, rows in tables) + KINDS + 1
 
 
 def symbolic_padded(level: Level, state: State) -> Float[Array, "thing column lane"]:
@@ -46,7 +46,7 @@ def symbolic_padded(level: Level, state: State) -> Float[Array, "thing column la
     size, flat = level.size, symbolic_flat(level, state)
     (things, columns), lanes = padded_shape(size), flat.shape[-1]
     rows, seen = [], 0
-    for kind, (count, width) in enumerate(blocks_of(size)):
+    for kind, (count, width) in enumerate(tables_of(size)):
         own = flat[seen : seen + count * width].reshape(count, width, lanes)
         zeros = jnp.zeros((count, columns - KINDS - 1 - width, lanes))
         is_kind = jnp.broadcast_to(jnp.eye(KINDS)[kind][:, None], (count, KINDS, lanes))
@@ -56,7 +56,7 @@ def symbolic_padded(level: Level, state: State) -> Float[Array, "thing column la
     return jnp.concatenate([jnp.concatenate(rows), gravity], axis=1)
 
 
-def blocks_of(size: Size) -> tuple[tuple[int, int], ...]:
+def tables_of(size: Size) -> tuple[tuple[int, int], ...]:
     """(how many, rows of each) in the order of the flat observation."""
     return (
         (size.polygons - len(UNSEEN_WALLS), POLYGON_ROWS),

@@ -1,7 +1,7 @@
 """What an agent sees: the symbolic-flat observation, one row per feature.
 
 Rows, in this order: every polygon but the walls and the ceiling, circles, joints, thrusters, gravity. What is not
-active is zero. Most rows are constant within a level (`level_features`); only places and speeds of movable bodies
+active is zero. Most rows are constant within a level (`level_features`); only positions and speeds of movable bodies
 change (`state_features`, at the rows `dynamic_features`), which a network's first layer can exploit.
 Facts: `kinetix.render.renderer_symbolic_flat` and `renderer_symbolic_common` 3.0.2.
 """
@@ -77,7 +77,7 @@ def _runs(size: Size) -> tuple[tuple[int, int, bool], ...]:
 
 
 def state_features(level: Level, state: State) -> Float[Array, "dynamic lane"]:
-    """The rows `dynamic_features`: place, velocity, spin and heading of every movable body."""
+    """The rows `dynamic_features`: position, velocity, spin and heading of every movable body."""
     at = slice(FIXED_POLYGONS, None)
     rotation = state.rotation[at]
     rows = [
@@ -87,30 +87,30 @@ def state_features(level: Level, state: State) -> Float[Array, "dynamic lane"]:
         jnp.sin(rotation),
         jnp.cos(rotation),
     ]
-    return _blocks(rows, level.model.active[at])
+    return _side_by_side(rows, level.model.active[at])
 
 
 def level_features(level: Level) -> Float[Array, "feature lane"]:
     """Everything that is constant within a level; zeros at the rows `dynamic_features`."""
     model, size = level.model, level.size
     floor, movable = slice(0, 1), slice(FIXED_POLYGONS, size.polygons)
-    blocks = [
-        _blocks(body_rows(level, floor) + polygon_rows(model, floor), model.active[floor]),
-        _blocks(body_rows(level, movable, constant=True) + polygon_rows(model, movable), model.active[movable]),
+    parts = [
+        _side_by_side(body_rows(level, floor) + polygon_rows(model, floor), model.active[floor]),
+        _side_by_side(body_rows(level, movable, constant=True) + polygon_rows(model, movable), model.active[movable]),
     ]
     if size.circles:
         circles = slice(size.polygons, size.bodies)
         shape = [model.radius, jnp.ones_like(model.radius)]
-        blocks.append(_blocks(body_rows(level, circles, constant=True) + shape, model.active[circles]))
+        parts.append(_side_by_side(body_rows(level, circles, constant=True) + shape, model.active[circles]))
     one_hot = lambda body: _one_hot(body, size.bodies)
     if size.joints:
         ends = one_hot(model.joint_b) + one_hot(model.joint_a)
-        blocks.append(_blocks(joint_rows(level) + ends, model.joint_active))
+        parts.append(_side_by_side(joint_rows(level) + ends, model.joint_active))
     if size.thrusters:
-        blocks.append(_blocks(thruster_rows(level) + one_hot(model.thruster_body), model.thruster_active))
-    blocks.append(_tidy(model.gravity[1:] / GRAVITY_UNIT))
-    lanes = max(block.shape[-1] for block in blocks)
-    return jnp.concatenate([jnp.broadcast_to(block, (len(block), lanes)) for block in blocks])
+        parts.append(_side_by_side(thruster_rows(level) + one_hot(model.thruster_body), model.thruster_active))
+    parts.append(_tidy(model.gravity[1:] / GRAVITY_UNIT))
+    lanes = max(part.shape[-1] for part in parts)
+    return jnp.concatenate([jnp.broadcast_to(part, (len(part), lanes)) for part in parts])
 
 
 def body_rows(level: Level, at: slice, constant: bool = False) -> list[Array]:
@@ -118,14 +118,14 @@ def body_rows(level: Level, at: slice, constant: bool = False) -> list[Array]:
     model, state = level.model, level.state
     if constant:
         nothing = jnp.zeros_like(model.friction[at])
-        place, spin, turn = [nothing] * 4, nothing, [nothing] * 2
+        motion, spin, turn = [nothing] * 4, nothing, [nothing] * 2
     else:
-        place = [*_split(state.position[at]), *_split(state.velocity[at])]
+        motion = [*_split(state.position[at]), *_split(state.velocity[at])]
         spin, heading = jnp.tanh(state.angular_velocity[at] / SPIN_UNIT), state.rotation[at]
         turn = [jnp.sin(heading), jnp.cos(heading)]
     mass = [model.inverse_mass[at], model.inverse_inertia[at], level.density[at]]
     surface = [model.friction[at], model.restitution[at]]
-    return [*place, *mass, spin, *_one_hot(level.role[at], len(Role)), *turn, *surface]
+    return [*motion, *mass, spin, *_one_hot(level.role[at], len(Role)), *turn, *surface]
 
 
 def polygon_rows(model: Model, at: slice) -> list[Array]:
@@ -186,7 +186,7 @@ def _one_hot(number: Int[Array, "thing lane"], count: int) -> list[Array]:
     return [number == k for k in range(count)]
 
 
-def _blocks(rows: list[Array], active: Array) -> Float[Array, "feature lane"]:
+def _side_by_side(rows: list[Array], active: Array) -> Float[Array, "feature lane"]:
     """Each thing's rows side by side, [row, thing, lane] to [thing * row, lane], blank where not active."""
     rows = jnp.broadcast_arrays(*(row.astype(jnp.float32) for row in rows))
     stacked = jnp.where(active[:, None], jnp.stack(rows, axis=1), 0.0)

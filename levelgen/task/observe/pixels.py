@@ -24,19 +24,19 @@ BORDER = 2 * PIXELS_PER_METRE  # invisible; patches are moved to lie inside it
 THRUSTER_SIDE = 4.0  # pixels
 BITS = 9  # of a packed colour's parts
 
-Colour = tuple[float, float, float]
-BACKGROUND: Colour = (255, 255, 255)
-FIXED: Colour = (80, 80, 80)
-SPOKE: Colour = (0, 0, 0)  # from a circle's centre to its rim
-ROLE_COLOUR: dict[Role, Colour] = {
+RGB = tuple[float, float, float]
+BACKGROUND: RGB = (255, 255, 255)
+FIXED: RGB = (80, 80, 80)
+SPOKE: RGB = (0, 0, 0)  # from a circle's centre to its rim
+ROLE_COLOUR: dict[Role, RGB] = {
     Role.PLAIN: (160, 160, 160),
     Role.GREEN: (0, 204, 0),
     Role.BLUE: (0, 102, 204),
     Role.RED: (255, 102, 102),
 }
 FIXED_SHADE = 0.5  # of a role's colour on what cannot move
-NO_MOTOR: Colour = (255, 255, 255)
-BINDING_COLOUR: tuple[Colour, ...] = ((255, 255, 0), (255, 0, 255), (0, 255, 255), (255, 153, 51))
+NO_MOTOR: RGB = (255, 255, 255)
+BINDING_COLOUR: tuple[RGB, ...] = ((255, 255, 0), (255, 0, 255), (0, 255, 255), (255, 153, 51))
 # Of the thruster: (from, to) along its axis and across it, as shares of its side from the middle; brightness, and
 # whether it has the binding's colour.
 NOZZLE = (((-0.5, -0.2), (-0.12, 0.12), 0.6, True), ((-0.2, 0.06), (-0.34, 0.34), 0.8, True))
@@ -52,7 +52,7 @@ class PixelsObservation:
     global_info: Float[Array, "1"]  # gravity / 10
 
 
-class Shape(NamedTuple):
+class Coverage(NamedTuple):
     """What a shape covers of each column, in pixels, and its colour."""
 
     low: Float[Array, " x"]
@@ -74,24 +74,24 @@ def pixels(level: Level, state: State) -> PixelsObservation:
     return PixelsObservation(parts / jnp.float32(2 * 255), level.model.gravity[1:] / GRAVITY_UNIT)
 
 
-def _shapes(level: Level, state: State) -> list[Shape]:
+def _shapes(level: Level, state: State) -> list[Coverage]:
     """From the floor to the thrusters."""
     model, size = level.model, level.size
-    place = state.position * PIXELS_PER_METRE
+    centre = state.position * PIXELS_PER_METRE
     colours = _body_colours(level)
-    floor = place[0] + model.vertices[0] * PIXELS_PER_METRE  # its rotation is not drawn
+    floor = centre[0] + model.vertices[0] * PIXELS_PER_METRE  # its rotation is not drawn
     floor_colour = _role_colour(level.role[0], jnp.array(True))
     shapes = [_shape(_polygon_planes(floor), floor_colour)]
     for body in range(FIXED_POLYGONS, size.polygons):
-        corners = place[body] + _turn(model.vertices[body] * PIXELS_PER_METRE, state.rotation[body])
-        interval = _meet(_columns(_polygon_planes(corners)), _patch(place[body]))
-        shapes.append(_if(model.active[body], Shape(*interval, colours[body])))
+        corners = centre[body] + _turn(model.vertices[body] * PIXELS_PER_METRE, state.rotation[body])
+        interval = _meet(_columns(_polygon_planes(corners)), _patch(centre[body]))
+        shapes.append(_if(model.active[body], Coverage(*interval, colours[body])))
     for circle in range(size.circles):
         body = size.polygons + circle
-        disc = _meet(_disc(place[body], model.radius[circle] * PIXELS_PER_METRE), _patch(place[body]))
-        spoke = _meet(disc, _columns(_spoke_planes(place[body], state.rotation[body])))
-        shapes.append(_if(model.active[body], Shape(*disc, colours[body])))
-        shapes.append(_if(model.active[body], Shape(*spoke, _packed(np.array(SPOKE)))))
+        disc = _meet(_disc(centre[body], model.radius[circle] * PIXELS_PER_METRE), _patch(centre[body]))
+        spoke = _meet(disc, _columns(_spoke_planes(centre[body], state.rotation[body])))
+        shapes.append(_if(model.active[body], Coverage(*disc, colours[body])))
+        shapes.append(_if(model.active[body], Coverage(*spoke, _packed(np.array(SPOKE)))))
     binding_colours = jnp.array(BINDING_COLOUR)
     for joint in range(size.joints):
         shapes.append(_joint(level, state, joint, binding_colours))
@@ -100,7 +100,7 @@ def _shapes(level: Level, state: State) -> list[Shape]:
     return shapes
 
 
-def _joint(level: Level, state: State, joint: int, colours: Float[Array, "binding 3"]) -> Shape:
+def _joint(level: Level, state: State, joint: int, colours: Float[Array, "binding 3"]) -> Coverage:
     """One pixel."""
     model, body = level.model, level.model.joint_a[joint]
     driven = model.motor_on[joint] & ~model.joint_fixed[joint]
@@ -108,21 +108,22 @@ def _joint(level: Level, state: State, joint: int, colours: Float[Array, "bindin
     x, y = jnp.round(_on_body(state, body, model.joint_anchor_a[joint]))
     column = jnp.arange(SIDE) == x
     return _if(
-        model.joint_active[joint], Shape(jnp.where(column, y, jnp.inf), jnp.where(column, y, -jnp.inf), _packed(colour))
+        model.joint_active[joint],
+        Coverage(jnp.where(column, y, jnp.inf), jnp.where(column, y, -jnp.inf), _packed(colour)),
     )
 
 
-def _thruster(level: Level, state: State, thruster: int, colours: Float[Array, "binding 3"]) -> list[Shape]:
+def _thruster(level: Level, state: State, thruster: int, colours: Float[Array, "binding 3"]) -> list[Coverage]:
     """Three rectangles along the thruster's axis."""
     model, body = level.model, level.model.thruster_body[thruster]
-    place = jnp.round(_on_body(state, body, model.thruster_position[thruster]))
+    centre = jnp.round(_on_body(state, body, model.thruster_position[thruster]))
     angle = model.thruster_rotation[thruster] + state.rotation[body]
     tint = colours[level.thruster_binding[thruster]]
     shapes = []
     for along, across, brightness, tinted in (*NOZZLE, *BASE):
         # Clockwise, as polygons are
         corners = np.array([(along[0], across[0]), (along[0], across[1]), (along[1], across[1]), (along[1], across[0])])
-        planes = _polygon_planes(place + _turn(jnp.asarray(corners * THRUSTER_SIDE, jnp.float32), angle))
+        planes = _polygon_planes(centre + _turn(jnp.asarray(corners * THRUSTER_SIDE, jnp.float32), angle))
         colour = brightness * (tint if tinted else jnp.array(BACKGROUND))
         shapes.append(_if(model.thruster_active[thruster], _shape(planes, _packed(colour))))
     return shapes
@@ -185,11 +186,11 @@ def _meet(one: Interval, other: Interval) -> Interval:
     return jnp.maximum(one[0], other[0]), jnp.minimum(one[1], other[1])
 
 
-def _shape(planes: Planes, colour: Int[Array, ""]) -> Shape:
-    return Shape(*_columns(planes), colour)
+def _shape(planes: Planes, colour: Int[Array, ""]) -> Coverage:
+    return Coverage(*_columns(planes), colour)
 
 
-def _if(shown: Array, shape: Shape) -> Shape:
+def _if(shown: Array, shape: Coverage) -> Coverage:
     return shape._replace(low=jnp.where(shown, shape.low, jnp.inf))
 
 

@@ -221,7 +221,7 @@ def test_actuators_that_are_not_there_may_be_bound_to_anything() -> None:
 def test_a_world_without_places_for_bodies() -> None:
     made = changed("static_env_params.num_polygons", 4)
     made["static_env_params"]["num_circles"] = 0
-    with pytest.raises(LevelFileError, match="no place for a body"):
+    with pytest.raises(LevelFileError, match="no room for a body"):
         from_document(made)
 
 

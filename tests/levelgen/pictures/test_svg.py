@@ -108,7 +108,7 @@ def test_a_difference_would_show(golden) -> None:
     still = scene(golden["l"], 3)
     body = max(i for i, part in enumerate(still.parts) if part.angle)
     part = still.parts[body]
-    for other in (replace(part, place=(part.place[0] + 0.06, part.place[1])), replace(part, shapes=())):
+    for other in (replace(part, position=(part.position[0] + 0.06, part.position[1])), replace(part, shapes=())):
         parts = [*still.parts[:body], other, *still.parts[body + 1 :]]
         with pytest.raises(AssertionError):
             assert_alike(picture(svg_of([replace(still, parts=tuple(parts))], [1.0])), pixels(still))

@@ -15,8 +15,8 @@ from configs.compose import distributions
 from levelgen.files.kinetix import state_to_kinetix
 from levelgen.level import SIZES, WORLD_SIDE, Level, Role
 from levelgen.sampling.distribution import Distribution
-from levelgen.sampling.overlap import Circles, count_contacts
-from levelgen.sampling.sampler import BLOCK, sample_levels
+from levelgen.sampling.overlap import WorldCircles, count_contacts
+from levelgen.sampling.sampler import CHUNK, sample_levels
 from levelgen.sampling.scenery import FLOOR_TOP, empty_level
 from levelgen.sampling.shuffle import separate
 from levelgen.task.actions import action_mask
@@ -96,7 +96,7 @@ def test_the_statistics_notice_a_change() -> None:
 
 def test_a_level_depends_on_its_id_alone(level: Level) -> None:
     """Bit for bit, in any company, order and place."""
-    ids = np.array([5, 3, 5, BLOCK + 2, 0])
+    ids = np.array([5, 3, 5, CHUNK + 2, 0])
     alone = [sample_levels(ids[i : i + 1], level.size) for i in range(len(ids))]
     together = sample_levels(jnp.asarray(ids), level.size)
     for many, few, *single in zip(*map(jax.tree.leaves, (level, together, *alone)), strict=True):
@@ -199,7 +199,7 @@ def test_contacts_of_a_new_body() -> None:
         corners = model.vertices[min(last, polygons - 1)]
         cos, sin = np.cos(state.rotation[last]), np.sin(state.rotation[last])
         turned = np.stack([cos * corners[:, 0] - sin * corners[:, 1], sin * corners[:, 0] + cos * corners[:, 1]], 1)
-        body = Circles(Vec(*state.position[last][:, None]), model.radius[max(last - polygons, 0)][None])
+        body = WorldCircles(Vec(*state.position[last][:, None]), model.radius[max(last - polygons, 0)][None])
         found = count_contacts(rest, state, turned + state.position[last], body, jnp.full(there.shape, last < polygons))
         assert expected[there].sum() > 100
         np.testing.assert_array_equal(np.asarray(found)[there], expected[there])
@@ -207,7 +207,7 @@ def test_contacts_of_a_new_body() -> None:
 
 @pytest.mark.parametrize("size", CUSTOM, ids=str)
 def test_any_size(size: Size) -> None:
-    level = sampled(size, BLOCK)
+    level = sampled(size, CHUNK)
     model = level.model
     assert level.size == size
     assert model.active[:FIXED_POLYGONS].all()
@@ -270,7 +270,7 @@ def test_wheels_follow_their_chance(chance: float) -> None:
     """Green, blue and a body joined to one of them: a rectangle to anything, or a circle to rectangles."""
     of = {"thruster_only_weight": 0.0, "connected_weight": 0.0, "free_weight": 0.0, "proposals": 1}
     size = Size(7, 3, 1, 1)
-    model = sampled(size, BLOCK, Distribution(connected_circle_chance=chance, **of)).model  # type: ignore[arg-type]
+    model = sampled(size, CHUNK, Distribution(connected_circle_chance=chance, **of)).model  # type: ignore[arg-type]
     circles, joint = model.active[size.polygons :].sum(0), model.joint_active[0]
     assert joint.all()
     assert circles.min() == chance  # of the levels whose green and blue are rectangles
@@ -278,7 +278,7 @@ def test_wheels_follow_their_chance(chance: float) -> None:
 
 @pytest.mark.parametrize("name", distributions())
 def test_presets_are_what_they_say(name: str) -> None:
-    level = sampled(SIZES["m"], BLOCK, distributions()[name])
+    level = sampled(SIZES["m"], CHUNK, distributions()[name])
     model = level.model
     movable = np.s_[FIXED_POLYGONS:]
     there, fixed = model.active[movable], (model.inverse_mass == 0)[movable] & model.active[movable]
@@ -301,7 +301,7 @@ def test_presets_are_what_they_say(name: str) -> None:
 def test_a_floor_that_is_green_or_blue_comes_with_the_other() -> None:
     for floor, other in ((Role.GREEN, Role.BLUE), (Role.BLUE, Role.GREEN)):
         chances = {"floor_red_chance": 0.0, "floor_blue_chance": 0.0, f"floor_{floor.name.lower()}_chance": 1.0}
-        level = sampled(Size(5, 1, 0, 1), BLOCK, Distribution(small_world=0, proposals=1, fixed_chance=0.5, **chances))
+        level = sampled(Size(5, 1, 0, 1), CHUNK, Distribution(small_world=0, proposals=1, fixed_chance=0.5, **chances))
         assert (level.role[0] == floor).all()
         body = level.model.active & (level.role == other)
         assert (body.sum(0) == 1).all()
