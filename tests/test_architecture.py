@@ -46,7 +46,7 @@ ARROWS_TO_TURN = {
     ("pipeline/read/verify.py", "pipeline.jobs"),
     ("pipeline/store/split.py", "pipeline.jobs"),
 }
-NAMES_TO_PART = {"Box", "Kernel", "Polygons", "Shape", "Trunk"}
+NAMES_TO_PART = {"Kernel", "Trunk"}
 
 
 def python_files(*folders: str) -> list[Path]:
