@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
 from levelgen.level import Level
-from levelgen.task.observe.entities import blocks_of
+from levelgen.task.observe.entities import tables_of
 from levelgen.task.observe.flat import (
     BODY_ROWS,
     CIRCLE_ROWS,
@@ -117,7 +117,7 @@ class EntityNetwork(nn.Module):
         """What is constant within each level."""
         size, features, bodies = levels.size, level_features(levels), resting_bodies(levels)
         things, seen, lanes = [], 0, features.shape[-1]
-        for kind, active, (count, width) in zip(KINDS, active_things(levels), blocks_of(size), strict=True):
+        for kind, active, (count, width) in zip(KINDS, active_things(levels), tables_of(size), strict=True):
             block = features[seen : seen + count * width].reshape(count, width, lanes)
             one_hot = block[:, kind.own_rows :].reshape(count, kind.ends, size.bodies, lanes)
             at_ends = jnp.einsum("brl,tebl->ertl", bodies, one_hot).reshape(kind.ends * BODY_ROWS, count, lanes)
