@@ -11,7 +11,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +135,7 @@ def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Bo
         Failure: no worker can start.
     """
     with connected():
-        crew = Crew(job, split.absolute(), board)
+        crew = Crew(_seen_from_elsewhere(job), split.absolute(), board)
         while True:
             crew.follow_cluster()
             crew.start_workers(len(queue.waiting))
@@ -144,6 +144,12 @@ def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Bo
                 return
             settle(crew.wait())
             board.refresh()
+
+
+def _seen_from_elsewhere(job: JobConfig) -> JobConfig:
+    """The job as a worker in another folder has to read it: no path is relative."""
+    absolute = lambda path: path and str(Path(path).expanduser().absolute())
+    return replace(job, out=absolute(job.out), continue_from=absolute(job.continue_from))
 
 
 class Crew:

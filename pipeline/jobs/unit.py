@@ -26,7 +26,7 @@ from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import TaskParams
 from pipeline.errors import Failure
 from pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
-from pipeline.store.checkpoints import experts_for, save_experts
+from pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
 from pipeline.store.fields import arrays_of, map_arrays, same_bits
 from pipeline.store.layout import attempt_paths, fragment_path
 from pipeline.store.locks import LockRefused, committing
@@ -78,7 +78,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool, run: Tr
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     """A failed attempt as a value: exceptions do not travel between processes."""
     reason, fatal = "".join(traceback.format_exception(error)), ""
-    if isinstance(error, LockRefused):
+    if isinstance(error, (LockRefused, SourceUnseen)):
         fatal = str(error)
     elif isinstance(error, OSError) and (what := FATAL.get(error.errno or 0)):
         fatal = f"Cannot write to {split}, {what}, then run the same command again."

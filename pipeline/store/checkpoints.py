@@ -1,8 +1,8 @@
 """Experts on the disk, so that a larger budget goes on instead of starting again: one Orbax checkpoint per unit."""
 
+import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import jax
@@ -17,10 +17,12 @@ from experts.slots import begin
 from levelgen.level import size_of
 from levelgen.sampling.sampler import sample_levels
 from pipeline.errors import Failure, UserError
-from pipeline.store.layout import data_path
+from pipeline.store.layout import MANIFEST, data_path
 from pipeline.store.manifest import differences, read_manifest, require_manifest, told
 
-ORBAX = Lock()  # it numbers its operations by process: two at once wait for each other's files, for ever
+
+class SourceUnseen(Failure):
+    """A worker does not find the split whose experts should go on."""
 
 
 def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
@@ -38,7 +40,7 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
         curves[place, : len(row.curve)] = row.curve
     begun = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows))
     tree = {"level_id": np.array(sorted(experts)), "curve": curves, "begun": begun}
-    with ORBAX, ocp.StandardCheckpointer() as checkpointer:
+    with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path.absolute(), tree)
 
 
@@ -53,7 +55,7 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
     level = sample_levels(jnp.zeros(1, jnp.int32), size_of(job.size), job.distribution)
     like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), job.expert), level)
     try:
-        with ORBAX, ocp.StandardCheckpointer() as checkpointer:
+        with ocp.StandardCheckpointer() as checkpointer:
             found = checkpointer.metadata(path.absolute()).item_metadata.tree
             count, longest = found["curve"].shape
             shaped = {
@@ -82,6 +84,7 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     evaluation alone solved it: those begin again.
 
     Raises:
+        SourceUnseen: that split is not there for this process.
         Failure: a checkpoint is damaged.
     """
     if not job.continue_from:
@@ -102,6 +105,11 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
 
 def _kept_in(source: Path, level_ids: Sequence[int]) -> dict[int, tuple[str, str | None]]:
     """Label and checkpoint of these levels: a worker asks for every unit, and reads the fragments of its levels."""
+    if not (source / MANIFEST).is_dir():
+        raise SourceUnseen(
+            f"The worker on {socket.gethostname()} finds no split at {source}, whose experts should go on: "
+            "use a folder that all machines of the cluster share, or leave out continue_from."
+        )
     table = read_manifest(source, ["label", "experts"], level_ids).table
     columns = (table.column(name).to_pylist() for name in ("level_id", "label", "experts"))
     return {level_id: (label, path) for level_id, label, path in zip(*columns, strict=True)}

@@ -64,3 +64,31 @@ def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: st
     for word in words:
         assert word in sentence
     assert sentence.endswith((".", ")"))
+
+
+def descendants(process: int) -> set[int]:
+    """All processes below this one; Ray's are in sessions of their own, but its children all the same."""
+    parents = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and (state := status(int(entry.name))):
+            parents[int(entry.name)] = int(state[1])
+    found, below = set(), {process}
+    while below:
+        below = {pid for pid, parent in parents.items() if parent in below}
+        found |= below
+    return found
+
+
+def status(pid: int) -> list[str] | None:
+    """State, parent, ... of a process; None when it is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+
+
+def title(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0").decode(errors="replace")
+    except OSError:
+        return ""

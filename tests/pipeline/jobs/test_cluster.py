@@ -1,13 +1,17 @@
 """Workers that die and clusters that shrink, on real Ray: everything that can be done is done."""
 
+import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from pipeline.jobs import cluster
 from pipeline.jobs.schedule import COMPANY
 from pipeline.store.manifest import fragment_paths, read_manifest
-from tests.pipeline.command import PATIENCE, assert_refused, run, start, until
+from tests.pipeline.command import PATIENCE, assert_refused, descendants, run, start, title, until
+from tests.pipeline.made import made_job
 
 LEVELS, DEADLY = 8, 2
 SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k")
@@ -49,23 +53,55 @@ def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
     )
 
 
+def test_workers_read_no_relative_path() -> None:
+    """They run in another folder than the command."""
+    job = cluster._seen_from_elsewhere(made_job("data", "continue_from=data/5k/s"))
+    assert job.out == str(Path("data").absolute())
+    assert job.continue_from == str(Path("data/5k/s").absolute())
+    assert cluster._seen_from_elsewhere(made_job()).continue_from == ""
+
+
 @pytest.mark.slow
-def test_a_cluster_of_two_machines_that_loses_one(tmp_path: Path) -> None:
-    """Ray's own nodes, each with a core: what the lost one had at work goes to the other, and no unit waits for it."""
+def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
+    """Ray's own nodes: a head without a core, one that is there, and one that joins before the first is lost.
+
+    They run in another folder than the command, which names the split that goes on relatively.
+    """
     from ray.cluster_utils import Cluster
 
-    machine = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
-    cluster = Cluster(initialize_head=True, head_node_args=machine)
+    memory: dict[str, Any] = {"object_store_memory": 80 * 2**20}
+    machines = Cluster(initialize_head=True, head_node_args=memory | {"num_cpus": 0, "include_dashboard": False})
     try:
-        second = cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
-        process = start(SETTINGS, tmp_path, address=cluster.address)
+        first = machines.add_node(num_cpus=1, **memory)
+        endless = ("generate", "levels=1k", "unit=1", "budget=5k", "stop=budget", "keep_experts=true")
+        process = start(endless, tmp_path, address=str(machines.address))
         until(lambda: fragment_paths(tmp_path / SPLIT), process)
-        cluster.remove_node(second, allow_graceful=False)
+        second = machines.add_node(num_cpus=1, **memory)
+        until(lambda: works_on(second), process)
+        machines.remove_node(first, allow_graceful=False)
+        before = len(fragment_paths(tmp_path / SPLIT))
+        until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before + LEVELS, process)
+        process.terminate()
         _, err = process.communicate(timeout=PATIENCE)
-        assert process.returncode == 0, err
+        assert process.returncode == 130, err
+        assert "The worker died" in err
         assert "Traceback" not in err
-        assert read_manifest(tmp_path / SPLIT).level_ids.tolist() == list(range(LEVELS))
+
+        trained = next(row for row in read_manifest(tmp_path / SPLIT).table.to_pylist() if row["experts"])
+        shutil.rmtree(tmp_path / SPLIT / trained["experts"])
+        words = ["regenerate", f"manifest={SPLIT}", "budget=8k", f"where=level_id = {trained['level_id']}"]
+        again = run([*words, "continue=true"], tmp_path, address=str(machines.address))
+        assert again.returncode == 3, again.stdout + again.stderr
+        (note,) = (tmp_path / "data/8k/s/quarantine").iterdir()
+        assert f"The experts in {tmp_path / SPLIT / trained['experts']} cannot be read" in note.read_text()
+
         own = run(["generate", "levels=1", "budget=2k", "out=own"], tmp_path)
         assert own.returncode == 0, own.stderr  # a cluster that RAY_ADDRESS does not name is let be
     finally:
-        cluster.shutdown()
+        machines.shutdown()
+
+
+def works_on(machine: Any) -> bool:
+    """Whether a worker has units on this node of Ray."""
+    raylets = {info[0].process.pid for kind, info in machine.all_processes.items() if kind == "raylet"}
+    return any(title(pid).startswith("ray::WorkerActor.work") for raylet in raylets for pid in descendants(raylet))

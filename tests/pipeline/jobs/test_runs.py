@@ -12,7 +12,7 @@ import pytest
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard
-from tests.pipeline.command import PATIENCE, ROOT, heed_ctrl_c, run, start, until
+from tests.pipeline.command import PATIENCE, ROOT, descendants, heed_ctrl_c, run, start, status, title, until
 
 LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
 COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
@@ -47,42 +47,14 @@ def assert_same_content(split: Path, other: Path) -> None:
     assert {f"shards/{path.name}" for path in (split / "shards").iterdir()} == read_manifest(split).shards
 
 
-def descendants(process: subprocess.Popen[str]) -> set[int]:
-    """All processes below this one; Ray's are in sessions of their own, but its children all the same."""
-    parents = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and (status := _status(int(entry.name))):
-            parents[int(entry.name)] = int(status[1])
-    found, below = set(), {process.pid}
-    while below:
-        below = {pid for pid, parent in parents.items() if parent in below}
-        found |= below
-    return found
-
-
-def _status(pid: int) -> list[str] | None:
-    """State, parent, ... of a process; None when it is gone."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return None
-
-
 def workers(process: subprocess.Popen[str]) -> list[int]:
     """Ray's workers that have units now."""
-    return sorted(pid for pid in descendants(process) if _title(pid).startswith("ray::WorkerActor.work"))
-
-
-def _title(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0").decode(errors="replace")
-    except OSError:
-        return ""
+    return sorted(pid for pid in descendants(process.pid) if title(pid).startswith("ray::WorkerActor.work"))
 
 
 def assert_all_gone(pids: set[int]) -> None:
     end = time.monotonic() + 30
-    while left := {pid for pid in pids if (status := _status(pid)) and status[0] != "Z"}:
+    while left := {pid for pid in pids if (state := status(pid)) and state[0] != "Z"}:
         assert time.monotonic() < end, f"orphans: {left}"
         time.sleep(0.1)
 
@@ -109,7 +81,7 @@ def test_in_other_units_the_same_comes_out(undisturbed: Path, tmp_path: Path) ->
 def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path) -> None:
     process = start(COMMAND, tmp_path)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
-    family = {pid for pid in descendants(process) if "Agent" not in _title(pid)}
+    family = {pid for pid in descendants(process.pid) if "Agent" not in title(pid)}
     process.kill()
     process.communicate()
     assert_all_gone(family)  # but for two idle helpers of Ray, which try for a minute to report that it died
@@ -137,7 +109,7 @@ def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
 def test_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
     process = start(COMMAND, tmp_path, preexec_fn=heed_ctrl_c)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
-    family = descendants(process)
+    family = descendants(process.pid)
     os.killpg(process.pid, number)  # as a terminal does
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
