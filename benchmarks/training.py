@@ -19,7 +19,7 @@ from experts import ppo
 from experts.config import ExpertConfig
 from experts.policy import network_of
 from experts.pool import slot_count
-from experts.ppo import Batch, Seen
+from experts.ppo import LevelConstants, Samples
 from experts.rollout import Manner, repeat, rollout, start
 from experts.slots import empty_slots
 from levelgen.level import SIZES, Level
@@ -54,7 +54,7 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
     count = levels.role.shape[-1]
     queue = endless_queue(levels, config)
     slots, _ = go_on(empty_slots(count, queue, config), queue, config)
-    experts, levels = slots.slot.training.expert, jax.tree.map(jnp.asarray, levels)
+    experts, levels = slots.slot.training.train_state, jax.tree.map(jnp.asarray, levels)
     experts = jax.tree.map(jnp.copy, experts)  # `advance` uses its slots up
     lanes, network = config.environments * count, network_of(levels.size, config)
     no = jnp.zeros(lanes, bool)
@@ -66,15 +66,15 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
 
     _, seen, last_value = act(experts.params, acting)
     advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
-    batch = Batch(seen.moving, seen.action, seen.log_probability, seen.value, advantage)
-    samples = jax.vmap(ppo.as_samples, in_axes=-2)(batch)
-    seen_once = Seen(network.constant(levels), action_mask(levels))
-    constant = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), seen_once)
+    samples = Samples(seen.moving, seen.action, seen.log_probability, seen.value, advantage)
+    rows = jax.vmap(ppo.as_rows, in_axes=-2)(samples)
+    constants = LevelConstants(network.constant(levels), action_mask(levels))
+    constants = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), constants)
 
     @jax.jit
     def update(experts):
         one = lambda given: ppo.update(given[0], given[1], network, given[2], given[3], config)
-        return jax.lax.map(one, (experts, keys, constant, samples))
+        return jax.lax.map(one, (experts, keys, constants, rows))
 
     yield partial(update, experts)
 

@@ -16,7 +16,7 @@ from experts.witness import Record, steps_to_goal, succeeds
 
 
 class Evaluation(NamedTuple):
-    """One evaluation, on the host; environments in the order of `experts.slots._manner`."""
+    """One evaluation, on the host; environments in the order of `experts.advance._manner`."""
 
     action: Int[np.ndarray, "256 6 attempt"]
     done: Bool[np.ndarray, "256 environment"]

@@ -14,10 +14,11 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
+from experts.advance import advance
 from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
 from experts.judge import Evaluation, Kept, Trained, Witness, witness_of
 from experts.queue import GROUP, empty_queue, enter, next_places
-from experts.slots import Begun, Mode, Queue, Report, Slots, advance, empty_slots
+from experts.slots import Begun, LevelQueue, Mode, Report, Slots, empty_slots
 from experts.witness import take
 from levelgen.level import Level
 from levelgen.task.rules import TaskParams
@@ -73,7 +74,7 @@ class Pool:
         self.updates, self.config, self.stopping, self.rules = updates, config, stopping, rules
         self._shaped = replace(rules, dense_reward_scale=config.dense_reward_scale)
         self._slots: Slots | None = None  # these two are there once the first levels have come
-        self._queue: Queue | None = None
+        self._queue: LevelQueue | None = None
         self._taken = 0  # levels that left the queue, ever
         self._at: dict[int, tuple[Submission, int]] = {}  # by index in the queue: levels that have not left their slots
         self._coming: deque[tuple[Submission, range]] = deque()  # levels that wait for room in the queue
@@ -156,8 +157,8 @@ class Pool:
     def _note(self, slot: int, seen: Report) -> None:
         """What became of the level in a slot."""
         assert self._slots is not None
-        place = int(seen.place[slot])
-        submission, i = self._at[place]
+        index = int(seen.index[slot])
+        submission, i = self._at[index]
         submission.rollouts[int(seen.mode[slot])] += 1
         if seen.mode[slot] == Mode.TRAIN:
             submission.curves[i].append(float(seen.share[slot]))
@@ -168,7 +169,7 @@ class Pool:
                 submission.experts[i] = Kept(expert_of(self._slots, slot, self.config), submission.curves[i])
             submission.witnesses[i] = witness_of(submission.evaluations[i], self.config)
             submission.solved += submission.witnesses[i] is not None
-            del self._at[place]
+            del self._at[index]
             submission.under_way.remove(i)
 
 

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation of one expert, on the experience of one rollout. Knows nothing of physics.
+"""Proximal policy optimisation of one expert, on the trajectory of one rollout. Knows nothing of physics.
 
 Schulman et al. 2017 (arXiv:1707.06347) with clipped values and per-minibatch normalised advantages.
 """
@@ -17,22 +17,22 @@ from levelgen.task.actions import CHOICES
 ADVANTAGE_EPSILON = 1e-8
 
 
-class Expert(NamedTuple):
+class TrainState(NamedTuple):
     """What learns."""
 
     params: Params
     optimiser: optax.OptState
 
 
-class Seen(NamedTuple):
+class LevelConstants(NamedTuple):
     """What is constant within a level."""
 
-    constant: Constant  # of what the network sees
+    features: Constant  # of what the network sees
     live: Bool[Array, "6"]  # entries of an action that something obeys
 
 
-class Batch(NamedTuple):
-    """Samples as columns; targets and advantages from GAE."""
+class Samples(NamedTuple):
+    """What an update learns from; targets and advantages from GAE. A minibatch is some of them."""
 
     moving: Float[Array, "dynamic sample"]
     action: Float[Array, "6 sample"]
@@ -48,10 +48,10 @@ def optimiser(config: ExpertConfig) -> optax.GradientTransformation:
     )
 
 
-def init(key: Key[Array, ""], network: ActorCritic, constant: Constant, config: ExpertConfig) -> Expert:
+def init(key: Key[Array, ""], network: ActorCritic, constant: Constant, config: ExpertConfig) -> TrainState:
     """An expert that has seen nothing."""
     params = initial(key, network, constant)
-    return Expert(params, optimiser(config).init(params))
+    return TrainState(params, optimiser(config).init(params))
 
 
 def advantages(
@@ -75,43 +75,45 @@ def advantages(
     return estimates
 
 
-def loss(params: Params, network: ActorCritic, seen: Seen, batch: Batch, config: ExpertConfig) -> Float[Array, ""]:
+def loss(
+    params: Params, network: ActorCritic, constants: LevelConstants, minibatch: Samples, config: ExpertConfig
+) -> Float[Array, ""]:
     """Clipped policy surrogate, clipped value error, entropy bonus; means over the minibatch."""
-    logits, value = forward(network, params, seen.constant, batch.moving)
-    live = seen.live[:, None]
-    ratio = jnp.exp(log_probability(logits, batch.action, live) - batch.log_probability)  # type: ignore[arg-type]
-    gain = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + ADVANTAGE_EPSILON)
+    logits, value = forward(network, params, constants.features, minibatch.moving)
+    live = constants.live[:, None]
+    ratio = jnp.exp(log_probability(logits, minibatch.action, live) - minibatch.log_probability)  # type: ignore[arg-type]
+    gain = (minibatch.advantage - minibatch.advantage.mean()) / (minibatch.advantage.std() + ADVANTAGE_EPSILON)
     clipped_ratio = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
     surrogate = jnp.minimum(ratio * gain, clipped_ratio * gain).mean()
 
-    target = batch.value + batch.advantage
-    near = batch.value + jnp.clip(value - batch.value, -config.clip, config.clip)
+    target = minibatch.value + minibatch.advantage
+    near = minibatch.value + jnp.clip(value - minibatch.value, -config.clip, config.clip)
     error = 0.5 * jnp.maximum(jnp.square(value - target), jnp.square(near - target)).mean()
     return config.value_weight * error - surrogate - config.entropy_weight * entropy(logits, live).mean()
 
 
 def update(
-    expert: Expert,
+    train_state: TrainState,
     key: Key[Array, ""],
     network: ActorCritic,
-    seen: Seen,
-    samples: Float[Array, "sample column"],
+    constants: LevelConstants,
+    rows: Float[Array, "sample column"],
     config: ExpertConfig,
-) -> Expert:
-    """Several epochs of minibatches, shuffled anew each epoch. `samples` are rows as `as_samples` lays them."""
+) -> TrainState:
+    """Several epochs of minibatches, shuffled anew each epoch. `rows` are samples as `as_rows` lays them."""
     transform = optimiser(config)
 
-    def learn(expert, minibatch):
-        gradient = jax.grad(loss)(expert.params, network, seen, from_samples(minibatch.T), config)
-        change, state = transform.update(gradient, expert.optimiser, expert.params)
-        params: Any = optax.apply_updates(expert.params, change)
-        return Expert(params, state), None
+    def learn(now, minibatch):
+        gradient = jax.grad(loss)(now.params, network, constants, from_rows(minibatch), config)
+        change, state = transform.update(gradient, now.optimiser, now.params)
+        params: Any = optax.apply_updates(now.params, change)
+        return TrainState(params, state), None
 
-    def epoch(expert, key):
-        minibatches = samples[shuffled(key, config)].reshape(config.minibatches, -1, samples.shape[1])
-        return jax.lax.scan(learn, expert, minibatches)
+    def epoch(now, key):
+        minibatches = rows[shuffled(key, config)].reshape(config.minibatches, -1, rows.shape[1])
+        return jax.lax.scan(learn, now, minibatches)
 
-    return jax.lax.scan(epoch, expert, jax.random.split(key, config.epochs))[0]
+    return jax.lax.scan(epoch, train_state, jax.random.split(key, config.epochs))[0]
 
 
 def shuffled(key: Key[Array, ""], config: ExpertConfig) -> Int[Array, " sample"]:
@@ -128,17 +130,18 @@ def shuffled(key: Key[Array, ""], config: ExpertConfig) -> Int[Array, " sample"]
     return (time * config.environments + environments).reshape(-1)
 
 
-def as_samples(batch: Batch) -> Float[Array, "sample column"]:
+def as_rows(samples: Samples) -> Float[Array, "sample column"]:
     """Everything a sample needs side by side in one row: shuffling is then one copy of rows.
 
-    `batch` has [time, ..., environment] in place of samples, as a rollout gives them.
+    `samples` has [time, ..., environment] instead of an axis of samples, as a rollout gives them.
     """
-    singles = [x[:, None] for x in (batch.log_probability, batch.value, batch.advantage)]
-    columns = jnp.concatenate([batch.moving, batch.action.astype(jnp.float32), *singles], axis=1)
+    singles = [x[:, None] for x in (samples.log_probability, samples.value, samples.advantage)]
+    columns = jnp.concatenate([samples.moving, samples.action.astype(jnp.float32), *singles], axis=1)
     return jnp.moveaxis(columns, 1, -1).reshape(-1, columns.shape[1])
 
 
-def from_samples(columns: Float[Array, "column sample"]) -> Batch:
+def from_rows(rows: Float[Array, "sample column"]) -> Samples:
+    columns = rows.T
     dynamic = columns.shape[0] - len(CHOICES) - 3
     action = columns[dynamic : dynamic + len(CHOICES)]
-    return Batch(columns[:dynamic], action, *columns[-3:])
+    return Samples(columns[:dynamic], action, *columns[-3:])

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from experts.config import ExpertConfig
-from experts.slots import Begun, Queue, begin
+from experts.slots import Begun, LevelQueue, begin
 from experts.witness import take
 from levelgen.level import Level
 
@@ -18,11 +18,11 @@ GROUP = 16  # levels that enter at once
 NO_EXPERTS: Mapping[int, Begun] = MappingProxyType({})
 
 
-def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig) -> Queue:
+def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig) -> LevelQueue:
     """A queue for levels of the size of these, without any."""
     one = take(levels, np.zeros(1, int))
     begun = jax.eval_shape(partial(begin, config=config), one, jnp.zeros(1, jnp.int32))
-    return Queue(
+    return LevelQueue(
         jax.tree.map(lambda x: jnp.zeros((*x.shape[:-1], capacity), x.dtype), one),
         jnp.zeros(capacity, jnp.int32),
         np.int32(0),
@@ -31,19 +31,19 @@ def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig
     )
 
 
-def next_places(queue: Queue, count: int) -> list[int]:
+def next_places(queue: LevelQueue, count: int) -> list[int]:
     """Places of the next levels that enter."""
     come = int(queue.count)
     return [number % queue.capacity for number in range(come, come + count)]
 
 
 def enter(
-    queue: Queue,
+    queue: LevelQueue,
     levels: Level,
     level_ids: Int[np.ndarray, " level"],
     config: ExpertConfig,
     begun: Mapping[int, Begun] = NO_EXPERTS,
-) -> Queue:
+) -> LevelQueue:
     """The queue (used up) with more levels. `begun` has the experts that go on, by place among these levels."""
     for first in range(0, len(level_ids), GROUP):
         some = range(first, min(first + GROUP, len(level_ids)))
@@ -61,7 +61,9 @@ def enter(
 
 
 @partial(jax.jit, donate_argnames="queue")
-def _put(queue: Queue, levels: Level, level_ids: Int[Array, "16"], experts: Begun, places: Int[Array, "16"]) -> Queue:
+def _put(
+    queue: LevelQueue, levels: Level, level_ids: Int[Array, "16"], experts: Begun, places: Int[Array, "16"]
+) -> LevelQueue:
     put = lambda old, new: old.at[places].set(new, mode="drop")
     return queue._replace(
         levels=jax.tree.map(lambda old, new: old.at[..., places].set(new, mode="drop"), queue.levels, levels),

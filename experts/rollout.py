@@ -36,7 +36,7 @@ class Manner(NamedTuple):
     rehearsal: Int[Array, "256 6 level"]  # by env step of the episode
 
 
-class Experience(NamedTuple):
+class Trajectory(NamedTuple):
     """What happened, time first."""
 
     moving: Float[Array, "time dynamic level environment"]  # the moving rows of the observation before the action
@@ -69,7 +69,7 @@ def rollout(
     manner: Manner,
     steps: int,
     rules: TaskParams,
-) -> tuple[Acting, Experience, Float[Array, "level environment"]]:
+) -> tuple[Acting, Trajectory, Float[Array, "level environment"]]:
     """Act for `steps` env steps, with automatic reset.
 
     Args:
@@ -83,7 +83,7 @@ def rollout(
         rules: of the task.
 
     Returns:
-        The episodes afterwards, the experience, and the value of the last observation.
+        The episodes afterwards, the trajectory, and the value of the last observation.
     """
     level_count = keys.shape[0]
     environments = len(manner.greedy) // level_count
@@ -109,14 +109,14 @@ def rollout(
         action = jnp.where(uniform[-1] < manner.stickiness, last, action)
         action = jnp.where(manner.rehearsing, rehearsed(manner.rehearsal, world.timestep), action)
         action = jnp.where(live, action, 0)
-        chance = log_probability(logits, action, live)
+        log_probs = log_probability(logits, action, live)
         after, outcome = task.step(lanes, world, action, rules)
-        played, chance, reward, done, goal, timestep = map(per_level, (action, chance, *outcome, world.timestep))
-        seen = Experience(moving, played, chance, value, reward, done, goal, timestep)
+        played, log_probs, reward, done, goal, timestep = map(per_level, (action, log_probs, *outcome, world.timestep))
+        seen = Trajectory(moving, played, log_probs, value, reward, done, goal, timestep)
         return Acting(after, jnp.where(outcome.done, 0, action)), seen
 
-    acting, experience = jax.lax.scan(act, acting, jnp.arange(steps))
-    return acting, experience, look(acting.world)[2]
+    acting, trajectory = jax.lax.scan(act, acting, jnp.arange(steps))
+    return acting, trajectory, look(acting.world)[2]
 
 
 def rehearsed(actions: Int[Array, "time 6 level"], timestep: Int[Array, " lane"]) -> Int[Array, "6 lane"]:

@@ -1,14 +1,8 @@
-"""Continuous batching: a fixed number of slots, each with an expert in training or under evaluation.
+"""The state of continuous batching: slots, each with an expert in training or under evaluation, and the queue.
 
-One compiled program, `advance`, takes every slot a rollout further. A level that is decided leaves its slot, and the
-next of the queue takes its place, on the device. What becomes of a level depends on the level, its id and the
-configuration alone: not on its slot, its neighbours or when it came.
-
-An evaluation interrupts the training of its slot and leaves no trace in it.
+`experts.advance` says how it changes.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
 from enum import IntEnum
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,23 +10,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int
 
 from experts import ppo, progress, stop
-from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
-from experts.policy import ActorCritic, Constant, network_of
-from experts.ppo import Batch, Expert, Seen
+from experts.config import RECORD_STEPS, ExpertConfig
+from experts.policy import Constant, network_of
+from experts.ppo import TrainState
 from experts.progress import Progress
-from experts.rollout import Acting, Experience, Manner, repeat, rollout, start
+from experts.rollout import Acting, repeat, start
 from experts.stop import Course
-from experts.success import Success, find, no_success, remember
+from experts.success import Success, no_success
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
-from levelgen.task.actions import CHOICES, action_mask
-from levelgen.task.rules import TaskParams
-
-STICKINESS = 0.25  # of sticky attempts (Machado et al. 2018, arXiv:1709.06009)
-MOVED = 0.1  # m/s and rad/s, the most by which velocities of moved attempts differ from the level's
+from levelgen.task.actions import CHOICES
 
 
 class Mode(IntEnum):
@@ -44,7 +34,7 @@ class Mode(IntEnum):
 class Training(NamedTuple):
     """An expert and what its training has shown."""
 
-    expert: Expert
+    train_state: TrainState
     progress: Progress
     course: Course
     success: Success  # the first
@@ -71,10 +61,10 @@ class Trial(NamedTuple):
 
 
 class Slot(NamedTuple):
-    """One place. In `Slots` every array has the slots first."""
+    """One slot. In `Slots` every array has the slots first."""
 
     mode: Int[Array, ""]
-    place: Int[Array, ""]  # of the level in the queue
+    index: Int[Array, ""]  # of the level in the queue
     deadline: Int[Array, ""]  # updates after which the last evaluation comes
     training: Training
     trial: Trial
@@ -89,17 +79,17 @@ class Slots(NamedTuple):
     taken: Int[Array, ""]  # levels that have left the queue, ever
 
 
-class Queue(NamedTuple):
-    """Levels that wait, in order: a ring, in which the level that came as number n has place n modulo capacity.
+class LevelQueue(NamedTuple):
+    """Levels that wait, in order: a ring, in which the level that came as number n has index n modulo capacity.
 
-    A level keeps its place until it leaves its slot.
+    A level keeps its index until it leaves its slot.
     """
 
-    levels: Level  # [..., place]
-    level_ids: Int[Array, " place"]
+    levels: Level  # [..., index]
+    level_ids: Int[Array, " index"]
     count: Int[Array, ""] | np.int32  # levels that have come, ever
     updates: Int[Array, ""] | np.int32  # that an expert may use
-    begun: Begun  # where their experts go on, place first
+    begun: Begun  # where their experts go on, index first
 
     @property
     def capacity(self) -> int:
@@ -109,19 +99,12 @@ class Queue(NamedTuple):
 class Report(NamedTuple):
     """What one call of `advance` did in each slot."""
 
-    place: Int[Array, " slot"]  # of the level in the queue
+    index: Int[Array, " slot"]  # of the level in the queue
     mode: Int[Array, " slot"]  # while it did
     share: Float[Array, " slot"]  # of a trained slot's finished episodes that reached the goal
     evaluated: Bool[Array, " slot"]  # an evaluation ended that solved the level, or after which it left
     left: Bool[Array, " slot"]
     taken: Int[Array, ""]  # levels that have left the queue, ever
-
-
-def over_slots(function: Callable, *slots: Any) -> Any:
-    """One slot after another on a CPU: its minibatch stays in a core's cache, and `cond` skips what it can."""
-    if jax.default_backend() == "cpu":
-        return jax.lax.map(lambda xs: function(*xs), slots)
-    return jax.vmap(function)(*slots)
 
 
 @partial(jax.jit, static_argnames="config")
@@ -131,227 +114,27 @@ def begin(levels: Level, level_ids: Int[Array, " level"], config: ExpertConfig) 
 
     def training(level_id, constant: Constant) -> Training:
         key = jax.random.fold_in(key_for(level_id, Stream.EXPERT), 0)
-        expert = ppo.init(key, network, constant, config)
+        train_state = ppo.init(key, network, constant, config)
         recent = jnp.zeros((RECORD_STEPS, len(CHOICES), lanes), jnp.int8)
-        return Training(expert, progress.start(lanes), stop.begin(), no_success(), recent)
+        return Training(train_state, progress.start(lanes), stop.begin(), no_success(), recent)
 
     experts = jax.vmap(training, in_axes=(0, -1))(level_ids, network.constant(levels))
     return Begun(experts, _by_slot(start(repeat(levels, lanes)), lanes))
 
 
 @partial(jax.jit, static_argnames=("count", "config"))
-def empty_slots(count: int, queue: Queue, config: ExpertConfig) -> Slots:
+def empty_slots(count: int, queue: LevelQueue, config: ExpertConfig) -> Slots:
     """Slots without levels."""
     blank = lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype)
     training, acting = jax.tree.map(blank, queue.begun)
     rows, zeros, no = config.record_rollouts * config.horizon, jnp.zeros(count, jnp.int32), jnp.zeros(count, bool)
     action = jnp.zeros((count, rows, len(CHOICES), config.attempts), jnp.int8)
     trial = Trial(zeros, no, no, no, action, *jnp.zeros((2, count, rows, config.environments), bool))
-    acting = _lanes(acting)
+    acting = lanes_of(acting)
     return Slots(Slot(zeros, zeros, zeros, training, trial), acting, acting, jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames=("config", "stopping", "rules"), donate_argnames="slots")
-def advance(
-    slots: Slots, queue: Queue, config: ExpertConfig, stopping: StopConfig, rules: TaskParams
-) -> tuple[Slots, Report]:
-    """A rollout in every slot, and what follows from it: an update, a part of an evaluation, another level.
-
-    Args:
-        slots: used up.
-        queue: the levels that wait.
-        config: what an expert is.
-        stopping: when a level leaves.
-        rules: of the task; their reward trains.
-    """
-    slots = refill(slots, queue, config)
-    slot = slots.slot
-    levels = jax.tree.map(lambda x: x[..., slot.place], queue.levels)
-    keys = jax.vmap(_key)(queue.level_ids[slot.place], slot)
-    lanes = repeat(levels, config.environments)
-    evaluating = slot.mode == Mode.EVALUATE
-
-    trains = repeat(~evaluating, config.environments)
-    fresh = repeat(slot.trial.part == 0, config.environments)
-    trial = _where(fresh, _moved_start(lanes, keys, config), slots.trial)
-    acting = _where(trains, slots.acting, trial)
-
-    network = network_of(levels.size, config)
-    manner = _manner(slot, evaluating, config)
-    acting, experience, last_value = rollout(
-        network, slot.training.expert.params, levels, acting, keys, manner, config.horizon, rules
-    )
-    now = _split(network, levels, keys, experience, last_value, manner, config)
-    slot, share, mode = over_slots(partial(_follow, network=network, config=config, stopping=stopping), slot, now)
-    left = (slot.mode == Mode.EMPTY) & (mode == Mode.EVALUATE)
-    evaluated = (mode == Mode.EVALUATE) & (left | slot.trial.solved)
-    after = Slots(slot, _where(trains, acting, slots.acting), acting, slots.taken)
-    return after, Report(slot.place, mode, share, evaluated, left, slots.taken)
-
-
-def refill(slots: Slots, queue: Queue, config: ExpertConfig) -> Slots:
-    """Slots that are empty take the next levels of the queue."""
-    free = slots.slot.mode == Mode.EMPTY
-    number = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
-    takes, place = free & (number < queue.count), number % queue.capacity
-
-    def fill() -> tuple[Slot, Acting]:
-        begun = jax.tree.map(lambda x: x[place], queue.begun)
-        choose = lambda new, old: jnp.where(takes.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-        put = lambda new, old: jax.tree.map(choose, new, old)
-        slot = slots.slot._replace(
-            mode=put(jnp.full_like(place, Mode.TRAIN), slots.slot.mode),
-            place=put(place, slots.slot.place),
-            deadline=put(jnp.full_like(place, queue.updates), slots.slot.deadline),
-            training=put(begun.training, slots.slot.training),
-        )
-        return slot, _where(repeat(takes, config.environments), _lanes(begun.acting), slots.acting)
-
-    slot, acting = jax.lax.cond(takes.any(), fill, lambda: (slots.slot, slots.acting))
-    return Slots(slot, acting, slots.trial, slots.taken + takes.sum(dtype=jnp.int32))
-
-
-class _Now(NamedTuple):
-    """What one slot's rollout gave."""
-
-    seen: Seen
-    key: Key[Array, ""]
-    samples: Float[Array, "sample column"]
-    action: Int[Array, "time 6 environment"]
-    reward: Float[Array, "time environment"]
-    done: Bool[Array, "time environment"]
-    goal: Bool[Array, "time environment"]
-    timestep: Int[Array, "time environment"]
-    rehearsing: Bool[Array, " environment"]
-
-
-def _split(
-    network: ActorCritic,
-    levels: Level,
-    keys: Key[Array, " slot"],
-    experience: Experience,
-    last_value: Float[Array, "slot environment"],
-    manner: Manner,
-    config: ExpertConfig,
-) -> _Now:
-    """By slot, slots first."""
-    seen = experience
-    advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
-    batch = Batch(seen.moving, seen.action, seen.log_probability, seen.value, advantage)
-    samples = jax.vmap(ppo.as_samples, in_axes=-2)(batch)
-    by_slot = lambda x: jnp.moveaxis(x, -2, 0)
-    return _Now(
-        jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), Seen(network.constant(levels), action_mask(levels))),
-        keys,
-        samples,
-        by_slot(seen.action.astype(jnp.int8)),
-        by_slot(seen.reward),
-        by_slot(seen.done),
-        by_slot(seen.goal),
-        by_slot(seen.timestep),
-        manner.rehearsing.reshape(-1, config.environments),
-    )
-
-
-def _follow(
-    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopConfig
-) -> tuple[Slot, Float[Array, ""], Int[Array, ""]]:
-    """What follows from a slot's rollout; also the share of successes, and the mode it was in."""
-    nothing = jnp.float32(jnp.nan)
-    branches = (
-        lambda: (slot, nothing),
-        lambda: _learn(slot, now, network, config, stopping),
-        lambda: (_collect(slot, now, config, stopping), nothing),
-    )
-    after, share = jax.lax.switch(slot.mode, branches)
-    return after, share, slot.mode
-
-
-def _learn(
-    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopConfig
-) -> tuple[Slot, Float[Array, ""]]:
-    """One update, and whether an evaluation comes next."""
-    training = slot.training
-    totals, share = progress.follow(training.progress, now.reward, now.done, now.goal, ~now.rehearsing)
-    recent = jnp.concatenate([training.recent, now.action])
-    success = remember(training.success, find(recent, now.goal, now.timestep))
-    shuffling = jax.random.fold_in(now.key, config.horizon)  # the rollout used 0 .. horizon - 1
-    expert = ppo.update(training.expert, shuffling, network, now.seen, now.samples, config)
-    course, due, final = stop.after_update(training.course, totals, share, slot.deadline, config, stopping)
-    training = Training(expert, totals, course, success, recent[config.horizon :])
-    trial = slot.trial._replace(part=jnp.int32(0), due=due, final=final)
-    return slot._replace(mode=jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share
-
-
-def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) -> Slot:
-    """A part of an evaluation; after the last, whether the level leaves."""
-    first = slot.trial.part * config.horizon
-    put = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, first, 0)
-    action = put(slot.trial.action, now.action[..., : config.attempts])
-    done, goal = put(slot.trial.done, now.done), put(slot.trial.goal, now.goal)
-    part = slot.trial.part + 1
-    hopeless = ~slot.trial.final & stop.fails(done, goal, part * config.horizon, stopping, config)
-    ended = (part == config.record_rollouts) | hopeless
-    solved = ended & ~hopeless & stop.solves(done, goal, stopping, config)
-    trial = Trial(part, slot.trial.due, slot.trial.final, solved, action, done, goal)
-    course, leaves, deadline = stop.after_evaluation(
-        slot.training.course, solved, trial.due, trial.final, slot.deadline, config, stopping
-    )
-    keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, old)
-    mode = jnp.where(leaves, Mode.EMPTY, Mode.TRAIN)
-    training = slot.training._replace(course=keep(course, slot.training.course))
-    return Slot(keep(mode, slot.mode), slot.place, keep(deadline, slot.deadline), training, trial)
-
-
-def _key(level_id: Int[Array, ""], slot: Slot) -> Key[Array, ""]:
-    """The key of a slot's next rollout."""
-    update = slot.training.course.updates
-    learning = jax.random.fold_in(key_for(level_id, Stream.EXPERT), update + 1)
-    evaluation = jax.random.fold_in(jax.random.fold_in(key_for(level_id, Stream.EVALUATION), update), slot.trial.part)
-    return jnp.where(slot.mode == Mode.EVALUATE, evaluation, learning)
-
-
-def _manner(slot: Slot, evaluating: Bool[Array, " slot"], config: ExpertConfig) -> Manner:
-    """Evaluations: attempts, then sticky ones, then moved ones. Training: rehearsals in the last environments."""
-    number = jnp.arange(config.environments)
-    sticky = (number >= config.attempts) & (number < config.attempts + config.sticky_attempts)
-    succeeded = slot.training.success.length > 0
-    guides = number >= config.environments - config.rehearsals
-    per_lane = lambda slots, environments: (slots[:, None] & environments).reshape(-1)
-    stickiness = STICKINESS * per_lane(evaluating, sticky) + config.persistence * per_lane(
-        ~evaluating & ~succeeded, guides
-    )
-    return Manner(
-        per_lane(evaluating, number == 0),
-        stickiness,
-        per_lane(~evaluating & succeeded, guides),
-        jnp.moveaxis(slot.training.success.action, 0, -1),
-    )
-
-
-def _moved_start(lanes: Level, keys: Key[Array, " slot"], config: ExpertConfig) -> Acting:
-    """The first state of each lane's level; bodies of the moved attempts start with slightly other velocities."""
-    number = jnp.arange(config.environments)
-    first = config.attempts + config.sticky_attempts
-    moved = jnp.tile((number >= first) & (number < first + config.moved_attempts), len(keys))
-    acting = start(lanes)
-    state, movable = acting.world.state, (lanes.model.inverse_mass > 0) & lanes.model.active
-
-    def noise(key):
-        shape = (3, len(movable), config.environments)
-        return jax.random.uniform(jax.random.fold_in(key, config.horizon), shape, minval=-MOVED, maxval=MOVED)
-
-    drawn = jnp.moveaxis(jax.vmap(noise)(keys), 0, -2).reshape(3, len(movable), -1)
-    drawn = jnp.where(movable & moved, drawn, 0.0)
-    state = replace(
-        state,
-        velocity=state.velocity + jnp.moveaxis(drawn[:2], 0, 1),
-        angular_velocity=state.angular_velocity + drawn[2],
-    )
-    return acting._replace(world=replace(acting.world, state=state))
-
-
-def _lanes(tree: Any) -> Any:
+def lanes_of(tree: Any) -> Any:
     """[slot, ..., environment] -> [..., lane]."""
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1), tree)
 
@@ -359,7 +142,3 @@ def _lanes(tree: Any) -> Any:
 def _by_slot(tree: Any, environments: int) -> Any:
     """[..., lane] -> [slot, ..., environment]."""
     return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, environments), -2, 0), tree)
-
-
-def _where(lanes: Bool[Array, " lane"], a: Any, b: Any) -> Any:
-    return jax.tree.map(lambda x, y: jnp.where(lanes, x, y), a, b)

@@ -118,12 +118,12 @@ def thruster_point(level: Level, state: State) -> Float[Array, "thruster 2 lane"
     return _points(state, model.thruster_body, model.thruster_position)
 
 
-def _points(state: State, body: Int[Array, "thing lane"], place: Float[Array, "thing 2 lane"]) -> Array:
+def _points(state: State, body: Int[Array, "thing lane"], point: Float[Array, "thing 2 lane"]) -> Array:
     """Points given in the frames of bodies, in the world."""
     pick = lambda x: jnp.stack([select(x, b) for b in body])
     rotation = pick(state.rotation)
     centre = vec(state.position).map(pick)
-    return unvec(vec(place).rotate(jnp.cos(rotation), jnp.sin(rotation)) + centre)
+    return unvec(vec(point).rotate(jnp.cos(rotation), jnp.sin(rotation)) + centre)
 
 
 def _no_manifold(level: Level) -> Manifold:

@@ -27,7 +27,7 @@ def main() -> None:
     from benchmarks.levels import load_levels
     from benchmarks.solved.variants import REFERENCE
     from experts.pool import slot_count
-    from experts.slots import Queue, Training, empty_slots
+    from experts.slots import LevelQueue, Training, empty_slots
     from experts.witness import take
     from levelgen.task.rules import TaskParams
 
@@ -44,11 +44,13 @@ def main() -> None:
         everyone = jax.device_get(endless_queue(levels, config))
         return [train_batch(of_batch(everyone, batch), updates) for batch in batches]
 
-    def of_batch(queue: Queue, batch: np.ndarray) -> Queue:
+    def of_batch(queue: LevelQueue, batch: np.ndarray) -> LevelQueue:
         begun, count = jax.tree.map(lambda x: x[batch], queue.begun), np.int32(len(batch))
-        return jax.device_put(Queue(take(queue.levels, batch), queue.level_ids[batch], count, queue.updates, begun))
+        return jax.device_put(
+            LevelQueue(take(queue.levels, batch), queue.level_ids[batch], count, queue.updates, begun)
+        )
 
-    def train_batch(queue: Queue, updates: int) -> tuple[Training, float]:
+    def train_batch(queue: LevelQueue, updates: int) -> tuple[Training, float]:
         now, goals, ended = empty_slots(slots, queue, config), 0.0, np.zeros(slots)
         for _ in range(updates):
             now, seen = go_on(now, queue, config, rules)
@@ -61,7 +63,9 @@ def main() -> None:
 
     def run() -> dict:
         seconds, out = timed(lambda: train(given.updates, batches))
-        finite = all(np.isfinite(np.asarray(x)).all() for training, _ in out for x in jax.tree.leaves(training.expert))
+        finite = all(
+            np.isfinite(np.asarray(x)).all() for training, _ in out for x in jax.tree.leaves(training.train_state)
+        )
         episodes = sum(float(np.asarray(training.progress.episodes).sum()) for training, _ in out)
         return {"seconds": seconds, "done": episodes, "goal": sum(goals for _, goals in out), "finite": bool(finite)}
 

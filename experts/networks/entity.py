@@ -84,7 +84,7 @@ class Encoder(nn.Module):
         return average + (nn.tanh(constant[:, :still]) @ things.weight[:still])[:, None]
 
 
-class Trunk(nn.Module):
+class EntityTrunk(nn.Module):
     width: int
     depth: int
     encoding: int
@@ -133,7 +133,7 @@ class EntityNetwork(nn.Module):
         self, constant: Constant, moving: Float[Array, "dynamic lane"]
     ) -> tuple[Float[Array, "logit lane"], Float[Array, " lane"]]:
         of_kinds = moving_things(self.size, constant, moving)
-        trunk = lambda outputs, gain, name: Trunk(self.width, self.depth, self.encoding, outputs, gain, name=name)
+        trunk = lambda outputs, gain, name: EntityTrunk(self.width, self.depth, self.encoding, outputs, gain, name=name)
         logits = trunk(LOGITS, POLICY_GAIN, "policy")(constant, of_kinds)
         return logits, trunk(1, VALUE_GAIN, "value")(constant, of_kinds)[0]
 

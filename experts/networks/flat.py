@@ -17,7 +17,7 @@ from physics.types import Size
 from physics.vector import rows
 
 
-class Kernel(NamedTuple):
+class FirstKernel(NamedTuple):
     """Of a first layer, in two: taking columns out of one would cost more than all products, backwards even more."""
 
     moving: Float[Array, "unit dynamic"]
@@ -40,16 +40,16 @@ class FirstDense(nn.Module):
     def __call__(
         self, constant: Float[Array, " resting"], moving: Float[Array, "dynamic lane"]
     ) -> Float[Array, "unit lane"]:
-        def initial(key: Array) -> Kernel:
+        def initial(key: Array) -> FirstKernel:
             whole = orthogonal(self.gain)(key, (self.units, feature_count(self.size)))
-            return Kernel(whole[:, dynamic_features(self.size)], whole[:, resting_features(self.size)])
+            return FirstKernel(whole[:, dynamic_features(self.size)], whole[:, resting_features(self.size)])
 
         kernel = self.param("kernel", initial)
         bias = self.param("bias", nn.initializers.zeros, (self.units,))
         return kernel.moving @ moving + (bias + kernel.constant @ constant)[:, None]
 
 
-class Trunk(nn.Module):
+class FlatTrunk(nn.Module):
     size: Size
     width: int
     depth: int
@@ -80,6 +80,6 @@ class FlatNetwork(nn.Module):
     def __call__(
         self, constant: Float[Array, " resting"], moving: Float[Array, "dynamic lane"]
     ) -> tuple[Float[Array, "logit lane"], Float[Array, " lane"]]:
-        trunk = lambda outputs, gain, name: Trunk(self.size, self.width, self.depth, outputs, gain, name=name)
+        trunk = lambda outputs, gain, name: FlatTrunk(self.size, self.width, self.depth, outputs, gain, name=name)
         logits = trunk(LOGITS, POLICY_GAIN, "policy")(constant, moving)
         return logits, trunk(1, VALUE_GAIN, "value")(constant, moving)[0]

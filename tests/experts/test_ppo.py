@@ -8,7 +8,7 @@ import pytest
 from experts import ppo
 from experts.config import ExpertConfig, Network
 from experts.policy import forward, log_probability, network_of, sample
-from experts.ppo import Batch, Seen
+from experts.ppo import LevelConstants, Samples
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.actions import CHOICES
@@ -34,12 +34,11 @@ def test_samples_keep_every_number_at_its_place() -> None:
     rng, time, lanes = np.random.default_rng(1), 4, 3
     moving = rng.normal(size=(time, DYNAMIC, lanes)).astype(np.float32)
     action = rng.integers(0, 2, (time, len(CHOICES), lanes))
-    chance, value, advantage = rng.normal(size=(3, time, lanes)).astype(np.float32)
-    samples = ppo.as_samples(Batch(moving, action, chance, value, advantage))
-    back = ppo.from_samples(samples.T)
+    log_probs, value, advantage = rng.normal(size=(3, time, lanes)).astype(np.float32)
+    back = ppo.from_rows(ppo.as_rows(Samples(moving, action, log_probs, value, advantage)))
     np.testing.assert_array_equal(back.moving, np.moveaxis(moving, 1, 0).reshape(DYNAMIC, -1))
     np.testing.assert_array_equal(back.action, np.moveaxis(action, 1, 0).reshape(len(CHOICES), -1))
-    for mine, theirs in zip(back[2:], (chance, value, advantage), strict=True):
+    for mine, theirs in zip(back[2:], (log_probs, value, advantage), strict=True):
         np.testing.assert_array_equal(mine, theirs.reshape(-1))
 
 
@@ -48,24 +47,24 @@ def test_samples_keep_every_number_at_its_place() -> None:
 def test_learns_a_bandit(kind: Network, seed: int) -> None:
     """One action entry pays when it is 2: after a few updates it is chosen nearly always."""
     config = ExpertConfig(network=kind, width=16, encoding=16, environments=32, horizon=8, learning_rate=3e-3)
-    network, samples = network_of(SIZE, config), config.steps_per_update
+    network, count = network_of(SIZE, config), config.steps_per_update
     constant = jax.tree.map(lambda x: x[..., 0], network.constant(sample_levels(jnp.array([seed]), SIZE)))
-    expert = ppo.init(jax.random.key(seed), network, constant, config)
-    seen, moving = Seen(constant, jnp.ones(len(CHOICES), bool)), jnp.ones((DYNAMIC, samples))
+    train_state = ppo.init(jax.random.key(seed), network, constant, config)
+    constants, moving = LevelConstants(constant, jnp.ones(len(CHOICES), bool)), jnp.ones((DYNAMIC, count))
 
     @jax.jit
-    def learn(expert, key):
-        logits, value = forward(network, expert.params, seen.constant, moving)
-        action = sample(logits, jax.random.uniform(key, (len(CHOICES), samples)))
+    def learn(now, key):
+        logits, value = forward(network, now.params, constants.features, moving)
+        action = sample(logits, jax.random.uniform(key, (len(CHOICES), count)))
         reward = (action[1] == 2).astype(jnp.float32)
-        chance = log_probability(logits, action, seen.live[:, None])
-        batch = Batch(moving[None], action[None], chance[None], value[None], (reward - value)[None])
-        rows = ppo.as_samples(batch)
-        return ppo.update(expert, jax.random.fold_in(key, 1), network, seen, rows, config), reward.mean()
+        log_probs = log_probability(logits, action, constants.live[:, None])
+        samples = Samples(moving[None], action[None], log_probs[None], value[None], (reward - value)[None])
+        rows = ppo.as_rows(samples)
+        return ppo.update(now, jax.random.fold_in(key, 1), network, constants, rows, config), reward.mean()
 
     rewards = []
     for key in jax.random.split(jax.random.key(seed), 40):
-        expert, reward = learn(expert, key)
+        train_state, reward = learn(train_state, key)
         rewards.append(float(reward))
     assert rewards[0] < 0.5
     assert rewards[-1] > 0.95

@@ -7,13 +7,14 @@ import jax
 import numpy as np
 import pytest
 
-from experts import slots as slots_module
+from experts import advance as advance_module
+from experts.advance import advance
 from experts.config import ExpertConfig, Rule, StopConfig
 from experts.judge import Trained
 from experts.labels import Label, Source
 from experts.pool import Pool, Spent
 from experts.queue import empty_queue, enter
-from experts.slots import Mode, Queue, advance, empty_slots
+from experts.slots import LevelQueue, Mode, empty_slots
 from experts.train import train_levels
 from experts.witness import take
 from levelgen.level import SIZES, Level
@@ -39,7 +40,7 @@ def train(
     return submission.trained(), submission.spent(config)
 
 
-def queue_of(levels: Level, updates: int) -> Queue:
+def queue_of(levels: Level, updates: int) -> LevelQueue:
     return enter(empty_queue(levels, 16, updates, CONFIG), levels, IDS, CONFIG)
 
 
@@ -86,22 +87,22 @@ def test_a_result_depends_neither_on_slot_nor_on_neighbours(
 
 
 def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
-    """No slot is empty while a level waits, and every level has one place."""
+    """No slot is empty while a level waits, and every level has one slot."""
     queue = queue_of(levels, 2)
     slots = empty_slots(2, queue, CONFIG)
-    modes, places = [], []
+    modes, indices = [], []
     for _ in range(400):
         slots, seen = advance(slots, queue, CONFIG, WHOLE, DEFAULT_RULES)
         modes.append(np.asarray(seen.mode))
-        places.append(np.where(modes[-1] == Mode.EMPTY, -1, np.asarray(seen.place)))
+        indices.append(np.where(modes[-1] == Mode.EMPTY, -1, np.asarray(seen.index)))
         if (modes[-1] == Mode.EMPTY).all():
             break
-    modes, places = np.array(modes), np.array(places)
-    assert sorted(set(places.reshape(-1)) - {-1}) == list(range(len(IDS)))
-    waited_for = (places == len(IDS) - 1).any(1).argmax()  # the last level has come
+    modes, indices = np.array(modes), np.array(indices)
+    assert sorted(set(indices.reshape(-1)) - {-1}) == list(range(len(IDS)))
+    waited_for = (indices == len(IDS) - 1).any(1).argmax()  # the last level has come
     assert (modes[:waited_for] != Mode.EMPTY).all()
-    for place in range(len(IDS)):
-        rows, slot = np.nonzero(places == place)
+    for index in range(len(IDS)):
+        rows, slot = np.nonzero(indices == index)
         assert len(set(slot)) == 1
         assert (np.diff(rows) == 1).all()
         assert (modes[rows, slot[0]] == [Mode.TRAIN] * 2 + [Mode.EVALUATE] * CONFIG.record_rollouts).all()
@@ -173,7 +174,9 @@ def test_all_slots_at_once_as_on_an_accelerator(levels: Level, monkeypatch: pyte
         return [jax.device_get(seen), jax.device_get(slots.slot.training)]
 
     one_by_one, ours = go(advance)
-    monkeypatch.setattr(slots_module, "over_slots", lambda function, *slots: jax.vmap(function)(*slots))
+    monkeypatch.setattr(advance_module, "over_slots", lambda function, *slots: jax.vmap(function)(*slots))
     together, theirs = go(jax.jit(advance.__wrapped__, static_argnums=(2, 3, 4)))
-    same([(r.place, r.mode, r.left) for r in one_by_one], [(r.place, r.mode, r.left) for r in together])
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), ours.expert.params, theirs.expert.params)
+    same([(r.index, r.mode, r.left) for r in one_by_one], [(r.index, r.mode, r.left) for r in together])
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), ours.train_state.params, theirs.train_state.params
+    )

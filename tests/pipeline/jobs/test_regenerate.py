@@ -67,7 +67,7 @@ def test_experts_come_back_bit_for_bit(folder: Path) -> None:
     for level_id, kept in experts.items():
         assert int(kept.begun.training.progress.env_steps) == trained[level_id]["env_steps"]
         np.testing.assert_array_equal(np.float32(kept.curve), np.float32(trained[level_id]["learning_curve"]))
-        assert all(np.isfinite(x).all() for x in jax.tree.leaves(kept.begun.training.expert.params))
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(kept.begun.training.train_state.params))
 
 
 @pytest.mark.slow
