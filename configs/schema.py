@@ -8,7 +8,7 @@ from typing import Any, Literal
 from configs.convert import plain
 from configs.errors import ConfigError
 from configs.numbers import parse_count
-from experts.config import ExpertConfig, StopConfig
+from experts.config import ExpertConfig, StopConfig, check_budget
 from levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION
 from levelgen.level import SIZES, size_of
 from levelgen.sampling.distribution import CONTROL_WEIGHTS, Distribution
@@ -50,11 +50,10 @@ class JobConfig:
         last = self.first_level + parse_count(self.levels, "levels") - 1
         if self.first_level < 0 or last > MAX_LEVEL_ID:
             raise ConfigError(f"level ids {self.first_level} to {last} do not fit: they run from 0 to {MAX_LEVEL_ID}.")
-        if self.env_steps < self.expert.steps_per_update:
-            raise ConfigError(
-                f"budget is {self.budget}: one update of an expert takes {self.expert.steps_per_update} env steps "
-                f"({self.expert.environments} environments x {self.expert.horizon}), so give at least that many."
-            )
+        try:
+            check_budget(self.env_steps, self.expert, self.stop)
+        except ValueError as error:
+            raise ConfigError(f"{error}.") from None
         if self.unit is not None and self.unit < 1:
             raise ConfigError(f"unit is {self.unit}: a work unit needs at least 1 level.")
         if self.workers < 0:

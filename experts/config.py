@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 RECORD_STEPS = 256  # env steps of a record
+MOST_DOUBLINGS = 6  # of the wait between evaluations
+MOST_COUNTED = 2**31 - 1  # env steps and updates are counted in 32 bits on the device
 
 
 class Network(StrEnum):
@@ -83,9 +85,10 @@ class ExpertConfig:
             raise ValueError(
                 f"minibatches is {self.minibatches}: it must divide environments x horizon = {self.steps_per_update}"
             )
-        if self.rehearsals > self.environments:
+        if self.rehearsals >= self.environments:
             raise ValueError(
-                f"rehearsals is {self.rehearsals}: it must not be above environments = {self.environments}"
+                f"rehearsals is {self.rehearsals}: it must be below environments = {self.environments}, so that in "
+                "some the expert chooses its own actions"
             )
         lanes = self.attempts + self.sticky_attempts + self.moved_attempts
         if lanes > self.environments:
@@ -130,3 +133,35 @@ class StopConfig:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
         if not 0 <= self.share <= 1:
             raise ValueError(f"share is {self.share}: it must be between 0 and 1")
+
+
+def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> None:
+    """Refuse a budget that experts cannot use.
+
+    Args:
+        budget: env steps of one expert.
+        config: what an expert is.
+        stopping: when a level leaves.
+
+    Raises:
+        ValueError: it does not suffice for one update, or counts of it do not fit.
+    """
+    if budget < config.steps_per_update:
+        raise ValueError(
+            f"budget is {budget}: one update of an expert takes {config.steps_per_update} env steps "
+            f"({config.environments} environments x {config.horizon}), so give at least that many"
+        )
+    if budget > MOST_COUNTED:
+        raise ValueError(f"budget is {budget}: an expert can count no more than {MOST_COUNTED} env steps")
+    updates = config.updates_in(budget)
+    waits = {
+        "wait": config.updates_in(stopping.wait) << MOST_DOUBLINGS,
+        "polish": config.updates_in(stopping.polish),
+        "first_rung": config.updates_in(stopping.first_rung),
+    }
+    for name, longest in waits.items():
+        if updates + longest > MOST_COUNTED:
+            raise ValueError(
+                f"stop.{name} is {getattr(stopping, name)}: with a budget of {budget}, updates would have to be "
+                f"counted beyond {MOST_COUNTED}, so give less"
+            )

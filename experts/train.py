@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from experts.before import Before, decide
-from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
+from experts.config import RECORD_STEPS, ExpertConfig, StopConfig, check_budget
 from experts.judge import Kept, judge
 from experts.labels import WITNESSED, Label, Verdict
 from experts.pool import NOTHING_BEGUN, Pool, Spent, Submission, Totals
@@ -74,7 +74,7 @@ def train_levels(
         keep: as for `begin`.
 
     Raises:
-        ValueError: the budget does not suffice for one update.
+        ValueError: as `check_budget`.
     """
     pool = new_pool(budget, config, stopping, rules)
     run = begin(pool, levels, level_ids, begun, keep)
@@ -141,11 +141,7 @@ def new_pool(
     """A pool for experts of one budget, env steps.
 
     Raises:
-        ValueError: the budget does not suffice for one update.
+        ValueError: as `check_budget`.
     """
-    if budget < config.steps_per_update:
-        raise ValueError(
-            f"a budget of {budget} env steps is too small: one update of an expert takes {config.steps_per_update} "
-            f"(environments {config.environments} x horizon {config.horizon})"
-        )
+    check_budget(budget, config, stopping)
     return Pool(config.updates_in(budget), config, stopping, rules)

@@ -14,6 +14,7 @@ from benchmarks.solved.variants import VARIANTS
 from benchmarks.statistics import wilson
 from configs.convert import plain
 from configs.numbers import parse_count
+from experts.config import check_budget
 from levelgen.level import size_of
 from pipeline.errors import UserError
 
@@ -59,8 +60,10 @@ def train(given: argparse.Namespace) -> Header:
     """
     budget, levels = parse_count(given.budget, "--budget"), parse_count(given.levels, "--levels")
     variant = VARIANTS[given.variant]
-    if budget < variant.expert.steps_per_update:
-        raise UserError(f"--budget is {budget}: one update takes {variant.expert.steps_per_update} env steps.")
+    try:
+        check_budget(budget, variant.expert, variant.stop)
+    except ValueError as error:
+        raise UserError(f"--{error}.") from None
     if given.first < 0:
         raise UserError(f"--first is {given.first}: level ids are 0 and above.")
     try:

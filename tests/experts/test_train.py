@@ -115,9 +115,23 @@ def test_levels_that_all_need_no_expert() -> None:
     assert (result.spent.trained, result.spent.idle) == (0, 0)
 
 
-def test_a_budget_below_one_update_is_refused() -> None:
-    with pytest.raises(ValueError, match="too small: one update of an expert takes 1024"):
-        new_pool(1023, CONFIG)
+@pytest.mark.parametrize(
+    ("budget", "stopping", "words"),
+    [
+        (1023, StopConfig(), "budget is 1023: one update of an expert takes 1024 env steps"),
+        (2**31, StopConfig(), "budget is 2147483648: an expert can count no more than 2147483647 env steps"),
+        (2**31 - 1, StopConfig(wait=2**35), "stop.wait is 34359738368: with a budget of 2147483647"),
+        (1024, StopConfig(polish=2**41), "stop.polish is"),
+        (1024, StopConfig(first_rung=2**41), "stop.first_rung is"),
+    ],
+)
+def test_a_budget_that_cannot_be_used_is_refused(budget: int, stopping: StopConfig, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        new_pool(budget, CONFIG, stopping)
+
+
+def test_the_largest_budget_is_accepted() -> None:
+    assert new_pool(2**31 - 1, CONFIG, StopConfig(wait=2**24)).updates == 2**21 - 1
 
 
 @pytest.mark.parametrize(
@@ -126,7 +140,7 @@ def test_a_budget_below_one_update_is_refused() -> None:
         ({"width": 0}, "width is 0"),
         ({"minibatches": 3}, "must divide"),
         ({"attempts": 64}, "are 80 together"),
-        ({"rehearsals": 33}, "rehearsals is 33"),
+        ({"rehearsals": 32}, "rehearsals is 32: it must be below environments = 32"),
         ({"persistence": 1.5}, "persistence is 1.5: it must be between 0 and 1"),
         ({"clip": 2.0}, "clip is 2.0"),
     ],
