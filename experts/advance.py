@@ -78,7 +78,7 @@ def advance(
 
 
 def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
-    """Slots that are empty take the next levels of the queue."""
+    """Slots that are empty take the next levels of the queue. One that is over is only evaluated again."""
     free = slots.slot.mode == Mode.EMPTY
     number = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
     takes, index = free & (number < queue.count), number % queue.capacity
@@ -87,11 +87,15 @@ def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
         begun = jax.tree.map(lambda x: x[index], queue.begun)
         choose = lambda new, old: jnp.where(takes.reshape(-1, *[1] * (old.ndim - 1)), new, old)
         put = lambda new, old: jax.tree.map(choose, new, old)
+        over, trial = begun.training.course.over, slots.slot.trial
         slot = slots.slot._replace(
-            mode=put(jnp.full_like(index, Mode.TRAIN), slots.slot.mode),
+            mode=put(jnp.where(over, Mode.EVALUATE, Mode.TRAIN), slots.slot.mode),
             index=put(index, slots.slot.index),
             deadline=put(jnp.full_like(index, queue.updates), slots.slot.deadline),
             training=put(begun.training, slots.slot.training),
+            trial=trial._replace(
+                part=put(jnp.zeros_like(index), trial.part), due=trial.due & ~takes, final=put(over, trial.final)
+            ),
         )
         return slot, _where(repeat(takes, config.environments), lanes_of(begun.acting), slots.acting)
 
@@ -165,7 +169,10 @@ def _learn(
     success = remember(training.success, find(recent, now.goal, now.timestep))
     shuffling = jax.random.fold_in(now.key, config.horizon)  # the rollout used 0 .. horizon - 1
     train_state = ppo.update(training.train_state, shuffling, network, now.constants, now.rows, config)
-    course, due, final = stop.after_update(training.course, totals, share, slot.deadline, config, stopping)
+    totals = progress.watch(totals, train_state.params)
+    course, due, final = stop.after_update(
+        training.course, totals, success.length > 0, share, slot.deadline, config, stopping
+    )
     training = Training(train_state, totals, course, success, recent[config.horizon :])
     trial = slot.trial._replace(part=jnp.int32(0), due=due, final=final)
     return slot._replace(mode=jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share

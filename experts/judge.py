@@ -118,11 +118,11 @@ def verdict_of(
     """A level's verdict: `episodes` are those of its record, `halted` tells that it left before its budget ended."""
     last = trained.evaluations[-1]
     attempts, sticky, moved = shares(last, config)
-    first = int(last.progress.first_success)
+    first, diverged = (int(x) for x in (last.progress.first_success, last.progress.diverged))
     if witness is not None:
         reason = solved_reason(witness.source, episodes)
     else:
-        reason = unsolved_reason(config.attempts, first != NEVER, halted)
+        reason = unsolved_reason(config.attempts, first != NEVER, halted, None if diverged == NEVER else diverged)
     return Verdict(
         label=Label.UNSOLVED if witness is None else Label.SOLVED,
         label_reason=reason,
@@ -142,16 +142,15 @@ def verdict_of(
 
 
 def shares(evaluation: Evaluation, config: ExpertConfig) -> tuple[float, float, float]:
-    """Success rates of the sampled attempts' episodes, and of the first episodes of sticky and of moved attempts.
+    """Success rates of sampled, of sticky and of moved attempts: of their first episodes.
 
-    Only a first episode starts with other velocities. NaN: no episode ended, or there are no such attempts.
+    Episodes after the first would count quick successes several times and slow failures never; and only a first one
+    starts with other velocities. One that has not ended within the record did not succeed. NaN: no such attempts.
     """
     done, goal = evaluation.done, evaluation.goal
-    sampled = slice(1 if config.attempts > 1 else 0, config.attempts)
-    ended = int(done[:, sampled].sum())
-    rate = float(goal[:, sampled].sum() / ended) if ended else float("nan")
     first = np.where(done.any(0), goal[np.argmax(done, 0), np.arange(done.shape[1])], False)
+    sampled = first[1 if config.attempts > 1 else 0 : config.attempts]
     sticky = first[config.attempts : config.attempts + config.sticky_attempts]
     moved = first[config.attempts + config.sticky_attempts :][: config.moved_attempts]
     mean = lambda x: float(x.mean()) if len(x) else float("nan")
-    return rate, mean(sticky), mean(moved)
+    return mean(sampled), mean(sticky), mean(moved)

@@ -24,6 +24,7 @@ class Source(StrEnum):
     NOTHING = "nothing"  # a trivial level's
 
 
+DIVERGED = "stopped being finite"  # in the reasons of levels whose experts diverged
 WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that stand on a witness
 
 
@@ -35,8 +36,8 @@ class Verdict:
     label_reason: str
     failed_by_noop: bool  # doing nothing lets green touch red
     witness: Source | None
-    # of the last evaluation; NaN: no episode ended
-    success_rate: float  # of the episodes of sampled attempts
+    # of the last evaluation; NaN: there were no such attempts
+    success_rate: float  # of sampled attempts, first episodes
     most_probable_succeeds: bool  # every episode of the attempt that takes the most probable actions
     sticky_success_rate: float  # of attempts where an action is sometimes repeated, first episodes
     moved_success_rate: float  # of attempts that start with slightly other velocities, first episodes
@@ -53,9 +54,12 @@ def solved_reason(source: Source, episodes: int) -> str:
     return f"the witness, {how}, reaches the goal in all {episodes} of its finished episodes"
 
 
-def unsolved_reason(attempts: int, training_successes: bool, halted: bool) -> str:
+def unsolved_reason(attempts: int, training_successes: bool, halted: bool, diverged: int | None) -> str:
+    """Why a level is unsolved: `diverged` are the env steps after which its expert was of no more use."""
     before = "the goal was reached in training" if training_successes else "the goal was never reached in training"
     why = ", and at a rung the best return had not grown" if halted else ""
+    if diverged is not None:
+        why = f", and its network's numbers {DIVERGED} after {diverged} env steps"
     return f"{before}{why}; none of the {attempts} attempts of the last evaluation is a witness"
 
 

@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax.typing import VariableDict as Params
 from jaxtyping import Array, Bool, Float, Int
 
-NEVER = -1  # no success yet
+NEVER = -1  # it has not happened yet
 
 
 class Progress(NamedTuple):
@@ -17,10 +18,12 @@ class Progress(NamedTuple):
     episodes: Int[Array, ""]  # that ended
     env_steps: Int[Array, ""]
     first_success: Int[Array, ""]  # env steps taken until then; NEVER
+    diverged: Int[Array, ""]  # env steps taken until a parameter of the expert was not finite; NEVER
 
 
 def start(environments: int) -> Progress:
-    return Progress(jnp.zeros(environments), jnp.float32(-jnp.inf), jnp.int32(0), jnp.int32(0), jnp.int32(NEVER))
+    never = jnp.int32(NEVER)
+    return Progress(jnp.zeros(environments), jnp.float32(-jnp.inf), jnp.int32(0), jnp.int32(0), never, never)
 
 
 def follow(
@@ -54,5 +57,13 @@ def follow(
         progress.episodes + done.sum(),
         progress.env_steps + steps * environments,
         first,
+        progress.diverged,
     )
     return after, jnp.where(ended > 0, reached / jnp.maximum(ended, 1), jnp.nan)
+
+
+def watch(progress: Progress, params: Params) -> Progress:
+    """Remember when an expert's parameters were no longer finite: nothing is learnt from there on."""
+    finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(params)]).all()
+    now = (progress.diverged == NEVER) & ~finite
+    return progress._replace(diverged=jnp.where(now, progress.env_steps, progress.diverged))

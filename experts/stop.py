@@ -5,10 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from experts.config import MOST_DOUBLINGS, RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.progress import NEVER, Progress
-
-MOST_DOUBLINGS = 6  # of the wait between evaluations
 
 
 class Course(NamedTuple):
@@ -19,34 +17,50 @@ class Course(NamedTuple):
     failed: Int[Array, ""]  # evaluations that did not solve the level
     solved: Bool[Array, ""]  # by an evaluation
     rung_return: Float[Array, ""]  # the best return at the last rung
+    over: Bool[Array, ""]  # for good: more budget would change nothing
 
 
 def begin() -> Course:
-    return Course(jnp.int32(0), jnp.int32(0), jnp.int32(0), jnp.bool_(False), jnp.float32(-jnp.inf))
+    return Course(jnp.int32(0), jnp.int32(0), jnp.int32(0), jnp.bool_(False), jnp.float32(-jnp.inf), jnp.bool_(False))
 
 
 def after_update(
     course: Course,
     progress: Progress,
+    usable: Bool[Array, ""],
     share: Float[Array, ""],
     deadline: Int[Array, ""],
     config: ExpertConfig,
     stopping: StopConfig,
 ) -> tuple[Course, Bool[Array, ""], Bool[Array, ""]]:
-    """The course, whether an evaluation is due, and whether the level leaves after one, due or not."""
+    """What one more update means.
+
+    Args:
+        course: before the update.
+        progress: after it.
+        usable: whether there is a success of training that a record can hold.
+        share: of the update's finished episodes that reached the goal.
+        deadline: updates after which the last evaluation comes.
+        config: what an expert is.
+        stopping: when a level leaves.
+
+    Returns:
+        The course, whether an evaluation is due, and whether the level leaves after one, due or not.
+    """
     updates = course.updates + 1
-    final = updates >= deadline
+    over = progress.diverged != NEVER
     evaluate = jnp.bool_(False)
     rung_return = course.rung_return
     if stopping.rule != Rule.BUDGET:
         evaluate = (share >= stopping.share) & (updates >= course.next_evaluation) & ~course.solved
-        final |= jnp.bool_(config.exploration) & (progress.first_success != NEVER)
+        over |= jnp.bool_(config.exploration) & usable
     if stopping.rule == Rule.HALVING:
         at_rung = is_rung(updates, config.updates_in(stopping.first_rung))
         moves = (progress.first_success != NEVER) | (progress.best_return >= rung_return + stopping.gain)
-        final |= at_rung & ~moves
+        over |= at_rung & ~moves
         rung_return = jnp.where(at_rung, progress.best_return, rung_return)
-    return course._replace(updates=updates, rung_return=rung_return), evaluate, final
+    course = course._replace(updates=updates, rung_return=rung_return, over=over)
+    return course, evaluate, over | (updates >= deadline)
 
 
 def after_evaluation(

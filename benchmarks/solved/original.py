@@ -159,7 +159,7 @@ def judged(seen: dict[str, np.ndarray], config: ExpertConfig, failed_by_noop: bo
 
     done, goal = seen["trained_done"], seen["trained_goal"]
     unknown = np.zeros(config.environments, np.float32), np.float32(np.nan)  # returns
-    totals = progress.Progress(*unknown, done.sum(), np.int64(done.size), first_success(goal))
+    totals = progress.Progress(*unknown, done.sum(), np.int64(done.size), first_success(goal), progress.NEVER)
     evaluation = judge.Evaluation(np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, no_success())
     witness = judge.witness_of([evaluation], config)
     of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))

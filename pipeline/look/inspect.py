@@ -17,6 +17,7 @@ from rich.table import Table
 
 from configs.compose import identified
 from configs.convert import typed
+from experts.labels import DIVERGED
 from levelgen.sampling.distribution import Distribution
 from pipeline.look import duplicates
 from pipeline.read.select import columns_in, select
@@ -65,6 +66,7 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
         "levels": chosen.num_rows,
         "labels": _counts(chosen, "label"),
         "unsolvable": _counts(select(chosen, "label = 'unsolvable'"), "label_reason"),
+        "diverged": total(chosen, f"contains(label_reason, '{DIVERGED}')::INT"),
         "failed_by_noop": int(np.sum(chosen.column("failed_by_noop").to_numpy())),
         "solve_rate": solved.num_rows / tried.num_rows if tried.num_rows else None,  # of the levels with an expert
         "steps_to_goal": _quantiles(solved, "steps_to_goal"),
@@ -119,6 +121,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         "distribution": f"{distribution['name'] or 'of its own'} ({distribution['hash']})",
         "levels": f"{facts['levels']} ({labels})",
         "unsolvable": "; ".join(f"{count} {reason}" for reason, count in facts["unsolvable"].items()) or None,
+        "experts that diverged": str(facts["diverged"]) if facts["diverged"] else None,
         "failed by doing nothing": str(facts["failed_by_noop"]),
         "solve rate of experts": f"{facts['solve_rate']:.1%}" if facts["solve_rate"] is not None else None,
         "steps to goal": _told(facts["steps_to_goal"]),

@@ -30,7 +30,7 @@ COLUMNS = pa.schema(
         pa.field("label_reason", pa.string(), nullable=False),
         pa.field("failed_by_noop", pa.bool_(), nullable=False),  # doing nothing lets green touch red
         pa.field("witness", pa.string()),  # most probable, sampled, exploration, nothing; null: there is none
-        # of the last evaluation; null: no episode ended, or there was none (SQL has NaN above every number)
+        # of the last evaluation, first episodes; null: there were no such attempts (SQL has NaN above every number)
         pa.field("success_rate", pa.float32()),  # of sampled attempts
         pa.field("most_probable_succeeds", pa.bool_(), nullable=False),
         pa.field("sticky_success_rate", pa.float32()),

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from experts import progress
 from experts.config import RECORD_STEPS, Choice, ExpertConfig
@@ -11,7 +10,7 @@ from experts.judge import Evaluation, repeated, shares, successful_episodes, wit
 from experts.labels import Source
 from experts.success import Success
 
-CONFIG = ExpertConfig(environments=8, attempts=3, sticky_attempts=2, moved_attempts=2)
+CONFIG = ExpertConfig(environments=8, rehearsals=2, attempts=3, sticky_attempts=2, moved_attempts=2)
 
 
 def evaluation(*episodes: list[tuple[int, bool]], success: int = 0) -> Evaluation:
@@ -63,11 +62,11 @@ def test_exploration_is_a_witness_only_if_wanted_and_only_where_there_is_no_othe
 
 
 def test_shares() -> None:
-    """Attempts 0 to 2, two sticky ones, two moved ones, one to spare."""
+    """Attempts 0 to 2, two sticky ones, two moved ones, one to spare: first episodes count, and those that last."""
     one = evaluation(
         [(9, False)],
-        [(9, True), (19, False)],
-        [(5, True)],
+        [(9, True), (19, True), (29, True)],
+        [],
         [(9, True), (19, False)],
         [(9, False), (19, True)],
         [],
@@ -75,10 +74,10 @@ def test_shares() -> None:
         [(3, True)],
     )
     rate, sticky, moved = shares(one, CONFIG)
-    assert rate == pytest.approx(2 / 3)
-    assert (sticky, moved) == (0.5, 0.5)
-    nothing = shares(evaluation(), ExpertConfig(environments=8, attempts=3, sticky_attempts=0, moved_attempts=0))
-    assert np.isnan(nothing).all()
+    assert (rate, sticky, moved) == (0.5, 0.5, 0.5)
+    nothing = shares(evaluation(), replace(CONFIG, sticky_attempts=0, moved_attempts=0))
+    assert nothing[0] == 0
+    assert np.isnan(nothing[1:]).all()
 
 
 def test_episodes() -> None:

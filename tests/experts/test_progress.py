@@ -42,3 +42,11 @@ def test_totals(seed: int, p_done: float, p_goal: float) -> None:
     ended, reached = (done & own).sum((1, 2)), (goal & own).sum((1, 2))
     np.testing.assert_allclose(shares, np.where(ended > 0, reached / np.maximum(ended, 1), np.nan), rtol=1e-6)
     assert totals.env_steps == rollouts * STEPS * ENVIRONMENTS
+
+
+def test_it_remembers_when_parameters_were_no_longer_finite() -> None:
+    totals = progress.start(ENVIRONMENTS)
+    for steps, last, expected in ((10, 1.0, progress.NEVER), (20, np.inf, 20), (30, np.nan, 20), (40, 1.0, 20)):
+        params = {"kernel": np.ones((2, 2)), "bias": np.array([0.0, last])}
+        totals = progress.watch(totals._replace(env_steps=np.int32(steps)), params)
+        assert totals.diverged == expected

@@ -9,7 +9,7 @@ import pytest
 
 from experts import advance as advance_module
 from experts.advance import advance
-from experts.config import ExpertConfig, Rule, StopConfig
+from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.judge import Trained
 from experts.labels import Label, Source
 from experts.pool import Pool, Spent
@@ -27,6 +27,7 @@ CONFIG = ExpertConfig(
 )
 SOLVED = StopConfig(successes=2, share=0.6, wait=2048)
 WHOLE = StopConfig(rule=Rule.BUDGET)
+HALVED = StopConfig(rule=Rule.HALVING, successes=4, first_rung=4 * 512, gain=10.0)
 UPDATES = 24  # 12,288 env steps
 
 
@@ -117,14 +118,13 @@ def test_nothing_is_compiled_again(levels: Level) -> None:
 
 
 def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) -> None:
-    stopping = StopConfig(rule=Rule.HALVING, successes=4, first_rung=4 * 512, gain=10.0)
-    halved, spent = train(levels, IDS, UPDATES, CONFIG, stopping)
+    halved, spent = train(levels, IDS, UPDATES, CONFIG, HALVED)
     never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
     assert never
     for i in never:
         assert len(halved[i].curve) in (4, 8)  # at the first rung there is nothing to compare with
     assert spent.trained == sum(len(of.curve) for of in halved) * CONFIG.steps_per_update
-    verdicts = train_levels(levels, IDS, UPDATES * 512, CONFIG, stopping).verdicts
+    verdicts = train_levels(levels, IDS, UPDATES * 512, CONFIG, HALVED).verdicts
     reasons = {i: verdict.label_reason for i, verdict in enumerate(verdicts) if verdict.label is Label.UNSOLVED}
     assert all("at a rung the best return had not grown" in reasons[i] for i in never)
 
@@ -150,16 +150,56 @@ def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[T
         same(polished[i].evaluations[0], solved[i].evaluations[0])
 
 
-@pytest.mark.parametrize("stopping", [WHOLE, SOLVED], ids=["budget", "solved"])
+@pytest.mark.parametrize("stopping", [WHOLE, SOLVED, HALVED], ids=["budget", "solved", "halving"])
 def test_going_on_equals_having_trained_through(levels: Level, stopping: StopConfig) -> None:
-    through, _ = train(levels, IDS, UPDATES, CONFIG, stopping)
-    first, _ = train(levels, IDS, UPDATES // 3, CONFIG, stopping, keep=True)
-    left = [i for i, of in enumerate(through) if len(of.curve) > UPDATES // 3]
-    kept = {place: first[i].expert for place, i in enumerate(left)}
-    later, spent = train(take(levels, np.array(left)), IDS[left], UPDATES, CONFIG, stopping, begun=kept)  # type: ignore[arg-type]
-    assert spent.trained == sum(len(through[i].curve) - UPDATES // 3 for i in left) * CONFIG.steps_per_update
+    """A level that left at a rung, too: it is over, and uses none of the larger budget."""
+    through, _ = train(levels, IDS, UPDATES, CONFIG, stopping, keep=True)
+    first, _ = train(levels, IDS, UPDATES // 2, CONFIG, stopping, keep=True)
+    left = [i for i, of in enumerate(first) if stopping == WHOLE or of.witness is None]
+    assert (stopping == HALVED) == any(len(first[i].curve) < UPDATES // 2 for i in left)
+    begun = {number: first[i].expert for number, i in enumerate(left)}
+    later, spent = train(take(levels, np.array(left)), IDS[left], UPDATES, CONFIG, stopping, begun=begun, keep=True)  # type: ignore[arg-type]
+    trained = sum(len(through[i].curve) - len(first[i].curve) for i in left)
+    assert spent.trained == trained * CONFIG.steps_per_update
     for i, of in zip(left, later, strict=True):
         same(of, through[i])
+
+
+def test_only_a_success_that_a_record_can_hold_ends_training(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(CONFIG, exploration=True)
+    queue = queue_of(levels, UPDATES)
+    slots = advance_module.refill(empty_slots(2, queue, config), queue, config)
+    slot = jax.tree.map(lambda x: x[0], slots.slot)
+    monkeypatch.setattr(advance_module.ppo, "update", lambda train_state, *_: train_state)
+    shape = (config.horizon, config.environments)
+    goal = np.zeros(shape, bool)
+    goal[3, 5] = True
+    done = goal.copy()
+    done[3, 6:] = True  # so few successes make no evaluation due
+    for length, mode in ((RECORD_STEPS, Mode.EVALUATE), (RECORD_STEPS + 1, Mode.TRAIN)):
+        now = advance_module._Now(
+            constants=None,  # type: ignore[arg-type]
+            key=jax.random.key(0),
+            rows=None,  # type: ignore[arg-type]
+            action=np.zeros((config.horizon, 6, config.environments), np.int8),  # type: ignore[arg-type]
+            reward=np.zeros(shape, np.float32),  # type: ignore[arg-type]
+            done=done,  # type: ignore[arg-type]
+            goal=goal,  # type: ignore[arg-type]
+            timestep=np.full(shape, length - 1),  # type: ignore[arg-type]
+            rehearsing=np.zeros(config.environments, bool),  # type: ignore[arg-type]
+        )
+        after, _ = advance_module._learn(slot, now, None, config, SOLVED)  # type: ignore[arg-type]
+        assert int(after.training.progress.first_success) == 4 * config.environments
+        assert after.mode == mode
+
+
+def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level) -> None:
+    config = replace(CONFIG, learning_rate=1e30)
+    verdicts = train_levels(take(levels, np.arange(2)), IDS[:2], UPDATES * 512, config, WHOLE).verdicts
+    for verdict in verdicts:
+        assert verdict.label is Label.UNSOLVED
+        assert verdict.env_steps < UPDATES * 512
+        assert f"its network's numbers stopped being finite after {verdict.env_steps} env steps" in verdict.label_reason
 
 
 def test_all_slots_at_once_as_on_an_accelerator(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:

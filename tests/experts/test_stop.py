@@ -16,8 +16,10 @@ SOLVED, HALVING = StopConfig(wait=2048, share=0.9), StopConfig(rule=Rule.HALVING
 def after(updates: int, share: float, stopping: StopConfig, best: float = 0.0, first: int = progress.NEVER, **course):
     now = stop.begin()._replace(updates=jnp.int32(updates - 1), **course)
     totals = progress.start(16)._replace(best_return=jnp.float32(best), first_success=jnp.int32(first))
-    now, due, final = stop.after_update(now, totals, jnp.float32(share), jnp.int32(100), CONFIG, stopping)
+    usable, share_, deadline = jnp.bool_(first != progress.NEVER), jnp.float32(share), jnp.int32(100)
+    now, due, final = stop.after_update(now, totals, usable, share_, deadline, CONFIG, stopping)
     assert int(now.updates) == updates
+    assert bool(now.over) == (bool(final) and updates < 100)
     return now, bool(due), bool(final)
 
 
@@ -37,9 +39,29 @@ def test_success_is_worth_an_evaluation() -> None:
 def test_a_success_of_training_ends_it_where_it_is_a_witness() -> None:
     config = replace(CONFIG, exploration=True)
     totals = progress.start(16)._replace(first_success=jnp.int32(5))
-    for stopping, ends in ((SOLVED, True), (StopConfig(rule=Rule.BUDGET), False)):
-        _, due, final = stop.after_update(stop.begin(), totals, jnp.float32(0.1), jnp.int32(100), config, stopping)
-        assert (bool(due), bool(final)) == (False, ends)
+    whole = StopConfig(rule=Rule.BUDGET)
+    for usable, stopping, ends in ((True, SOLVED, True), (False, SOLVED, False), (True, whole, False)):
+        course, due, final = stop.after_update(
+            stop.begin(), totals, jnp.bool_(usable), jnp.float32(0.1), jnp.int32(100), config, stopping
+        )
+        assert (bool(due), bool(final), bool(course.over)) == (False, ends, ends)
+
+
+@pytest.mark.parametrize("stopping", [StopConfig(rule=Rule.BUDGET), SOLVED, HALVING])
+def test_an_expert_that_diverged_leaves(stopping: StopConfig) -> None:
+    totals = progress.start(16)._replace(diverged=jnp.int32(1024))
+    course, _, final = stop.after_update(
+        stop.begin(), totals, jnp.bool_(False), jnp.float32(0.0), jnp.int32(100), CONFIG, stopping
+    )
+    assert (bool(final), bool(course.over)) == (True, True)
+
+
+def test_a_level_that_its_last_update_brings_to_a_rung_is_over_with_any_budget() -> None:
+    totals, course = progress.start(16), stop.begin()._replace(updates=jnp.int32(7), rung_return=jnp.float32(0.5))
+    course, _, final = stop.after_update(
+        course, totals, jnp.bool_(False), jnp.float32(0.0), jnp.int32(8), CONFIG, HALVING
+    )
+    assert (bool(final), bool(course.over)) == (True, True)
 
 
 def test_at_a_rung_learning_has_to_move() -> None:

@@ -1,18 +1,22 @@
 """Questions about a manifest: what a condition chooses, and that nothing more is read than it takes."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
 import pytest
 
-from experts.labels import Label
-from pipeline.look.inspect import survey
+from experts.labels import Label, unsolved_reason
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.jobs.unit import commit
+from pipeline.look.inspect import inspect, survey
 from pipeline.read.select import columns_in
 from pipeline.store import manifest
+from pipeline.store.layout import split_path
 from pipeline.store.manifest import Fragment, read_fragment
 from pipeline.store.schema import COLUMNS
-from tests.pipeline.made import made_split
+from tests.pipeline.made import made_job, made_result, made_split, made_verdict
 
 LABELS = [Label.SOLVED, Label.TRIVIAL, Label.UNSOLVED, Label.UNSOLVABLE]
 
@@ -65,3 +69,17 @@ def test_only_the_columns_of_the_question_are_read(split: Path, monkeypatch: pyt
 )
 def test_columns_of_a_condition(where: str | None, columns: list[str]) -> None:
     assert columns_in(where) == columns
+
+
+def test_experts_that_diverged_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    job, ids = made_job(str(tmp_path), "levels=3"), [0, 1, 2]
+    split = split_path(job.out, job.budget, job.size)
+    split.mkdir(parents=True)
+    reasons = [unsolved_reason(8, True, False, diverged) for diverged in (None, 1024, 2048)]
+    verdicts = [made_verdict(Label.UNSOLVED, label_reason=reason) for reason in reasons]
+    result = dataclasses.replace(made_result(ids, [Label.UNSOLVED] * 3), verdicts=verdicts)
+    commit(job, split, WorkUnit(tuple(ids)), result)
+    assert survey(split)["diverged"] == 2
+    assert survey(split, "level_id < 2")["diverged"] == 1
+    inspect(split, None, 0, as_json=False)
+    assert "experts that diverged:           2\n" in capsys.readouterr().out
