@@ -1,54 +1,52 @@
 """From Hydra's dictionaries to typed frozen dataclasses, and back to plain data for hashing.
 
-Every value is checked against the dataclass's annotations, ranges by its own `__post_init__`
-(which raises ValueError). No dictionary travels beyond this module's callers.
+cattrs takes values apart along the dataclasses' annotations; ranges are their own affair (`__post_init__` raises
+ValueError). Here stands what a value may be, and the sentence if it is not. No dictionary travels beyond this
+module's callers.
 """
 
-import dataclasses
-import math
-import types
-from collections.abc import Iterable, Mapping
-from enum import Enum
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from enum import StrEnum
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+from cattrs import BaseValidationError, Converter, ForbiddenExtraKeysError
+from cattrs.errors import AttributeValidationNote
+from cattrs.gen import make_dict_structure_fn
 
 from configs.errors import ConfigError, suggestion
 
 T = TypeVar("T")
+CONVERTER = Converter()
+SCALARS = {  # with the types of values that may be written for them: 1000 is a fine word where words are wanted
+    bool: ("true or false", (bool,)),
+    int: ("a whole number", (int,)),
+    float: ("a number", (int, float)),
+    str: ("a word", (int, float, str)),
+}
 
 
 def typed(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     """An instance of the dataclass `cls` from nested mappings; what is missing takes its default.
 
+    Args:
+        cls: the dataclass.
+        values: settings by name, groups of them as mappings.
+        path: name of the group that they are, for messages.
+
     Raises:
         ConfigError: an unknown key, a value of the wrong type, or one that the dataclass refuses.
     """
-    hints = get_type_hints(cls)
-    names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
-    for key in values:
-        if key not in names:
-            raise ConfigError(f"there is no setting {_join(path, str(key))}{suggestion(str(key), names)}.")
-    arguments = {name: _value(hints[name], values[name], _join(path, name)) for name in names if name in values}
     try:
-        return cls(**arguments)
-    except ConfigError:
-        raise
-    except ValueError as error:
-        raise ConfigError(f"{_join(path, '')}{error}") from None
-    except TypeError as error:  # a field without a default was not given
-        raise ConfigError(f"{path or cls.__name__} is incomplete: {error}.") from None
+        return CONVERTER.structure(values, cls)
+    except BaseValidationError as error:
+        raise ConfigError(_sentence(error, path)) from None
 
 
 def plain(value: Any) -> Any:
-    """Nested dataclasses, tuples and enums as JSON's types."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Enum):
-        return value.name.lower()
-    if isinstance(value, (tuple, list)):
-        return [plain(item) for item in value]
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    return value
+    """Nested dataclasses and enumerations as JSON's types."""
+    return CONVERTER.unstructure(value)
 
 
 def flat(tree: Mapping[str, Any], path: str = "") -> dict[str, Any]:
@@ -64,67 +62,59 @@ def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _value(hint: Any, value: Any, path: str) -> Any:
-    """`value` as the annotated type `hint`."""
-    origin, arguments = get_origin(hint), get_args(hint)
-    if dataclasses.is_dataclass(hint):
+def _sentence(error: Exception, path: str) -> str:
+    """The first thing that is wrong, with the name of its setting."""
+    notes = [note for note in getattr(error, "__notes__", ()) if isinstance(note, AttributeValidationNote)]
+    path = _join(path, notes[0].name) if notes else path
+    match error:
+        case BaseValidationError():
+            return _sentence(error.exceptions[0], path)
+        case ForbiddenExtraKeysError():
+            key = min(error.extra_fields)
+            return f"there is no setting {_join(path, key)}{suggestion(key, [f.name for f in fields(error.cl)])}."
+        case KeyError():
+            return f"{path} is missing."
+        case ConfigError():
+            return str(error)
+    # A value's own error goes on after the setting's name, a dataclass's begins with the name of its field
+    return f"{path} {error}." if notes else f"{_join(path, str(error))}."
+
+
+@CONVERTER.register_structure_hook_factory(is_dataclass)
+def _group(cls: type) -> Callable[[Any, Any], Any]:
+    build = make_dict_structure_fn(cls, CONVERTER, _cattrs_forbid_extra_keys=True)
+
+    def read(value: Any, _: Any) -> Any:
         if not isinstance(value, Mapping):
-            raise ConfigError(
-                f"{path} is {value!r}, but it is a group of settings: set one of them, as in {path}.NAME=VALUE."
-            )
-        return typed(hint, value, path)  # type: ignore[arg-type]
-    if origin in (Union, types.UnionType):
-        return _alternative(arguments, value, path)
-    if origin is Literal:
-        if value not in arguments:
-            choices = ", ".join(map(str, arguments))
-            raise ConfigError(
-                f"{path} is {value!r}: choose one of {choices}{suggestion(str(value), map(str, arguments))}."
-            )
-        return value
-    if origin is tuple:
-        return _tuple(arguments, value, path)
-    if isinstance(hint, type) and issubclass(hint, Enum):
-        return _value(Literal[tuple(member.name.lower() for member in hint)], value, path) and hint[str(value).upper()]
-    return _scalar(hint, value, path)
+            raise ValueError(f"is {value!r}, but it is a group of settings: set one of them, as in GROUP.NAME=VALUE")
+        return build(value, cls)
+
+    return read
 
 
-def _alternative(hints: tuple[Any, ...], value: Any, path: str) -> Any:
-    """The first of several types that fits; `None` only where it is one of them."""
-    if value is None and type(None) in hints:
-        return None
-    errors = []
-    for hint in hints:
-        if hint is type(None):
-            continue
-        try:
-            return _value(hint, value, path)
-        except ConfigError as error:
-            errors.append(error)
-    raise errors[0]
+@CONVERTER.register_structure_hook_factory(lambda hint: get_origin(hint) is Literal)
+def _literal(hint: Any) -> Callable[[Any, Any], Any]:
+    return lambda value, _: _one_of(get_args(hint), value)
 
 
-def _tuple(hints: tuple[Any, ...], value: Any, path: str) -> tuple[Any, ...]:
-    if isinstance(value, str) or not isinstance(value, Iterable):
-        raise ConfigError(f"{path} is {value!r}: write a list, as in {path}=[1,2].")
-    items = list(value)
-    kinds = [hints[0]] * len(items) if len(hints) == 2 and hints[1] is Ellipsis else list(hints)
-    if len(kinds) != len(items):
-        raise ConfigError(f"{path} has {len(items)} entries: it needs {len(kinds)}.")
-    return tuple(_value(kind, item, f"{path}[{i}]") for i, (kind, item) in enumerate(zip(kinds, items, strict=True)))
+def _member(value: Any, cls: type[StrEnum]) -> StrEnum:
+    return cls(_one_of([member.value for member in cls], value))
 
 
-SCALARS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+def _one_of(choices: Sequence[Any], value: Any) -> Any:
+    if value not in choices:
+        words = [str(choice) for choice in choices]
+        raise ValueError(f"is {value!r}: choose one of {', '.join(words)}{suggestion(str(value), words)}")
+    return value
 
 
-def _scalar(hint: Any, value: Any, path: str) -> Any:
-    if hint not in SCALARS:
-        raise TypeError(f"{path}: no rule to read a {hint} from a configuration")
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if hint is float and is_number and math.isfinite(value):
-        return float(value)
-    if hint is str and is_number:  # 1000 is a fine word where words are wanted
-        return str(value)
-    if hint is not float and type(value) is hint:
-        return value
-    raise ConfigError(f"{path} is {value!r}: it must be {SCALARS[hint]}.")
+def _scalar(value: Any, kind: type) -> Any:
+    wanted, types = SCALARS[kind]
+    if type(value) not in types or (kind is float and not abs(value) <= sys.float_info.max):
+        raise ValueError(f"is {value!r}: it must be {wanted}")
+    return kind(value)
+
+
+CONVERTER.register_structure_hook(StrEnum, _member)
+for _kind in SCALARS:
+    CONVERTER.register_structure_hook(_kind, _scalar)
