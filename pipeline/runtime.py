@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from pipeline.compiled import remove_damaged
 from pipeline.quota import cpu_quota
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
@@ -47,7 +48,9 @@ def prepare_jax(core: int | None = None) -> None:
         _pin(core)
     import jax  # reads the environment above
 
-    jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
+    programs = cache_folder() / "jax"
+    remove_damaged(programs)
+    jax.config.update("jax_compilation_cache_dir", str(programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder
+from pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder, own_cores
 from tests.pipeline.command import ROOT
 
 # Orthogonal weights of several layers for several experts: batched QR factorisations side by side in one program
@@ -45,6 +45,16 @@ def test_factorisations_side_by_side_do_not_deadlock(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
 def test_xla_has_one_thread_to_compute(tmp_path: Path) -> None:
     assert int(python(COUNT, tmp_path)) <= 1
+
+
+@pytest.mark.skipif(sys.platform != "linux" or len(own_cores()) < 2, reason="looks at /proc; needs a second core")
+def test_runs_with_fewer_workers_than_cores_do_not_meet_on_one(tmp_path: Path) -> None:
+    program = (
+        "from pipeline.runtime import cores_for, prepare_jax; prepare_jax(cores_for(1)[0]); "
+        "import os; print(*os.sched_getaffinity(0))"
+    )
+    one, two = (set(python(program, tmp_path).split()) for _ in range(2))
+    assert len(one | two) > 1
 
 
 def test_flags_of_the_user_stay(tmp_path: Path) -> None:

@@ -1,0 +1,59 @@
+"""A compiled program that was half-written is compiled once more, and then kept."""
+
+from pathlib import Path
+
+from pipeline.compiled import READABLE, remove_damaged
+from tests.pipeline.test_runtime import python
+
+COMPILE = """
+from pipeline import runtime
+runtime.MIN_COMPILE_SECONDS = 0
+runtime.prepare_jax()
+import warnings
+warnings.simplefilter("error")  # JAX warns of what it cannot read
+import jax
+jax.jit(lambda x: x @ x + 1)(jax.numpy.ones((8, 8)))
+"""
+
+
+def programs(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("*-cache")}
+
+
+def test_a_truncated_program_is_replaced_without_a_warning(tmp_path: Path) -> None:
+    folder = tmp_path / "jax"
+    python(COMPILE, tmp_path)
+    whole = programs(folder)
+    remove_damaged(folder)
+    assert programs(folder) == whole
+    for name, content in whole.items():
+        (folder / name).write_bytes(content[: len(content) // 2])
+    python(COMPILE, tmp_path)
+    again = programs(folder)
+    assert again.keys() == whole.keys()
+    assert all(len(again[name]) > len(whole[name]) // 2 for name in whole)
+    remove_damaged(folder)
+    assert programs(folder) == again
+
+
+def test_programs_are_read_when_they_have_changed(tmp_path: Path) -> None:
+    """Damage of the same size and time would be seen only by reading."""
+    program = tmp_path / "jit_f-0-cache"
+    program.write_bytes(b"damaged")
+    remove_damaged(tmp_path)
+    assert not program.exists()
+    program.write_bytes(b"damaged")
+    state = [len(b"damaged"), program.stat().st_mtime_ns]
+    (tmp_path / READABLE).write_text(f'{{"{program.name}": {state}}}')
+    remove_damaged(tmp_path)
+    assert program.exists()
+    program.write_bytes(b"damaged again")
+    remove_damaged(tmp_path)
+    assert not program.exists()
+
+
+def test_a_damaged_note_is_no_obstacle(tmp_path: Path) -> None:
+    (tmp_path / READABLE).write_text("[")
+    (tmp_path / "jit_f-0-cache").write_bytes(b"")
+    remove_damaged(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [READABLE]
