@@ -20,11 +20,11 @@ from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task import rules as task
 from levelgen.task.actions import CHOICES, controls
+from physics.block import Block, Given, scratch_buffers
+from physics.codegen.buffers import LANES
 from physics.codegen.primitives import ELEMENTWISE
-from physics.engine import STAGES, Block, Given, step_block
-from physics.lanes import LANES
+from physics.engine import STAGES, step_block
 from physics.pairs import table_of
-from physics.rooms import is_room, scratch_rooms
 from physics.step import as_machine_code
 from physics.types import DEFAULT_PARAMS
 from pipeline.runtime import own_cores, prepare_jax
@@ -66,15 +66,13 @@ def seconds(given: Given, stages: tuple) -> float:
 def count(given: Given, stages: tuple) -> Counter:
     """Vector operations, loads and stores of one block of lanes, on average."""
     size, total = given.model.size, Counter()
-    arrays = lambda rooms: jax.tree.map(
-        lambda r: np.zeros((*r.shape, LANES) if r.lanes else r.shape, r.dtype), rooms, is_leaf=is_room
-    )
 
     def kernel(given, table, after, scratch):
         block = Block(*jax.tree.map(jax.new_ref, (table, given, after)), None, jax.tree.map(jax.new_ref, scratch))
         step_block(block, DEFAULT_PARAMS, stages)
 
-    table, scratch = table_of(size, True), arrays(scratch_rooms(size))
+    table = table_of(size, True)
+    scratch = jax.tree.map(lambda buffer: np.zeros(buffer.array().shape, buffer.dtype), scratch_buffers(size))
     for first in range(0, COUNTED, LANES):
         mine = jax.tree.map(lambda x, at=first: np.array(x[..., at : at + LANES]), given)
         handed = mine, table, jax.tree.map(np.zeros_like, mine.before), scratch

@@ -1,25 +1,16 @@
-"""What the solver moves: the bodies' places and velocities, and what it adds up to push them with."""
-
-from typing import NamedTuple
+"""The bodies: they fall, yield to what pushes them, and go where their velocities take them."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from physics.lanes import Ref, each
+from physics.block import Block
+from physics.lanes import Scalar, each
 from physics.trigonometry import cos_sin
-from physics.types import FIXED_POLYGONS, Model, Params, State
+from physics.types import FIXED_POLYGONS, Params
 from physics.vector import Vec
 
 
-class Bodies(NamedTuple):
-    """References, one row a body."""
-
-    motion: Ref  # [body, 5, lane]: place x, y (m), velocity x, y (m/s), angular velocity (rad/s)
-    push: Ref  # [body, 3, lane]: sum of impulses x, y (N s), angular (N m s), since the body last yielded to them
-    turn: Ref  # [body, 2, lane]: cosine and sine of the rotation
-
-
-def place(motion: Float[Array, "5 lane"]) -> Vec:
+def position(motion: Float[Array, "5 lane"]) -> Vec:
     return Vec(motion[0], motion[1])
 
 
@@ -27,22 +18,24 @@ def velocity(motion: Float[Array, "5 lane"]) -> Vec:
     return Vec(motion[2], motion[3])
 
 
-def start(model: Model, before: State, bodies: Bodies, params: Params) -> None:
+def start(block: Block, params: Params) -> None:
     """Read the bodies, and let those of finite mass fall."""
+    model, before, bodies = block.model, block.given.before, block.scratch.bodies
 
     def read(i):
         falls = jnp.where(model.inverse_mass[i] != 0, params.dt, 0.0)
         v = [before.velocity[i, k] + model.gravity[k] * falls for k in range(2)]
-        place = before.position[i]
-        bodies.motion[i] = jnp.stack([place[0], place[1], *v, before.angular_velocity[i]])
+        centre = before.position[i]
+        bodies.motion[i] = jnp.stack([centre[0], centre[1], *v, before.angular_velocity[i]])
         bodies.push[i] = jnp.zeros_like(bodies.push[i])
         bodies.turn[i] = jnp.stack(cos_sin(before.rotation[i]))
 
     each(bodies.motion.shape[0], read)
 
 
-def yield_one(model: Model, bodies: Bodies, i) -> None:
+def yield_one(block: Block, i: Scalar) -> None:
     """Let the impulses in `push` change the velocities of body i."""
+    model, bodies = block.model, block.scratch.bodies
     mass, push = model.inverse_mass[i], bodies.push[i]
     bodies.motion[i, 2] += mass * push[0]
     bodies.motion[i, 3] += mass * push[1]
@@ -50,13 +43,14 @@ def yield_one(model: Model, bodies: Bodies, i) -> None:
     bodies.push[i] = jnp.zeros_like(push)
 
 
-def yield_all(model: Model, bodies: Bodies) -> None:
+def yield_all(block: Block) -> None:
     """The same for every body; the scenery never moves."""
-    each(bodies.motion.shape[0], lambda i: yield_one(model, bodies, i), first=FIXED_POLYGONS)
+    each(block.scratch.bodies.motion.shape[0], lambda i: yield_one(block, i), first=FIXED_POLYGONS)
 
 
-def integrate(before: State, after: State, bodies: Bodies, params: Params) -> None:
-    """Euler step, then bounds on places and speeds."""
+def integrate(block: Block, params: Params) -> None:
+    """Euler step, then bounds on positions and speeds."""
+    before, after, bodies = block.given.before, block.after, block.scratch.bodies
 
     def clip(x, most):
         return jnp.clip(x, -most, most)

@@ -3,43 +3,32 @@
 Facts: `jax2d.joint`. Joints are solved one after another; each also moves its bodies towards each other.
 """
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 
-from physics.body import Bodies, place, velocity
-from physics.lanes import NOBODY, Ref, anywhere, each, pick, spread, when
-from physics.types import FIXED_POLYGONS, Model, Params, State
+from physics.block import Block
+from physics.body import position, velocity
+from physics.lanes import NOBODY, Scalar, anywhere, each, pick, spread, when
+from physics.types import FIXED_POLYGONS, Params
 from physics.vector import Vec, nonzero, spin
 
 
-class Joints(NamedTuple):
-    """References, one row a joint, constant over a step but for the impulses. Masses are 0 where it may not act."""
-
-    acts: Ref  # [joint, lane]: active, with active bodies, not both immovable
-    turns: Ref  # [joint, lane]: whether an angular impulse applies
-    arms: Ref  # [joint, 4, lane]: from the centre of a to its anchor, of b to its, in the world
-    masses: Ref  # [joint, 4, lane]: inverse masses of a and b, inverse inertias of a and b
-    weight: Ref  # [joint, lane]: share of a's anchor in the joint's point: the heavier body decides
-    angle: Ref  # [joint, lane]: angle of b relative to a, from the joint's resting angle, rad
-    angle_bias: Ref  # [joint, lane]: rad/s that the angle asks for
-    impulse: Ref  # [joint, 3, lane]: accumulated, x, y (N s) and angular (N m s)
-
-
-def prepare(model: Model, before: State, bodies: Bodies, to: Joints, params: Params) -> None:
+def prepare(block: Block, params: Params) -> None:
     """All joints as constraints."""
+    model, before, to = block.model, block.given.before, block.scratch.joints
 
     def one(j):
         to.acts[j] = jnp.zeros_like(to.acts[j])
         to.impulse[j] = jnp.stack(
             [before.joint_impulse[j, 0], before.joint_impulse[j, 1], before.joint_angular_impulse[j]]
         )
-        when(anywhere(model.joint_active[j]), lambda: _prepare_one(model, before, bodies, to, j, params))
+        when(anywhere(model.joint_active[j]), lambda: _prepare_one(block, params, j))
 
     each(to.acts.shape[0], one)
 
 
-def _prepare_one(model: Model, before: State, bodies: Bodies, to: Joints, j, params: Params) -> None:
+def _prepare_one(block: Block, params: Params, j: Scalar) -> None:
+    model, before, bodies, to = block.model, block.given.before, block.scratch.bodies, block.scratch.joints
+
     def read(i):
         alive = model.active[i].astype(bodies.turn.dtype)
         mass = [model.inverse_mass[i], model.inverse_inertia[i]]
@@ -66,8 +55,9 @@ def _prepare_one(model: Model, before: State, bodies: Bodies, to: Joints, j, par
     to.angle_bias[j] = jnp.where(fixed, angle * params.fixed_joint_bias, beyond * params.joint_limit_bias)
 
 
-def warm_start(model: Model, bodies: Bodies, to: Joints) -> None:
+def warm_start(block: Block) -> None:
     """Push with the impulses that the last step ended with."""
+    model, bodies, to = block.model, block.scratch.bodies, block.scratch.joints
 
     def one(j):
         x, y, turn = jnp.where(to.acts[j], to.impulse[j], 0.0)
@@ -80,22 +70,20 @@ def warm_start(model: Model, bodies: Bodies, to: Joints) -> None:
     each(to.acts.shape[0], lambda j: when(anywhere(to.acts[j]), lambda: one(j)))
 
 
-def solve(model: Model, bodies: Bodies, to: Joints, params: Params) -> None:
+def solve(block: Block, params: Params) -> None:
     """One pass over the joints, one after another."""
-
-    def one(j):
-        when(anywhere(to.acts[j]), lambda: _solve_one(model, bodies, to, j, params))
-
-    each(to.acts.shape[0], one)
+    acts = block.scratch.joints.acts
+    each(acts.shape[0], lambda j: when(anywhere(acts[j]), lambda: _solve_one(block, params, j)))
 
 
-def _solve_one(model: Model, bodies: Bodies, to: Joints, j, params: Params) -> None:
+def _solve_one(block: Block, params: Params, j: Scalar) -> None:
+    model, bodies, to = block.model, block.scratch.bodies, block.scratch.joints
     a, b = model.joint_a[j], model.joint_b[j]
     motion_a, motion_b = pick(bodies.motion.shape[0], lambda i: bodies.motion[i], a, b)
     mass_a, mass_b, inertia_a, inertia_b = to.masses[j]
     a_x, a_y, b_x, b_y = to.arms[j]
     arm_a, arm_b, fixed = Vec(a_x, a_y), Vec(b_x, b_y), model.joint_fixed[j]
-    x_a, x_b, w_a, w_b = place(motion_a), place(motion_b), motion_a[4], motion_b[4]
+    x_a, x_b, w_a, w_b = position(motion_a), position(motion_b), motion_a[4], motion_b[4]
 
     # anchors first, then their difference: a gap of exactly zero must come out as zero, because the
     # angle correction below looks at signs
@@ -129,8 +117,9 @@ def _solve_one(model: Model, bodies: Bodies, to: Joints, j, params: Params) -> N
     to.impulse[j] = jnp.stack([x + pull.x, y + pull.y, jnp.where(fixed, angular + twist, 0.0)])
 
 
-def remember(after: State, to: Joints) -> None:
+def remember(block: Block) -> None:
     """Hand the accumulated impulses to the next step."""
+    after, to = block.after, block.scratch.joints
 
     def write(j):
         x, y, turn = jnp.where(to.acts[j], to.impulse[j], 0.0)

@@ -2,7 +2,7 @@
 
 A reference reads and writes rows: `ref[i]` is a row of lanes, i a number that may be known only at run time. What
 differs between lanes is computed in all of them and selected; what no lane needs is skipped. The same source becomes
-machine code (`physics.codegen`), a Pallas kernel, or plain XLA operations on all lanes at once.
+machine code (`physics.codegen`), or plain XLA operations on all lanes at once.
 
 Whether something is skipped depends on the other lanes, so computing it must change nothing in a lane that does not
 need it. Select what is added there, for 0 times infinity is not 0; let a lane's own condition decide, not a guess that
@@ -11,17 +11,35 @@ the computation would find nothing; and let no result show the sign of a zero, f
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-LANES = 16  # of a block: as many float32 as the widest vector register holds
 NOBODY = -1  # instead of a body's number
 
-Ref = Any  # a reference to an array, `jax.Ref`
 Scalar = Int[Array, ""] | int
+
+
+class Rows(Protocol):
+    """An array, or a reference to one, of which a kernel reads rows."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    @property
+    def dtype(self) -> np.dtype: ...
+
+    def __getitem__(self, index: Any, /) -> Array: ...
+
+
+class Ref(Rows, Protocol):
+    """A reference to an array (`jax.Ref`), of which a kernel reads and writes rows."""
+
+    def __setitem__(self, index: Any, value: ArrayLike, /) -> None: ...
 
 
 def each(count: Scalar, do: Callable[[Any], None], first: Scalar = 0) -> None:

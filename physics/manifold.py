@@ -10,12 +10,14 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.body import Bodies, place
+from physics.block import Block
+from physics.body import position
 from physics.contact import Contact
-from physics.lanes import Ref, anywhere, each, when
-from physics.pairs import Table, pairs_of
+from physics.lanes import Ref, Scalar, anywhere, each, when
+from physics.pairs import CIRCLE_POLYGON, CIRCLES, POLYGONS, pairs_of
 from physics.types import MAX_VERTICES, Model
 from physics.vector import Vec, nonzero, where
 
@@ -32,19 +34,6 @@ MARGIN = 0.01
 Found = Callable[[int, list, list[Contact]], None]
 
 
-class Polygons(NamedTuple):
-    """References to each polygon's geometry, [x or y, polygon, vertex, lane] where it has vertices."""
-
-    start: Ref  # first vertex of each face, in the polygon's frame
-    edge: Ref  # from there to the next
-    along: Ref  # the same, of length 1
-    length: Ref  # [polygon, vertex, lane]
-    support: Ref  # [polygon, vertex, lane]: largest projection on the face's normal, from the centre; FAR: no such face
-    vertex: Ref  # in the world
-    normal: Ref  # outward unit normal of each face, in the world
-    box: Ref  # [polygon, 4, lane]: lowest x, y and highest x, y
-
-
 class Outline(NamedTuple):
     """One polygon in the world; components [vertex, lane]."""
 
@@ -54,16 +43,24 @@ class Outline(NamedTuple):
     support: Array
 
 
-def read_vec(ref: Ref, i) -> Vec:
+def read_vec(ref: Ref, i: Scalar) -> Vec:
     return Vec(ref[0, i], ref[1, i])
 
 
-def write_vec(ref: Ref, i, v: Vec) -> None:
+def write_vec(ref: Ref, i: Scalar, v: Vec) -> None:
     ref[0, i], ref[1, i] = v.x, v.y
 
 
-def outline_polygons(model: Model, bodies: Bodies, to: Polygons) -> None:
+def faces(start: Vec) -> tuple[Vec, Array, Vec]:
+    """Of each face of polygons, [vertex, ...]: the edge from its vertex to the next, its length, its outward normal."""
+    edge = start.map(lambda x: jnp.roll(x, -1, axis=0)) - start
+    length = edge.norm()
+    return edge, length, Vec(-edge.y, edge.x).scale(1 / nonzero(length))
+
+
+def outline_polygons(block: Block) -> None:
     """All polygons' geometry, in their own frames and in the world."""
+    model, bodies, to = block.model, block.scratch.bodies, block.scratch.outlines
 
     def one(i):
         triangle = model.n_vertices[i] == 3
@@ -74,12 +71,10 @@ def outline_polygons(model: Model, bodies: Bodies, to: Polygons) -> None:
 
         start = Vec(close(corners[:, 0]), close(corners[:, 1]))
         missing = triangle & (jnp.arange(MAX_VERTICES) == MAX_VERTICES - 1)[:, None]
-        edge = start.map(lambda x: jnp.roll(x, -1, axis=0)) - start
-        length = edge.norm()
-        outward = Vec(-edge.y, edge.x).scale(1 / nonzero(length))
+        edge, length, outward = faces(start)
         support = outward.map(lambda x: x[:, None]).dot(start.map(lambda x: x[None])).max(1)
         cos, sin = bodies.turn[i]
-        vertex = start.rotate(cos, sin) + place(bodies.motion[i])
+        vertex = start.rotate(cos, sin) + position(bodies.motion[i])
         write_vec(to.start, i, start)
         write_vec(to.edge, i, edge)
         write_vec(to.along, i, edge.scale(1 / nonzero(length)))
@@ -92,61 +87,67 @@ def outline_polygons(model: Model, bodies: Bodies, to: Polygons) -> None:
     each(to.support.shape[0], one)
 
 
-def find_contacts(model: Model, bodies: Bodies, polygons: Polygons, table: Table, found: Found) -> None:
+def find_contacts(block: Block, found: Found) -> None:
     """All pairs that may touch, in the order of `pairs.py`; `found` for those that come near each other."""
-    size = model.size
-    pairs = pairs_of(size)
+    pairs = pairs_of(block.model.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
-    disc = lambda i: (place(bodies.motion[i]), model.radius[i - size.polygons])
-
-    def polygon_pair(p):
-        a, b = table.a[p], table.b[p]
-        mine, other = polygons.box[a], polygons.box[b]
-        apart = (mine[:2] > other[2:] + MARGIN) | (other[:2] > mine[2:] + MARGIN)
-        may = may_touch(model, a, b) & ~apart.any(0)
-
-        def narrow():
-            contacts = _polygon_polygon(_outline(bodies, polygons, a), _outline(bodies, polygons, b))
-            found(0, [p, n + p], [c._replace(active=c.active & may) for c in contacts])
-
-        when(anywhere(may), narrow)
-
-    def circle_polygon(c):
-        a, b = table.a[c], table.b[c]
-        (centre, radius), box = disc(a), polygons.box[b]
-        reach = radius + MARGIN
-        apart = (centre.x < box[0] - reach) | (centre.x > box[2] + reach)
-        apart |= (centre.y < box[1] - reach) | (centre.y > box[3] + reach)
-        may = may_touch(model, a, b) & ~apart
-
-        def narrow():
-            contact = _circle_polygon(bodies, polygons, centre, radius, b)
-            found(1, [c], [contact._replace(active=contact.active & may)])
-
-        when(anywhere(may), narrow)
-
-    def circle_circle(c):
-        a, b = table.a[c], table.b[c]
-        contact = _circle_circle(*disc(a), *disc(b))
-        contact = contact._replace(active=contact.active & may_touch(model, a, b))
-        when(anywhere(contact.active), lambda: found(2, [c], [contact]))
-
-    each(n, polygon_pair)
-    each(2 * n + m, circle_polygon, first=2 * n)
-    each(pairs.contacts, circle_circle, first=2 * n + m)
+    each(n, lambda p: _polygons(block, p, n, found))
+    each(2 * n + m, lambda c: _circle_and_polygon(block, c, found), first=2 * n)
+    each(pairs.contacts, lambda c: _circles(block, c, found), first=2 * n + m)
 
 
-def may_touch(model: Model, a, b) -> Bool[Array, " lane"]:
+def _polygons(block: Block, p: Scalar, count: int, found: Found) -> None:
+    """Pair p of `count` pairs of polygons."""
+    a, b = block.table.a[p], block.table.b[p]
+    box = block.scratch.outlines.box
+    mine, other = box[a], box[b]
+    apart = (mine[:2] > other[2:] + MARGIN) | (other[:2] > mine[2:] + MARGIN)
+    may = may_touch(block.model, a, b) & ~apart.any(0)
+
+    def narrow():
+        contacts = _polygon_polygon(_outline(block, a), _outline(block, b))
+        found(POLYGONS, [p, count + p], [c._replace(active=c.active & may) for c in contacts])
+
+    when(anywhere(may), narrow)
+
+
+def _circle_and_polygon(block: Block, c: Scalar, found: Found) -> None:
+    a, b = block.table.a[c], block.table.b[c]
+    (centre, radius), box = _disc(block, a), block.scratch.outlines.box[b]
+    reach = radius + MARGIN
+    apart = (centre.x < box[0] - reach) | (centre.x > box[2] + reach)
+    apart |= (centre.y < box[1] - reach) | (centre.y > box[3] + reach)
+    may = may_touch(block.model, a, b) & ~apart
+
+    def narrow():
+        contact = _circle_polygon(block, centre, radius, b)
+        found(CIRCLE_POLYGON, [c], [contact._replace(active=contact.active & may)])
+
+    when(anywhere(may), narrow)
+
+
+def _circles(block: Block, c: Scalar, found: Found) -> None:
+    a, b = block.table.a[c], block.table.b[c]
+    contact = _circle_circle(*_disc(block, a), *_disc(block, b))
+    contact = contact._replace(active=contact.active & may_touch(block.model, a, b))
+    when(anywhere(contact.active), lambda: found(CIRCLES, [c], [contact]))
+
+
+def _disc(block: Block, i: Scalar) -> tuple[Vec, Array]:
+    """Centre and radius of a circle."""
+    return position(block.scratch.bodies.motion[i]), block.model.radius[i - block.model.size.polygons]
+
+
+def may_touch(model: Model, a: ArrayLike, b: ArrayLike) -> Bool[Array, " lane"]:
     """Both bodies are active and their collision modes allow it (joined bodies still have manifolds)."""
     mode_a, mode_b = model.collision_mode[a], model.collision_mode[b]
     modes = (mode_a == 2) | (mode_b == 2) | (mode_a * mode_b > 0)
     return modes & model.active[a] & model.active[b]
 
 
-def _outline(bodies: Bodies, polygons: Polygons, i) -> Outline:
-    return Outline(
-        place(bodies.motion[i]), read_vec(polygons.vertex, i), read_vec(polygons.normal, i), polygons.support[i]
-    )
+def _outline(block: Block, i: Scalar) -> Outline:
+    of, centre = block.scratch.outlines, position(block.scratch.bodies.motion[i])
+    return Outline(centre, read_vec(of.vertex, i), read_vec(of.normal, i), of.support[i])
 
 
 class Face(NamedTuple):
@@ -211,14 +212,15 @@ def _polygon_polygon(a: Outline, b: Outline) -> list[Contact]:
     return [contact(first, depth1, touching), contact(second, depth2, touching & (depth2 < 0))]
 
 
-def _circle_polygon(bodies: Bodies, polygons: Polygons, centre: Vec, radius: Array, i) -> Contact:
+def _circle_polygon(block: Block, centre: Vec, radius: Array, i: Scalar) -> Contact:
     """The circle's centre clipped to the polygon's nearest edge."""
+    bodies, outlines = block.scratch.bodies, block.scratch.outlines
     cos, sin = bodies.turn[i]
-    polygon = place(bodies.motion[i])
+    polygon = position(bodies.motion[i])
     local = (centre - polygon).unrotate(cos, sin)  # in the polygon's frame
-    start, length = read_vec(polygons.start, i), polygons.length[i]
-    edge, along = read_vec(polygons.edge, i), read_vec(polygons.along, i)
-    missing = polygons.support[i] == FAR
+    start, length = read_vec(outlines.start, i), outlines.length[i]
+    edge, along = read_vec(outlines.edge, i), read_vec(outlines.along, i)
+    missing = outlines.support[i] == FAR
 
     to_centre = local - start
     clipped = start + along.scale(jnp.clip(along.dot(to_centre), 0.0, length))

@@ -6,15 +6,18 @@ pairs, circle-polygon pairs, circle-circle pairs.
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
+from physics.lanes import Rows
 from physics.types import FIXED_POLYGONS, SOLVER_BATCH, Size
 
 KINDS = 3  # of pairs: polygons, circle-polygon, circles
 GROUPS = 4  # of contacts: first and second points of polygon pairs, circle-polygon, circles
-KIND_OF_GROUP = (0, 0, 1, 2)
+POLYGONS, CIRCLE_POLYGON, CIRCLES = range(KINDS)
+KIND_OF_GROUP = (POLYGONS, POLYGONS, CIRCLE_POLYGON, CIRCLES)
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,13 @@ class Pairs:
     circle: PairKind
 
     @property
+    def by_group(self) -> tuple[PairKind, ...]:
+        """The pairs of each group of contacts."""
+        return tuple((self.polygon, self.circle_polygon, self.circle)[kind] for kind in KIND_OF_GROUP)
+
+    @property
     def contacts(self) -> int:
-        return 2 * len(self.polygon) + len(self.circle_polygon) + len(self.circle)
+        return sum(map(len, self.by_group))
 
 
 @cache
@@ -65,15 +73,15 @@ def pairs_of(size: Size) -> Pairs:
 class Table(NamedTuple):
     """What kernels look up by number: references, or the arrays behind them. A segment is a solver batch of a group."""
 
-    a: Any  # [contact] first body
-    b: Any  # [contact] second body
-    kept: Any  # [contact] 0 where the padding defect forgets the accumulated impulses, else 1
-    start: Any  # [group] first contact
-    kind: Any  # [group] of its pairs
-    pairs: Any  # [group] of the kind
-    batches: Any  # [group] of the kind
-    group: Any  # [segment]
-    turn: Any  # [segment] number of the batch
+    a: Int[Rows, "contact"]  # first body
+    b: Int[Rows, "contact"]  # second body
+    kept: Float[Rows, "contact"]  # 0 where the padding defect forgets the accumulated impulses, else 1
+    start: Int[Rows, "group"]  # first contact
+    kind: Int[Rows, "group"]  # of its pairs
+    pairs: Float[Rows, "group"]  # how many pairs the kind has
+    batches: Float[Rows, "group"]  # how many solver batches the kind has
+    group: Int[Rows, "segment"]
+    turn: Float[Rows, "segment"]  # number of the batch
 
     @property
     def segments(self) -> int:
@@ -82,8 +90,7 @@ class Table(NamedTuple):
 
 def table_of(size: Size, faithful_padding: bool) -> Table:
     """The lookup tables of a size. Whole numbers that lanes calculate with are floats, exact ones."""
-    pairs = pairs_of(size)
-    kinds = [(pairs.polygon, pairs.circle_polygon, pairs.circle)[kind] for kind in KIND_OF_GROUP]
+    kinds = pairs_of(size).by_group
     kept = [np.ones(len(pair), np.float32) for pair in kinds]
     for pair, row in zip(kinds, kept, strict=True):
         row[len(pair) - 1 :] = not (faithful_padding and pair.padded)

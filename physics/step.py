@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from physics.codegen.compile import bytes_of, compile_kernel
-from physics.engine import STAGES, Block, Given, Stage, step_block
-from physics.lanes import LANES
+from physics.block import Block, Given, manifold_buffers, scratch_buffers
+from physics.buffers import buffers_like
+from physics.codegen.buffers import LANES, Buffer
+from physics.codegen.compile import compile_kernel
+from physics.engine import STAGES, Stage, step_block
 from physics.pairs import table_of
-from physics.rooms import Room, is_room, manifold_rooms, rooms_of, scratch_rooms
 from physics.types import DEFAULT_PARAMS, Manifold, Model, Params, Size, State
 
 
@@ -73,17 +74,16 @@ def on_all_lanes(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
     """The step as XLA's own operations, all lanes as one block: slow on a CPU, but anywhere and in any precision."""
     size, lanes, dtype = given.model.size, given.before.rotation.shape[-1], given.before.position.dtype
 
-    def empty(room: Room):
-        shape = (*room.shape, lanes) if room.lanes else room.shape
-        return jax.new_ref(jnp.zeros(shape, dtype if room.dtype == "float32" else room.dtype))
+    def empty(buffer: Buffer):
+        array = buffer.array(lanes)
+        return jax.new_ref(jnp.zeros(array.shape, dtype if array.dtype == jnp.float32 else array.dtype))
 
-    empties = lambda rooms: jax.tree.map(empty, rooms, is_leaf=is_room)
     table = jax.tree.map(jnp.asarray, table_of(size, params.faithful_padding))
     table = jax.tree.map(lambda x: jax.new_ref(x.astype(dtype) if x.dtype == jnp.float32 else x), table)
     read = jax.tree.map(jax.new_ref, given)
     after = jax.tree.map(lambda x: jax.new_ref(jnp.zeros_like(x)), given.before)
-    contacts = empties(manifold_rooms(size)) if seen else None
-    step_block(Block(table, read, after, contacts, empties(scratch_rooms(size))), params)
+    contacts = jax.tree.map(empty, manifold_buffers(size)) if seen else None
+    step_block(Block(table, read, after, contacts, jax.tree.map(empty, scratch_buffers(size))), params)
     return jax.tree.map(lambda ref: ref[...], (after, contacts))
 
 
@@ -93,44 +93,53 @@ def as_machine_code(given: Given, params: Params, seen: bool, stages: tuple[Stag
     With fewer `stages`, it takes less time and fills in less: to measure what each costs.
     """
     lanes = given.before.rotation.shape[-1]
-    kernel = _compiled(given.model.size, params, seen, rooms_of(given), stages)
+    kernel = _compiled(given.model.size, params, seen, buffers_like(given), stages)
     missing = -lanes % LANES
     fill = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge")
     given = jax.tree.map(fill, given) if missing else given
-    shape = lambda room: jax.ShapeDtypeStruct((*room.shape, lanes + missing), room.dtype)
-    results = [shape(room) for room in leaves(kernel.results)]
+    results = [buffer.array(lanes + missing) for buffer in jax.tree.leaves(kernel.results)]
     call = jax.ffi.ffi_call(kernel.name, [*results, jax.ShapeDtypeStruct((kernel.scratch_bytes,), np.uint8)])
     *filled, _ = call(*jax.tree.leaves(given), *table_of(given.model.size, params.faithful_padding))
     filled = [x[..., :lanes] for x in filled] if missing else filled
-    return jax.tree.unflatten(jax.tree.structure(kernel.results, is_leaf=is_room), filled)
+    return jax.tree.unflatten(jax.tree.structure(kernel.results), filled)
 
 
 class Kernel(NamedTuple):
     """A compiled step."""
 
     name: str  # for `jax.ffi.ffi_call`
-    results: tuple[State, Manifold | None]  # rooms
+    results: tuple[State, Manifold | None]  # buffers
     scratch_bytes: int
-
-
-def leaves(rooms: Any) -> list[Room]:
-    return jax.tree.leaves(rooms, is_leaf=is_room)
 
 
 @cache
 def _compiled(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...]) -> Kernel:
-    table = jax.tree.map(lambda x: Room(x.shape, str(x.dtype), lanes=False), table_of(size, params.faithful_padding))
-    results, scratch = (given.before, manifold_rooms(size) if seen else None), scratch_rooms(size)
+    buffers, jaxpr = trace(size, params, seen, given, stages)
+    reads, table, results, scratch = map(jax.tree.leaves, buffers)
+    name = compile_kernel(jaxpr, [*reads, *table], results, scratch)
+    return Kernel(name, buffers[2], sum(buffer.bytes for buffer in scratch))
+
+
+def trace(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...] = STAGES) -> tuple[Any, Any]:
+    """The step of a block as a jaxpr.
+
+    Args:
+        size: of the worlds.
+        params: constants of the engine.
+        seen: whether contacts are written down.
+        given: buffers of what the step reads.
+        stages: which of its stages.
+
+    Returns:
+        Buffers of what it is given, of the lookup tables, of its results and of its scratch memory; and the jaxpr,
+        of a function of one reference for each of their leaves.
+    """
+    table = jax.tree.map(lambda x: Buffer(x.shape, str(x.dtype), lanes=False), table_of(size, params.faithful_padding))
+    results = given.before, manifold_buffers(size) if seen else None
+    buffers = given, table, results, scratch_buffers(size)
 
     def kernel(*arrays):
         given, table, (after, contacts), scratch = jax.tree.map(jax.new_ref, arrays)
         step_block(Block(table, given, after, contacts, scratch), params, stages)
 
-    arrays = jax.tree.map(_block_of, (given, table, results, scratch), is_leaf=is_room)
-    jaxpr = jax.make_jaxpr(kernel)(*arrays)
-    name = compile_kernel(jaxpr, leaves((given, table)), leaves(results), leaves(scratch))
-    return Kernel(name, results, sum(map(bytes_of, leaves(scratch))))
-
-
-def _block_of(room: Room) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct((*room.shape, LANES) if room.lanes else room.shape, room.dtype)
+    return buffers, jax.make_jaxpr(kernel)(*jax.tree.map(Buffer.array, buffers))

@@ -12,8 +12,8 @@ from jax.lax import RoundingMethod
 from llvmlite import ir
 
 from physics.codegen import primitives
+from physics.codegen.buffers import BYTES, LANES
 from physics.codegen.values import INDEX, STORED, Operand, Value, array, constant, has_lanes, llvm_type
-from physics.lanes import LANES
 
 
 @dataclass(frozen=True)
@@ -64,23 +64,19 @@ def _as_said(b: ir.IRBuilder, x: Value | Memory, aval: Any) -> Value | Memory:
     return primitives.with_lanes(b, x) if isinstance(x, Value) and has_lanes(aval.shape) else x
 
 
-def _equation(b: ir.IRBuilder, equation, operands: list) -> list:
+def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
+    """Emit one equation; its results."""
     name, params = equation.primitive.name, equation.params
     out: Any = equation.outvars[0].aval if equation.outvars else None
     if name == "round" and params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
         raise NotImplementedError("a kernel rounds halves to even")
     if name in primitives.ELEMENTWISE:
         return [primitives.elementwise(b, name, operands, str(out.dtype))]
+    if name in CONTROL:
+        return CONTROL[name](b, equation, operands)
+    if name in ACCESS:
+        return ACCESS[name](b, params, operands)
     match name:
-        case "get":
-            return [_get(b, *_place(params, operands))]
-        case "swap":
-            place = _place(params, operands, 2)
-            before = [_get(b, *place)]
-            _swap(b, operands[1], *place)
-            return before
-        case "addupdate":
-            return _add(b, operands[1], *_place(params, operands, 2))
         case "convert_element_type":
             return [primitives.convert(b, operands[0], str(params["new_dtype"]))]
         case "broadcast_in_dim":
@@ -91,10 +87,10 @@ def _equation(b: ir.IRBuilder, equation, operands: list) -> list:
             return [_power(b, operands[0], params["y"], str(out.dtype))]
         case "slice":
             return [_slice(operands[0], params)]
-        case "concatenate" | "stack":
-            join, axis = (np.concatenate, "dimension") if name == "concatenate" else (np.stack, "axis")
-            pieces = [primitives.with_lanes(b, x) for x in operands] if any(x.lanes for x in operands) else operands
-            return [Value(join([x.rows for x in pieces], axis=params[axis]), pieces[0].dtype, pieces[0].lanes)]
+        case "concatenate":
+            return [_join(b, np.concatenate, operands, params["dimension"])]
+        case "stack":
+            return [_join(b, np.stack, operands, params["axis"])]
         case "reduce_or" | "reduce_and" | "reduce_max" | "reduce_min" | "reduce_sum":
             return [primitives.reduction(b, name, operands[0], params["axes"], str(out.dtype))]
         case "iota":
@@ -103,17 +99,12 @@ def _equation(b: ir.IRBuilder, equation, operands: list) -> list:
             return operands
         case "new_ref" if isinstance(operands[0], Memory):  # to an argument: the argument itself
             return operands
-        case "while":
-            return _while(b, params, operands)
-        case "scan":
-            return _scan(b, params, operands)
-        case "cond":
-            return _cond(b, params, operands, equation.outvars)
-        case "jit" | "closed_call":
-            return lower(b, params["jaxpr"], operands)
-        case "custom_jvp_call":
-            return lower(b, params["call_jaxpr"], operands)
     raise NotImplementedError(f"a kernel cannot use the primitive {name}")
+
+
+def _join(b: ir.IRBuilder, how: Callable, operands: list[Value], axis: int) -> Value:
+    pieces = [primitives.with_lanes(b, x) for x in operands] if any(x.lanes for x in operands) else operands
+    return Value(how([x.rows for x in pieces], axis=axis), pieces[0].dtype, pieces[0].lanes)
 
 
 def _power(b: ir.IRBuilder, x: Value, y: int, dtype: str) -> Value:
@@ -139,7 +130,7 @@ def _slice(x: Value, params: dict) -> Value:
     return Value(x.rows[cut[: x.rows.ndim]], x.dtype, x.lanes)
 
 
-def _place(params: dict, operands: list, first: int = 1) -> tuple[Memory, list]:
+def _indexed(params: dict, operands: list, first: int = 1) -> tuple[Memory, list]:
     """The memory that a reference names and, for each axis but the lanes, the row numbers that are meant."""
     memory = operands[0]
     transforms = jax.tree.unflatten(params["tree"], operands[first:])
@@ -173,13 +164,17 @@ def _rows(axes: list) -> tuple[tuple[int, ...], Callable[[tuple], list]]:
     shape = tuple(len(axis) for axis in axes if isinstance(axis, list))
 
     def address(at):
-        place = iter(at)
-        return [axis[next(place)] if isinstance(axis, list) else axis for axis in axes]
+        numbers = iter(at)
+        return [axis[next(numbers)] if isinstance(axis, list) else axis for axis in axes]
 
     return shape, address
 
 
-def _get(b: ir.IRBuilder, memory: Memory, axes: list) -> Value:
+def _get(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
+    return [_read(b, *_indexed(params, operands))]
+
+
+def _read(b: ir.IRBuilder, memory: Memory, axes: list) -> Value:
     shape, address = _rows(axes)
     return Value(array(shape, lambda at: _load(b, memory, address(at))), memory.dtype, memory.lanes)
 
@@ -187,31 +182,32 @@ def _get(b: ir.IRBuilder, memory: Memory, axes: list) -> Value:
 def _load(b: ir.IRBuilder, memory: Memory, index: list) -> Operand:
     kind = STORED[memory.dtype]
     kind = ir.VectorType(kind, LANES) if memory.lanes else kind
-    x = b.load(memory.at(b, index), align=STORED_BYTES[memory.dtype], typ=kind)
+    x = b.load(memory.at(b, index), align=BYTES[memory.dtype], typ=kind)
     return b.trunc(x, llvm_type("bool", memory.lanes)) if memory.dtype == "bool" else x
-
-
-STORED_BYTES = {"float32": 4, "int32": 4, "bool": 1}
 
 
 def _store(b: ir.IRBuilder, memory: Memory, index: list, x: Operand) -> None:
     if memory.dtype == "bool":
         kind = STORED["bool"]
         x = b.zext(x, ir.VectorType(kind, LANES) if memory.lanes else kind)
-    b.store(x, memory.at(b, index), align=STORED_BYTES[memory.dtype])
+    b.store(x, memory.at(b, index), align=BYTES[memory.dtype])
 
 
-def _swap(b: ir.IRBuilder, x: Value, memory: Memory, axes: list) -> None:
-    """Write."""
+def _swap(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
+    """Write, and hand on what was there."""
+    memory, axes = _indexed(params, operands, 2)
+    before = _read(b, memory, axes)
     shape, address = _rows(axes)
-    rows = np.broadcast_to(_written(b, x, memory).rows, shape)
+    rows = np.broadcast_to(_written(b, operands[1], memory).rows, shape)
     for at in np.ndindex(*shape):
         _store(b, memory, address(at), rows[at])
+    return [before]
 
 
-def _add(b: ir.IRBuilder, x: Value, memory: Memory, axes: list) -> list:
+def _add(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
+    memory, axes = _indexed(params, operands, 2)
     shape, address = _rows(axes)
-    rows = np.broadcast_to(_written(b, x, memory).rows, shape)
+    rows = np.broadcast_to(_written(b, operands[1], memory).rows, shape)
     for at in np.ndindex(*shape):
         now = primitives.combine(b, "add", memory.dtype, _load(b, memory, address(at)), rows[at])
         _store(b, memory, address(at), now)
@@ -256,7 +252,8 @@ def _loop(b: ir.IRBuilder, start: list[Value], go_on, body) -> list[Value]:
     return values
 
 
-def _while(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
+def _while(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list[Value]:
+    params = equation.params
     m, n = params["cond_nconsts"], params["body_nconsts"]
     of_test, of_body, start = operands[:m], operands[m : m + n], operands[m + n :]
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
@@ -267,8 +264,9 @@ def _while(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
     return _loop(b, start, go_on, lambda values: lower(b, body, [*of_body, *values]))
 
 
-def _scan(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
+def _scan(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list[Value]:
     """A `fori_loop` of fixed length: a scan that neither reads nor writes sequences."""
+    params = equation.params
     body, constants = params["jaxpr"], operands[: params["num_consts"]]
     start = operands[params["num_consts"] :]
     if len(start) != params["num_carry"] or len(body.out_avals) != params["num_carry"]:
@@ -283,24 +281,41 @@ def _scan(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
     return _loop(b, [counter, *start], lambda values: b.icmp_signed("<", values[0].rows[()], length), step)[1:]
 
 
-def _cond(b: ir.IRBuilder, params: dict, operands: list, outvars) -> list[Value]:
+def _cond(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list[Value]:
     which, operands = operands[0].rows[()], operands[1:]
-    branches, after = params["branches"], b.append_basic_block("after")
-    blocks = [b.append_basic_block(f"branch{i}") for i in range(len(branches))]
-    switch = b.switch(which, blocks[0])
-    for i, block in enumerate(blocks[1:], 1):
-        switch.add_case(constant(i, "int32"), block)
+    branches, after = equation.params["branches"], b.append_basic_block("after")
+    starts = [b.append_basic_block(f"branch{i}") for i in range(len(branches))]
+    switch = b.switch(which, starts[0])
+    for i, start in enumerate(starts[1:], 1):
+        switch.add_case(constant(i, "int32"), start)
     ends = []
-    for branch, block in zip(branches, blocks, strict=True):
-        b.position_at_end(block)
-        values = [_as_said(b, x, v.aval) for x, v in zip(lower(b, branch, operands), outvars, strict=True)]
+    for branch, start in zip(branches, starts, strict=True):
+        b.position_at_end(start)
+        results = lower(b, branch, operands)
+        values = [_as_said(b, x, v.aval) for x, v in zip(results, equation.outvars, strict=True)]
         ends.append((b.block, values))
         b.branch(after)
     b.position_at_end(after)
     merged = []
     for flat in zip(*(_flat(values) for _, values in ends), strict=True):
         phi = b.phi(flat[0].type)
-        for (block, _), x in zip(ends, flat, strict=True):
-            phi.add_incoming(x, block)
+        for (end, _), x in zip(ends, flat, strict=True):
+            phi.add_incoming(x, end)
         merged.append(phi)
     return _unflat(ends[0][1], merged)
+
+
+def _call(parameter: str) -> Callable[[ir.IRBuilder, core.JaxprEqn, list], list[Value]]:
+    """What is called, in its place."""
+    return lambda b, equation, operands: lower(b, equation.params[parameter], operands)
+
+
+CONTROL: dict[str, Callable[[ir.IRBuilder, core.JaxprEqn, list], list[Value]]] = {
+    "while": _while,
+    "scan": _scan,
+    "cond": _cond,
+    "jit": _call("jaxpr"),
+    "closed_call": _call("call_jaxpr"),
+    "custom_jvp_call": _call("call_jaxpr"),
+}
+ACCESS: dict[str, Callable[[ir.IRBuilder, dict, list], list[Value]]] = {"get": _get, "swap": _swap, "addupdate": _add}

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from physics.lanes import LANES
+from physics.codegen.buffers import LANES
 
 Operand = Any  # an LLVM value; llvmlite does not say of its own that they have types
 INDEX = ir.IntType(64)
-ELEMENT = {"float32": ir.FloatType(), "int32": ir.IntType(32), "bool": ir.IntType(1)}
+ELEMENT = {"float32": ir.FloatType(), "int32": ir.IntType(32), "bool": ir.IntType(1)}  # in registers
 STORED = {**ELEMENT, "bool": ir.IntType(8)}  # in memory
 
 

@@ -25,7 +25,7 @@ AS_WRITTEN = {"xla_disable_hlo_passes": "algsimp,simplify-fp-conversions", "xla_
 
 def worlds(name: str) -> Any:
     """Golden states of a size's name, scattered worlds of four numbers; to be given to a step."""
-    from physics.engine import Given
+    from physics.block import Given
     from physics.types import Size
 
     if name in "sml":

@@ -12,11 +12,11 @@ import jax
 import numpy as np
 import pytest
 
-from physics.engine import Given
-from physics.lanes import LANES
+from physics.block import Given
+from physics.codegen.buffers import LANES
 from physics.step import as_machine_code, on_all_lanes
 from physics.types import Params, Size
-from tests.physics.kernels import same_bits
+from tests.physics.codegen.kernels import same_bits
 from tests.physics.worlds import scattered
 
 SIZE = Size(polygons=6, circles=3, joints=4, thrusters=2)

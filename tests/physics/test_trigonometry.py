@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physics.lanes import LANES
-from physics.rooms import Room
+from physics.codegen.buffers import LANES, Buffer
 from physics.trigonometry import cos_sin, tanh
-from tests.physics.kernels import Kernel
+from tests.physics.codegen.kernels import Kernel
 
 COUNT = 4096 * LANES
 
@@ -19,7 +18,7 @@ def _all_three(x, out):
     out[...] = jnp.stack([*cos_sin(x[0]), tanh(x[0])])
 
 
-KERNEL = Kernel(_all_three, [Room((1,))], [Room((3,))])
+KERNEL = Kernel(_all_three, [Buffer((1,))], [Buffer((3,))])
 
 
 _jitted = jax.jit(lambda x: jnp.stack([*cos_sin(x), tanh(x)]))

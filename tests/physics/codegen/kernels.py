@@ -7,12 +7,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hypothesis import strategies as st
 
-from physics.codegen.compile import bytes_of, compile_kernel
-from physics.lanes import LANES
-from physics.rooms import Room
+from physics.codegen.buffers import LANES, Buffer
+from physics.codegen.compile import compile_kernel
 
 Arrays = Sequence[np.ndarray]
+
+
+def rows(elements: st.SearchStrategy, dtype: Any, count: int = 3) -> st.SearchStrategy[np.ndarray]:
+    """[count, lane], of one block."""
+    numbers = st.lists(elements, min_size=count * LANES, max_size=count * LANES)
+    return numbers.map(lambda x: np.array(x, dtype).reshape(count, LANES))
 
 
 class Kernel:
@@ -21,9 +27,9 @@ class Kernel:
     def __init__(
         self,
         body: Callable[..., None],
-        arguments: Sequence[Room],
-        results: Sequence[Room],
-        scratch: Sequence[Room] = (),
+        arguments: Sequence[Buffer],
+        results: Sequence[Buffer],
+        scratch: Sequence[Buffer] = (),
     ) -> None:
         self.body, self.arguments, self.results, self.scratch = body, arguments, results, scratch
 
@@ -34,12 +40,8 @@ class Kernel:
         def kernel(*arrays):
             self.body(*map(jax.new_ref, arrays))
 
-        jaxpr = jax.make_jaxpr(kernel)(*(_shape(room) for room in self._rooms))
+        jaxpr = jax.make_jaxpr(kernel)(*map(Buffer.array, [*self.arguments, *self.results, *self.scratch]))
         return compile_kernel(jaxpr, self.arguments, self.results, self.scratch)
-
-    @property
-    def _rooms(self) -> list[Room]:
-        return [*self.arguments, *self.results, *self.scratch]
 
     def as_machine_code(self, *arguments: np.ndarray) -> list[np.ndarray]:
         """What it makes of arguments of some blocks of lanes."""
@@ -48,8 +50,8 @@ class Kernel:
     @functools.cached_property
     def _machine_code(self) -> Any:
         def call(arguments):
-            shapes = [_shape(room, arguments[0].shape[-1]) for room in self.results]
-            workspace = jax.ShapeDtypeStruct((sum(map(bytes_of, self.scratch)),), np.uint8)
+            shapes = [buffer.array(arguments[0].shape[-1]) for buffer in self.results]
+            workspace = jax.ShapeDtypeStruct((sum(buffer.bytes for buffer in self.scratch),), np.uint8)
             return jax.ffi.ffi_call(self._name, [*shapes, workspace])(*arguments)
 
         return jax.jit(call)
@@ -59,13 +61,13 @@ class Kernel:
         blocks = []
         for first in range(0, arguments[0].shape[-1], LANES):
             block = [
-                x[..., first : first + LANES] if room.lanes else x
-                for x, room in zip(arguments, self.arguments, strict=True)
+                x[..., first : first + LANES] if buffer.lanes else x
+                for x, buffer in zip(arguments, self.arguments, strict=True)
             ]
             blocks.append([np.asarray(x) for x in self._xla(block)])
         return [
-            np.concatenate([block[i] for block in blocks], -1) if room.lanes else blocks[-1][i]
-            for i, room in enumerate(self.results)
+            np.concatenate([block[i] for block in blocks], -1) if buffer.lanes else blocks[-1][i]
+            for i, buffer in enumerate(self.results)
         ]
 
     @functools.cached_property
@@ -73,17 +75,13 @@ class Kernel:
         def run(block):
             given = [jax.new_ref(jnp.asarray(x)) for x in block]
             filled, scratch = (
-                [jax.new_ref(jnp.zeros(_shape(room).shape, room.dtype)) for room in rooms]
-                for rooms in (self.results, self.scratch)
+                [jax.new_ref(jnp.zeros(buffer.array().shape, buffer.dtype)) for buffer in buffers]
+                for buffers in (self.results, self.scratch)
             )
             self.body(*given, *filled, *scratch)
             return [ref[...] for ref in filled]
 
         return jax.jit(run)
-
-
-def _shape(room: Room, lanes: int = LANES) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct((*room.shape, lanes) if room.lanes else room.shape, room.dtype)
 
 
 def same_bits(ours: Arrays, theirs: Arrays, zeros: bool = True) -> None:

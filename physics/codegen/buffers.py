@@ -1,0 +1,29 @@
+"""The arrays that a kernel reads, writes and works in."""
+
+import math
+from dataclasses import dataclass
+
+import jax
+
+LANES = 16  # of a block: as many float32 as the widest vector register holds
+ALIGNMENT = 64  # bytes: a cache line, and the widest vector
+BYTES = {"float32": 4, "int32": 4, "bool": 1}
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """An array without its numbers. JAX's trees take it for a leaf, so it stands where an array or a reference will."""
+
+    shape: tuple[int, ...]  # without the lanes
+    dtype: str = "float32"
+    lanes: bool = True
+
+    def array(self, lanes: int = LANES) -> jax.ShapeDtypeStruct:
+        """The array, with so many lanes if it has any."""
+        return jax.ShapeDtypeStruct((*self.shape, lanes) if self.lanes else self.shape, self.dtype)
+
+    @property
+    def bytes(self) -> int:
+        """Of one block of lanes, in whole cache lines."""
+        count = math.prod(self.shape) * (LANES if self.lanes else 1)
+        return -(-count * BYTES[self.dtype] // ALIGNMENT) * ALIGNMENT

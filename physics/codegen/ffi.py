@@ -1,0 +1,197 @@
+"""A function that XLA calls: the kernel for each block of lanes of the buffers in XLA's call frame.
+
+The structures are those of version 0.3 of XLA's foreign function interface (xla/ffi/api/c_api.h), the one that jaxlib
+0.10.0 to 0.10.2 ship. XLA asks a handler which version it was made for, and refuses others than 0.1 to its own.
+tests/physics/codegen/test_ffi.py compares all of this with the header of the jaxlib that is installed.
+"""
+
+import ctypes
+from collections.abc import Sequence
+from ctypes import c_int, c_int64, c_size_t, c_uint32, c_void_p
+from typing import Any
+
+from llvmlite import ir
+
+from physics.codegen.buffers import LANES, Buffer
+from physics.codegen.values import INDEX, STORED, Operand
+
+VERSION_MAJOR, VERSION_MINOR = 0, 3
+METADATA_QUERY = 1  # XLA_FFI_Extension_Metadata: XLA asks which version the handler was made for
+
+
+class ExtensionBase(ctypes.Structure):
+    _fields_ = (("struct_size", c_size_t), ("type", c_int), ("next", c_void_p))
+
+
+class ApiVersion(ctypes.Structure):
+    _fields_ = (
+        ("struct_size", c_size_t),
+        ("extension_start", c_void_p),
+        ("major_version", c_int),
+        ("minor_version", c_int),
+    )
+
+
+class Metadata(ctypes.Structure):
+    """What XLA wants to know. It hands it over with no traits and no state, which is true of ours: not written."""
+
+    _fields_ = (
+        ("struct_size", c_size_t),
+        ("api_version", ApiVersion),
+        ("traits", c_uint32),
+    )
+
+
+class MetadataExtension(ctypes.Structure):
+    _fields_ = (("extension_base", ExtensionBase), ("metadata", c_void_p))
+
+
+class FrameBuffer(ctypes.Structure):
+    """An argument or a result."""
+
+    _fields_ = (
+        ("struct_size", c_size_t),
+        ("extension_start", c_void_p),
+        ("dtype", c_int),
+        ("data", c_void_p),
+        ("rank", c_int64),
+        ("dims", c_void_p),
+    )
+
+
+class Args(ctypes.Structure):
+    _fields_ = (
+        ("struct_size", c_size_t),
+        ("extension_start", c_void_p),
+        ("size", c_int64),
+        ("types", c_void_p),
+        ("args", c_void_p),
+    )
+
+
+class Rets(ctypes.Structure):
+    _fields_ = (
+        ("struct_size", c_size_t),
+        ("extension_start", c_void_p),
+        ("size", c_int64),
+        ("types", c_void_p),
+        ("rets", c_void_p),
+    )
+
+
+class CallFrame(ctypes.Structure):
+    """What XLA calls a handler with; its last fields are not read."""
+
+    _fields_ = (
+        ("struct_size", c_size_t),
+        ("extension_start", c_void_p),
+        ("api", c_void_p),
+        ("ctx", c_void_p),
+        ("stage", c_int),
+        ("args", Args),
+        ("rets", Rets),
+    )
+
+
+HEADER_NAMES = {
+    ExtensionBase: "XLA_FFI_Extension_Base",
+    ApiVersion: "XLA_FFI_Api_Version",
+    Metadata: "XLA_FFI_Metadata",
+    MetadataExtension: "XLA_FFI_Metadata_Extension",
+    FrameBuffer: "XLA_FFI_Buffer",
+    Args: "XLA_FFI_Args",
+    Rets: "XLA_FFI_Rets",
+    CallFrame: "XLA_FFI_CallFrame",
+}
+
+BYTE, POINTER, INT = ir.IntType(8), ir.PointerType(), ir.IntType(32)
+NULL = ir.Constant(POINTER, None)
+
+
+def _offset(structure: Any, *path: str) -> int:
+    """Bytes from the start of a structure to a field, in a structure in it, and so on."""
+    total = 0
+    for name in path:
+        total += getattr(structure, name).offset
+        structure = dict(structure._fields_)[name]
+    return total
+
+
+def _load(b: ir.IRBuilder, pointer: Operand, offset: int, kind: ir.Type = POINTER) -> Operand:
+    return b.load(b.gep(pointer, [INDEX(offset)], source_etype=BYTE), typ=kind)
+
+
+def add_handler(
+    module: ir.Module,
+    block: ir.Function,
+    arguments: Sequence[Buffer],
+    results: Sequence[Buffer],
+    scratch: Sequence[Buffer],
+) -> None:
+    """Add `handler(frame)` to the module: `block(lanes, pointers ...)` for each block of lanes.
+
+    Args:
+        module: where `block` is.
+        block: the kernel; see `compile.compile_kernel`.
+        arguments: what XLA hands over; the first has lanes.
+        results: what XLA wants filled; after them it hands over one more, the scratch memory.
+        scratch: what the kernel works in.
+    """
+    function = ir.Function(module, ir.FunctionType(POINTER, [POINTER]), "handler")
+    (frame,) = function.args
+    b = ir.IRBuilder(function.append_basic_block("entry"))
+    _answer_query(b, frame)
+    handed = _load(b, frame, _offset(CallFrame, "args", "args"))
+    filled = _load(b, frame, _offset(CallFrame, "rets", "rets"))
+    buffer = lambda array, i: _load(b, array, ctypes.sizeof(c_void_p) * i)
+    data = [_load(b, buffer(handed, i), _offset(FrameBuffer, "data")) for i in range(len(arguments))]
+    data += [_load(b, buffer(filled, i), _offset(FrameBuffer, "data")) for i in range(len(results) + 1)]
+    lanes = _last_dimension(b, buffer(handed, 0))
+    *outside, memory = data
+    workspace, offset = [], 0
+    for part in scratch:
+        workspace.append(b.gep(memory, [INDEX(offset)], source_etype=BYTE))
+        offset += part.bytes
+    _each_block(b, lanes, block, list(zip([*arguments, *results], outside, strict=True)), workspace)
+    b.ret(NULL)  # success
+
+
+def _answer_query(b: ir.IRBuilder, frame: Operand) -> None:
+    """Where XLA asks for the handler's metadata, write down the version and return."""
+    extension = _load(b, frame, _offset(CallFrame, "extension_start"))
+    with b.if_then(b.icmp_unsigned("!=", extension, NULL)):
+        kind = _load(b, extension, _offset(MetadataExtension, "extension_base", "type"), INT)
+        with b.if_then(b.icmp_signed("==", kind, INT(METADATA_QUERY))):
+            metadata = _load(b, extension, _offset(MetadataExtension, "metadata"))
+            for field, number in (("major_version", VERSION_MAJOR), ("minor_version", VERSION_MINOR)):
+                offset = _offset(Metadata, "api_version", field)
+                b.store(INT(number), b.gep(metadata, [INDEX(offset)], source_etype=BYTE))
+            b.ret(NULL)
+
+
+def _last_dimension(b: ir.IRBuilder, buffer: Operand) -> Operand:
+    last = b.sub(_load(b, buffer, _offset(FrameBuffer, "rank"), INDEX), INDEX(1))
+    dimension = b.gep(_load(b, buffer, _offset(FrameBuffer, "dims")), [last], source_etype=INDEX)
+    return b.load(dimension, typ=INDEX)
+
+
+def _each_block(
+    b: ir.IRBuilder, lanes: Operand, block: ir.Function, outside: list[tuple[Buffer, Any]], workspace: list
+) -> None:
+    """for lane in range(0, lanes, LANES): block(lanes, pointers from that lane on ...)"""
+    start = b.block
+    test, body, done = (b.append_basic_block(name) for name in ("test", "body", "done"))
+    b.branch(test)
+    b.position_at_end(test)
+    lane = b.phi(INDEX)
+    lane.add_incoming(INDEX(0), start)
+    b.cbranch(b.icmp_signed("<", lane, lanes), body, done)
+    b.position_at_end(body)
+    here = [
+        b.gep(pointer, [lane], source_etype=STORED[buffer.dtype]) if buffer.lanes else pointer
+        for buffer, pointer in outside
+    ]
+    b.call(block, [lanes, *here, *workspace])
+    lane.add_incoming(b.add(lane, INDEX(LANES)), b.block)
+    b.branch(test)
+    b.position_at_end(done)

@@ -1,0 +1,78 @@
+"""The structures that a handler reads are those of XLA's C header, which jaxlib ships."""
+
+import ctypes
+import re
+from pathlib import Path
+
+import jaxlib
+import pytest
+
+from physics.codegen import ffi
+
+HEADER = Path(jaxlib.__file__).parent / "include" / "xla" / "ffi" / "api" / "c_api.h"
+NUMBERS = {
+    "size_t": ctypes.c_size_t,
+    "int": ctypes.c_int,
+    "int64_t": ctypes.c_int64,
+    "XLA_FFI_Handler_Traits": ctypes.c_uint32,
+}
+
+
+@pytest.fixture(scope="module")
+def header() -> str:
+    """Without comments."""
+    return re.sub(r"//.*", "", HEADER.read_text())
+
+
+def declared(header: str, name: str) -> list[tuple[str, str]]:
+    """Type and name of each field of a structure."""
+    found = re.search(rf"\bstruct {name} {{(.*?)}}", header, re.DOTALL)
+    assert found, f"{HEADER} has no {name}"
+    fields = re.findall(r"([\w\s]+?[\s*]+)(\w+);", found[1])
+    return [(re.sub(r"\b(const|struct)\b", "", kind).strip(), field) for kind, field in fields]
+
+
+def kind_of(header: str, name: str) -> type:
+    """A C type as ctypes has it."""
+    if name.endswith("*"):
+        return ctypes.c_void_p
+    if name in NUMBERS:
+        return NUMBERS[name]
+    if re.search(rf"typedef enum {{[^}}]*}} {name};", header):
+        return ctypes.c_int
+    if re.search(rf"\bstruct {name} {{", header):
+        return structure(header, name)
+    raise AssertionError(f"{HEADER} has a type that this test does not know: {name}")
+
+
+def structure(header: str, name: str) -> type[ctypes.Structure]:
+    fields = [(field, kind_of(header, kind)) for kind, field in declared(header, name)]
+    return type(name, (ctypes.Structure,), {"_fields_": fields})
+
+
+@pytest.mark.parametrize("ours", ffi.HEADER_NAMES, ids=ffi.HEADER_NAMES.values())
+def test_fields_are_where_the_header_has_them(header: str, ours: type[ctypes.Structure]) -> None:
+    theirs = structure(header, ffi.HEADER_NAMES[ours])
+    assert len(theirs._fields_) >= len(ours._fields_) > 0
+    for name, kind, *_ in ours._fields_:
+        mine, their = getattr(ours, name), getattr(theirs, name)
+        said = f"{theirs.__name__}.{name} is not where physics/codegen/ffi.py has it: write down the header's fields"
+        assert (mine.offset, mine.size) == (their.offset, their.size), said
+        assert issubclass(kind, ctypes.Structure) == issubclass(dict(theirs._fields_)[name], ctypes.Structure)
+
+
+def test_the_version_that_a_handler_announces_is_the_headers(header: str) -> None:
+    """A new version may mean something else by the same fields: read what changed, then announce it."""
+    said = {name: int(number) for name, number in re.findall(r"#define XLA_FFI_API_(MAJOR|MINOR) (\d+)", header)}
+    assert said == {"MAJOR": ffi.VERSION_MAJOR, "MINOR": ffi.VERSION_MINOR}
+    query = re.search(r"XLA_FFI_Extension_Metadata = (\d+)", header)
+    assert query
+    assert int(query[1]) == ffi.METADATA_QUERY
+
+
+def test_structures_of_other_fields_are_told_apart(header: str) -> None:
+    """The comparison sees a field that has moved."""
+    moved = header.replace("XLA_FFI_ExecutionStage stage;", "int64_t more; XLA_FFI_ExecutionStage stage;")
+    assert moved != header
+    with pytest.raises(AssertionError, match=r"CallFrame\.stage is not where"):
+        test_fields_are_where_the_header_has_them(moved, ffi.CallFrame)

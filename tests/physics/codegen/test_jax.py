@@ -1,0 +1,106 @@
+"""What JAX makes of the step: the primitives and parameters that physics/codegen/lower.py was written for."""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+
+import jax
+import pytest
+from jax.extend import core
+
+from physics.block import Given
+from physics.buffers import buffers_like
+from physics.codegen.buffers import LANES
+from physics.step import trace
+from physics.types import Params, Size
+from tests.physics.worlds import scattered
+
+SIZE = Size(polygons=6, circles=3, joints=4, thrusters=2)  # one of everything
+PARAMETERS: dict[str, set[str]] = {
+    **{name: set() for name in ("abs", "add", "and", "div", "eq", "floor", "ge", "gt", "le", "lt", "max", "min")},
+    **{name: set() for name in ("ne", "neg", "not", "or", "select_n", "sign", "square", "sub")},
+    **{name: {"axes"} for name in ("reduce_and", "reduce_max", "reduce_min", "reduce_or")},
+    "broadcast_in_dim": {"broadcast_dimensions", "shape", "sharding"},
+    "concatenate": {"dimension"},
+    "cond": {"branches"},
+    "convert_element_type": {"new_dtype", "sharding", "weak_type"},
+    "get": {"tree"},
+    "iota": {"dimension", "dtype", "shape", "sharding"},
+    "jit": {
+        "compiler_options_kvs", "ctx_mesh", "donated_invars", "in_layouts", "in_shardings", "inline", "jaxpr",
+        "keep_unused", "name", "out_layouts", "out_shardings",
+    },
+    "mul": {"out_dtype"},
+    "new_ref": {"kind", "memory_space"},
+    "round": {"rounding_method"},
+    "scan": {"jaxpr", "length", "num_carry", "num_consts", "reverse", "unroll"},
+    "slice": {"limit_indices", "start_indices", "strides"},
+    "sqrt": {"accuracy"},
+    "squeeze": {"dimensions"},
+    "stack": {"axis"},
+    "swap": {"tree"},
+    "while": {"body_jaxpr", "body_nconsts", "cond_jaxpr", "cond_nconsts"},
+}  # fmt: skip
+CHANGED = (
+    f"JAX {jax.__version__} {{}}. Read what changed, mend physics/codegen/lower.py, then write it down here: "
+    "a parameter that nobody reads can change what a primitive means."
+)
+
+
+def equations(jaxpr: core.Jaxpr) -> Iterator[core.JaxprEqn]:
+    """Of a jaxpr and of all within it."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for inner in jax.tree.leaves(equation.params, is_leaf=lambda x: isinstance(x, core.Jaxpr | core.ClosedJaxpr)):
+            if isinstance(inner, core.ClosedJaxpr):
+                yield from equations(inner.jaxpr)
+            elif isinstance(inner, core.Jaxpr):
+                yield from equations(inner)
+
+
+@functools.cache
+def of_the_step() -> list[core.JaxprEqn]:
+    given = buffers_like(Given(*scattered(SIZE, LANES)))
+    return list(equations(trace(SIZE, Params(), True, given)[1].jaxpr))
+
+
+def test_the_step_uses_the_primitives_that_are_known() -> None:
+    used = {equation.primitive.name for equation in of_the_step()}
+    new, gone = used - set(PARAMETERS), set(PARAMETERS) - used
+    assert not new, CHANGED.format(f"makes new primitives of the step: {sorted(new)}")
+    assert not gone, CHANGED.format(f"makes no more of the primitives {sorted(gone)}")
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_a_primitive_has_the_parameters_that_are_known(name: str) -> None:
+    for equation in of_the_step():
+        if equation.primitive.name == name:
+            said = CHANGED.format(f"gives {name} the parameters {sorted(equation.params)}")
+            assert set(equation.params) == PARAMETERS[name], said
+
+
+def test_parameters_that_are_not_read_mean_nothing() -> None:
+    """They may only say what is the default."""
+    for equation in of_the_step():
+        name, params = equation.primitive.name, equation.params
+        means_nothing = (
+            params.get("sharding") is None
+            and params.get("accuracy") is None
+            and params.get("out_dtype") is None
+            and params.get("reverse", False) is False
+            and params.get("memory_space") is None
+        )
+        assert means_nothing, CHANGED.format(f"makes {name} with {params}")
+
+
+def test_a_reference_is_indexed_as_is_known() -> None:
+    """By one indexer: whole numbers, scalars, and slices of start, size and stride."""
+    for equation in of_the_step():
+        if equation.primitive.name in ("get", "swap"):
+            operands = equation.invars[1 + (equation.primitive.name == "swap") :]
+            transforms = jax.tree.unflatten(equation.params["tree"], operands)
+            assert len(transforms) <= 1
+            for index in transforms[0].indices if transforms else ():
+                if dataclasses.is_dataclass(index):
+                    names = [field.name for field in dataclasses.fields(index)]
+                    assert names == ["start", "size", "stride"], CHANGED.format(f"slices by {names}")
