@@ -143,8 +143,8 @@ def _remembered(block: Block, c: Scalar, acts: Bool[Array, " lane"]) -> Float[Ar
 def share_out(block: Block) -> None:
     """Share the contacts that act out into solver batches.
 
-    The reference sorts the pairs of a kind stably, those that do not touch first, and the pair at sorted index p
-    belongs to batch p mod batches: the k-th of A touching pairs among N, from 1, has index N - A + k - 1.
+    The reference sorts the pairs of a kind stably, those that do not touch first, and the pair of rank p, from 0,
+    belongs to batch p mod batches: the k-th of A touching pairs among N, k from 1, has rank N - A + k - 1.
     """
     to, table = block.scratch.constraints, block.table
 
@@ -154,8 +154,8 @@ def share_out(block: Block) -> None:
 
         def one(k):
             c = to.acting[k]
-            index = first + to.batch[c]
-            turn = index - batches * jnp.floor((index + 0.5) / batches)  # exact: whole numbers
+            rank = first + to.batch[c]
+            turn = rank - batches * jnp.floor((rank + 0.5) / batches)  # exact: whole numbers
             to.batch[c] = jnp.where(to.batch[c] == NONE, NONE, turn)
 
         each(table.start[group] + to.counts[group], one, first=table.start[group])

@@ -104,7 +104,7 @@ def as_machine_code(given: Given, params: Params, seen: bool, stages: tuple[Stag
     return jax.tree.unflatten(jax.tree.structure(kernel.results), filled)
 
 
-class Kernel(NamedTuple):
+class CompiledStep(NamedTuple):
     """A compiled step."""
 
     name: str  # for `jax.ffi.ffi_call`
@@ -113,11 +113,11 @@ class Kernel(NamedTuple):
 
 
 @cache
-def _compiled(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...]) -> Kernel:
+def _compiled(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...]) -> CompiledStep:
     buffers, jaxpr = trace(size, params, seen, given, stages)
     reads, table, results, scratch = map(jax.tree.leaves, buffers)
     name = compile_kernel(jaxpr, [*reads, *table], results, scratch)
-    return Kernel(name, buffers[2], sum(buffer.bytes for buffer in scratch))
+    return CompiledStep(name, buffers[2], sum(buffer.bytes for buffer in scratch))
 
 
 def trace(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...] = STAGES) -> tuple[Any, Any]:
