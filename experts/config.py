@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-RECORD_STEPS = 256  # env steps of a record
+RECORD_STEPS = 256  # env steps of a record, with automatic reset inside
 MOST_DOUBLINGS = 6  # of the wait between evaluations
 MOST_COUNTED = 2**31 - 1  # env steps and updates are counted in 32 bits on the device
 

@@ -17,13 +17,13 @@ from rich.table import Table
 
 from configs.compose import identified
 from configs.convert import typed
+from experts.config import RECORD_STEPS
 from experts.labels import DIVERGED
 from levelgen.sampling.distribution import Distribution
 from pipeline.look import duplicates
 from pipeline.read.select import columns_in, select
 from pipeline.store.layout import data_path
 from pipeline.store.manifest import Manifest, require_manifest
-from pipeline.store.schema import RECORD_STEPS
 from pipeline.store.shard import stored_bytes
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)

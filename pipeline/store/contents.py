@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from experts.config import RECORD_STEPS
 from experts.witness import Record
 from levelgen.identity.keys import MAX_LEVEL_ID
 from levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
@@ -17,7 +18,7 @@ from levelgen.task.actions import CHOICES
 from physics.pairs import pairs_of
 from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
 from pipeline.store.fields import annotated
-from pipeline.store.schema import RECORD_STEPS, FieldPlace, field_table
+from pipeline.store.schema import FieldPlace, field_table
 
 COUNTED = {  # fields with one entry for each thing of a kind
     "polygons": "level/model/n_vertices",

@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.store.schema import ALONG_TIME, PACKED, RECORD_STEPS, FieldPlace
+from experts.config import RECORD_STEPS
+from pipeline.store.schema import ALONG_TIME, PACKED, FieldPlace
 
 
 def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldPlace]) -> dict[str, np.ndarray]:

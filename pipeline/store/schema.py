@@ -12,7 +12,6 @@ import pyarrow as pa
 
 MANIFEST_VERSION = 4
 SHARD_VERSION = 1
-RECORD_STEPS = 256  # of a record, with automatic reset inside
 
 # Keys of a fragment's metadata
 VERSION_KEY = b"levelproof.manifest_version"

@@ -20,12 +20,13 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 
+from experts.config import RECORD_STEPS
 from levelgen.level import name_of
 from pipeline.errors import Failure
 from pipeline.store.contents import ContentsError, check_level_ids, check_numbers, size_in, table_for
 from pipeline.store.layout import data_path, fragment_of
 from pipeline.store.packing import pack, unpack
-from pipeline.store.schema import ALONG_TIME, PACKED, RECORD_STEPS, SHARD_VERSION, FieldPlace, field_table
+from pipeline.store.schema import ALONG_TIME, PACKED, SHARD_VERSION, FieldPlace, field_table
 
 FORMAT = "levelproof.shard"
 LEVEL = 5  # of zstd; 9 saves 2% and encodes at 3 MB/s

@@ -14,6 +14,7 @@ import numpy as np
 
 from configs.compose import compose_job
 from configs.schema import JobConfig
+from experts.config import RECORD_STEPS
 from experts.labels import Label, Source, Verdict
 from experts.train import Spent, UnitResult
 from experts.witness import Record, replay, succeeds
@@ -26,7 +27,6 @@ from pipeline.jobs.unit import commit
 from pipeline.store.contents import highest
 from pipeline.store.fields import arrays_of, tree_of
 from pipeline.store.layout import split_path
-from pipeline.store.schema import RECORD_STEPS
 
 T = TypeVar("T")
 PLAYED = 64  # levels of `played_split`

@@ -12,10 +12,10 @@ import pytest
 import zarr
 from zarr.codecs import GzipCodec
 
+from experts.config import RECORD_STEPS
 from pipeline.errors import Failure
 from pipeline.store.contents import table_for
 from pipeline.store.layout import data_path
-from pipeline.store.schema import RECORD_STEPS
 from pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
 from tests.pipeline.made import made_fields
 

@@ -8,12 +8,13 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from experts.config import RECORD_STEPS
 from experts.witness import Record
 from levelgen.level import SIZES, Level
 from pipeline.errors import Failure
 from pipeline.store.fields import arrays_of, same_bits, tree_of
 from pipeline.store.packing import pack, unpack
-from pipeline.store.schema import ALONG_TIME, RECORD_STEPS, FieldPlace, field_table
+from pipeline.store.schema import ALONG_TIME, FieldPlace, field_table
 from pipeline.store.shard import Shard, stored_bytes, write_shard
 from tests.pipeline.made import made_fields, made_level, made_record
 
