@@ -17,7 +17,7 @@ from jaxtyping import Int
 from experts.advance import advance
 from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
 from experts.judge import Evaluation, Kept, Trained, Witness, witness_of
-from experts.queue import GROUP, empty_queue, enter, next_places
+from experts.queue import GROUP, empty_queue, enter, next_indices
 from experts.slots import Begun, LevelQueue, Mode, Report, Slots, empty_slots
 from experts.witness import take
 from levelgen.level import Level
@@ -145,13 +145,13 @@ class Pool:
             if self._queue is None:
                 self._queue = empty_queue(submission.levels, capacity_of(self.config), self.updates, self.config)
                 self._slots = empty_slots(slot_count(self.config), self._queue, self.config)
-            places = next_places(self._queue, len(some))
-            if not self._at.keys().isdisjoint(places):
+            indices = next_indices(self._queue, len(some))
+            if not self._at.keys().isdisjoint(indices):
                 return
             begun = {i - some.start: submission.begun[i].begun for i in some if i in submission.begun}
             at = np.array(some)
             self._queue = enter(self._queue, take(submission.levels, at), submission.level_ids[at], self.config, begun)
-            self._at.update({place: (submission, i) for place, i in zip(places, some, strict=True)})
+            self._at.update({index: (submission, i) for index, i in zip(indices, some, strict=True)})
             self._coming.popleft()
 
     def _note(self, slot: int, seen: Report) -> None:

@@ -31,8 +31,8 @@ def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig
     )
 
 
-def next_places(queue: LevelQueue, count: int) -> list[int]:
-    """Places of the next levels that enter."""
+def next_indices(queue: LevelQueue, count: int) -> list[int]:
+    """Indices that the next levels will have."""
     come = int(queue.count)
     return [number % queue.capacity for number in range(come, come + count)]
 
@@ -44,29 +44,29 @@ def enter(
     config: ExpertConfig,
     begun: Mapping[int, Begun] = NO_EXPERTS,
 ) -> LevelQueue:
-    """The queue (used up) with more levels. `begun` has the experts that go on, by place among these levels."""
+    """The queue (used up) with more levels. `begun` has the experts that go on, by index among these levels."""
     for first in range(0, len(level_ids), GROUP):
         some = range(first, min(first + GROUP, len(level_ids)))
         fill = np.minimum(np.arange(first, first + GROUP), some[-1])
-        block, ids = take(levels, fill), np.asarray(level_ids, np.int32)[fill]
-        experts = begin(block, ids, config)
+        group, ids = take(levels, fill), np.asarray(level_ids, np.int32)[fill]
+        experts = begin(group, ids, config)
         if mine := {i - first: begun[i] for i in some if i in begun}:
             experts = jax.tree.map(np.array, experts)
             for i, expert in mine.items():
                 jax.tree.map(partial(_put_row, i), experts, expert)
         nowhere = [queue.capacity] * (GROUP - len(some))
-        queue = _put(queue, block, ids, experts, np.array(next_places(queue, len(some)) + nowhere))
+        queue = _put(queue, group, ids, experts, np.array(next_indices(queue, len(some)) + nowhere))
         queue = queue._replace(count=np.int32(int(queue.count) + len(some)))
     return queue
 
 
 @partial(jax.jit, donate_argnames="queue")
 def _put(
-    queue: LevelQueue, levels: Level, level_ids: Int[Array, "16"], experts: Begun, places: Int[Array, "16"]
+    queue: LevelQueue, levels: Level, level_ids: Int[Array, "16"], experts: Begun, indices: Int[Array, "16"]
 ) -> LevelQueue:
-    put = lambda old, new: old.at[places].set(new, mode="drop")
+    put = lambda old, new: old.at[indices].set(new, mode="drop")
     return queue._replace(
-        levels=jax.tree.map(lambda old, new: old.at[..., places].set(new, mode="drop"), queue.levels, levels),
+        levels=jax.tree.map(lambda old, new: old.at[..., indices].set(new, mode="drop"), queue.levels, levels),
         level_ids=put(queue.level_ids, level_ids),
         begun=jax.tree.map(put, queue.begun, experts),
     )

@@ -29,13 +29,13 @@ def verdicts(levels: Level) -> list[Verdict | None]:
     return decide(levels, DEFAULT_RULES).verdicts
 
 
-def places(verdicts: list[Verdict | None], label: Label) -> list[int]:
+def indices(verdicts: list[Verdict | None], label: Label) -> list[int]:
     return [i for i, verdict in enumerate(verdicts) if verdict and verdict.label is label]
 
 
 def test_trivial_levels_are_those_that_doing_nothing_solves(levels: Level, verdicts: list[Verdict | None]) -> None:
     idle = replay(levels, np.zeros((RECORD_STEPS, 6, COUNT), np.int32))
-    trivial = places(verdicts, Label.TRIVIAL)
+    trivial = indices(verdicts, Label.TRIVIAL)
     np.testing.assert_array_equal(trivial, np.flatnonzero(succeeds(idle.done, idle.goal)))
     assert len(trivial) > 10
     for i in trivial:
@@ -48,7 +48,7 @@ def test_trivial_levels_are_those_that_doing_nothing_solves(levels: Level, verdi
 
 def test_unsolvable_levels_have_a_proof(levels: Level, verdicts: list[Verdict | None]) -> None:
     known = facts_of(levels, DEFAULT_RULES)
-    unsolvable = places(verdicts, Label.UNSOLVABLE)
+    unsolvable = indices(verdicts, Label.UNSOLVABLE)
     np.testing.assert_array_equal(unsolvable, np.flatnonzero(known.proof != Proof.NONE))
     assert len(unsolvable) > 3
     for i in unsolvable:
@@ -68,7 +68,7 @@ def test_facts_do_not_depend_on_neighbours(levels: Level) -> None:
 
 def test_nobody_trains_on_what_is_decided(levels: Level, verdicts: list[Verdict | None]) -> None:
     """An expert of this configuration could not even be made: it would need a terabyte."""
-    trivial, unsolvable = places(verdicts, Label.TRIVIAL)[:3], places(verdicts, Label.UNSOLVABLE)[:2]
+    trivial, unsolvable = indices(verdicts, Label.TRIVIAL)[:3], indices(verdicts, Label.UNSOLVABLE)[:2]
     at = np.array([*trivial, *unsolvable])
     result = train_levels(take(levels, at), at, 10**9, ExpertConfig(width=10**6, depth=2))
     assert [v.label for v in result.verdicts] == [Label.TRIVIAL] * 3 + [Label.UNSOLVABLE] * 2

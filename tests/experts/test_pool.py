@@ -6,7 +6,7 @@ import pytest
 
 from experts.judge import Trained
 from experts.pool import Pool, Submission, capacity_of
-from experts.queue import empty_queue, enter, next_places
+from experts.queue import empty_queue, enter, next_indices
 from experts.witness import take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
@@ -99,7 +99,7 @@ def test_entries_of_a_queue_go_round(levels: Level) -> None:
     queue = empty_queue(levels, 20, 1, CONFIG)
     for at in (range(12), range(12, 24)):
         some, ids = part(levels, at)
-        assert next_places(queue, len(ids)) == [i % 20 for i in at]
+        assert next_indices(queue, len(ids)) == [i % 20 for i in at]
         queue = enter(queue, some, ids, CONFIG)
     assert int(queue.count) == 24
     expected = [*IDS[20:24], *IDS[4:20]]
