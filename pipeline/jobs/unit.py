@@ -3,7 +3,6 @@
 Idempotent: an attempt that dies anywhere leaves at most a shard that no fragment names. Knows nothing of workers.
 """
 
-import errno
 import math
 import traceback
 from dataclasses import asdict
@@ -27,22 +26,13 @@ from levelgen.task.rules import TaskParams
 from pipeline.errors import Failure
 from pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
 from pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
+from pipeline.store.disk import REFUSALS
 from pipeline.store.fields import arrays_of, map_arrays, same_bits
-from pipeline.store.layout import attempt_paths, fragment_path
+from pipeline.store.layout import new_attempt
 from pipeline.store.locks import LockRefused, committing
-from pipeline.store.manifest import write_fragment
+from pipeline.store.manifest import begin_fragment, write_fragment
 from pipeline.store.provenance import device, versions
 from pipeline.store.shard import write_shard
-
-# The disk refuses: the next attempt would train for nothing.
-FATAL = {
-    errno.ENOSPC: "the disk is full: free some space",
-    errno.EDQUOT: "your disk quota is used up: free some space",
-    errno.EFBIG: "the disk refuses files this large: choose another folder or raise the limit",
-    errno.EROFS: "the disk is read-only: make it writable",
-    errno.EACCES: "writing is not permitted: check the folder's permissions",
-    errno.EPERM: "writing is not permitted: check the folder's permissions",
-}
 
 
 def pool_for(job: JobConfig) -> Pool:
@@ -80,7 +70,7 @@ def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     reason, fatal = "".join(traceback.format_exception(error)), ""
     if isinstance(error, (LockRefused, SourceUnseen)):
         fatal = str(error)
-    elif isinstance(error, OSError) and (what := FATAL.get(error.errno or 0)):
+    elif isinstance(error, OSError) and (what := REFUSALS.get(error.errno or 0)):
         fatal = f"Cannot write to {split}, {what}, then run the same command again."
     return UnitOutcome(unit, reason=reason, fatal=fatal)
 
@@ -121,23 +111,24 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
         OSError: the disk refuses; nothing is committed.
     """
     kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label in WITNESSED]
-    shard, experts = attempt_paths(split, unit.name)
+    paths = new_attempt(split, unit.name)
     rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
     for row, content, signature in zip(rows, content_hashes(result.levels), signatures(result.levels), strict=True):
         row |= {"content_hash": content, "signature": signature}
     for place, i in enumerate(kept):
-        rows[i] |= {"shard": str(shard.relative_to(split)), "row": place}
+        rows[i] |= {"shard": str(paths.shard.relative_to(split)), "row": place}
     for row in rows if result.experts else ():
         if row["level_id"] in result.experts:
-            row["experts"] = str(experts.relative_to(split))
+            row["experts"] = str(paths.experts.relative_to(split))
     with committing(split):
+        begin_fragment(paths)
         if result.experts:
-            save_experts(experts, result.experts)
+            save_experts(paths.experts, result.experts)
         if kept:
             write_shard(
-                shard, [int(result.level_ids[i]) for i in kept], shard_arrays(result.levels, result.record, kept)
+                paths.shard, [int(result.level_ids[i]) for i in kept], shard_arrays(result.levels, result.record, kept)
             )
-        write_fragment(fragment_path(split, unit.name), rows, job.hash, job.results)
+        write_fragment(paths, rows, job.hash, job.results)
 
 
 def shard_arrays(levels: Level, record: Record, kept: list[int]) -> dict[str, np.ndarray]:

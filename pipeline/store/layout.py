@@ -1,25 +1,43 @@
 """Names of files and folders of a split `{out}/{budget}/{size}`. Knows nothing of what is in them.
 
 manifest/000000000000-000000000015.parquet          a fragment: the commit marker of a work unit
-shards/000000000000-000000000015-5f0c2a9b.zarr      data of one attempt at that unit
-experts/000000000000-000000000015-5f0c2a9b         experts of one attempt at that unit, if they are kept
+manifest/.000000000000-000000000015-5f0c2a9b.begun  the fragment of one attempt at that unit, until it is whole
+shards/000000000000-000000000015-5f0c2a9b.zarr      data of that attempt
+experts/000000000000-000000000015-5f0c2a9b          its experts, if they are kept
 quarantine/000000000000-000000000015.txt            why a unit was given up
 job.json                                            what the last command wanted
 .writer.lock, .commit.lock                          see pipeline/store/locks.py
 """
 
+import os
 import re
 import secrets
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from pipeline.errors import Failure
 
-MANIFEST, SHARDS, EXPERTS, QUARANTINE = "manifest", "shards", "experts", "quarantine"
+FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE = "manifest", "shards", "experts", "quarantine"
 WRITER_LOCK, COMMIT_LOCK, JOB = ".writer.lock", ".commit.lock", "job.json"
 DIGITS = 12  # of a level id in file names, so that names sort as ids do
-UNIT = rf"(\d{{{DIGITS}}})-(\d{{{DIGITS}}})"
+UNIT = rf"([0-9]{{{DIGITS}}})-([0-9]{{{DIGITS}}})"
 ATTEMPT = rf"{UNIT}-[0-9a-f]{{8}}"
+# Paths below the split:
+FRAGMENT = re.compile(rf"{MANIFEST}/{UNIT}\.parquet")
+BEGUN = re.compile(rf"{MANIFEST}/\.{ATTEMPT}\.begun")
 DATA = re.compile(rf"{SHARDS}/{ATTEMPT}\.zarr|{EXPERTS}/{ATTEMPT}")
+MADE = re.compile(rf"({DATA.pattern})(\.orbax-checkpoint-tmp.*)?")  # as Orbax calls experts until all is there
+JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # by the process of this number
+
+
+class Attempt(NamedTuple):
+    """Where one attempt at a unit writes; no other attempt has these names, but for the fragment's."""
+
+    fragment: Path
+    begun: Path  # there before anything else of the attempt, and renamed to the fragment by its commit
+    shard: Path
+    experts: Path
 
 
 def split_path(out: str, budget: str, size: str) -> Path:
@@ -35,10 +53,21 @@ def fragment_path(split: Path, unit: str) -> Path:
     return split / MANIFEST / f"{unit}.parquet"
 
 
-def attempt_paths(split: Path, unit: str) -> tuple[Path, Path]:
-    """New paths for a shard and for experts, used by no other attempt at this unit."""
+def new_attempt(split: Path, unit: str) -> Attempt:
     name = f"{unit}-{secrets.token_hex(4)}"
-    return split / SHARDS / f"{name}.zarr", split / EXPERTS / name
+    return Attempt(
+        fragment_path(split, unit),
+        split / MANIFEST / f".{name}.begun",
+        split / SHARDS / f"{name}.zarr",
+        split / EXPERTS / name,
+    )
+
+
+def attempt_of(path: Path) -> str:
+    """Name of the attempt that made this, by a path of `BEGUN` or `MADE`."""
+    found = re.search(ATTEMPT, path.name)
+    assert found, path
+    return found[0]
 
 
 def data_path(split: Path, name: str) -> Path:
@@ -62,6 +91,21 @@ def ids_of(fragment: Path) -> tuple[int, int] | None:
     """The lowest and the highest level id in a fragment, by its name; None where the name does not tell."""
     found = re.fullmatch(rf"{UNIT}\.parquet", fragment.name)
     return (int(found[1]), int(found[2])) if found else None
+
+
+def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[..., bool]) -> list[Path]:
+    """What one folder of a split, if it is there, has of these paths and of one kind (`DirEntry.is_file`, `is_dir`).
+
+    Links are of no kind, whatever they lead to.
+    """
+    if not (split / folder).is_dir():
+        return []
+    with os.scandir(split / folder) as found:
+        return [
+            split / folder / entry.name
+            for entry in found
+            if paths.fullmatch(os.path.join(folder, entry.name)) and is_kind(entry, follow_symlinks=False)
+        ]
 
 
 def fragment_of(shard: Path) -> Path:

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import compress
+from os import DirEntry
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from configs.convert import flat
 from configs.schema import hash_of
 from levelgen.identity.keys import MAX_LEVEL_ID
 from pipeline.errors import Failure, UserError
-from pipeline.store.layout import MANIFEST, ids_of
+from pipeline.store.disk import flush, flush_entry
+from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
 from pipeline.store.schema import COLUMNS, CONFIG_KEY, HASH_KEY, MANIFEST_VERSION, VERSION_KEY
 
 SHOWN = 6  # differing settings that an error lists
@@ -38,11 +40,24 @@ class Fragment:
     config: dict[str, Any]  # the settings that decide results
 
 
-def write_fragment(path: Path, rows: Sequence[Mapping[str, Any]], config_hash: str, config: Mapping[str, Any]) -> None:
-    """Commit a unit: write its manifest rows to `path`, durably and in one step.
+def begin_fragment(attempt: Attempt) -> None:
+    """Note on the disk that an attempt begins to write: what it leaves when it dies can be told from what others own.
 
     Raises:
-        OSError: the disk refuses; nothing is at `path` then, or what was there before.
+        OSError: the disk refuses.
+    """
+    attempt.begun.parent.mkdir(parents=True, exist_ok=True)
+    attempt.begun.touch(exist_ok=False)
+    flush(attempt.begun)
+
+
+def write_fragment(
+    attempt: Attempt, rows: Sequence[Mapping[str, Any]], config_hash: str, config: Mapping[str, Any]
+) -> None:
+    """Commit a unit: write its manifest rows to the attempt's fragment, durably and in one step.
+
+    Raises:
+        OSError: the disk refuses; no fragment is there then, or the one that was there before.
     """
     metadata = {
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
@@ -50,26 +65,20 @@ def write_fragment(path: Path, rows: Sequence[Mapping[str, Any]], config_hash: s
         CONFIG_KEY: json.dumps(config, sort_keys=True).encode(),
     }
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS.with_metadata(metadata))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with temporary.open("wb") as file:
-            pq.write_table(table, file, compression="zstd", write_page_checksum=True)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the new name itself
-    finally:
-        os.close(folder)
+    with attempt.begun.open("wb") as file:
+        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
+        file.flush()
+        os.fsync(file.fileno())
+    attempt.begun.replace(attempt.fragment)
+    flush_entry(attempt.fragment.parent)  # the new name itself
 
 
 def fragment_paths(split: Path) -> list[Path]:
-    """All committed fragments of a split, in the order of their level ids."""
-    return sorted(path for path in (split / MANIFEST).glob("*.parquet") if not path.name.startswith("."))
+    """All committed fragments of a split, in the order of their level ids: files with the exact name of one.
+
+    Whatever else is in the folder (copies, links, what file systems and editors leave) is none.
+    """
+    return sorted(entries(split, MANIFEST, FRAGMENT, DirEntry.is_file))
 
 
 def read_fragment(path: Path, columns: Sequence[str] | None = None) -> tuple[Fragment, pa.Table]:
@@ -170,7 +179,8 @@ def read_manifest(
             changes = told(differences(fragments[0].config, fragment.config))
             raise Failure(
                 f"The split {split} mixes two configurations, {fragments[0].path.name} and {fragment.path.name} "
-                f"({changes}): move the fragments of one of them elsewhere."
+                f"({changes}): move the fragments of one of them elsewhere, with the shards and experts that are "
+                "named after them."
             )
     schema = pa.schema([COLUMNS.field(name) for name in names])
     table = (

@@ -11,7 +11,6 @@ array lie in one file (zarr's sharding codec), compressed with Blosc-zstd 5 afte
 CRC-32C. The group's attributes hold the field table. Measurements: docs/storage.md.
 """
 
-import os
 import stat
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -24,6 +23,7 @@ from experts.config import RECORD_STEPS
 from levelgen.level import name_of
 from pipeline.errors import Failure
 from pipeline.store.contents import ContentsError, check_level_ids, check_numbers, size_in, table_for
+from pipeline.store.disk import flush
 from pipeline.store.layout import data_path, fragment_of
 from pipeline.store.packing import pack, unpack
 from pipeline.store.schema import ALONG_TIME, PACKED, SHARD_VERSION, FieldPlace, field_table
@@ -61,7 +61,7 @@ def write_shard(path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.nd
                 dimension_names=("level", "component", "time")[: values.ndim],
                 config={"write_empty_chunks": True},
             )
-    _flush(path)
+    flush(path)
 
 
 class Shard:
@@ -166,13 +166,3 @@ def stored_bytes(path: Path) -> int:
     """Bytes of all files of a shard; what links lead to is not its own."""
     about = (entry.lstat() for entry in path.rglob("*"))
     return sum(file.st_size for file in about if stat.S_ISREG(file.st_mode))
-
-
-def _flush(path: Path) -> None:
-    """Everything below `path` to the disk: the fragment that names it may be written only after."""
-    for entry in [path, *path.rglob("*"), path.parent]:
-        descriptor = os.open(entry, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -1,9 +1,8 @@
-"""A split opened for writing: its folder, its lock, its configuration, and what dead attempts left behind."""
+"""A split opened for writing: its folders, its lock and its configuration."""
 
 import json
 import os
 import shlex
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,9 +10,10 @@ from pathlib import Path
 from configs.schema import JobConfig
 from pipeline.errors import UserError
 from pipeline.jobs.schedule import runs
-from pipeline.store.layout import EXPERTS, JOB, MANIFEST, SHARDS, split_path
-from pipeline.store.locks import Locked, nobody_commits, only_writer, require_locks
-from pipeline.store.manifest import Manifest, differences, read_manifest, told
+from pipeline.store.layout import FOLDERS, JOB, split_path
+from pipeline.store.leftovers import clean
+from pipeline.store.locks import Locked, only_writer, require_locks
+from pipeline.store.manifest import Manifest, differences, told
 
 
 @contextmanager
@@ -30,6 +30,7 @@ def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, 
     """
     split = split_path(job.out, job.budget, job.size)
     _make_writable(split)
+    _require_own_folders(split)
     try:
         with only_writer(split):
             require_locks(split)
@@ -57,24 +58,6 @@ def require_same(manifest: Manifest, job: JobConfig) -> None:
     )
 
 
-def clean(split: Path, say: Callable[[str], None]) -> Manifest:
-    """Remove shards and experts that no fragment names and half-written files; what is committed stays.
-
-    Done while nobody commits: a worker of a killed run may still be about to name its shard.
-    """
-    with nobody_commits(split, say):
-        manifest = read_manifest(split)
-        for path in (split / SHARDS).glob("*.zarr"):
-            if f"{SHARDS}/{path.name}" not in manifest.shards:
-                shutil.rmtree(path)
-        for path in (split / EXPERTS).glob("*"):
-            if f"{EXPERTS}/{path.name}" not in manifest.experts:
-                shutil.rmtree(path)
-        for path in [*(split / MANIFEST).glob(".*"), *split.glob(f".{JOB}.*")]:
-            path.unlink()
-    return manifest
-
-
 def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[int]) -> None:
     """Write down what this command wants, for `levelproof status`."""
     note = {
@@ -97,3 +80,14 @@ def _make_writable(split: Path) -> None:
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise UserError(f"Cannot write to {split} ({reason}): choose another folder with out=NAME.") from None
+
+
+def _require_own_folders(split: Path) -> None:
+    """Refuse links: what is removed from a split is looked for in these folders."""
+    for path in (split / name for name in FOLDERS):
+        if path.is_symlink() or (path.exists() and not path.is_dir()):
+            what = "a link" if path.is_symlink() else "no folder"
+            raise UserError(
+                f"The folders of a split must be in it, and {path} is {what}: put a folder in its place, "
+                "or choose another one for the split with out=NAME."
+            )

@@ -12,7 +12,8 @@ from pipeline.errors import Failure, UserError
 from pipeline.jobs.regenerate import split_words
 from pipeline.read.verify import examine
 from pipeline.store.checkpoints import load_experts, require_same_experts
-from pipeline.store.manifest import read_manifest
+from pipeline.store.layout import new_attempt
+from pipeline.store.manifest import begin_fragment, read_manifest
 from tests.pipeline.command import run
 from tests.pipeline.made import made_job
 
@@ -100,11 +101,13 @@ def test_a_damaged_checkpoint_is_named(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_experts_that_no_fragment_names_are_removed(folder: Path, tmp_path: Path) -> None:
+def test_experts_that_a_dead_attempt_left_are_removed(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "data", tmp_path / "data")
     experts = tmp_path / "data/8k/s/experts"
     named = set(experts.iterdir())
-    shutil.copytree(min(named), experts / "000000000000-000000000011-dead0000")
+    dead = new_attempt(tmp_path / "data/8k/s", "000000000000-000000000011")
+    begin_fragment(dead)
+    shutil.copytree(min(named), dead.experts)
     assert run(["generate", *SETTINGS, "budget=8k", "keep_experts=true"], tmp_path).returncode == 0
     assert set(experts.iterdir()) == named
 

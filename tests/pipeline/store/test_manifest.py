@@ -12,8 +12,9 @@ from experts.labels import Label
 from pipeline.errors import Failure, UserError
 from pipeline.jobs.unit import manifest_row
 from pipeline.store import manifest as manifest_file
-from pipeline.store.layout import fragment_path, unit_name
+from pipeline.store.layout import new_attempt, unit_name
 from pipeline.store.manifest import (
+    begin_fragment,
     differences,
     fragment_paths,
     read_fragment,
@@ -32,12 +33,13 @@ def job() -> JobConfig:
 
 
 def commit(split: Path, job: JobConfig, level_ids: list[int], label: Label = Label.SOLVED) -> Path:
-    path = fragment_path(split, unit_name(level_ids[0], level_ids[-1]))
+    attempt = new_attempt(split, unit_name(level_ids[0], level_ids[-1]))
     rows = [manifest_row(job, i, made_verdict(label)) for i in level_ids]
-    rows = [row | {"shard": f"shards/{path.stem}-ab.zarr", "row": i} for i, row in enumerate(rows)]
+    rows = [row | {"shard": f"shards/{attempt.shard.name}", "row": i} for i, row in enumerate(rows)]
     rows = [row | {"content_hash": f"c1:{row['level_id']}", "signature": ["n1:a", "n1:b"]} for row in rows]
-    write_fragment(path, rows, job.hash, job.results)
-    return path
+    begin_fragment(attempt)
+    write_fragment(attempt, rows, job.hash, job.results)
+    return attempt.fragment
 
 
 def test_rows_come_back_sorted_with_every_column(tmp_path: Path, job: JobConfig) -> None:
@@ -86,17 +88,26 @@ def test_nothing_committed_is_an_empty_manifest(tmp_path: Path) -> None:
         require_manifest(tmp_path / "nowhere")
 
 
-def test_a_half_written_fragment_is_none(tmp_path: Path, job: JobConfig) -> None:
-    commit(tmp_path, job, [0])
-    (tmp_path / "manifest/.000000000001-000000000001.parquet.77").write_bytes(b"PAR1")
-    assert len(fragment_paths(tmp_path)) == 1
+def test_what_is_no_fragment_is_not_read(tmp_path: Path, job: JobConfig) -> None:
+    """A half-written one, a copy, what a notebook, a desktop and NFS leave, folders and links."""
+    path = commit(tmp_path, job, [0])
+    begin_fragment(new_attempt(tmp_path, unit_name(1, 1)))
+    for name in ("all.parquet", f"{path.stem} (copy).parquet", ".DS_Store", ".nfs0000000000003a1b00000002"):
+        path.with_name(name).write_bytes(b"PAR1")
+    for name in (".ipynb_checkpoints", f"{unit_name(2, 2)}.parquet"):
+        path.with_name(name).mkdir()
+    path.with_name(f"{unit_name(3, 3)}.parquet").symlink_to("nowhere")
+    path.with_name(f"{unit_name(4, 4)}.parquet").symlink_to(path)
+    assert fragment_paths(tmp_path) == [path]
+    assert read_manifest(tmp_path).level_ids.tolist() == [0]
 
 
-def test_a_failed_write_leaves_nothing(tmp_path: Path, job: JobConfig) -> None:
-    path = fragment_path(tmp_path, "x")
+def test_a_failed_write_commits_nothing(tmp_path: Path, job: JobConfig) -> None:
+    attempt = new_attempt(tmp_path, unit_name(0, 0))
+    begin_fragment(attempt)
     with pytest.raises((pa.ArrowException, ValueError, TypeError)):
-        write_fragment(path, [{"level_id": "no number"}], job.hash, job.results)
-    assert not list(tmp_path.rglob("*.parquet*"))
+        write_fragment(attempt, [{"level_id": "no number"}], job.hash, job.results)
+    assert list(tmp_path.rglob("*.*")) == [attempt.begun]
 
 
 def test_any_damaged_byte_of_a_fragment_is_seen_or_harmless(tmp_path: Path, job: JobConfig) -> None:
@@ -132,7 +143,7 @@ def test_another_version_is_refused(tmp_path: Path, job: JobConfig) -> None:
 def test_two_configurations_in_one_split_are_named(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [0])
     commit(tmp_path, made_job("data", "expert.width=32"), [1])
-    with pytest.raises(Failure, match=r"mixes two configurations.*expert.width was 64, now 32"):
+    with pytest.raises(Failure, match=r"mixes two configurations.*expert.width was 64, now 32.*with the shards"):
         read_manifest(tmp_path)
 
 

@@ -1,18 +1,17 @@
-"""A split opened for writing: one writer, one configuration, and nothing of dead attempts left."""
+"""A split opened for writing: one writer, one configuration, folders of its own."""
 
-import multiprocessing
 from pathlib import Path
 
 import pytest
 
 from configs.schema import JobConfig
 from experts.labels import Label
-from pipeline.errors import Failure, UserError
+from pipeline.errors import UserError
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
-from pipeline.store.locks import committing, is_written
-from pipeline.store.manifest import fragment_paths
-from pipeline.store.split import clean, writing
+from pipeline.store.layout import FOLDERS
+from pipeline.store.locks import is_written
+from pipeline.store.split import writing
 from tests.pipeline.made import made_job, made_result
 
 
@@ -30,28 +29,6 @@ def test_the_folder_is_made_and_its_path_is_budget_and_size(tmp_path: Path, job:
         assert split == tmp_path / "data/128k/s"
         assert split.is_dir()
         assert len(manifest.level_ids) == 0
-
-
-def test_what_dead_attempts_left_is_removed_and_what_is_committed_stays(job: JobConfig) -> None:
-    with writing(job, print) as (split, _):
-        committed(job, split)
-        kept = {path.name for path in (split / "shards").iterdir()}
-        (split / "shards/000000000000-000000000001-dead.zarr/dyn32").mkdir(parents=True)
-        (split / "manifest/.000000000002-000000000003.parquet.99").touch()
-    with writing(job, print) as (split, manifest):
-        assert {path.name for path in (split / "shards").iterdir()} == kept
-        assert [path.name for path in (split / "manifest").iterdir()] == [path.name for path in fragment_paths(split)]
-        assert manifest.level_ids.tolist() == [0, 1]
-
-
-def test_a_damaged_fragment_stops_the_cleaning(job: JobConfig) -> None:
-    """Its shard is named by it alone, and must not be taken for a leftover."""
-    with writing(job, print) as (split, _):
-        committed(job, split)
-    fragment_paths(split)[0].write_bytes(b"x")
-    with pytest.raises(Failure, match="is damaged"), writing(job, print):
-        pass
-    assert len(list((split / "shards").iterdir())) == 1
 
 
 def test_another_configuration_is_refused_with_every_difference(tmp_path: Path, job: JobConfig) -> None:
@@ -94,26 +71,20 @@ def test_one_writer_at_a_time(job: JobConfig) -> None:
         pass
 
 
-def _commit_slowly(split: Path, held, go_on) -> None:
-    with committing(split):
-        held.set()
-        go_on.wait()
-        (split / "committed").touch()
-
-
-def test_cleaning_waits_for_a_commit_under_way(tmp_path: Path) -> None:
-    """A worker that outlives its killed run may be between its shard and its fragment."""
-    spawn = multiprocessing.get_context("spawn")
-    held, go_on = spawn.Event(), spawn.Event()
-    worker = spawn.Process(target=_commit_slowly, args=(tmp_path, held, go_on))
-    worker.start()
-    assert held.wait(60)
-    waiting = spawn.Process(target=clean, args=(tmp_path, print))
-    waiting.start()
-    waiting.join(1)
-    assert waiting.is_alive()
-    go_on.set()
-    waiting.join(60)
-    worker.join(60)
-    assert waiting.exitcode == 0
-    assert (tmp_path / "committed").exists()
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_folder_that_leads_out_of_the_split_is_refused(tmp_path: Path, job: JobConfig, name: str) -> None:
+    split, elsewhere = tmp_path / "data/128k/s", tmp_path / "elsewhere"
+    split.mkdir(parents=True)
+    mine = elsewhere / "000000000000-000000000001-5f0c2a9b"
+    mine.mkdir(parents=True)
+    (split / name).symlink_to(elsewhere)
+    with (
+        pytest.raises(UserError, match=rf"{name} is a link: put a folder in its place, .* out=NAME"),
+        writing(job, print),
+    ):
+        pass
+    assert mine.is_dir()
+    (split / name).unlink()
+    (split / name).touch()
+    with pytest.raises(UserError, match=rf"{name} is no folder"), writing(job, print):
+        pass

@@ -1,0 +1,63 @@
+"""What is on the disk for good, and why a disk refuses."""
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+# The disk refuses: whoever tries again works for nothing.
+REFUSALS = {
+    errno.ENOSPC: "the disk is full: free some space",
+    errno.EDQUOT: "your disk quota is used up: free some space",
+    errno.EFBIG: "the disk refuses files this large: choose another folder or raise the limit",
+    errno.EROFS: "the disk is read-only: make it writable",
+    errno.EACCES: "writing is not permitted: check the folder's permissions",
+    errno.EPERM: "writing is not permitted: check the folder's permissions",
+}
+
+
+def flush(path: Path) -> None:
+    """A file, or all below a folder, to the disk; and its name, and that of the folder it is in.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    for entry in [path, *path.rglob("*"), *path.parents[:2]]:
+        flush_entry(entry)
+
+
+def flush_entry(path: Path) -> None:
+    """A file, or the names in a folder, to the disk.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def refusal(error: BaseException) -> int | None:
+    """The disk's refusal that an exception of a library tells of, in whatever words, as an errno of `REFUSALS`.
+
+    To be asked about exceptions of writing only: TensorStore and XLA call full memory what they call a full disk.
+    """
+    for link in _chain(error):
+        if isinstance(link, OSError) and link.errno in REFUSALS:
+            return link.errno
+        for number in REFUSALS:
+            if os.strerror(number) in str(link):
+                return number
+        if "RESOURCE_EXHAUSTED" in str(link):
+            return errno.ENOSPC
+    return None
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    """An exception, those in it, and those it came from."""
+    yield error
+    for link in (error.__cause__ or error.__context__, *getattr(error, "exceptions", ())):
+        if link is not None:
+            yield from _chain(link)

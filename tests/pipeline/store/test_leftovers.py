@@ -1,0 +1,141 @@
+"""Cleaning: what dead attempts left goes, and nothing else, whatever it is called."""
+
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from experts.labels import Label
+from pipeline.errors import Failure
+from pipeline.jobs import unit
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.jobs.unit import commit
+from pipeline.store.layout import attempt_of
+from pipeline.store.leftovers import clean
+from pipeline.store.locks import committing
+from pipeline.store.manifest import fragment_paths
+from tests.pipeline.made import made_job, made_result
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    """With levels 0 and 1 committed."""
+    committed(tmp_path, 0)
+    return tmp_path
+
+
+def committed(split: Path, first: int) -> None:
+    ids = [first, first + 1]
+    commit(made_job(), split, WorkUnit(tuple(ids)), made_result(ids, [Label.SOLVED, Label.UNSOLVED]))
+
+
+@pytest.fixture
+def dead(split: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """An attempt that died between its shard and its fragment, while Orbax was writing; its name."""
+
+    def die(*_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(unit, "write_fragment", die)
+        with pytest.raises(MemoryError):
+            committed(split, 2)
+    (begun,) = (split / "manifest").glob("*.begun")
+    attempt = attempt_of(begun)
+    assert (split / f"shards/{attempt}.zarr").is_dir()
+    (split / f"experts/{attempt}.orbax-checkpoint-tmp").mkdir(parents=True)
+    return attempt
+
+
+def everything(split: Path) -> set[Path]:
+    return set(split.rglob("*"))
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+def test_what_a_dead_attempt_left_goes_and_what_is_committed_stays(split: Path, dead: str, said: list[str]) -> None:
+    (split / ".job.json.123").touch()
+    before = everything(split)
+    assert clean(split, said.append).level_ids.tolist() == [0, 1]
+    gone = {path for path in before if dead in path.as_posix()} | {split / ".job.json.123"}
+    assert everything(split) == before - gone
+    assert not said
+
+
+@pytest.mark.usefixtures("dead")
+def test_what_others_put_there_stays(split: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    clean(split, print)
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (elsewhere / "mine").touch()
+    attempt = "000000000004-000000000005-5f0c2a9b"
+    folders = ("experts/mine", "shards/mine.zarr", "manifest/.ipynb_checkpoints", f"manifest/.{attempt[:-1]}0.begun")
+    for name in folders:
+        (split / name).mkdir(parents=True)
+        (split / name / "file").touch()
+    for name in ("manifest/.DS_Store", "manifest/.nfs0000000000003a1b00000002", ".job.json.swp"):
+        (split / name).touch()
+    for name in (f"experts/{attempt}", f"shards/{attempt}.zarr", "manifest/.linked"):
+        (split / name).symlink_to(elsewhere)
+    before = everything(split)
+    (split / f"manifest/.{attempt}.begun").touch()  # it is the links that keep their target from going
+    assert clean(split, print).level_ids.tolist() == [0, 1]
+    assert everything(split) == before
+    assert (elsewhere / "mine").exists()
+
+
+def test_data_of_a_fragment_that_is_kept_elsewhere_stays_and_is_told(split: Path, said: list[str]) -> None:
+    committed(split, 2)
+    moved = fragment_paths(split)[0]
+    (shard,) = (split / "shards").glob(f"{moved.stem}-*")
+    moved.rename(split / "kept.parquet")
+    before = everything(split)
+    assert clean(split, said.append).level_ids.tolist() == [2, 3]
+    assert everything(split) == before
+    (sentence,) = said
+    assert f"No fragment names {shard}: delete" in sentence
+
+
+def test_a_copy_made_while_a_unit_was_committed_is_whole(split: Path) -> None:
+    """The copy has both the mark that the attempt began and the fragment that it became."""
+    (shard,) = (split / "shards").iterdir()
+    begun = split / f"manifest/.{attempt_of(shard)}.begun"
+    begun.touch()
+    clean(split, print)
+    assert shard.is_dir()
+    assert not begun.exists()
+
+
+def test_what_cannot_be_removed_now_is_removed_by_the_next_run(
+    split: Path, dead: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "rmtree", lambda path, ignore_errors: None)
+        clean(split, print)
+    assert [path for path in everything(split) if dead in path.name]
+    clean(split, print)
+    assert not [path for path in everything(split) if dead in path.name]
+
+
+def test_a_damaged_fragment_stops_the_cleaning(split: Path, dead: str) -> None:
+    """What it names is named by it alone."""
+    fragment_paths(split)[0].write_bytes(b"x")
+    before = everything(split)
+    with pytest.raises(Failure, match="is damaged"):
+        clean(split, print)
+    assert everything(split) == before
+
+
+def test_cleaning_waits_for_a_commit_under_way(split: Path, dead: str) -> None:
+    """A worker that outlives its killed run may be between its shard and its fragment."""
+    with ThreadPoolExecutor() as other:
+        with committing(split):
+            cleaned = other.submit(clean, split, print)
+            with pytest.raises(TimeoutError):
+                cleaned.result(0.5)
+            assert (split / f"shards/{dead}.zarr").is_dir()
+        cleaned.result(60)
+    assert not (split / f"shards/{dead}.zarr").exists()
