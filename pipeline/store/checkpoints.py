@@ -1,7 +1,10 @@
 """Experts on the disk, so that a larger budget goes on instead of starting again: one Orbax checkpoint per unit."""
 
+import logging
+import os
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,7 @@ from experts.slots import begin
 from levelgen.level import size_of
 from levelgen.sampling.sampler import sample_levels
 from pipeline.errors import Failure, UserError
+from pipeline.store.disk import flush, refusal
 from pipeline.store.layout import MANIFEST, data_path
 from pipeline.store.manifest import differences, read_manifest, require_manifest, told
 
@@ -26,7 +30,7 @@ class SourceUnseen(Failure):
 
 
 def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
-    """Write these experts, by level id.
+    """Write these experts, by level id, durably.
 
     Raises:
         OSError: the disk refuses.
@@ -40,8 +44,25 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
         curves[place, : len(row.curve)] = row.curve
     begun = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows))
     tree = {"level_id": np.array(sorted(experts)), "curve": curves, "begun": begun}
-    with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(path.absolute(), tree)
+    try:
+        with _unlogged(), ocp.StandardCheckpointer() as checkpointer:
+            checkpointer.save(path.absolute(), tree)
+    except Exception as error:  # Orbax and TensorStore raise many kinds
+        if number := refusal(error):
+            raise OSError(number, os.strerror(number), str(path)) from error
+        raise
+    flush(path)
+
+
+@contextmanager
+def _unlogged() -> Iterator[None]:
+    """Without Orbax's log: it writes a failure's traceback on stderr, and raises the same failure."""
+    logger = logging.getLogger("absl")
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:

@@ -1,0 +1,108 @@
+"""A disk that is full refuses every writer in the same way; what is flushed."""
+
+import errno
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experts.judge import Kept
+from experts.slots import begin as begin_experts
+from levelgen.level import SIZES
+from levelgen.sampling.sampler import sample_levels
+from pipeline.store.checkpoints import save_experts
+from pipeline.store.disk import refusal
+from pipeline.store.fields import arrays_of
+from pipeline.store.layout import new_attempt, unit_name
+from pipeline.store.manifest import begin_fragment, write_fragment
+from pipeline.store.shard import write_shard
+from tests.pipeline.made import made_job, made_level, made_record
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Iterator[Path]:
+    """A real file system with 64 KiB."""
+    folder = tmp_path / "tiny"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)]
+    if os.getuid() or subprocess.run(mount, check=False, capture_output=True).returncode:
+        pytest.skip("only root can make a tiny file system, and not everywhere")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def kept_experts() -> dict[int, Kept]:
+    job = made_job("data", "expert.width=8", "expert.environments=24")
+    ids = np.arange(1, dtype=np.int32)
+    begun = begin_experts(sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution), ids, job.expert)
+    return {0: Kept(jax.tree.map(lambda x: np.asarray(x[0]), begun), [0.0])}
+
+
+@pytest.mark.slow
+def test_experts_on_a_full_disk(tiny: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(OSError, match="No space left") as refused:
+        save_experts(new_attempt(tiny, unit_name(0, 0)).experts, kept_experts())
+    assert refused.value.errno == errno.ENOSPC
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_shard_on_a_full_disk(tiny: Path) -> None:
+    fields = arrays_of(made_level("s", 3), "level/") | arrays_of(made_record("s", 3), "record/")
+    with pytest.raises(OSError, match="No space left") as refused:
+        write_shard(new_attempt(tiny, unit_name(0, 0)).shard, [0, 1, 2], fields)
+    assert refused.value.errno == errno.ENOSPC
+
+
+def test_a_fragment_on_a_full_disk(tiny: Path) -> None:
+    job, paths = made_job(), new_attempt(tiny, unit_name(0, 0))
+    begin_fragment(paths)
+    with pytest.raises(OSError, match="No space left"):
+        (tiny / "filler").write_bytes(bytes(2**17))
+    with pytest.raises(OSError, match="No space left") as refused:
+        write_fragment(paths, [], job.hash, job.results)
+    assert refused.value.errno == errno.ENOSPC
+    assert not paths.fragment.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [
+        ("RESOURCE_EXHAUSTED: Error writing local file", errno.ENOSPC),
+        ("Failed to write 9 bytes: Disk quota exceeded [os_error_code='122']", errno.EDQUOT),
+        ("PERMISSION_DENIED: Failed to open: Permission denied", errno.EACCES),
+        ("an array of another shape", None),
+    ],
+)
+def test_a_library_s_words_for_it_are_known(text: str, number: int | None) -> None:
+    def raised(cause: Exception) -> Exception:
+        try:
+            raise RuntimeError("could not be saved") from cause
+        except RuntimeError as error:
+            return error
+
+    assert refusal(raised(ValueError(text))) == number
+    assert refusal(ExceptionGroup("several", [KeyError("x"), raised(ValueError(text))])) == number
+
+
+@pytest.mark.slow
+def test_experts_are_on_the_disk_before_the_fragment_names_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed: set[Path] = set()
+    fsync = os.fsync
+
+    def note(descriptor: int) -> None:
+        fsync(descriptor)
+        flushed.add(Path(os.readlink(f"/proc/self/fd/{descriptor}")))
+
+    monkeypatch.setattr(os, "fsync", note)
+    experts = new_attempt(tmp_path, unit_name(0, 0)).experts
+    save_experts(experts, kept_experts())
+    assert flushed >= {tmp_path, experts.parent, experts, *experts.rglob("*")}
