@@ -15,7 +15,7 @@ from levelgen.task.rules import TaskParams, TaskState, advance
 from physics.types import Size
 from tests.levelgen.opened import Played, handmade_levels, open_in_reference
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.campaign
 HANDMADE = {"s": 10, "m": 24, "l": 40}
 STEPS = 32  # env steps that each level is played
 OURS = 4  # levels of our sampler that are opened with the handmade ones

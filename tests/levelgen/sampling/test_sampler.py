@@ -26,8 +26,10 @@ from physics.types import FIXED_POLYGONS, Size
 from physics.vector import Vec
 from tests.golden.load import HERE, load
 
-COUNTS = {"s": 4096, "m": 4096, "l": 2048}  # levels
-CUSTOM = [Size(5, 1, 0, 1), Size(4, 3, 2, 2), Size(8, 0, 3, 0)]
+COUNTS = {"s": 1024, "m": 1024, "l": 512}  # levels
+MANY = {"s": 4096, "m": 4096, "l": 2048}  # in a campaign
+MORE = pytest.mark.campaign
+CUSTOM = [Size(4, 3, 2, 2), Size(8, 0, 3, 0)]
 SIGNIFICANT = 1e-3  # over all statistics of a size together
 RARE = 10  # values seen less often, in both samples together, are counted as one
 
@@ -76,9 +78,11 @@ def p_value(ours: np.ndarray, theirs: dict[str, np.ndarray]) -> float:
     return float(stats.chi2_contingency(table)[1]) if table.shape[1] > 1 else 1.0
 
 
-@pytest.mark.parametrize("size", COUNTS)
-def test_statistics_of_the_reference(size: str) -> None:
-    ours, theirs = summaries(sampled(SIZES[size], COUNTS[size])), reference_statistics(size)
+@pytest.mark.parametrize(
+    ("size", "count"), [*COUNTS.items(), *(pytest.param(*item, marks=MORE) for item in MANY.items())]
+)
+def test_statistics_of_the_reference(size: str, count: int) -> None:
+    ours, theirs = summaries(sampled(SIZES[size], count)), reference_statistics(size)
     assert {name for name, values in ours.items() if len(values)} == set(theirs)
     p = {name: p_value(ours[name], theirs[name]) for name in theirs}
     assert len(p) >= 90
@@ -86,10 +90,11 @@ def test_statistics_of_the_reference(size: str) -> None:
     assert min(p.values()) > SIGNIFICANT / len(p), f"differs from the reference: {worst}"
 
 
-def test_the_statistics_notice_a_change() -> None:
-    """Three motors in four are on, instead of four in five; no other statistic."""
-    changed = Distribution(motor_chance=0.75)
-    ours, theirs = summaries(sampled(SIZES["s"], COUNTS["s"], changed)), reference_statistics("s")
+@pytest.mark.parametrize(("chance", "count"), [(0.7, COUNTS["s"]), pytest.param(0.75, MANY["s"], marks=MORE)])
+def test_the_statistics_notice_a_change(chance: float, count: int) -> None:
+    """Fewer motors than four in five are on; no other statistic."""
+    changed = Distribution(motor_chance=chance)
+    ours, theirs = summaries(sampled(SIZES["s"], count, changed)), reference_statistics("s")
     p = {name: p_value(ours[name], theirs[name]) for name in theirs}
     assert [name for name in p if p[name] < SIGNIFICANT / len(p)] == ["joint motor on"]
 
@@ -265,7 +270,7 @@ def test_what_must_act_follows_its_weights() -> None:
     assert abs(model.joint_active.any(0).mean() - 0.75) < 0.03
 
 
-@pytest.mark.parametrize("chance", [0.0, 1.0])
+@pytest.mark.parametrize("chance", [pytest.param(0.0, marks=MORE), 1.0])
 def test_wheels_follow_their_chance(chance: float) -> None:
     """Green, blue and a body joined to one of them: a rectangle to anything, or a circle to rectangles."""
     of = {"thruster_only_weight": 0.0, "connected_weight": 0.0, "free_weight": 0.0, "proposals": 1}
@@ -298,11 +303,12 @@ def test_presets_are_what_they_say(name: str) -> None:
         assert ((model.active & (level.role == role)).sum(0) == 1).all()
 
 
-def test_a_floor_that_is_green_or_blue_comes_with_the_other() -> None:
-    for floor, other in ((Role.GREEN, Role.BLUE), (Role.BLUE, Role.GREEN)):
-        chances = {"floor_red_chance": 0.0, "floor_blue_chance": 0.0, f"floor_{floor.name.lower()}_chance": 1.0}
-        level = sampled(Size(5, 1, 0, 1), CHUNK, Distribution(small_world=0, proposals=1, fixed_chance=0.5, **chances))
-        assert (level.role[0] == floor).all()
-        body = level.model.active & (level.role == other)
-        assert (body.sum(0) == 1).all()
-        assert (level.model.inverse_mass > 0)[body].all()
+@pytest.mark.parametrize("floor", [Role.GREEN, pytest.param(Role.BLUE, marks=MORE)])
+def test_a_floor_that_is_green_or_blue_comes_with_the_other(floor: Role) -> None:
+    other = Role.GREEN + Role.BLUE - floor
+    chances = {"floor_red_chance": 0.0, "floor_blue_chance": 0.0, f"floor_{floor.name.lower()}_chance": 1.0}
+    level = sampled(Size(5, 1, 0, 1), CHUNK, Distribution(small_world=0, proposals=1, fixed_chance=0.5, **chances))
+    assert (level.role[0] == floor).all()
+    body = level.model.active & (level.role == other)
+    assert (body.sum(0) == 1).all()
+    assert (level.model.inverse_mass > 0)[body].all()

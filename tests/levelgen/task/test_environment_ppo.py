@@ -42,7 +42,7 @@ def solved(algo, ts, rng) -> jax.Array:
     return jax.vmap(play)(jax.random.split(rng, EPISODES)).mean()
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_it_learns() -> None:
     """On four random levels; of which some are solved by chance."""
     env, params = make(sample_levels(jnp.arange(4), SIZES["s"]), ActionType.DISCRETE)
