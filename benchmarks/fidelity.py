@@ -87,7 +87,7 @@ def p_value(ours: np.ndarray, theirs: np.ndarray) -> float | None:
         return 1.0
     if not table.sum(1).all():
         return 0.0  # one side never has what the other has
-    return float(stats.chi2_contingency(table)[1])
+    return float(stats.chi2_contingency(table).pvalue)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def compare(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, Compared]:

@@ -68,7 +68,8 @@ def count(given: Given, stages: tuple) -> Counter:
     size, total = given.model.size, Counter()
 
     def kernel(given, table, after, scratch):
-        block = Block(*jax.tree.map(jax.new_ref, (table, given, after)), None, jax.tree.map(jax.new_ref, scratch))
+        table, given, after, scratch = jax.tree.map(jax.new_ref, (table, given, after, scratch))
+        block = Block(table, given, after, None, scratch)
         step_block(block, DEFAULT_PARAMS, stages)
 
     table = table_of(size, True)

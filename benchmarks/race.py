@@ -89,7 +89,7 @@ def contestants(
     cores, python = own_cores(), oracle.oracle_python()
     shared, whole = shares(count, cores), [Share(None, 0, count)]
 
-    def entry(name: str, start: list[object], words: Callable[[Share], list[object]], split: list[Share]) -> Entry:
+    def entry(name: str, start: Sequence[object], words: Callable[[Share], list[object]], split: list[Share]) -> Entry:
         commands = [[str(x) for x in (*start, *words(of), *_on(of.core))] for of in split]
         return Entry(name, commands, oracle.our_environment() if name == OURS else oracle.environment(), steps)
 

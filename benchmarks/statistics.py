@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 from scipy.stats import binomtest
 from statsmodels.stats.multitest import multipletests
 
@@ -22,4 +23,4 @@ def mcnemar(only_one: int, only_other: int) -> float:
 
 def holm(p: Sequence[float]) -> list[float]:
     """Corrected p, in the given order: below a bound where Holm's procedure rejects at that bound."""
-    return multipletests(p, method="holm")[1].tolist() if p else []
+    return np.asarray(multipletests(p, method="holm")[1]).tolist() if p else []

@@ -1,11 +1,13 @@
 """One way to run JAX for all tests: as a worker does, with compiled code kept between tests and between runs.
 
-And the reference's own environment, for the tests that compare with it.
+And the reference's own environment, for the campaigns that compare with it; and what was not run, said at the end.
 """
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
@@ -15,8 +17,9 @@ from pipeline.errors import Failure
 from pipeline.runtime import CACHE_VARIABLE, prepare_jax
 
 ROOT = Path(__file__).parent.parent
-ASKED = "LEVELPROOF_TEST_ORACLE"
+DEMANDED = "LEVELPROOF_TEST_ORACLE"
 MOST_MAPS = 20_000
+DESELECTED = pytest.StashKey[int]()
 
 os.environ.setdefault(CACHE_VARIABLE, str(ROOT / ".pytest_cache" / "levelproof"))
 prepare_jax()  # before any test touches JAX; commands that tests start inherit the folder
@@ -34,14 +37,55 @@ def room_for_programs() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def reference() -> Path:
-    """The Python of the reference's environment.
+    """The Python of the reference's environment, made in the cache folder if it is not there.
 
-    Making it downloads a gigabyte and takes minutes, so the tests do it only when asked to.
+    That downloads a gigabyte, so whatever needs it is a campaign (see below). Where no package index can be reached,
+    its tests are skipped; with LEVELPROOF_TEST_ORACLE=1 they fail.
     """
-    there = (oracle.cache_folder() / "reference" / "ready").is_file()
-    if not (there or os.environ.get(oracle.PYTHON_VARIABLE) or os.environ.get(ASKED)):
-        pytest.skip(f"the reference's environment is not there: {ASKED}=1 makes it, {oracle.PYTHON_VARIABLE} names one")
     try:
         return oracle.oracle_python()
     except Failure as failure:
+        if os.environ.get(DEMANDED):
+            raise
         pytest.skip(f"the reference's environment cannot be made: {failure}")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What runs the reference is a campaign: golden states stand for it in the other tests."""
+    for item in items:
+        if "reference" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.campaign)
+
+
+def pytest_deselected(items: list[pytest.Item]) -> None:
+    if items:
+        stash = items[0].config.stash
+        stash[DESELECTED] = stash.get(DESELECTED, 0) + len(items)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """A process of pytest-xdist tells the one that reports."""
+    told: dict[str, Any] | None = getattr(session.config, "workeroutput", None)
+    if told is not None:
+        told["deselected"] = session.config.stash.get(DESELECTED, 0)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Each process has deselected the same tests."""
+    stash = node.config.stash
+    stash[DESELECTED] = max(stash.get(DESELECTED, 0), getattr(node, "workeroutput", {}).get("deselected", 0))
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """What was not run, how much of it, and why."""
+    reasons = Counter(
+        report.longrepr[-1].removeprefix("Skipped: ") for report in terminalreporter.stats.get("skipped", [])
+    )
+    left_out, asked = config.stash.get(DESELECTED, 0), config.getoption("markexpr")
+    terminalreporter.section("not run")
+    terminalreporter.line(f"{reasons.total()} skipped")
+    for reason, count in reasons.most_common():
+        terminalreporter.line(f"  {count}: {reason}")
+    terminalreporter.line(f"{left_out} not asked for (-m '{asked}'); `pytest -m campaign` runs the campaigns")

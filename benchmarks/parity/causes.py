@@ -76,12 +76,13 @@ def find_cause(step: Step, level: Level, action: np.ndarray, theirs: Stepped) ->
         action: [6, 1].
         theirs: what the reference made of it, one lane.
     """
+    explained = False
     for most in MOVES:
         seen = neighbours(step, level, action, most)
-        if reached(seen.after.state, theirs.state):
-            return Cause(True, name_cause(step, seen, action, theirs), most, spread(seen.after.state))
-    broken = is_broken(level.state, theirs.state)
-    return Cause(broken, name_cause(step, seen, action, theirs), MOVES[-1], spread(seen.after.state))
+        if explained := reached(seen.after.state, theirs.state):
+            break
+    explained = explained or is_broken(level.state, theirs.state)
+    return Cause(explained, name_cause(step, seen, action, theirs), most, spread(seen.after.state))
 
 
 def neighbours(step: Step, level: Level, action: np.ndarray, most: int) -> Neighbours:

@@ -133,7 +133,7 @@ def train_batch(
 
     worlds, out, count = reference.folder / "levels.npz", reference.folder / "out.npz", len(level_ids)
     start = levels.state, np.zeros(count, np.int32), np.full(count, NO_DISTANCE, np.float32)
-    np.savez(worlds, level_id=level_ids, **state_to_kinetix(levels, *start))
+    np.savez(worlds, level_id=level_ids, **state_to_kinetix(levels, *start))  # pyright: ignore[reportArgumentType]
     reference.ask(do="begin", levels=str(worlds))
     for update in range(updates):
         reference.ask(do="update")
@@ -153,13 +153,21 @@ def judged(seen: dict[str, np.ndarray], config: ExpertConfig, failed_by_noop: bo
         config: of its expert.
         failed_by_noop: whether doing nothing lets green touch red.
     """
+    import jax.numpy as jnp
+
     from experts import judge, progress
     from experts.success import no_success
     from experts.witness import succeeds
 
     done, goal = seen["trained_done"], seen["trained_goal"]
-    unknown = np.zeros(config.environments, np.float32), np.float32(np.nan)  # returns
-    totals = progress.Progress(*unknown, done.sum(), np.int64(done.size), first_success(goal), progress.NEVER)
+    totals = progress.Progress(
+        episode_return=jnp.zeros(config.environments),
+        best_return=jnp.float32(jnp.nan),  # unknown
+        episodes=jnp.int32(done.sum()),
+        env_steps=jnp.int32(done.size),
+        first_success=jnp.int32(first_success(goal)),
+        diverged=jnp.int32(progress.NEVER),
+    )
     evaluation = judge.Evaluation(np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, no_success())
     witness = judge.witness_of([evaluation], config)
     of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))
