@@ -33,6 +33,7 @@ class Contact(NamedTuple):
 class Levers(NamedTuple):
     """Geometry of a contact; r goes from a body's centre to the contact point."""
 
+    normal: Vec  # n
     cross_a: Array  # r x n
     cross_b: Array
     dot_a: Array  # r . n; the tangent is (n.y, -n.x), so r x t = -(r . n)
@@ -127,7 +128,7 @@ def prepare(
         to.counts[group] += 1
         normal, point = _geometry(to, c)
         lever = _levers(bodies.motion[a], bodies.motion[b], normal, point)
-        _push(bodies, a, b, acts, normal, lever, impulse[0], impulse[1])
+        _push(bodies, a, b, lever, acts, (impulse[0], impulse[1]))
 
     when(anywhere(acts), constrain)
 
@@ -218,7 +219,7 @@ def _geometry(to: Constraints, c: Scalar) -> tuple[Vec, Vec]:
 
 def _levers(motion_a: Array, motion_b: Array, normal: Vec, point: Vec) -> Levers:
     r_a, r_b = point - position(motion_a), point - position(motion_b)
-    return Levers(r_a.cross(normal), r_b.cross(normal), r_a.dot(normal), r_b.dot(normal))
+    return Levers(normal, r_a.cross(normal), r_b.cross(normal), r_a.dot(normal), r_b.dot(normal))
 
 
 def _solve_one(block: Block, c: Scalar, segment: Scalar) -> None:
@@ -248,13 +249,14 @@ def _solve_one(block: Block, c: Scalar, segment: Scalar) -> None:
     to.impulse[c] = jnp.stack(
         [jnp.where(mine, normal * kept, before_normal), jnp.where(mine, tangent * kept, before_tangent)]
     )
-    _push(bodies, a, b, mine, n, lever, normal - before_normal, tangent - before_tangent)
+    _push(bodies, a, b, lever, mine, (normal - before_normal, tangent - before_tangent))
 
 
 def _push(
-    bodies: Bodies, a: Scalar, b: Scalar, mine: Array, n: Vec, lever: Levers, normal: Array, tangent: Array
+    bodies: Bodies, a: Scalar, b: Scalar, lever: Levers, mine: Bool[Array, " lane"], impulse: tuple[Array, Array]
 ) -> None:
-    """Push both bodies of a contact apart, in the lanes that it is `mine` in."""
+    """Push both bodies of a contact apart, in the lanes that it is `mine` in; `impulse`: normal and tangent, N s."""
+    n, (normal, tangent) = lever.normal, impulse
     only = lambda x: jnp.where(mine, x, 0.0)
     x, y = only(normal * n.x + tangent * n.y), only(normal * n.y - tangent * n.x)
     bodies.push[a] += jnp.stack([-x, -y, only(tangent * lever.dot_a - normal * lever.cross_a)])

@@ -51,11 +51,19 @@ def write_vec(ref: Ref, i: Scalar, v: Vec) -> None:
     ref[0, i], ref[1, i] = v.x, v.y
 
 
-def faces(start: Vec) -> tuple[Vec, Array, Vec]:
-    """Of each face of polygons, [vertex, ...]: the edge from its vertex to the next, its length, its outward normal."""
+class Faces(NamedTuple):
+    """The faces of polygons; components [vertex, ...]."""
+
+    edge: Vec  # from a face's vertex to the next
+    length: Array  # of the edge, m
+    outward: Vec  # unit normal
+
+
+def faces(start: Vec) -> Faces:
+    """The faces of clockwise polygons whose vertices are `start`, [vertex, ...]."""
     edge = start.map(lambda x: jnp.roll(x, -1, axis=0)) - start
     length = edge.norm()
-    return edge, length, Vec(-edge.y, edge.x).scale(1 / nonzero(length))
+    return Faces(edge, length, Vec(-edge.y, edge.x).scale(1 / nonzero(length)))
 
 
 def outline_polygons(block: Block) -> None:

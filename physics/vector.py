@@ -16,7 +16,7 @@ class Vec(NamedTuple):
     x: Array
     y: Array
 
-    def __add__(self, other: "Vec") -> "Vec":  # type: ignore[override]
+    def __add__(self, other: "Vec") -> "Vec":  # pyright: ignore[reportIncompatibleMethodOverride]
         return Vec(self.x + other.x, self.y + other.y)
 
     def __sub__(self, other: "Vec") -> "Vec":

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.manifold import FLIP_BIAS
+from physics.manifold import FLIP_BIAS, faces
 from physics.types import Model, State
 from physics.vector import Vec, nonzero, vec
 
@@ -56,8 +56,7 @@ def polygons_in_world(model: Model, state: State) -> WorldPolygons:
 
 
 def with_normals(vertex: Vec) -> WorldPolygons:
-    edge = vertex.map(lambda x: jnp.roll(x, -1, 0)) - vertex
-    return WorldPolygons(vertex, Vec(-edge.y, edge.x).scale(1 / nonzero(edge.norm())))
+    return WorldPolygons(vertex, faces(vertex).outward)
 
 
 def polygon_contacts(a: WorldPolygons, b: WorldPolygons) -> Int[Array, "polygon lane"]:
@@ -87,8 +86,7 @@ def deepest(a: WorldPolygons, b: WorldPolygons) -> tuple[Float[Array, "polygon l
 def touch(polygons: WorldPolygons, circles: WorldCircles) -> Bool[Array, "pair lane"]:
     """Whether the circle's centre is inside the polygon or within its radius of an edge."""
     vertex, normal = polygons
-    edge = vertex.map(lambda x: jnp.roll(x, -1, 0)) - vertex
-    length = edge.norm()
+    edge, length, _ = faces(vertex)
     along = edge.scale(1 / nonzero(length))
     offset = circles.centre - vertex
     clipped = along.scale(jnp.clip(along.dot(offset), 0.0, length))

@@ -1,64 +1,55 @@
 """Shapes in the types are kept: every field says its own, and the engine returns what it says."""
 
-import ast
 import dataclasses
 import inspect
+from typing import get_type_hints
 
 import jax
 import pytest
+from jaxtyping import AbstractArray
 
-import physics.types
+from physics.block import axes_of, manifold_buffers, scratch_buffers
+from physics.buffers import buffers_of
+from physics.codegen.buffers import Buffer
 from physics.pairs import pairs_of
 from physics.step import step
-from physics.types import FIXED_POLYGONS, Manifold, Model, Params, State
+from physics.types import FIXED_POLYGONS, Manifold, Model, Params, Size, State
 from tests.physics.worlds import ROOM, idle, room
 
-KINDS = {"Float": "float32", "Int": "int32", "Bool": "bool"}
-
-
-def annotations(cls: type) -> dict[str, tuple[str, list[str]]]:
-    """Field -> (kind, axis names), read from the source: `Float[Array, "body 2 lane"]`."""
-    tree = ast.parse(inspect.getsource(cls))
-    fields = {}
-    for line in ast.walk(tree):
-        if isinstance(line, ast.AnnAssign) and isinstance(line.annotation, ast.Subscript):
-            kind, shape = line.annotation.value, line.annotation.slice
-            assert isinstance(kind, ast.Name)
-            assert isinstance(shape, ast.Tuple)
-            assert isinstance(shape.elts[1], ast.Constant)
-            fields[line.target.id] = (kind.id, str(shape.elts[1].value).split())
-    return fields
+FEW = Size(polygons=6, circles=3, joints=4, thrusters=2)
 
 
 @pytest.mark.parametrize("cls", [Model, State, Manifold])
 def test_every_field_is_annotated_with_its_shape_lanes_last(cls: type) -> None:
-    said = annotations(cls)
-    assert set(said) == {field.name for field in dataclasses.fields(cls)}
-    for name, (kind, axes) in said.items():
-        assert kind in KINDS, name
-        assert axes[-1] == "lane", name
+    hints = get_type_hints(cls)
+    assert set(hints) == {field.name for field in dataclasses.fields(cls)}
+    for name, hint in hints.items():
+        assert issubclass(hint, AbstractArray), name
+        assert hint.dim_str.split()[-1] == "lane", name
 
 
 def test_worlds_have_the_shapes_that_the_types_say() -> None:
     lanes = 3
     model, state = room(lanes)
     after, manifold = jax.eval_shape(lambda: step(model, state, *idle(lanes), Params()))
-    axis = {
-        "lane": lanes,
-        "body": ROOM.bodies,
-        "polygon": ROOM.polygons,
-        "circle": ROOM.circles,
-        "joint": ROOM.joints,
-        "thruster": ROOM.thrusters,
-        "vertex": physics.types.MAX_VERTICES,
-        "contact": pairs_of(ROOM).contacts,
-        "2": 2,
-    }
     for value in (model, state, after, manifold):
-        for name, (kind, axes) in annotations(type(value)).items():
-            field = getattr(value, name)
-            assert field.shape == tuple(axis[a] for a in axes), name
-            assert str(field.dtype) == KINDS[kind], name
+        said = buffers_of(type(value), axes_of(ROOM))
+        for field in dataclasses.fields(value):
+            array, buffer = getattr(value, field.name), getattr(said, field.name)
+            assert (array.shape, str(array.dtype)) == ((*buffer.shape, lanes), buffer.dtype), field.name
+
+
+def test_scratch_memory_has_the_shapes_that_annotations_say() -> None:
+    """With lanes and without, of all dtypes, of axes named and numbered."""
+    scratch = scratch_buffers(FEW)
+    contacts = 2 * (6 * 5 // 2 - 4 * 3 // 2) + 3 * 6 + 3
+    assert scratch.bodies.motion == Buffer((9, 5))
+    assert scratch.outlines.vertex == Buffer((2, 6, 4))
+    assert scratch.joints.acts == Buffer((4,), "bool")
+    assert scratch.constraints.impulse == Buffer((contacts, 2))
+    assert scratch.constraints.acting == Buffer((contacts,), "int32", lanes=False)
+    assert scratch.constraints.ends == Buffer((5 + 1,), "int32", lanes=False)  # circle-polygon pairs: two batches
+    assert manifold_buffers(FEW).normal == Buffer((contacts, 2))
 
 
 def test_types_are_trees_of_arrays() -> None:
