@@ -11,7 +11,7 @@ def add(commands: Commands) -> None:
         commands,
         "verify",
         run,
-        "read every shard of a split and replay every witness",
+        "make every level of a split again, read every shard, replay every witness",
         "levelproof verify data/128k/s",
     )
     add_split(parser)

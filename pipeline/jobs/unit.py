@@ -27,7 +27,7 @@ from pipeline.errors import Failure
 from pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
 from pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
 from pipeline.store.disk import REFUSALS
-from pipeline.store.fields import arrays_of, map_arrays, same_bits
+from pipeline.store.fields import arrays_of, map_arrays, unlike_fields
 from pipeline.store.layout import new_attempt
 from pipeline.store.locks import LockRefused, committing
 from pipeline.store.manifest import begin_fragment, write_fragment
@@ -92,16 +92,6 @@ def check_witnesses(result: UnitResult, task: TaskParams) -> None:
             raise Failure(f"The witness of level {level_id} does not replay: its {wrong[i]} differs.")
         if not reached[i]:
             raise Failure(f"The witness of level {level_id} does not reach the goal when replayed.")
-
-
-def unlike_fields(record: Record, again: Record) -> dict[int, str]:
-    """The first field whose bits differ, for each level (by its place) that is not the same in both."""
-    ours, theirs = arrays_of(record), arrays_of(again)
-    wrong: dict[int, str] = {}
-    for name, values in ours.items():
-        for i in np.flatnonzero(~same_bits(values, theirs[name])):
-            wrong.setdefault(int(i), name)
-    return wrong
 
 
 def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> None:

@@ -1,39 +1,32 @@
-"""Is a split what it claims to be? Every shard read, every witness replayed, manifest rows against shard rows.
+"""Is a split what it claims to be? Every level made again from its id, every label that needs no expert worked out
+again, every shard read, every witness replayed.
 
-Bits are promised on the stack that made a row; on another one, that the witness reaches the goal.
+Bits are promised on the stack that made a row. On another one a level has to look as its id makes it, its world has to
+be the one that its row's content hash says, and its witness has to reach the goal.
 """
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+import pyarrow as pa
+from rich.console import Console
+from rich.progress import Progress
 
 from configs.convert import typed
 from configs.errors import ConfigError
-from experts.labels import WITNESSED, Label
-from experts.witness import Record, replay, steps_to_goal, succeeds
-from levelgen.level import Level
+from levelgen.identity.keys import SAMPLER_VERSION
+from levelgen.level import size_of
+from levelgen.sampling.sampler import BLOCK, Distribution
 from levelgen.task.rules import TaskParams
 from pipeline.errors import Exit, Failure
-from pipeline.jobs.unit import unlike_fields
+from pipeline.read.evidence import COLUMNS, Evidence, Findings, Making
 from pipeline.runtime import prepare_jax
-from pipeline.store.fields import tree_of
-from pipeline.store.manifest import require_manifest
-from pipeline.store.provenance import device, versions
+from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.shard import Shard, open_shard
 
-
-@dataclass
-class Findings:
-    """What was looked at, and what is wrong."""
-
-    shards: int = 0
-    witnesses: int = 0
-    same_bits: int = 0  # of the witnesses: replayed bit for bit
-    wrong: list[str] = field(default_factory=list)
+PATIENCE = 2.0  # s before a bar is shown
 
 
 def verify(split: Path, as_json: bool) -> Exit:
@@ -41,7 +34,7 @@ def verify(split: Path, as_json: bool) -> Exit:
 
     Raises:
         UserError: no split.
-        Failure: a fragment is damaged.
+        Failure: a fragment is damaged, or other levels are made here.
     """
     findings = examine(split)
     if as_json:
@@ -50,62 +43,61 @@ def verify(split: Path, as_json: bool) -> Exit:
         for sentence in findings.wrong:
             print(sentence)
         print(
-            f"{split}: {findings.shards} shards read, {findings.witnesses} witnesses replayed, "
-            f"{findings.same_bits} of them bit for bit, {len(findings.wrong)} problems."
+            f"{split}: {findings.levels} levels made again, {findings.shards} shards read, {findings.witnesses} "
+            f"witnesses replayed, {findings.same_bits} of them bit for bit, {len(findings.wrong)} problems."
         )
     return Exit.FAILED if findings.wrong else Exit.DONE
 
 
 def examine(split: Path) -> Findings:
     """Look at every row and every shard of a split."""
-    manifest, findings = require_manifest(split), Findings()
+    manifest, findings = require_manifest(split, COLUMNS), Findings()
+    making = _making(manifest)
     prepare_jax()
-    try:
-        task = typed(TaskParams, (manifest.config or {})["task"], "task")
-    except (ConfigError, KeyError) as error:
-        raise Failure(
-            f"The split {split} was made by a levelproof with other settings ({error}): use that one."
-        ) from None
-    by_shard: dict[str, list[dict[str, Any]]] = {}
-    for row in manifest.table.to_pylist():
-        if (row["label"] in WITNESSED) != (row["shard"] is not None):
-            findings.wrong.append(f"Level {row['level_id']} is {row['label']}, and its shard is {row['shard']}.")
-        if row["shard"] is not None:
-            by_shard.setdefault(row["shard"], []).append(row)
-    for name, rows in by_shard.items():
-        try:
-            _examine_shard(open_shard(split, name, rows[0]["size"]), rows, task, findings)
-        except Failure as failure:
-            findings.wrong.append(str(failure))
+    shards: dict[str, Shard | None] = {}
+    for block in _with_bar(manifest.table):
+        names = block.column("shard").drop_null().unique().to_pylist()
+        shards = {name: shards[name] if name in shards else _opened(name, making, findings) for name in names}
+        Evidence(block, making, shards, findings).examine()
     return findings
 
 
-def _examine_shard(shard: Shard, rows: list[dict[str, Any]], task: TaskParams, findings: Findings) -> None:
-    claimed = {row["row"]: row["level_id"] for row in rows}
-    if claimed != dict(enumerate(shard.level_ids)):
-        raise Failure(f"The shard {shard.path} holds levels {shard.level_ids}, the manifest says {claimed}.")
-    arrays = shard.read()
-    level, record = tree_of(Level, arrays, "level/"), tree_of(Record, arrays, "record/")
-    again = replay(level, record.action, task)
-    done, goal = np.asarray(again.done), np.asarray(again.goal)
-    differs, reached, steps = unlike_fields(record, again), succeeds(done, goal), steps_to_goal(done)
+def _making(manifest: Manifest) -> Making:
+    """Raises Failure where this program makes other levels, or plays them by other rules."""
+    config = manifest.config or {}
+    try:
+        if config["sampler_version"] != SAMPLER_VERSION:
+            raise ConfigError(f"sampler version {config['sampler_version']}, here it is {SAMPLER_VERSION}")
+        size_of(config["size"])
+        rules = typed(TaskParams, config["task"], "task")
+        distribution = typed(Distribution, config["distribution"], "distribution")
+    except (ValueError, KeyError, TypeError) as error:
+        raise Failure(
+            f"The split {manifest.split} was made by a levelproof with other settings ({error}): use that one."
+        ) from None
+    return Making(manifest.split, config["size"], distribution, rules)
+
+
+def _opened(name: str, making: Making, findings: Findings) -> Shard | None:
+    try:
+        shard = open_shard(making.split, name, making.size)
+    except Failure as failure:
+        findings.wrong.append(str(failure))
+        return None
     findings.shards += 1
-    for row in rows:
-        i, level_id = row["row"], row["level_id"]
-        findings.witnesses += 1
-        findings.same_bits += i not in differs
-        if i in differs and _same_stack(row):
-            findings.wrong.append(f"The witness of level {level_id} does not replay: its {differs[i]} differs.")
-        elif not reached[i]:
-            findings.wrong.append(f"The witness of level {level_id} does not reach the goal when replayed.")
-        elif row["label"] == Label.TRIVIAL and np.any(record.action[..., i]):
-            findings.wrong.append(f"Level {level_id} is trivial, and its witness does something.")
-        elif i not in differs and row["steps_to_goal"] != steps[i]:
-            findings.wrong.append(
-                f"Level {level_id} reaches the goal in {steps[i]} steps, the manifest says {row['steps_to_goal']}."
-            )
+    return shard
 
 
-def _same_stack(row: Mapping[str, Any]) -> bool:
-    """Whether bits are promised: the row was made with these versions on such a device."""
-    return row["versions"] == versions() and row["device"] == device()
+def _with_bar(table: pa.Table) -> Iterator[pa.Table]:
+    """The rows, as many at once as the sampler makes, with a bar on stderr where it takes long."""
+    console, began = Console(stderr=True), time.monotonic()
+    bar = Progress(console=console, transient=True, disable=not console.is_terminal)
+    task = bar.add_task("levels looked at", total=table.num_rows)
+    try:
+        for first in range(0, table.num_rows, BLOCK):
+            yield table.slice(first, BLOCK)
+            bar.update(task, completed=min(first + BLOCK, table.num_rows))
+            if time.monotonic() - began > PATIENCE:
+                bar.start()
+    finally:
+        bar.stop()

@@ -65,3 +65,13 @@ def same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.zeros(a.shape[-1], bool)
     raw_a, raw_b = (np.ascontiguousarray(x).view(np.dtype(f"u{x.dtype.itemsize}")) for x in (a, b))
     return (raw_a == raw_b).all(tuple(range(a.ndim - 1)))
+
+
+def unlike_fields(ours: T, theirs: T) -> dict[int, str]:
+    """The first field whose bits differ, for each level (by its index) that is not the same in both trees."""
+    others = arrays_of(theirs)
+    wrong: dict[int, str] = {}
+    for name, values in arrays_of(ours).items():
+        for i in np.flatnonzero(~same_bits(values, others[name])):
+            wrong.setdefault(int(i), name)
+    return wrong

@@ -8,16 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import zarr
 from zarr.codecs import GzipCodec
 
 from experts.config import RECORD_STEPS
+from experts.labels import Label
+from pipeline.cli.main import main
 from pipeline.errors import Failure
 from pipeline.store.contents import table_for
 from pipeline.store.layout import data_path
+from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
-from tests.pipeline.made import made_fields
+from tests.pipeline.made import made_fields, made_split
 
 LEVELS = [5, 9, 12]
 NAME = "shards/000000000005-000000000012-0123abcd.zarr"
@@ -273,3 +277,52 @@ def test_names_of_data_and_links_on_the_way(tmp_path: Path) -> None:
     (split / experts).symlink_to("/etc")
     with pytest.raises(Failure, match="is a link to another place"):
         data_path(split, experts)
+
+
+@pytest.mark.slow
+def test_commands_refuse_it_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    split = made_split(tmp_path, [[Label.SOLVED, Label.SOLVED]])
+    (name,) = read_manifest(split).shards
+    fields = Shard(split / name).read() | {"level/model/joint_a": np.full((1, 2), 200, np.int32)}
+    shutil.rmtree(split / name)
+    write_shard(split / name, [0, 1], fields)
+    for words in (["show", str(split), "0", "-o", "level.png"], ["export", str(split), "0", "-o", "level.json"]):
+        assert main([*words[:-1], str(tmp_path / words[-1])]) == 1
+        (sentence,) = capsys.readouterr().err.splitlines()
+        assert "level/model/joint_a has numbers that size s cannot have" in sentence
+    assert main(["verify", str(split)]) == 1
+    out = capsys.readouterr().out
+    assert out.count("level/model/joint_a has numbers that size s cannot have") == 1
+
+
+def test_no_command_looks_at_other_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not even for how much is in them."""
+    split = made_split(tmp_path / "data", [[Label.SOLVED]])
+    (tmp_path / "secret").write_bytes(b"x" * 1000)
+    (path,) = fragment_paths(split)
+    table = pq.read_table(path)
+    for name in (str(tmp_path), "../../..", "shards/../../../.."):
+        column = table.schema.get_field_index("shard")
+        changed = table.set_column(column, table.schema.field(column), [[name]])
+        pq.write_table(changed, path, write_page_checksum=True)
+        for words in (["inspect", str(split)], ["show", str(split), "0", "-o", str(tmp_path / "level.png")]):
+            assert main(words) == 1
+            told = capsys.readouterr()
+            assert told.out == ""
+            (sentence,) = told.err.splitlines()
+            assert "which can be neither a shard nor experts of this split" in sentence
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [np.nan, np.inf, -3e38])
+def test_worlds_without_sense_are_drawn_or_refused(tmp_path: Path, number: float) -> None:
+    split = made_split(tmp_path, [[Label.SOLVED]])
+    (name,) = read_manifest(split).shards
+    shard = Shard(split / name)
+    fields = {name: np.full_like(x, number) if x.dtype == np.float32 else x for name, x in shard.read().items()}
+    fields["record/goal"][3], fields["record/done"][3] = True, True
+    shutil.rmtree(shard.path)
+    write_shard(shard.path, [0], fields)
+    for suffix in (".png", ".gif", ".svg"):
+        assert main(["show", str(split), "0", "-o", str(tmp_path / f"level{suffix}")]) in (0, 1)
+    assert main(["export", str(split), "0", "-o", str(tmp_path / "level.json")]) == 2

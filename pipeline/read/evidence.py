@@ -1,0 +1,233 @@
+"""What speaks for some rows of a manifest: their ids, their shards, the replay of their witnesses, and proofs.
+
+Worked out for many levels at once, whatever shards they lie in.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Bool, Int
+
+from experts.before import decide
+from experts.labels import WITNESSED, Label
+from experts.witness import LANES, Record, replay, steps_to_goal, succeeds
+from levelgen.identity.content import content_hashes
+from levelgen.identity.signature import signatures
+from levelgen.level import Level, size_of
+from levelgen.sampling.sampler import Distribution, sample_levels
+from levelgen.task.rules import TaskParams
+from pipeline.errors import Failure
+from pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
+from pipeline.store.provenance import device, versions
+from pipeline.store.shard import Shard
+
+COLUMNS = (
+    "label", "label_reason", "failed_by_noop", "content_hash", "signature", "size", "steps_to_goal", "shard", "row",
+    "versions", "device",
+)  # fmt: skip
+TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels that an expert's training gives
+
+Mask = Bool[np.ndarray, " level"]
+
+
+@dataclass
+class Findings:
+    """What was looked at, and what is wrong: at most one sentence for each level and each shard."""
+
+    levels: int = 0
+    shards: int = 0
+    witnesses: int = 0
+    same_bits: int = 0  # of the witnesses: replayed bit for bit
+    wrong: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Making:
+    """What a split's levels are made and played by."""
+
+    split: Path
+    size: str
+    distribution: Distribution
+    rules: TaskParams
+
+
+class Evidence:
+    """What there is to ask about some rows. A level of which something is wrong is asked no more."""
+
+    def __init__(self, rows: pa.Table, making: Making, shards: dict[str, Shard | None], findings: Findings) -> None:
+        """Look at nothing yet.
+
+        Args:
+            rows: with COLUMNS and the level ids.
+            making: of their split.
+            shards: those that rows name; None: nothing of it can be used, and that is told.
+            findings: where to tell.
+        """
+        self.making, self.shards, self.findings = making, shards, findings
+        self.ids: np.ndarray = rows.column("level_id").to_numpy()
+        self.of: dict[str, list[Any]] = {name: rows.column(name).to_pylist() for name in COLUMNS if name != "versions"}
+        self.same_stack = same_stack(rows)
+        self.told = np.zeros(len(self.ids), bool)
+
+    def examine(self) -> None:
+        sizes, shard, labels = self.of["size"], self.of["shard"], self.of["label"]
+        self._tell(
+            [size != self.making.size for size in sizes],
+            lambda i: f"is of size {sizes[i]}, its split of {self.making.size}",
+        )
+        self._tell(
+            [(label in WITNESSED) != (name is not None) for label, name in zip(labels, shard, strict=True)],
+            lambda i: f"is {labels[i]}, and its shard is {shard[i]}",
+        )
+        stored = np.flatnonzero(self._claims())
+        made = sample_levels(jnp.asarray(self.ids), size_of(self.making.size), self.making.distribution)
+        levels = jax.tree.map(np.array, made)  # to be replaced by what shards hold
+        known = self._identity(levels)
+        for first in range(0, len(stored), LANES):
+            known |= self._witnesses(stored[first : first + LANES], levels)
+        self._labels(levels, known)
+        self.findings.levels += len(self.ids)
+
+    def _tell(self, where: Any, what: Callable[[int], str]) -> None:
+        """Note what is wrong with these levels, those that have a sentence left out."""
+        where = np.asarray(where, bool)
+        self.findings.wrong += [f"Level {self.ids[i]} {what(int(i))}." for i in np.flatnonzero(where & ~self.told)]
+        self.told |= where
+
+    def _mask(self, lanes: Int[np.ndarray, " lane"]) -> Mask:
+        return np.isin(np.arange(len(self.ids)), lanes)
+
+    def _claims(self) -> Mask:
+        """Which levels have a row of a shard: one whose id stands there."""
+        holds: list[int | None] = []
+        for name, row in zip(self.of["shard"], self.of["row"], strict=True):
+            shard = self.shards.get(name)
+            ids = shard.level_ids if shard else []
+            holds.append(ids[row] if row is not None and 0 <= row < len(ids) else None)
+        unusable = np.array([name is not None and self.shards[name] is None for name in self.of["shard"]])
+        wrong = [
+            name is not None and there != of for name, there, of in zip(self.of["shard"], holds, self.ids, strict=True)
+        ]
+        self._tell(
+            wrong & ~unusable,
+            lambda i: (
+                f"is said to be row {self.of['row'][i]} of {self.of['shard'][i]}, which has level {holds[i]} there"
+            ),
+        )
+        self.told |= unusable
+        return np.array([there == of for there, of in zip(holds, self.ids, strict=True)])
+
+    def _identity(self, made: Level) -> Mask:
+        """Whether rows are of the very levels that their ids make; on another stack, levels have to look like those."""
+        rows = list(zip(self.of["content_hash"], self.of["signature"], strict=True))
+        ours = list(zip(content_hashes(made), signatures(made), strict=True))
+        same = np.array([a == b for a, b in zip(rows, ours, strict=True)])
+        near = np.array([bool(set(a[1]) & set(b[1])) for a, b in zip(rows, ours, strict=True)])
+        self._tell(
+            ~np.where(self.same_stack, same, near),
+            lambda _: "has not the content hash and the signature of the level that its id makes",
+        )
+        return same
+
+    def _witnesses(self, lanes: Int[np.ndarray, " lane"], levels: Level) -> Mask:
+        """Look at what shards hold of these levels, and put their worlds in place of those in `levels`.
+
+        Returns:
+            The levels of which worlds were found that their rows speak of.
+        """
+        lanes, arrays = self._read(lanes)
+        if not len(lanes):
+            return np.zeros(len(self.ids), bool)
+        level, record = tree_of(Level, arrays, "level/"), tree_of(Record, arrays, "record/")
+        self._worlds(lanes, level, levels)
+        again = replay(level, record.action, self.making.rules)
+        done = np.asarray(again.done)
+        differs, steps, claimed = unlike_fields(record, again), steps_to_goal(done), self.of["steps_to_goal"]
+        self.findings.witnesses += len(lanes)
+        self.findings.same_bits += len(lanes) - len(differs)
+        lane_of = {int(i): lane for lane, i in enumerate(lanes)}
+        unlike = self._mask(lanes[list(differs)])
+        self._tell(
+            unlike & self.same_stack,
+            lambda i: f"has a witness that does not replay: its {differs[lane_of[i]]} differs",
+        )
+        self._tell(
+            self._mask(lanes[~succeeds(done, again.goal)]),
+            lambda _: "has a witness that does not reach the goal when replayed",
+        )
+        trivial = np.array([self.of["label"][i] == Label.TRIVIAL for i in lanes])
+        self._tell(
+            self._mask(lanes[record.action.any((0, 1)) & trivial]),
+            lambda _: "is trivial, and its witness does something",
+        )
+        late = self._mask(lanes[[claimed[i] != count for i, count in zip(lanes, steps, strict=True)]])
+        self._tell(
+            late & ~unlike,
+            lambda i: f"reaches the goal in {steps[lane_of[i]]} steps, the manifest says {claimed[i]}",
+        )
+        return self._mask(lanes)
+
+    def _read(self, lanes: Int[np.ndarray, " lane"]) -> tuple[Int[np.ndarray, " lane"], dict[str, np.ndarray]]:
+        """The levels that could be read, and what their shards hold of them, side by side."""
+        by_shard: dict[str, list[int]] = {}
+        for i in lanes:
+            by_shard.setdefault(self.of["shard"][i], []).append(int(i))
+        found, parts = [], []
+        for name, mine in by_shard.items():
+            if (shard := self.shards[name]) is None:  # seen to be damaged before
+                continue
+            try:
+                parts.append(shard.read([self.of["row"][i] for i in mine]))
+                found += mine
+            except Failure as failure:
+                self.findings.wrong.append(str(failure))
+                self.shards[name] = None
+                self.told |= [other == name for other in self.of["shard"]]
+        names = parts[0] if parts else {}
+        return np.array(found, int), {name: np.concatenate([part[name] for part in parts], -1) for name in names}
+
+    def _worlds(self, lanes: Int[np.ndarray, " lane"], stored: Level, levels: Level) -> None:
+        """Compare the worlds in shards with those that ids make, and put them in their place."""
+        ours = arrays_of(levels)
+        same = np.array([same_bits(x, ours[name][..., lanes]) for name, x in arrays_of(stored).items()]).all(0)
+        self._tell(
+            self._mask(lanes[~same]) & self.same_stack, lambda _: "has another world in its shard than its id makes"
+        )
+        if not same.all():
+            hashes = content_hashes(stored)
+            other = [self.of["content_hash"][i] != of for i, of in zip(lanes, hashes, strict=True)]
+            self._tell(self._mask(lanes[other]), lambda _: "has another world in its shard than its content hash says")
+        for name, values in arrays_of(stored).items():
+            ours[name][..., lanes] = values
+
+    def _labels(self, levels: Level, known: Mask) -> None:
+        """Labels that need no expert, worked out again for the levels of which every bit is known."""
+        verdicts, failed = decide(levels, self.making.rules)
+        labels, reasons = self.of["label"], self.of["label_reason"]
+        rows = list(zip(verdicts, labels, reasons, strict=True))
+        wrong = np.array([label != v.label if v else label not in TRAINED for v, label, _ in rows])
+        self._tell(
+            known & wrong,
+            lambda i: (
+                f"is {labels[i]}, and {f'it should be {v.label}' if (v := verdicts[i]) else 'nothing proves that'}"
+            ),
+        )
+        unlike = np.array([v is not None and reason != v.label_reason for v, _, reason in rows])
+        self._tell(known & unlike & self.same_stack, lambda i: f"is {labels[i]} for another reason than its row has")
+        self._tell(
+            known & (failed != np.array(self.of["failed_by_noop"])),
+            lambda i: f"{'fails' if failed[i] else 'does not fail'} by doing nothing, the manifest says otherwise",
+        )
+
+
+def same_stack(rows: pa.Table) -> Mask:
+    """Whether bits are promised: a row was made with these versions on such a device."""
+    made_with = rows.column("versions").combine_chunks()
+    same = [made_with.field(name).to_numpy(zero_copy_only=False) == value for name, value in versions().items()]
+    return np.logical_and.reduce([*same, rows.column("device").to_numpy() == device()])

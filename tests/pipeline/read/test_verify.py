@@ -1,0 +1,221 @@
+"""Forged splits: each lie is found, by levels made again, labels worked out again, and witnesses replayed."""
+
+import dataclasses
+import itertools
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from experts.before import decide
+from experts.labels import WITNESSED, Label
+from experts.train import UnitResult
+from experts.witness import replay, steps_to_goal, succeeds, take
+from levelgen.level import SIZES
+from levelgen.sampling.sampler import sample_levels
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.jobs.unit import commit
+from pipeline.read import evidence
+from pipeline.read.verify import examine
+from pipeline.store.layout import split_path
+from pipeline.store.manifest import fragment_paths, read_manifest
+from pipeline.store.shard import Shard, write_shard
+from tests.pipeline.made import SPENT, made_job, made_verdict
+
+pytestmark = pytest.mark.slow
+UNIT, UNITS = 8, 6
+
+Row = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A split of several small shards without training: random actions solve what they solve."""
+    job, ids = made_job(str(tmp_path_factory.mktemp("data")), "size=s"), np.arange(UNIT * UNITS)
+    levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
+    before, failed = decide(levels, job.task)
+    action = np.repeat(np.random.default_rng(0).integers(0, 2, (16, 6, len(ids))), 16, axis=0).astype(np.int32)
+    action[..., [verdict is not None for verdict in before]] = 0
+    record = replay(levels, action, job.task)
+    solved, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
+    verdicts = [
+        known or made_verdict(Label.SOLVED if solved[i] else Label.UNSOLVED, failed_by_noop=bool(failed[i]))
+        for i, known in enumerate(before)
+    ]
+    path = split_path(job.out, job.budget, job.size)
+    path.mkdir(parents=True)
+    for lanes in ids.reshape(UNITS, UNIT):
+        told = [
+            dataclasses.replace(verdicts[i], steps_to_goal=int(steps[i]) if verdicts[i].label in WITNESSED else None)
+            for i in lanes
+        ]
+        result = UnitResult(lanes, take(levels, lanes), take(record, lanes), told, SPENT)
+        commit(job, path, WorkUnit(tuple(lanes.tolist())), result)
+    assert set(read_manifest(path, ["label"]).labels) == set(Label)
+    return path
+
+
+@pytest.fixture
+def split(honest: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(honest, tmp_path / "s"))
+
+
+def forge(split: Path, change: Callable[[Row], None], level_ids: list[int] | None = None) -> None:
+    """Change rows, and write their fragments as they were written."""
+    for path in fragment_paths(split):
+        table = pq.read_table(path)
+        rows = table.to_pylist()
+        for row in rows:
+            if level_ids is None or row["level_id"] in level_ids:
+                change(row)
+        pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), path, write_page_checksum=True)
+
+
+def of_label(split: Path, *labels: Label) -> list[Row]:
+    return [row for row in read_manifest(split).table.to_pylist() if row["label"] in labels]
+
+
+def neighbours(split: Path) -> tuple[Row, Row]:
+    """Two levels of one shard."""
+    rows = of_label(split, *WITNESSED)
+    return next((a, b) for a, b in itertools.pairwise(rows) if a["shard"] == b["shard"])
+
+
+def exchange_worlds(split: Path, a: Row, b: Row) -> None:
+    path = split / a["shard"]
+    shard = Shard(path)
+    order = np.arange(len(shard.level_ids))
+    order[[a["row"], b["row"]]] = b["row"], a["row"]
+    arrays = shard.read(order)
+    shutil.rmtree(path)
+    write_shard(path, shard.level_ids, arrays)
+
+
+def of_another_stack(row: Row) -> None:
+    row["device"] = "cpu: of another kind"
+
+
+def assert_told(split: Path, *sentences: str) -> None:
+    wrong = examine(split).wrong
+    assert len(wrong) == len(sentences), wrong
+    for sentence, told in zip(sentences, sorted(wrong), strict=True):
+        assert sentence in told
+
+
+def test_an_honest_split_has_nothing_wrong(honest: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its small shards are replayed together, in as few blocks as they fit in."""
+    counts: list[int] = []
+    counted = lambda level, action, rules: counts.append(action.shape[-1]) or replay(level, action, rules)
+    monkeypatch.setattr(evidence, "replay", counted)
+    found = examine(honest)
+    assert found.wrong == []
+    assert (found.levels, found.shards) == (UNIT * UNITS, len(read_manifest(honest).shards))
+    assert found.witnesses == found.same_bits == len(of_label(honest, *WITNESSED))
+    assert counts == [found.witnesses]
+
+
+@pytest.mark.parametrize("adapts", [False, True])
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_worlds_moved_under_each_other_s_ids(split: Path, adapts: bool, elsewhere: bool) -> None:
+    """Whether or not their rows are moved as well, and on whatever stack they say that they were made."""
+    a, b = neighbours(split)
+    exchange_worlds(split, a, b)
+    if adapts:
+        for row, other in ((a, b), (b, a)):
+            kept = {name: row[name] for name in ("level_id", "row", "shard")}
+            forge(split, lambda of, new=other | kept: of.update(new), [row["level_id"]])
+    if elsewhere:
+        forge(split, of_another_stack)
+    what = "another world in its shard" if not adapts else "has not the content hash and the signature"
+    assert_told(split, *sorted(f"Level {row['level_id']} has {what.removeprefix('has ')}" for row in (a, b)))
+
+
+@pytest.mark.parametrize("label", [Label.SOLVED, Label.UNSOLVED, Label.TRIVIAL])
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_row_relabelled_unsolvable(split: Path, label: Label, elsewhere: bool) -> None:
+    level_id = of_label(split, label)[0]["level_id"]
+    reason = of_label(split, Label.UNSOLVABLE)[0]["label_reason"]
+    change = {"label": "unsolvable", "label_reason": reason, "shard": None, "row": None, "steps_to_goal": None}
+    forge(split, lambda row: row.update(change), [level_id])
+    if elsewhere:
+        forge(split, of_another_stack)
+    proper = "it should be trivial" if label is Label.TRIVIAL else "nothing proves that"
+    assert_told(split, f"Level {level_id} is unsolvable, and {proper}.")
+
+
+@pytest.mark.parametrize(("label", "other"), [("unsolvable", "unsolved"), ("trivial", "solved")])
+def test_a_label_that_hides_what_is_known(split: Path, label: str, other: str) -> None:
+    level_id = of_label(split, Label(label))[0]["level_id"]
+    forge(split, lambda row: row.update(label=other), [level_id])
+    assert_told(split, f"Level {level_id} is {other}, and it should be {label}.")
+
+
+def test_identities_exchanged(split: Path) -> None:
+    a, b = of_label(split, Label.UNSOLVED)[:2]
+    for row, other, name in ((a, b, "content_hash"), (b, a, "signature")):
+        forge(split, lambda of, name=name, other=other: of.update({name: other[name]}), [row["level_id"]])
+    sentence = "Level {} has not the content hash and the signature of the level that its id makes."
+    assert_told(split, *sorted(sentence.format(row["level_id"]) for row in (a, b)))
+
+
+def test_other_lies_of_rows(split: Path) -> None:
+    solved, trivial, unsolved = (of_label(split, label)[0] for label in (Label.SOLVED, Label.TRIVIAL, Label.UNSOLVED))
+    forge(split, lambda row: row.update(steps_to_goal=row["steps_to_goal"] + 1), [solved["level_id"]])
+    forge(split, lambda row: row.update(label_reason="a feeling"), [trivial["level_id"]])
+    forge(split, lambda row: row.update(failed_by_noop=not row["failed_by_noop"]), [unsolved["level_id"]])
+    last = of_label(split, Label.UNSOLVED)[-1]["level_id"]
+    forge(split, lambda row: row.update(size="m"), [last])
+    told = {
+        solved["level_id"]: "reaches the goal in ",
+        trivial["level_id"]: "is trivial for another reason than its row has",
+        unsolved["level_id"]: "by doing nothing, the manifest says otherwise",
+        last: "is of size m, its split of s",
+    }
+    assert_told(split, *(told[i] for i in sorted(told, key=lambda i: f"Level {i} ")))
+
+
+def test_rows_of_shards_that_are_not_theirs(split: Path) -> None:
+    a, b = neighbours(split)
+    forge(split, lambda row: row.update(row=b["row"]), [a["level_id"]])
+    assert_told(
+        split, f"Level {a['level_id']} is said to be row {b['row']} of {a['shard']}, which has level {b['level_id']}"
+    )
+    forge(split, lambda row: row.update(row=10**6), [a["level_id"]])
+    assert_told(split, "which has level None there")
+
+
+def test_a_record_that_differs_in_one_bit(split: Path) -> None:
+    row = of_label(split, Label.SOLVED)[0]
+    shard = Shard(split / row["shard"])
+    arrays = shard.read()
+    arrays["record/reward"].view(np.uint32)[7, row["row"]] ^= 1
+    shutil.rmtree(shard.path)
+    write_shard(shard.path, shard.level_ids, arrays)
+    assert_told(split, f"Level {row['level_id']} has a witness that does not replay: its reward differs.")
+    forge(split, of_another_stack)
+    assert_told(split)
+
+
+def test_a_hostile_shard_is_one_sentence_and_the_others_are_looked_at(split: Path) -> None:
+    row = of_label(split, Label.SOLVED)[0]
+    shard = Shard(split / row["shard"])
+    arrays = shard.read()
+    arrays["level/model/joint_a"][:] = 200
+    shutil.rmtree(shard.path)
+    write_shard(shard.path, shard.level_ids, arrays)
+    found = examine(split)
+    (sentence,) = found.wrong
+    assert "its field level/model/joint_a has numbers that size s cannot have" in sentence
+    assert 0 < found.witnesses == len(of_label(split, *WITNESSED)) - len(shard.level_ids)
+    for name in ("/etc", "../../elsewhere", row["shard"]):
+        if name == row["shard"]:
+            shutil.rmtree(split / "shards")
+        forge(split, lambda row, name=name: row.update(shard=name), [row["level_id"]])
+        assert all(sentence.startswith(("The manifest of ", "The shard ")) for sentence in examine(split).wrong)
