@@ -18,7 +18,7 @@ from configs.convert import typed
 from configs.errors import ConfigError
 from levelgen.identity.keys import SAMPLER_VERSION
 from levelgen.level import size_of
-from levelgen.sampling.sampler import BLOCK, Distribution
+from levelgen.sampling.sampler import CHUNK, Distribution
 from levelgen.task.rules import TaskParams
 from pipeline.errors import Exit, Failure
 from pipeline.read.evidence import COLUMNS, Evidence, Findings, Making
@@ -94,9 +94,9 @@ def _with_bar(table: pa.Table) -> Iterator[pa.Table]:
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
     task = bar.add_task("levels looked at", total=table.num_rows)
     try:
-        for first in range(0, table.num_rows, BLOCK):
-            yield table.slice(first, BLOCK)
-            bar.update(task, completed=min(first + BLOCK, table.num_rows))
+        for first in range(0, table.num_rows, CHUNK):
+            yield table.slice(first, CHUNK)
+            bar.update(task, completed=min(first + CHUNK, table.num_rows))
             if time.monotonic() - began > PATIENCE:
                 bar.start()
     finally:

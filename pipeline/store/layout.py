@@ -87,10 +87,10 @@ def data_path(split: Path, name: str) -> Path:
     return path
 
 
-def ids_of(fragment: Path) -> tuple[int, int] | None:
-    """The lowest and the highest level id in a fragment, by its name; None where the name does not tell."""
-    found = re.fullmatch(rf"{UNIT}\.parquet", fragment.name)
-    return (int(found[1]), int(found[2])) if found else None
+def ids_of(fragment: Path) -> tuple[int, int]:
+    """The lowest and the highest level id in a fragment, by its name."""
+    first, last = fragment.stem.split("-")
+    return int(first), int(last)
 
 
 def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[..., bool]) -> list[Path]:

@@ -20,7 +20,6 @@ import pyarrow.parquet as pq
 
 from configs.convert import flat
 from configs.schema import hash_of
-from levelgen.identity.keys import MAX_LEVEL_ID
 from pipeline.errors import Failure, UserError
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
@@ -197,7 +196,7 @@ def read_manifest(
 def _covering(fragments: Sequence[Path], level_ids: Sequence[int]) -> list[Path]:
     """The fragments that, by their names, may have one of these levels."""
     wanted = np.unique(np.asarray(level_ids, np.int64))
-    ranges = [ids_of(path) or (0, MAX_LEVEL_ID) for path in fragments]
+    ranges = [ids_of(path) for path in fragments]
     first, last = np.array(ranges, np.int64).reshape(-1, 2).T
     has = np.searchsorted(wanted, first) < np.searchsorted(wanted, last, side="right")
     return list(compress(fragments, has))
