@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Shaped
 from scipy import stats
 
 from benchmarks import oracle
@@ -29,6 +30,7 @@ from pipeline.runtime import prepare_jax
 SIGNIFICANT = 1e-3
 COUNTED = 40  # statistics with at most so many different values are compared by their counts
 RARE = 10  # values seen less often, in both samples together, are counted as one
+Samples = dict[str, Shaped[np.ndarray, " value"]]  # by statistic: of a level, body, joint or thruster each
 CODES = ("role", "roles", "kinds", "place", "binding")  # last words of statistics whose numbers are names
 
 
@@ -59,7 +61,7 @@ def reference_levels(size: str, count: int, seed: int) -> Level:
         return level_from_kinetix({name: file[name] for name in file.files})
 
 
-def samples(level: Level) -> dict[str, np.ndarray]:
+def samples(level: Level) -> Samples:
     """Every statistic's values."""
     lanes = level.role.shape[-1]
     zeros = np.zeros(lanes, np.int32), np.zeros(lanes, np.float32)
@@ -71,7 +73,7 @@ def samples(level: Level) -> dict[str, np.ndarray]:
     }
 
 
-def p_value(ours: np.ndarray, theirs: np.ndarray) -> float | None:
+def p_value(ours: Shaped[np.ndarray, " value"], theirs: Shaped[np.ndarray, " value"]) -> float | None:
     """Of the hypothesis that both samples have one distribution; None where both hold one and the same value."""
     ours, theirs = (np.asarray(x, np.float32) for x in (ours, theirs))
     values = np.unique(np.concatenate([ours, theirs]))
@@ -90,7 +92,7 @@ def p_value(ours: np.ndarray, theirs: np.ndarray) -> float | None:
     return float(stats.chi2_contingency(table).pvalue)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def compare(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, Compared]:
+def compare(ours: Samples, theirs: Samples) -> dict[str, Compared]:
     """Statistic by statistic; what neither side ever has is left out."""
     names = [name for name in theirs if len(ours[name]) or len(theirs[name])]
     p = {name: p_value(ours[name], theirs[name]) for name in names}
@@ -101,7 +103,7 @@ def compare(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[
     }
 
 
-def told(name: str, values: np.ndarray) -> str:
+def told(name: str, values: Shaped[np.ndarray, " value"]) -> str:
     """A sample in a word: its mean, the share of True, or the most frequent name and its share."""
     if not len(values):
         return "none"

@@ -9,10 +9,12 @@ touching or not, would leave of the first point.
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from benchmarks.reference.actions import sticky_actions
 from benchmarks.report import Report, Table
@@ -48,7 +50,7 @@ def play(level: Level, now: task.TaskState, actions: jax.Array):
     return jax.lax.scan(act, now, actions)
 
 
-def in_blocks(level: Level, now: task.TaskState, actions: np.ndarray):
+def in_blocks(level: Level, now: task.TaskState, actions: Int[np.ndarray, "step 6 lane"]) -> tuple[task.TaskState, Any]:
     """All lanes, LANES at a time."""
     cuts = [np.arange(i, i + LANES) for i in range(0, now.timestep.size, LANES)]
     parts = [play(take(level, cut), take(now, cut), actions[..., cut]) for cut in cuts]

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Int
 
 from benchmarks.parity.distance import CONTACT_IMPULSES, JOINT_IMPULSES, MOTION, OFF, evolving_gaps
 from benchmarks.parity.engines import Stepped
@@ -30,7 +31,7 @@ DEEP = 0.1  # m of overlap
 RESTING = 0.01  # rad/s
 SPINNING = 5.0  # rad/s
 FAST = 20.0  # m/s
-Step = Callable[[Level, np.ndarray], Stepped]
+Step = Callable[[Level, Int[np.ndarray, "6 lane"]], Stepped]
 
 BROKEN_WORLD = "broken world"
 TOUCHING = "touching or not"
@@ -67,25 +68,25 @@ class Neighbours(NamedTuple):
     after: Stepped
 
 
-def find_cause(step: Step, level: Level, action: np.ndarray, theirs: Stepped) -> Cause:
+def find_cause(step: Step, level: Level, action: Int[np.ndarray, "6 1"], theirs: Stepped) -> Cause:
     """Of one state that is off.
 
     Args:
         step: our physics step of BLOCK lanes.
         level: one lane, stepped from its `state`.
-        action: [6, 1].
         theirs: what the reference made of it, one lane.
     """
-    explained = False
-    for most in MOVES:
-        seen = neighbours(step, level, action, most)
-        if explained := reached(seen.after.state, theirs.state):
-            break
-    explained = explained or is_broken(level.state, theirs.state)
+    *less, most = MOVES
+    for moved in less:
+        seen = neighbours(step, level, action, moved)
+        if reached(seen.after.state, theirs.state):
+            return Cause(True, name_cause(step, seen, action, theirs), moved, spread(seen.after.state))
+    seen = neighbours(step, level, action, most)
+    explained = reached(seen.after.state, theirs.state) or is_broken(level.state, theirs.state)
     return Cause(explained, name_cause(step, seen, action, theirs), most, spread(seen.after.state))
 
 
-def neighbours(step: Step, level: Level, action: np.ndarray, most: int) -> Neighbours:
+def neighbours(step: Step, level: Level, action: Int[np.ndarray, "6 1"], most: int) -> Neighbours:
     """Worlds near to that of one lane, after a step."""
     level = near_worlds(level, most)
     return Neighbours(level, step(level, np.repeat(action, COPIES, -1)))
@@ -127,7 +128,7 @@ def spread(states: State) -> float:
         return float(max(np.ptp(getattr(states, name), axis=-1).max() for name in MOTION))
 
 
-def name_cause(step: Step, seen: Neighbours, action: np.ndarray, theirs: Stepped) -> str:
+def name_cause(step: Step, seen: Neighbours, action: Int[np.ndarray, "6 1"], theirs: Stepped) -> str:
     """The first kind that fits, decisions by the last bit before what merely amplifies."""
     before = lanes_of(seen.level, [0])
     ours = lanes_of(seen.after, [0])
@@ -149,8 +150,8 @@ class Bodies:
     """What the difference is about, in one world."""
 
     worst: int  # the movable body that is off most
-    group: np.ndarray  # [body]: those it touches or is joined to, over others too
-    contacts: np.ndarray  # [contact]: those that act on the group
+    group: Bool[np.ndarray, " body"]  # those it touches or is joined to, over others too
+    contacts: Bool[np.ndarray, " contact"]  # those that act on the group
 
     @staticmethod
     def off(before: Level, ours: Stepped, theirs: Stepped) -> "Bodies":

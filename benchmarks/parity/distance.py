@@ -62,7 +62,7 @@ def distances(level: Level, ours: Stepped, theirs: Stepped) -> Distances:
     return Distances(fields, np.asarray(ours.state.contact_active != theirs.state.contact_active).sum(0))
 
 
-def evolving_gaps(ours: State, theirs: State) -> dict[str, np.ndarray]:
+def evolving_gaps(ours: State, theirs: State) -> dict[str, Float[np.ndarray, "... lane"]]:
     """Difference of every number that evolves, in the units of UNITS; lanes of either may broadcast.
 
     Impulses of contacts that do not touch are nobody's: the reference leaves old numbers there.
@@ -76,7 +76,7 @@ def evolving_gaps(ours: State, theirs: State) -> dict[str, np.ndarray]:
     return gaps
 
 
-def gap(a: ArrayLike, b: ArrayLike) -> np.ndarray:
+def gap(a: ArrayLike, b: ArrayLike) -> Float[np.ndarray, "..."]:
     """|a - b|; equal where both are no number, infinite where one is."""
     a, b = np.asarray(a), np.asarray(b)
     same = (a == b) | (np.isnan(a) & np.isnan(b))

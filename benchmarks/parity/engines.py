@@ -71,19 +71,19 @@ def _act(level: Level, now: TaskState, action: Int[Array, "6 lane"]):
     return task.step(level, now, action, RULES)
 
 
-def step_ours(level: Level, action: np.ndarray, params: Params = RULES.physics) -> Stepped:
+def step_ours(level: Level, action: Int[np.ndarray, "6 lane"], params: Params = RULES.physics) -> Stepped:
     """One physics step of every lane."""
     state, manifold, motor, thrust = jax.device_get(_one_step(level, action, params))
     control = np.concatenate([np.broadcast_to(x, (len(x), action.shape[-1])) for x in (motor, thrust)])
     return Stepped(state, manifold.normal, manifold.penetration, manifold.point, control)
 
 
-def env_step_ours(level: Level, action: np.ndarray) -> State:
+def env_step_ours(level: Level, action: Int[np.ndarray, "6 lane"]) -> State:
     """One env step of every lane, without reset."""
     return jax.device_get(_env_step(level, action))
 
 
-def play_ours(level: Level, start: State, action: np.ndarray, record: bool) -> Played:
+def play_ours(level: Level, start: State, action: Int[np.ndarray, "step 6 lane"], record: bool) -> Played:
     """Episodes from `start`, which resets lead to the level's own state."""
     level = jax.tree.map(jnp.asarray, level)
     lanes = action.shape[-1]
@@ -125,13 +125,13 @@ class Reference:
         told, fields = self._ask("handmade")
         return told["names"], level_from_kinetix(fields)
 
-    def step(self, level: Level, action: np.ndarray) -> Stepped:
+    def step(self, level: Level, action: Int[np.ndarray, "6 lane"]) -> Stepped:
         """One physics step of every lane."""
         fields = self._ask("step", (level, level.state, action))[1]
         normal, penetration, point = (self._contacts(fields, name) for name in GEOMETRY.values())
         return Stepped(state_from_kinetix(fields), normal, penetration, point, np.moveaxis(fields["control"], 0, -1))
 
-    def play(self, level: Level, start: State, action: np.ndarray, record: bool) -> Played:
+    def play(self, level: Level, start: State, action: Int[np.ndarray, "step 6 lane"], record: bool) -> Played:
         """As `play_ours`, but resets lead to `start`."""
         fields = self._ask("play", (level, start, action), record=record)[1]
         told = fields.pop("reward"), fields.pop("done")

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Int
 
 from benchmarks.parity.causes import MOVES, is_broken, near_worlds, reached
 from benchmarks.parity.distance import MOTION, OFF, evolving_gaps, gap, largest
@@ -36,10 +37,10 @@ NAMES = {-1: "red", 0: "time", 1: "goal"}
 class Outcome:
     """The first episode's end, by lane."""
 
-    step: np.ndarray  # env step, from 0
-    reward: np.ndarray  # -1, 0, 1
+    step: Int[np.ndarray, " lane"]  # env step, from 0
+    reward: Int[np.ndarray, " lane"]  # -1, 0, 1
 
-    def same(self, other: "Outcome") -> np.ndarray:
+    def same(self, other: "Outcome") -> Bool[np.ndarray, " lane"]:
         return (self.step == other.step) & (self.reward == other.reward)
 
     def text(self, lane: int) -> str:
@@ -81,9 +82,9 @@ class Block:
     """What a block of pairs gave."""
 
     theirs: Outcome
-    same: np.ndarray
-    reference_itself: np.ndarray
-    ours_itself: np.ndarray
+    same: Bool[np.ndarray, " pair"]
+    reference_itself: Bool[np.ndarray, " pair"]
+    ours_itself: Bool[np.ndarray, " pair"]
     parted: list[Parted]
     record: State  # the reference's
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
 from levelgen.level import WORLD_SIDE, Level
@@ -196,13 +197,13 @@ SCENES: dict[str, Change] = {
 }
 
 
-def movable(level: Level) -> np.ndarray:
-    """Active bodies of finite mass, [body, lane]."""
+def movable(level: Level) -> Bool[np.ndarray, "body lane"]:
+    """Active bodies of finite mass."""
     return np.asarray(level.model.active) & (np.asarray(level.model.inverse_mass) != 0)
 
 
-def with_masses(level: Level, where: np.ndarray) -> Level:
-    """Masses and inertias from shapes and densities where asked, [body, lane]."""
+def with_masses(level: Level, where: Bool[np.ndarray, "body lane"]) -> Level:
+    """Masses and inertias from shapes and densities where asked."""
     model = level.model
     area = np.concatenate([polygon_area(model.vertices, model.n_vertices), circle_area(model.radius)])
     turning = np.concatenate([polygon_inertia(model.vertices, model.n_vertices), circle_inertia(model.radius)])

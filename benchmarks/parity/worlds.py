@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import jax
 import numpy as np
+from jaxtyping import Float, Float32, Shaped
 
 from levelgen.files.kinetix import state_from_kinetix
 from levelgen.level import Level
@@ -45,14 +46,16 @@ def contact_bodies(size: Size) -> tuple[np.ndarray, np.ndarray]:
     return a, b
 
 
-def record_from_kinetix(fields: Mapping[str, np.ndarray]) -> State:
+def record_from_kinetix(fields: Mapping[str, Shaped[np.ndarray, "step lane ..."]]) -> State:
     """States of the reference (step, lane, ...) as ours, [..., step, lane]."""
     steps, lanes = fields["polygon/rotation"].shape[:2]
     flat = state_from_kinetix({name: x.reshape(steps * lanes, *x.shape[2:]) for name, x in fields.items()})
     return jax.tree.map(lambda x: x.reshape(*x.shape[:-1], steps, lanes), flat)
 
 
-def nudged(values: np.ndarray, rng: np.random.Generator, most: int = 1) -> np.ndarray:
+def nudged(
+    values: Float[np.ndarray, "*shape"], rng: np.random.Generator, most: int = 1
+) -> Float32[np.ndarray, "*shape"]:
     """Each number moved by at most `most` units in its last place; zeros stay."""
     moves = rng.integers(-most, most + 1, values.shape)
     out = values.astype(np.float32)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Shaped
 
 from benchmarks import oracle
 from benchmarks.contest import Process
@@ -122,7 +122,7 @@ def train_batch(
     level_ids: Int[np.ndarray, " level"],
     updates: int,
     report: Callable[[float], None],
-) -> tuple[float, list[dict[str, np.ndarray]]]:
+) -> tuple[float, list[dict[str, Shaped[np.ndarray, "..."]]]]:
     """Core-seconds of the batch, and what the reference's process shows of each level (see `judged`).
 
     Raises:
@@ -144,7 +144,7 @@ def train_batch(
     return seconds, [{name: x[i] for name, x in seen.items()} for i in range(count)]
 
 
-def judged(seen: dict[str, np.ndarray], config: ExpertConfig, failed_by_noop: bool) -> Verdict:
+def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, failed_by_noop: bool) -> Verdict:
     """The verdict on a level, by the rules for our own experts.
 
     Args:

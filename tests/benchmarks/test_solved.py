@@ -209,7 +209,7 @@ def test_plot(ours: Results, tmp_path: Path) -> None:
     [
         (["--size", "q"], "choose one of s, m, l"),
         (["--budget", "5x"], "write a whole number"),
-        (["--budget", "500"], "one update takes 1024 env steps"),
+        (["--budget", "500"], "takes 1024 env steps"),
         (["--first", "-1"], "level ids are 0 and above"),
         (["--jobs", "4000"], "cores"),
     ],
