@@ -1,0 +1,30 @@
+"""One level that a user names: found without reading the others."""
+
+from pathlib import Path
+
+import pytest
+
+from experts.labels import Label
+from pipeline.errors import UserError
+from pipeline.read.levels import COLUMNS, find_level
+from pipeline.store import manifest
+from pipeline.store.manifest import read_fragment
+from tests.pipeline.made import made_split
+
+
+def test_one_fragment_and_few_columns_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    split, read = made_split(tmp_path, [[Label.SOLVED] * 2] * 4), []
+
+    def noted(path: Path, columns: list[str]) -> object:
+        read.append((path.stem, set(columns)))
+        return read_fragment(path, columns)
+
+    monkeypatch.setattr(manifest, "read_fragment", noted)
+    found, row = find_level(split, 5)
+    assert (row["level_id"], row["row"], row["label"]) == (5, 1, "solved")
+    assert found.config is not None
+    assert read == [("000000000004-000000000005", {"level_id", *COLUMNS})]
+    read.clear()
+    with pytest.raises(UserError, match=r"^There is no level 8 in .*: it has 8 levels, from 0 to 7\.$"):
+        find_level(split, 8)
+    assert [columns for _, columns in read] == [{"level_id"}] * 4
