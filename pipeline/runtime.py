@@ -77,11 +77,11 @@ def own_cores() -> list[int]:
 
 
 def cores_for(workers: int) -> list[int | None]:
-    """The core that each worker stays on, for at most `workers` of them (0: one for each core).
+    """The core that each worker stays on, for at most so many workers.
 
     None leaves that to the system, where not every core has a worker: two runs side by side would choose the same.
     """
-    cores = own_cores()[: workers or None]
+    cores = own_cores()[:workers]
     return [*cores] if cores == _allowed_cores() else [None] * len(cores)
 
 

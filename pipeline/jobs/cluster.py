@@ -135,7 +135,7 @@ def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Bo
         Failure: no worker can start.
     """
     with connected():
-        crew = Crew(_seen_from_elsewhere(job), split.absolute(), board)
+        crew = Crew(_seen_from_elsewhere(job), split.absolute(), len(queue.waiting), board)
         while True:
             crew.follow_cluster()
             crew.start_workers(len(queue.waiting))
@@ -155,10 +155,11 @@ def _seen_from_elsewhere(job: JobConfig) -> JobConfig:
 class Crew:
     """All workers of a job."""
 
-    def __init__(self, job: JobConfig, split: Path, board: Board) -> None:
+    def __init__(self, job: JobConfig, split: Path, units: int, board: Board) -> None:
         self._job, self._split, self._board = job, split, board
+        self._most = min(job.workers or units, units)
         self._gpus = _on_gpus()
-        self._handles = [self._handle(each) for each in _room(self._gpus, job.workers)]
+        self._handles = [self._handle(each) for each in _room(self._gpus, self._most)]
         self._given_up = 0  # workers that cannot start
         self._rescan_at = time.monotonic() + RESCAN
         self._notice_at = time.monotonic() + PATIENCE
@@ -175,7 +176,7 @@ class Crew:
         if not _existing() or time.monotonic() < self._rescan_at:
             return
         self._rescan_at = time.monotonic() + RESCAN
-        room = _room(self._gpus, self._job.workers)
+        room = _room(self._gpus, self._most)
         surplus = len(self._handles) + self._given_up - len(room)
         self._handles += [self._handle(each) for each in room[: max(0, -surplus)]]
         gone = [handle for handle in self._handles if handle.actor is None or handle.starting is not None]
@@ -304,16 +305,16 @@ def _on_gpus() -> bool:
     return ray.get(ray.remote(num_gpus=1, max_calls=1)(_jax_sees_a_gpu).remote())
 
 
-def _room(gpus: bool, workers: int) -> list[Resources]:
-    """What each worker occupies now: one for each GPU, or else each core, and at most `workers` of them, if any."""
+def _room(gpus: bool, most: int) -> list[Resources]:
+    """What each worker occupies now: one for each GPU, or else each core, and at most so many."""
     now = ray.cluster_resources()
     if gpus:
         room = [Resources(gpus=1)] * int(now.get("GPU", 0))
     elif _existing():  # which cores its machines have is theirs to know
         room = [Resources()] * int(now.get("CPU", 0))
     else:
-        return [Resources(core) for core in cores_for(workers)]
-    return (room or [Resources(gpus=int(gpus))])[: workers or None]  # one that waits: more machines may join
+        return [Resources(core) for core in cores_for(most)]
+    return (room or [Resources(gpus=int(gpus))])[:most]  # one that waits: more machines may join
 
 
 def _jax_sees_a_gpu() -> bool:

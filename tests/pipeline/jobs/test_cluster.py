@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from pipeline.jobs import cluster
+from pipeline.jobs.progress import Board, Tally
 from pipeline.jobs.schedule import COMPANY
+from pipeline.store.layout import JOB
 from pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import PATIENCE, assert_refused, descendants, run, start, title, until
 from tests.pipeline.made import made_job
@@ -61,9 +64,34 @@ def test_workers_read_no_relative_path() -> None:
     assert cluster._seen_from_elsewhere(made_job()).continue_from == ""
 
 
+def test_there_are_as_many_workers_as_a_cluster_has_room_for_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    now: dict[str, float] = {}  # a head without a core
+    monkeypatch.setattr(cluster.ray, "cluster_resources", lambda: now)
+    monkeypatch.setattr(cluster, "RESCAN", 0.0)
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
+    crew = cluster.Crew(made_job(), SPLIT, 6, Board(Tally(1, 0, 0), Console()))
+    capped = cluster.Crew(made_job("data", "workers=2"), SPLIT, 6, Board(Tally(1, 0, 0), Console()))
+    assert len(crew._handles) == 1  # it waits for machines that join
+    for cores in (4, 3, 8, 0):
+        now["CPU"] = cores
+        for each in (crew, capped):
+            each.follow_cluster()
+        assert len(crew._handles) == min(max(cores, 1), 6)  # of six units, each
+        assert len(capped._handles) == min(max(cores, 1), 2)
+    crew._handles[0].actor = "one that has answered"
+    now["CPU"] = 2
+    crew.follow_cluster()
+    now["CPU"] = 1
+    crew.follow_cluster()
+    assert [handle.actor for handle in crew._handles] == ["one that has answered"]
+    assert cluster._room(True, 6) == [cluster.Resources(gpus=1)]
+    now["GPU"] = 2.0
+    assert cluster._room(True, 6) == [cluster.Resources(gpus=1)] * 2
+
+
 @pytest.mark.slow
 def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
-    """Ray's own nodes: a head without a core, one that is there, and one that joins before the first is lost.
+    """Ray's own nodes: a head without a core, one that joins a waiting run, and one more before the first is lost.
 
     They run in another folder than the command, which names the split that goes on relatively.
     """
@@ -72,9 +100,10 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
     memory: dict[str, Any] = {"object_store_memory": 80 * 2**20}
     machines = Cluster(initialize_head=True, head_node_args=memory | {"num_cpus": 0, "include_dashboard": False})
     try:
-        first = machines.add_node(num_cpus=1, **memory)
-        endless = ("generate", "levels=1k", "unit=1", "budget=5k", "stop=budget", "keep_experts=true")
+        endless = ("generate", "levels=1k", "unit=1", "budget=5k", "keep_experts=true")
         process = start(endless, tmp_path, address=str(machines.address))
+        until((tmp_path / SPLIT / JOB).exists, process)
+        first = machines.add_node(num_cpus=1, **memory)
         until(lambda: fragment_paths(tmp_path / SPLIT), process)
         second = machines.add_node(num_cpus=1, **memory)
         until(lambda: works_on(second), process)
@@ -87,7 +116,8 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
         assert "The worker died" in err
         assert "Traceback" not in err
 
-        trained = next(row for row in read_manifest(tmp_path / SPLIT).table.to_pylist() if row["experts"])
+        rows = read_manifest(tmp_path / SPLIT).table.to_pylist()
+        trained = next(row for row in rows if row["label"] == "unsolved" and row["experts"])
         shutil.rmtree(tmp_path / SPLIT / trained["experts"])
         words = ["regenerate", f"manifest={SPLIT}", "budget=8k", f"where=level_id = {trained['level_id']}"]
         again = run([*words, "continue=true"], tmp_path, address=str(machines.address))
