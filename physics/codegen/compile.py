@@ -4,7 +4,6 @@ import ctypes
 import hashlib
 from collections.abc import Sequence
 from functools import cache
-from threading import Lock
 
 import jax
 from jax.extend import core
@@ -16,7 +15,6 @@ from physics.codegen.lower import Memory, lower
 from physics.codegen.values import INDEX
 
 _libraries: dict[str, binding.ResourceTracker] = {}  # machine code must outlive every executable that calls it
-_registering = Lock()  # a name is registered once, whichever thread asks first
 
 
 def compile_kernel(
@@ -38,12 +36,11 @@ def compile_kernel(
     """
     text = str(_module(jaxpr, arguments, results, scratch))
     name = "levelproof_" + hashlib.sha256(text.encode()).hexdigest()[:16]
-    with _registering:
-        if name not in _libraries:
-            library = _link(name, _object_code(text))
-            handler = jax.ffi.pycapsule(ctypes.c_void_p(library["handler"]))
-            jax.ffi.register_ffi_target(name, handler, platform="cpu")
-            _libraries[name] = library
+    if name not in _libraries:
+        library = _link(name, _object_code(text))
+        handler = jax.ffi.pycapsule(ctypes.c_void_p(library["handler"]))
+        jax.ffi.register_ffi_target(name, handler, platform="cpu")
+        _libraries[name] = library
     return name
 
 

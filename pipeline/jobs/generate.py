@@ -12,7 +12,7 @@ from rich.console import Console
 from configs.schema import JobConfig
 from pipeline.errors import Exit, Failure
 from pipeline.jobs.progress import Board, Tally, say
-from pipeline.jobs.schedule import UnitOutcome, UnitQueue, WorkUnit, levels_text, plan_units
+from pipeline.jobs.schedule import UnitOutcome, UnitQueue, WorkUnit, levels_text, plan_units, runs
 from pipeline.store.checkpoints import require_same_experts
 from pipeline.store.layout import quarantine_path
 from pipeline.store.manifest import Manifest, read_manifest
@@ -37,7 +37,7 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
         wanted = set(job.level_ids if level_ids is None else map(int, level_ids))
         done = wanted.intersection(manifest.level_ids.tolist())
         queue = UnitQueue.of(plan_units(sorted(wanted), done, job.levels_per_unit))
-        note_job(split, job, command, sorted(wanted))
+        note_job(split, job, command, runs(sorted(wanted)))
         if queue.waiting:
             solved = _labels(manifest, wanted)["solved"]
             board = Board(Tally(len(wanted), len(done), solved), console)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from configs.schema import JobConfig
 from pipeline.errors import UserError
-from pipeline.jobs.schedule import runs
 from pipeline.store.layout import FOLDERS, JOB, split_path
 from pipeline.store.leftovers import clean
 from pipeline.store.locks import Locked, only_writer, require_locks
@@ -58,11 +57,11 @@ def require_same(manifest: Manifest, job: JobConfig) -> None:
     )
 
 
-def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[int]) -> None:
-    """Write down what this command wants, for `levelproof status`."""
+def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[tuple[int, int]]) -> None:
+    """Write down which runs of level ids this command wants, first and last of each, for `levelproof status`."""
     note = {
         "command": shlex.join(command),
-        "level_ids": runs(wanted),
+        "level_ids": wanted,
         "config_hash": job.hash,
     }
     temporary = split / f".{JOB}.{os.getpid()}"
