@@ -95,7 +95,7 @@ class Pool:
             begun: by index among them, experts that go on.
             keep: whether the result has the experts.
         """
-        submission = Submission(levels, np.asarray(level_ids, np.int32), begun, keep)
+        submission = Submission(levels, level_ids, begun, keep)
         count = len(level_ids)
         self._submissions.append(submission)
         self._coming.extend((submission, range(i, min(i + GROUP, count))) for i in range(0, count, GROUP))

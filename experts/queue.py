@@ -48,7 +48,7 @@ def enter(
     for first in range(0, len(level_ids), GROUP):
         some = range(first, min(first + GROUP, len(level_ids)))
         fill = np.minimum(np.arange(first, first + GROUP), some[-1])
-        group, ids = take(levels, fill), np.asarray(level_ids, np.int32)[fill]
+        group, ids = take(levels, fill), level_ids[fill]
         experts = begin(group, ids, config)
         if mine := {i - first: begun[i] for i in some if i in begun}:
             experts = jax.tree.map(np.array, experts)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from experts.before import Before, decide
 from experts.config import RECORD_STEPS, ExpertConfig, StopConfig, check_budget
@@ -16,6 +17,7 @@ from experts.judge import Kept, judge
 from experts.labels import WITNESSED, Label, Verdict
 from experts.pool import NOTHING_BEGUN, Pool, Spent, Submission, Totals
 from experts.witness import Record, replay, take
+from levelgen.identity.keys import level_id_array
 from levelgen.level import ACTIONS, Level
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
@@ -31,7 +33,7 @@ def quiet(env_steps: int, levels: float, solved: int) -> None:
 class UnitResult:
     """What came of some levels, on the host, in the order they were given."""
 
-    level_ids: np.ndarray  # int64
+    level_ids: Int[np.ndarray, " level"]
     levels: Level
     record: Record  # all zero where the level has no witness
     verdicts: list[Verdict]
@@ -102,7 +104,7 @@ def begin(
         begun: by level id, experts that go on with what they have left of the budget; the others begin.
         keep: whether the result has the experts.
     """
-    level_ids = np.asarray(level_ids)
+    level_ids = level_id_array(level_ids)
     levels = jax.tree.map(np.asarray, levels)
     before = decide(levels, pool.rules)
     left = np.array([i for i, verdict in enumerate(before.verdicts) if verdict is None], int)
@@ -132,7 +134,7 @@ def finish(pool: Pool, run: TrainingRun) -> UnitResult:
     record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
     ended = zip(level_ids[left].tolist(), trained, strict=True)
     experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
-    return UnitResult(level_ids.astype(np.int64), levels, record, known, submission.spent(pool.config), experts)
+    return UnitResult(level_ids, levels, record, known, submission.spent(pool.config), experts)
 
 
 def new_pool(

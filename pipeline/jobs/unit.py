@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from configs.compose import again
@@ -19,6 +18,7 @@ from experts.pool import Pool
 from experts.train import TrainingRun, UnitResult, begin, finish, new_pool
 from experts.witness import Record, replay, succeeds
 from levelgen.identity.content import content_hashes
+from levelgen.identity.keys import level_id_array
 from levelgen.identity.signature import signatures
 from levelgen.level import Level, size_of
 from levelgen.sampling.sampler import sample_levels
@@ -46,8 +46,8 @@ def begin_unit(job: JobConfig, unit: WorkUnit, pool: Pool) -> TrainingRun:
     Raises:
         Failure: the experts that should go on cannot be read.
     """
-    ids = np.asarray(unit.level_ids, np.int32)
-    levels = sample_levels(jnp.asarray(ids), size_of(job.size), job.distribution)
+    ids = level_id_array(unit.level_ids)
+    levels = sample_levels(ids, size_of(job.size), job.distribution)
     return begin(pool, levels, ids, experts_for(job, unit.level_ids), job.keep_experts)
 
 

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
@@ -45,7 +44,7 @@ def sample(job: JobConfig, out: Path) -> None:
 
 def sheet_of(job: JobConfig) -> Image.Image:
     """The initial worlds of the job's levels, row after row."""
-    levels = jax.tree.map(np.asarray, sample_levels(jnp.array(job.level_ids), size_of(job.size), job.distribution))
+    levels = jax.tree.map(np.asarray, sample_levels(job.level_ids, size_of(job.size), job.distribution))
     pictures = []
     for lane, level_id in enumerate(job.level_ids):
         level = jax.tree.map(lambda x, lane=lane: x[..., lane : lane + 1], levels)

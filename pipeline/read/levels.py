@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
-
 from configs.convert import typed
 from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelgen.level import Level, size_of
@@ -44,7 +42,7 @@ def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
         return tree_of(Level, open_shard(manifest.split, row["shard"], row["size"]).read([row["row"]]), "level/")
     prepare_jax()
     distribution = typed(Distribution, (manifest.config or {})["distribution"])
-    return sample_levels(jnp.array([row["level_id"]], jnp.int32), size_of(row["size"]), distribution)
+    return sample_levels([row["level_id"]], size_of(row["size"]), distribution)
 
 
 def is_level_file(source: Path) -> bool:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from configs.schema import JobConfig
@@ -73,7 +72,7 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
     """
     import orbax.checkpoint as ocp
 
-    level = sample_levels(jnp.zeros(1, jnp.int32), size_of(job.size), job.distribution)
+    level = sample_levels([0], size_of(job.size), job.distribution)
     like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), job.expert), level)
     try:
         with ocp.StandardCheckpointer() as checkpointer:
