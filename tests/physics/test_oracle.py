@@ -43,7 +43,7 @@ def stepped(size: str):
 
 
 def errors(ours, theirs) -> np.ndarray:
-    """Largest absolute difference of any place or speed of a lane (NaN counts as infinite)."""
+    """Largest absolute difference of any position or speed of a lane (NaN counts as infinite)."""
     gaps = [np.abs(getattr(ours, name) - getattr(theirs, name)) for name in MOTION]
     worst = np.max([gap.reshape(-1, gap.shape[-1]).max(0) for gap in gaps], 0)
     return np.where(np.isnan(worst), np.inf, worst)
@@ -102,7 +102,6 @@ def test_golden_states_show_everything(size: str) -> None:
     assert not missing, f"size {size} shows too little: {missing}"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
 def test_one_step_is_the_references(size: str) -> None:
     worst = errors(stepped(size), golden(size).after)
@@ -111,7 +110,6 @@ def test_one_step_is_the_references(size: str) -> None:
     assert np.median(worst) < 5e-6
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
 def test_every_kind_of_state_agrees(size: str) -> None:
     """No kind of state hides its errors behind the others."""
@@ -121,7 +119,6 @@ def test_every_kind_of_state_agrees(size: str) -> None:
         assert (worst[lanes] < 1e-4).mean() >= 0.9, name  # circles deep in a polygon amplify rounding most
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
 def test_what_the_next_step_starts_from_agrees(size: str) -> None:
     """Which contacts are active, and the impulses that warm starting reads."""

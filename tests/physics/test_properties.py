@@ -183,7 +183,7 @@ class TestMirror:
 class TestPrecision:
     """One step in single precision against the same source in double precision."""
 
-    @pytest.mark.parametrize("size", ["s", *[pytest.param(size, marks=pytest.mark.slow) for size in "ml"]])
+    @pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.campaign) for size in "ml")])
     def test_one_step(self, size: str) -> None:
         world = golden(size)
         single, _ = play(*world)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -203,7 +204,7 @@ class TestInactive:
 class TestBounds:
     @few
     @given(st.floats(-1e4, 1e4, width=32), st.floats(-1e4, 1e4, width=32), st.floats(-1e4, 1e4, width=32))
-    def test_places_and_speeds_are_bounded(self, x, y, w) -> None:
+    def test_positions_and_speeds_are_bounded(self, x, y, w) -> None:
         model, state = room()
         state = changed(state, velocity={BALL: (x, y)}, angular_velocity={BALL: w})
         after, _ = play(model, state, *idle())
@@ -216,7 +217,7 @@ class TestBounds:
 class TestLanes:
     """A lane's bits depend on its own world alone, not on its neighbours nor on their number."""
 
-    BLOCK = 64
+    SOME = 64
     STEPS = 16
 
     @classmethod
@@ -231,28 +232,33 @@ class TestLanes:
         for field in dataclasses.fields(ours):
             np.testing.assert_array_equal(getattr(ours, field.name), getattr(theirs, field.name), field.name)
 
-    @pytest.mark.slow
     def test_the_order_of_lanes_changes_no_bits(self) -> None:
-        order = np.random.default_rng(1).permutation(self.BLOCK)
-        straight = self.after(np.arange(self.BLOCK))
+        order = np.random.default_rng(1).permutation(self.SOME)
+        straight = self.after(np.arange(self.SOME))
         self.same_bits(self.after(order), jax.tree.map(lambda x: x[..., order], straight))
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize(("size", "count"), [("s", 1), ("s", 40), ("m", 3), ("l", 3)])
+    @pytest.mark.parametrize(
+        ("size", "count"), [("s", 40), *(pytest.param(size, 3, marks=pytest.mark.campaign) for size in "sml")]
+    )
     def test_neighbours_change_no_bits(self, size: str, count: int) -> None:
-        """A block filled up with repetitions of its last lane, as the last block of a job is."""
-        filled = self.after(np.minimum(np.arange(self.BLOCK), count - 1), size=size)
-        whole = self.after(np.arange(self.BLOCK), size=size)
+        """Lanes filled up with repetitions of the last one, as those of a job's end are."""
+        filled = self.after(np.minimum(np.arange(self.SOME), count - 1), size=size)
+        whole = self.after(np.arange(self.SOME), size=size)
         mine = lambda tree: jax.tree.map(lambda x: x[..., :count], tree)
         self.same_bits(mine(filled), mine(whole))
 
-    @pytest.mark.parametrize("size", ["s", "m", "l"])
-    @pytest.mark.parametrize("count", [1, 3, 16, 129])
+    @pytest.mark.parametrize(
+        ("size", "count"),
+        [
+            *(("s", 1), ("s", 16), ("l", 129)),  # less than a block, a whole one, some and the rest
+            *(pytest.param(*case, marks=pytest.mark.campaign) for case in itertools.product("sml", (3, 17, 100))),
+        ],
+    )
     def test_the_number_of_lanes_changes_no_bits(self, size: str, count: int) -> None:
         alone, together = self.after(np.arange(count), size=size), self.after(np.arange(256), size=size)
         self.same_bits(alone, jax.tree.map(lambda x: x[..., :count], together))
 
-    @pytest.mark.parametrize("size", ["s", "m", "l"])
+    @pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.campaign) for size in "ml")])
     def test_being_watched_changes_no_bits(self, size: str) -> None:
         """A step that writes no contacts down leads to the same state."""
         of = load(HERE / f"{size}.npz")
@@ -292,17 +298,17 @@ class TestPadding:
         np.testing.assert_allclose(after.contact_normal_impulse[-1], weight, rtol=0.2)
 
     @pytest.mark.parametrize(
-        ("contact", "places", "gravity"),
+        ("contact", "positions", "gravity"),
         [
             (3, {BOX: (2.5, 5 - HALF + 0.005)}, 9.81),  # ceiling and box: first points
             (7, {BOX: (2.5, 5 - HALF + 0.005)}, 9.81),  # second points
             (17, {BOX: (2.5, FLOOR_TOP + HALF), OTHER: (2.5, FLOOR_TOP + 2 * HALF + RADIUS - 0.005)}, -9.81),
         ],
     )
-    def test_the_last_pair_of_each_kind(self, contact: int, places: dict, gravity: float) -> None:
+    def test_the_last_pair_of_each_kind(self, contact: int, positions: dict, gravity: float) -> None:
         """Ceiling and box, second circle and box; the two circles: above."""
         model, state = room(gravity=gravity)
-        state = changed(state, position={BALL: (4.0, 2.0), OTHER: (1.0, 2.0)} | places)
+        state = changed(state, position={BALL: (4.0, 2.0), OTHER: (1.0, 2.0)} | positions)
         for faithful in (True, False):
             after, _ = play(model, state, *idle(), steps=4, params=Params(faithful_padding=faithful))
             assert after.contact_active[contact].all()
