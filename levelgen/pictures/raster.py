@@ -12,14 +12,8 @@ from jaxtyping import Int
 from PIL import Image, ImageDraw
 
 from levelgen.level import WORLD_SIDE, Level
-from levelgen.pictures.scene import (
-    BORDER,
-    EDGE,
-    HATCH_PITCH,
-    HATCH_WIDTH,
-    PAPER,
-    Caption,
-    Colour,
+from levelgen.pictures.scene import scene_of
+from levelgen.pictures.shapes import (
     Disc,
     Line,
     Part,
@@ -31,8 +25,16 @@ from levelgen.pictures.scene import (
     Text,
     font,
     placed,
-    scene_of,
 )
+from levelgen.pictures.style import (
+    BORDER,
+    EDGE,
+    HATCH_PITCH,
+    HATCH_WIDTH,
+    PAPER,
+    Colour,
+)
+from levelgen.pictures.words import Caption
 from physics.types import State
 
 SUPERSAMPLING = 4  # drawn this much larger, then averaged

@@ -14,13 +14,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from levelgen.level import WORLD_SIDE
-from levelgen.pictures.scene import (
-    BORDER,
-    EDGE,
-    HATCH_PITCH,
-    HATCH_WIDTH,
-    PAPER,
-    Colour,
+from levelgen.pictures.shapes import (
     Disc,
     Line,
     Part,
@@ -33,6 +27,14 @@ from levelgen.pictures.scene import (
     placed,
     text_drop,
     text_width,
+)
+from levelgen.pictures.style import (
+    BORDER,
+    EDGE,
+    HATCH_PITCH,
+    HATCH_WIDTH,
+    PAPER,
+    Colour,
 )
 
 WIDTH = 480  # user units, of a picture

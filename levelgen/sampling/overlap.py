@@ -1,7 +1,9 @@
 """How much a body touches the others: the number of contacts the engine would find.
 
-The sampler asks this of every proposal, so only pairs with the new body are looked at. Contacts count as in
-physics/manifold.py: up to two of a pair of polygons, one where a circle is concerned; joined bodies count too.
+The sampler asks this of every proposal, so only pairs with the new body are looked at, all at once. Contacts count as
+in physics/manifold.py, which a test compares: up to two of a pair of polygons, one where a circle is concerned; joined
+bodies count too. The geometry is not shared with it, because it measures from vertices where the kernel has projections
+on faces: other last bits, and now and then another count, would make other levels of the same ids.
 """
 
 from typing import NamedTuple

@@ -17,8 +17,10 @@ from jaxtyping import Array, Bool
 from configs.convert import typed
 from levelgen.level import ACTIONS, Level, name_of
 from levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
-from levelgen.pictures.scene import Caption, Scene, scene_of
+from levelgen.pictures.scene import scene_of
+from levelgen.pictures.shapes import Scene
 from levelgen.pictures.svg import write_svg
+from levelgen.pictures.words import Caption
 from levelgen.task.rules import StepResult, TaskParams, TaskState, advance, has_nan, reset
 from physics.types import State
 from pipeline.errors import Failure, UserError

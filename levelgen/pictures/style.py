@@ -1,0 +1,33 @@
+"""How pictures for people look: colours, and lengths in metres."""
+
+from levelgen.level import Role
+
+Colour = tuple[int, int, int]
+
+BORDER = 0.08  # m of the walls and the ceiling that shows
+HEADER, FOOTER = 0.36, 0.30  # m of picture above and below the world
+EDGE = 0.022  # m, width of the line around a shape
+HATCH_PITCH, HATCH_WIDTH = 0.1, 0.018  # m; measured along x
+
+SKY: Colour = (247, 247, 243)
+GRID: Colour = (234, 235, 230)
+INK: Colour = (38, 44, 52)
+PAPER: Colour = (255, 255, 255)
+MUTED: Colour = (128, 135, 144)
+FIXED_PLAIN: Colour = (98, 105, 115)
+ROLE_COLOUR: dict[Role, Colour] = {
+    Role.PLAIN: (168, 175, 184),
+    Role.GREEN: (62, 176, 92),
+    Role.BLUE: (58, 124, 220),
+    Role.RED: (224, 78, 66),
+}
+BINDING_COLOUR: tuple[Colour, ...] = (  # of the action's entries: four motors, two thrusters
+    (245, 184, 22),
+    (206, 66, 196),
+    (26, 184, 186),
+    (245, 124, 40),
+    (126, 87, 226),
+    (240, 96, 140),
+)
+FLAMES: tuple[tuple[float, Colour], ...] = ((1.0, (245, 124, 40)), (0.6, (255, 214, 92)))  # length, colour
+CAPTION_SIZE, KEY_SIZE = 0.155, 0.14  # m, of letters

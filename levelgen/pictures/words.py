@@ -1,0 +1,91 @@
+"""The words of a picture: title, badge and clock above the world, and the keys of an action below it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int
+
+from levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
+from levelgen.pictures.shapes import Disc, Part, Rectangle, Shape, Text, text_width
+from levelgen.pictures.style import (
+    BINDING_COLOUR,
+    BORDER,
+    CAPTION_SIZE,
+    FOOTER,
+    HEADER,
+    INK,
+    KEY_SIZE,
+    MUTED,
+    PAPER,
+    ROLE_COLOUR,
+)
+
+ELLIPSIS = "…"
+
+
+@dataclass(frozen=True)
+class Caption:
+    """The words above the world."""
+
+    title: str = ""  # left; shortened to what there is room for
+    clock: str = ""  # right
+    outcome: str = ""  # a badge in the middle
+    good: bool = True  # colour of the badge
+
+
+def caption_parts(caption: Caption) -> list[Part]:
+    """Title, badge and clock, each a part."""
+    middle, left, right, size = WORLD_SIDE + BORDER + HEADER / 2, 0.04, WORLD_SIDE - 0.04, CAPTION_SIZE
+    title, clock, outcome = (printable(words) for words in (caption.title, caption.clock, caption.outcome))
+    badge = text_width(outcome, size) + 0.3 if outcome else 0.0
+    title = _fitted(title, right - left - badge - text_width(clock, size) - 0.1, size)
+    shapes: tuple[Shape, ...] = ()
+    if outcome:
+        start = left + (text_width(title, size) + 0.2 if title else 0.09)
+        end = start + text_width(outcome, size)
+        colour = ROLE_COLOUR[Role.GREEN] if caption.good else ROLE_COLOUR[Role.RED]
+        box = Rectangle((start - 0.09, middle - 0.12), (end + 0.09, middle + 0.12), colour, corner=0.1)
+        shapes = (box, Text((start, middle), outcome, PAPER, size))
+    of = lambda words, *rest: (Text(*rest),) if words else ()
+    return [
+        Part(of(title, (left, middle), title, INK, size)),
+        Part(of(clock, (right, middle), clock, MUTED, size, True)),
+        Part(shapes),
+    ]
+
+
+def printable(words: str) -> str:
+    """Names of files may hold anything."""
+    return "".join(letter if letter.isprintable() else "?" for letter in words)
+
+
+def _fitted(words: str, room: float, size: float) -> str:
+    """As much of the words' beginning as there is room for, m."""
+    if text_width(words, size) <= room:
+        return words
+    while words and text_width(words + ELLIPSIS, size) > room:
+        words = words[:-1]
+    return words.rstrip() + ELLIPSIS
+
+
+def key_parts(level: Level, action: Int[np.ndarray, "6"]) -> list[Part]:
+    """A key for each live entry, lit in its binding's colour while it is used."""
+    middle, left, parts = -FOOTER / 2, 0.04, []
+    for entry in live_entries(level):
+        is_motor = entry < MOTOR_BINDINGS
+        name = f"M{entry + 1}" if is_motor else f"T{entry - MOTOR_BINDINGS + 1}"
+        state = ("off", "forward" if is_motor else "on", "back")[int(action[entry])]
+        lit, colour = int(action[entry]) != 0, BINDING_COLOUR[entry]
+        key = Disc((left + 0.07, middle), 0.07, colour if lit else PAPER, colour)
+        parts.append(Part((key, Text((left + 0.2, middle), f"{name} {state}", INK if lit else MUTED, KEY_SIZE))))
+        left += 0.2 + text_width(f"{name} forward", KEY_SIZE) + 0.06
+    return parts
+
+
+def live_entries(level: Level) -> list[int]:
+    """Action entries of ONE level (no lane axis) that some motor or thruster obeys."""
+    model = level.model
+    motor = model.joint_active & ~model.joint_fixed & model.motor_on & ~level.motor_auto
+    motors = {int(binding) for binding in level.motor_binding[motor]}
+    thrusters = {MOTOR_BINDINGS + int(binding) for binding in level.thruster_binding[model.thruster_active]}
+    return sorted(motors | thrusters)
