@@ -1,10 +1,8 @@
 """Experts on the disk, so that a larger budget goes on instead of starting again: one Orbax checkpoint per unit."""
 
-import logging
 import os
 import socket
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from pipeline.errors import Failure, UserError
 from pipeline.store.disk import flush, refusal
 from pipeline.store.layout import MANIFEST, data_path
 from pipeline.store.manifest import differences, read_manifest, require_manifest, told
+from pipeline.store.quiet import quiet_failures
 
 
 class SourceUnseen(Failure):
@@ -44,24 +43,13 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
     begun = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows))
     tree = {"level_id": np.array(sorted(experts)), "curve": curves, "begun": begun}
     try:
-        with _unlogged(), ocp.StandardCheckpointer() as checkpointer:
+        with quiet_failures(), ocp.StandardCheckpointer() as checkpointer:
             checkpointer.save(path.absolute(), tree)
     except Exception as error:  # Orbax and TensorStore raise many kinds
         if number := refusal(error):
             raise OSError(number, os.strerror(number), str(path)) from error
         raise
     flush(path)
-
-
-@contextmanager
-def _unlogged() -> Iterator[None]:
-    """Without Orbax's log: it writes a failure's traceback on stderr, and raises the same failure."""
-    logger = logging.getLogger("absl")
-    before, logger.disabled = logger.disabled, True
-    try:
-        yield
-    finally:
-        logger.disabled = before
 
 
 def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:

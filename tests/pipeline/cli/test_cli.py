@@ -204,18 +204,21 @@ def test_show_draws_a_witness(made: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(made: Path, tmp_path: Path) -> None:
+def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(tmp_path: Path) -> None:
     """A limit on the size of files stands in for a full disk: both refuse in the middle of a write."""
-    limit = 2_000  # bytes; a shard's data is longer
+    limit = 2_000  # bytes; experts, which come first, are longer
+    command = ["generate", "levels=4", "unit=4", "budget=5k", "keep_experts=true", "executor=inline"]
 
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    done = run(["generate", *TINY, "executor=inline"], tmp_path, preexec_fn=limited)
+    done = run(command, tmp_path, preexec_fn=limited)
     assert_refused(done, 1, "Cannot write to data/5k/s", "run the same command again")
     assert fragment_paths(tmp_path / "data/5k/s") == []
-    assert run(["generate", *TINY, "executor=inline"], tmp_path).returncode == 0
+    assert run(command, tmp_path).returncode == 0
     assert len(read_manifest(tmp_path / "data/5k/s").level_ids) == 4
+    data = {path.stem for folder in ("shards", "experts") for path in (tmp_path / "data/5k/s" / folder).iterdir()}
+    assert len(data) == 1
 
 
 @pytest.mark.slow

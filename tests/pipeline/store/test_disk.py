@@ -46,11 +46,10 @@ def kept_experts() -> dict[int, Kept]:
 
 
 @pytest.mark.slow
-def test_experts_on_a_full_disk(tiny: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_experts_on_a_full_disk(tiny: Path) -> None:
     with pytest.raises(OSError, match="No space left") as refused:
         save_experts(new_attempt(tiny, unit_name(0, 0)).experts, kept_experts())
     assert refused.value.errno == errno.ENOSPC
-    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_shard_on_a_full_disk(tiny: Path) -> None:
