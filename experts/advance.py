@@ -54,8 +54,8 @@ def advance(
     """
     slots = refill(slots, queue, config)
     slot = slots.slot
-    levels = jax.tree.map(lambda x: x[..., slot.index], queue.levels)
-    keys = jax.vmap(_key)(queue.level_ids[slot.index], slot)
+    levels = jax.tree.map(lambda x: x[..., slot.queue_index], queue.levels)
+    keys = jax.vmap(_key)(queue.level_ids[slot.queue_index], slot)
     lanes = repeat(levels, config.environments)
     evaluating = slot.mode == Mode.EVALUATE
 
@@ -74,14 +74,14 @@ def advance(
     left = (slot.mode == Mode.EMPTY) & (mode == Mode.EVALUATE)
     evaluated = (mode == Mode.EVALUATE) & (left | slot.trial.solved)
     after = Slots(slot, _where(trains, acting, slots.acting), acting, slots.taken)
-    return after, Report(slot.index, mode, share, evaluated, left, slots.taken)
+    return after, Report(slot.queue_index, mode, share, evaluated, left, slots.taken)
 
 
 def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
     """Slots that are empty take the next levels of the queue. One that is over is only evaluated again."""
     free = slots.slot.mode == Mode.EMPTY
     number = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
-    takes, index = free & (number < queue.count), number % queue.capacity
+    takes, index = free & (number < queue.come), number % queue.capacity
 
     def fill() -> tuple[Slot, Acting]:
         begun = jax.tree.map(lambda x: x[index], queue.begun)
@@ -90,7 +90,7 @@ def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
         over, trial = begun.training.course.over, slots.slot.trial
         slot = slots.slot._replace(
             mode=put(jnp.where(over, Mode.EVALUATE, Mode.TRAIN), slots.slot.mode),
-            index=put(index, slots.slot.index),
+            queue_index=put(index, slots.slot.queue_index),
             deadline=put(jnp.full_like(index, queue.updates), slots.slot.deadline),
             training=put(begun.training, slots.slot.training),
             trial=trial._replace(
@@ -195,7 +195,7 @@ def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) 
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, old)
     mode = jnp.where(leaves, Mode.EMPTY, Mode.TRAIN)
     training = slot.training._replace(course=keep(course, slot.training.course))
-    return Slot(keep(mode, slot.mode), slot.index, keep(deadline, slot.deadline), training, trial)
+    return Slot(keep(mode, slot.mode), slot.queue_index, keep(deadline, slot.deadline), training, trial)
 
 
 def _key(level_id: Int[Array, ""], slot: Slot) -> Key[Array, ""]:

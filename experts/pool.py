@@ -115,7 +115,7 @@ class Pool:
     @property
     def wants(self) -> int:
         """Levels by which as many would wait as there are slots: with them none is empty for a while."""
-        come = int(self._queue.count) if self._queue else 0
+        come = int(self._queue.come) if self._queue else 0
         waiting = come - self._taken + sum(len(some) for _, some in self._coming)
         return max(0, slot_count(self.config) - waiting)
 
@@ -157,7 +157,7 @@ class Pool:
     def _note(self, slot: int, seen: Report) -> None:
         """What became of the level in a slot."""
         assert self._slots is not None
-        index = int(seen.index[slot])
+        index = int(seen.queue_index[slot])
         submission, i = self._at[index]
         submission.rollouts[int(seen.mode[slot])] += 1
         if seen.mode[slot] == Mode.TRAIN:

@@ -33,7 +33,7 @@ def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig
 
 def next_indices(queue: LevelQueue, count: int) -> list[int]:
     """Indices that the next levels will have."""
-    come = int(queue.count)
+    come = int(queue.come)
     return [number % queue.capacity for number in range(come, come + count)]
 
 
@@ -56,7 +56,7 @@ def enter(
                 jax.tree.map(partial(_put_row, i), experts, expert)
         nowhere = [queue.capacity] * (GROUP - len(some))
         queue = _put(queue, group, ids, experts, np.array(next_indices(queue, len(some)) + nowhere))
-        queue = queue._replace(count=np.int32(int(queue.count) + len(some)))
+        queue = queue._replace(come=np.int32(int(queue.come) + len(some)))
     return queue
 
 

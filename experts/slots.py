@@ -64,7 +64,7 @@ class Slot(NamedTuple):
     """One slot. In `Slots` every array has the slots first."""
 
     mode: Int[Array, ""]
-    index: Int[Array, ""]  # of the level in the queue
+    queue_index: Int[Array, ""]  # of the level in the queue
     deadline: Int[Array, ""]  # updates after which the last evaluation comes
     training: Training
     trial: Trial
@@ -87,7 +87,7 @@ class LevelQueue(NamedTuple):
 
     levels: Level  # [..., index]
     level_ids: Int[Array, " index"]
-    count: Int[Array, ""] | np.int32  # levels that have come, ever
+    come: Int[Array, ""] | np.int32  # levels that have come, ever
     updates: Int[Array, ""] | np.int32  # that an expert may use
     begun: Begun  # where their experts go on, index first
 
@@ -99,7 +99,7 @@ class LevelQueue(NamedTuple):
 class Report(NamedTuple):
     """What one call of `advance` did in each slot."""
 
-    index: Int[Array, " slot"]  # of the level in the queue
+    queue_index: Int[Array, " slot"]  # of the level in the queue
     mode: Int[Array, " slot"]  # while it did
     share: Float[Array, " slot"]  # of a trained slot's finished episodes that reached the goal
     evaluated: Bool[Array, " slot"]  # an evaluation ended that solved the level, or after which it left

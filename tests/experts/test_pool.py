@@ -101,7 +101,7 @@ def test_entries_of_a_queue_go_round(levels: Level) -> None:
         some, ids = part(levels, at)
         assert next_indices(queue, len(ids)) == [i % 20 for i in at]
         queue = enter(queue, some, ids, CONFIG)
-    assert int(queue.count) == 24
+    assert int(queue.come) == 24
     expected = [*IDS[20:24], *IDS[4:20]]
     np.testing.assert_array_equal(queue.level_ids, expected)
     same(jax.device_get(queue.levels), take(levels, np.array(expected) - IDS[0]))

@@ -95,7 +95,7 @@ def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
     for _ in range(400):
         slots, seen = advance(slots, queue, CONFIG, WHOLE, DEFAULT_RULES)
         modes.append(np.asarray(seen.mode))
-        indices.append(np.where(modes[-1] == Mode.EMPTY, -1, np.asarray(seen.index)))
+        indices.append(np.where(modes[-1] == Mode.EMPTY, -1, np.asarray(seen.queue_index)))
         if (modes[-1] == Mode.EMPTY).all():
             break
     modes, indices = np.array(modes), np.array(indices)
@@ -216,7 +216,7 @@ def test_all_slots_at_once_as_on_an_accelerator(levels: Level, monkeypatch: pyte
     one_by_one, ours = go(advance)
     monkeypatch.setattr(advance_module, "over_slots", lambda function, *slots: jax.vmap(function)(*slots))
     together, theirs = go(jax.jit(advance.__wrapped__, static_argnums=(2, 3, 4)))
-    same([(r.index, r.mode, r.left) for r in one_by_one], [(r.index, r.mode, r.left) for r in together])
+    same([(r.queue_index, r.mode, r.left) for r in one_by_one], [(r.queue_index, r.mode, r.left) for r in together])
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), ours.train_state.params, theirs.train_state.params
     )
