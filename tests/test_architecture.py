@@ -2,6 +2,7 @@
 
 import ast
 import re
+import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -89,6 +90,12 @@ def test_imports_run_one_way(path: Path) -> None:
         return
     wrong = {outer for outer in map(room, imported(path)) if outer and not allowed(inner, outer)}
     assert not wrong
+
+
+def test_the_product_and_nothing_else_is_installed_and_checked() -> None:
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
+    assert set(tools["hatch"]["build"]["targets"]["wheel"]["packages"]) == set(PRODUCT)
+    assert set(tools["pyright"]["include"]) >= set(PRODUCT)
 
 
 def test_measuring_does_not_import_the_tests() -> None:
