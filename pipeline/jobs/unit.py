@@ -27,7 +27,7 @@ from pipeline.errors import Failure
 from pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
 from pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
 from pipeline.store.disk import REFUSALS
-from pipeline.store.fields import arrays_of, map_arrays, unlike_fields
+from pipeline.store.fields import arrays_of, unlike_fields
 from pipeline.store.layout import new_attempt
 from pipeline.store.locks import LockRefused, committing
 from pipeline.store.manifest import begin_fragment, write_fragment
@@ -122,13 +122,9 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
 
 
 def shard_arrays(levels: Level, record: Record, kept: list[int]) -> dict[str, np.ndarray]:
-    """Every field of the levels at these places, by its name in the shard."""
-    chosen = (map_arrays(lambda x: x[..., kept], tree) for tree in (levels, record))
-    return {
-        name: x
-        for tree, path in zip(chosen, ("level/", "record/"), strict=True)
-        for name, x in arrays_of(tree, path).items()
-    }
+    """Every field of the levels with these indices, by its name in the shard."""
+    arrays = arrays_of(levels, "level/") | arrays_of(record, "record/")
+    return {name: values[..., kept] for name, values in arrays.items()}
 
 
 def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, Any]:

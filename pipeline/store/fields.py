@@ -4,10 +4,11 @@ Knows nothing of files. Names are paths: `state/position`, `model/joint_anchor_a
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
+from jax.tree_util import keystr, tree_flatten_with_path
 from jaxtyping import Bool, Float, Int
 
 T = TypeVar("T")
@@ -16,11 +17,8 @@ DTYPES = {Bool: np.bool_, Int: np.int32, Float: np.float32}  # of arrays that ar
 
 def arrays_of(tree: Any, path: str = "") -> dict[str, np.ndarray]:
     """Every leaf of a nested dataclass of arrays, by its path."""
-    arrays: dict[str, np.ndarray] = {}
-    for field in dataclasses.fields(tree):
-        value, name = getattr(tree, field.name), f"{path}{field.name}"
-        arrays |= arrays_of(value, f"{name}/") if dataclasses.is_dataclass(value) else {name: np.asarray(value)}
-    return arrays
+    leaves, _ = tree_flatten_with_path(tree)
+    return {path + keystr(keys, simple=True, separator="/"): np.asarray(leaf) for keys, leaf in leaves}
 
 
 def tree_of(cls: type[T], arrays: Mapping[str, np.ndarray], path: str = "") -> T:
@@ -47,16 +45,6 @@ def annotated(cls: type, counts: Mapping[str, int], path: str = "") -> dict[str,
             shape = [counts[word] if word in counts else int(word) for word in hint.dim_str.split()]
             arrays[f"{path}{name}"] = np.zeros(shape, DTYPES[hint.dtype])
     return arrays
-
-
-def map_arrays(change: Callable[[np.ndarray], np.ndarray], tree: T) -> T:
-    """`change` applied to every leaf."""
-    changes = {
-        field.name: map_arrays(change, value) if dataclasses.is_dataclass(value) else change(np.asarray(value))
-        for field in dataclasses.fields(tree)  # type: ignore[arg-type]
-        for value in [getattr(tree, field.name)]
-    }
-    return dataclasses.replace(tree, **changes)  # type: ignore[type-var]
 
 
 def same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
