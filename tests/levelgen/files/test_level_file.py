@@ -273,7 +273,7 @@ def places() -> list[tuple[str, ...]]:
 
 
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.just("set") | st.just("drop"), JUNK), min_size=1, max_size=3))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_a_level_with_anything_anywhere_is_refused_in_a_sentence_or_read(changes) -> None:
     made = copy.deepcopy(document())
     for number, what, junk in changes:
@@ -291,7 +291,7 @@ def test_a_level_with_anything_anywhere_is_refused_in_a_sentence_or_read(changes
 
 
 @given(st.binary(max_size=60), st.integers(0, 3_000), st.integers(0, 40))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_bytes_of_any_kind_are_refused_in_a_sentence_or_read(junk: bytes, start: int, gone: int) -> None:
     assert_sentence_or_level(junk)
     text = json.dumps(document()).encode()

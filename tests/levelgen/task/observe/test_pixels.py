@@ -18,7 +18,7 @@ def draw(level: Level) -> np.ndarray:
     return 255 * np.asarray(image)
 
 
-@pytest.mark.parametrize("size", ["s", "m", "l"])
+@pytest.mark.parametrize("size", ["s", "m", pytest.param("l", marks=pytest.mark.campaign)])
 def test_pixels_are_the_references(size: str) -> None:
     seen = load_seen(size)
     ours = draw(seen.level)
