@@ -29,7 +29,7 @@ class WorkUnit:
 def plan_units(wanted: Iterable[int], done: Collection[int], unit: int) -> list[WorkUnit]:
     """Units that cover what is wanted and not done.
 
-    A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same places.
+    A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same ids.
     """
     left: dict[int, list[int]] = {}
     for level_id in wanted:

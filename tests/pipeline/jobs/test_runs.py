@@ -31,7 +31,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def content(split: Path) -> tuple[str, dict[int, dict]]:
-    """The rows without their places, and the stored fields of every solved level."""
+    """The rows without their shard rows, and the stored fields of every solved level."""
     manifest = read_manifest(split)
     rows = manifest.table.to_pylist()
     fields = {row["level_id"]: Shard(split / row["shard"]).read([row["row"]]) for row in rows if row["shard"]}

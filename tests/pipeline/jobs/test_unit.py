@@ -41,7 +41,7 @@ def result(job: JobConfig) -> UnitResult:
     return result
 
 
-def solved_place(result: UnitResult) -> int:
+def solved_index(result: UnitResult) -> int:
     return [verdict.label for verdict in result.verdicts].index(Label.SOLVED)
 
 
@@ -51,13 +51,13 @@ def test_real_witnesses_pass_the_gate(job: JobConfig, result: UnitResult) -> Non
 
 @pytest.mark.parametrize("name", ["reward", "last_distance", "timestep", "done"])
 def test_a_record_that_differs_in_one_bit_does_not_pass(job: JobConfig, result: UnitResult, name: str) -> None:
-    place = solved_place(result)
+    index = solved_index(result)
     values = np.array(getattr(result.record, name))
-    at = values[200:201, place : place + 1]
+    at = values[200:201, index : index + 1]
     at[...] = ~at if at.dtype == bool else (at.view(np.uint32) ^ 1).view(at.dtype)
     wrong = dataclasses.replace(result, record=dataclasses.replace(result.record, **{name: values}))
     with pytest.raises(
-        Failure, match=f"witness of level {result.level_ids[place]} does not replay: its {name} differs"
+        Failure, match=f"witness of level {result.level_ids[index]} does not replay: its {name} differs"
     ):
         check_witnesses(wrong, job.task)
 
