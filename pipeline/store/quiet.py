@@ -8,7 +8,7 @@ from typing import Any
 
 
 class _ForgivingLoop(asyncio.SelectorEventLoop):
-    """An event loop that may be told of the end of a write after it was closed.
+    """An event loop that may be told of the end of a write after it was closed, and says nothing of it.
 
     The first write that fails ends the loop that Orbax waits in. TensorStore's others end later, each with a traceback.
     """
@@ -20,6 +20,9 @@ class _ForgivingLoop(asyncio.SelectorEventLoop):
             if not self.is_closed():
                 raise
             return asyncio.Handle(callback, args, self, context)
+
+    def call_exception_handler(self, context: dict[str, Any]) -> None:
+        """Of an exception that nobody has asked a write for."""
 
 
 class _ForgivingPolicy(asyncio.DefaultEventLoopPolicy):

@@ -72,7 +72,13 @@ def test_what_others_put_there_stays(split: Path, tmp_path_factory: pytest.TempP
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     (elsewhere / "mine").touch()
     attempt = "000000000004-000000000005-5f0c2a9b"
-    folders = ("experts/mine", "shards/mine.zarr", "manifest/.ipynb_checkpoints", f"manifest/.{attempt[:-1]}0.begun")
+    folders = (
+        "experts/mine",
+        f"experts/{attempt}-mine",
+        f"shards/{attempt}.zarr.mine",
+        "manifest/.ipynb_checkpoints",
+        f"manifest/.{attempt[:-1]}0.begun",
+    )
     for name in folders:
         (split / name).mkdir(parents=True)
         (split / name / "file").touch()
