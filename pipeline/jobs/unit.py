@@ -105,8 +105,8 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
     rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
     for row, content, signature in zip(rows, content_hashes(result.levels), signatures(result.levels), strict=True):
         row |= {"content_hash": content, "signature": signature}
-    for place, i in enumerate(kept):
-        rows[i] |= {"shard": str(paths.shard.relative_to(split)), "row": place}
+    for row_of_shard, i in enumerate(kept):
+        rows[i] |= {"shard": str(paths.shard.relative_to(split)), "row": row_of_shard}
     for row in rows if result.experts else ():
         if row["level_id"] in result.experts:
             row["experts"] = str(paths.experts.relative_to(split))

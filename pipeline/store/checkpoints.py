@@ -38,8 +38,8 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
     rows = [experts[level_id] for level_id in sorted(experts)]
     longest = max(len(row.curve) for row in rows)
     curves = np.full((len(rows), longest), np.nan, np.float32)
-    for place, row in enumerate(rows):
-        curves[place, : len(row.curve)] = row.curve
+    for i, row in enumerate(rows):
+        curves[i, : len(row.curve)] = row.curve
     begun = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows))
     tree = {"level_id": np.array(sorted(experts)), "curve": curves, "begun": begun}
     try:
@@ -78,9 +78,9 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
             f"The experts in {path} cannot be read ({reason}): leave out continue_from to train them from the start."
         ) from error
     experts = {}
-    for place, level_id in enumerate(tree["level_id"].tolist()):
-        begun = jax.tree.map(lambda x, place=place: x[place], tree["begun"])
-        curve = tree["curve"][place, : int(begun.training.course.updates)]
+    for i, level_id in enumerate(tree["level_id"].tolist()):
+        begun = jax.tree.map(lambda x, i=i: x[i], tree["begun"])
+        curve = tree["curve"][i, : int(begun.training.course.updates)]
         experts[level_id] = Kept(begun, curve.tolist())
     return experts
 

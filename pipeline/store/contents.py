@@ -18,7 +18,7 @@ from levelgen.task.actions import CHOICES
 from physics.pairs import pairs_of
 from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
 from pipeline.store.fields import annotated
-from pipeline.store.schema import FieldPlace, field_table
+from pipeline.store.schema import FieldSpec, field_table
 
 COUNTED = {  # fields with one entry for each thing of a kind
     "polygons": "level/model/n_vertices",
@@ -34,7 +34,7 @@ class ContentsError(ValueError):
 
 
 @cache
-def table_for(size: Size) -> tuple[FieldPlace, ...]:
+def table_for(size: Size) -> tuple[FieldSpec, ...]:
     """The field table of a shard of this size."""
     counts = {"body": size.bodies, "polygon": size.polygons, "circle": size.circles, "joint": size.joints}
     counts |= {"thruster": size.thrusters, "vertex": MAX_VERTICES, "contact": pairs_of(size).contacts}
@@ -45,21 +45,21 @@ def table_for(size: Size) -> tuple[FieldPlace, ...]:
     return tuple(field_table(level | record))
 
 
-def size_in(table: Sequence[FieldPlace]) -> Size:
+def size_in(table: Sequence[FieldSpec]) -> Size:
     """The size of which a shard with this table is, the whole of which has to be that size's.
 
     Raises:
         ContentsError: it is of none.
     """
-    shapes = {place.name: place.shape for place in table}
+    shapes = {field.name: field.shape for field in table}
     try:
         size = Size(*(shapes[name][0] for name in COUNTED.values()))
     except (KeyError, IndexError):
         raise ContentsError("its fields are those of no size") from None
     if not all(type(n) is int and low <= n <= MOST_THINGS for low, n in zip(FEWEST, size, strict=True)):
         raise ContentsError("its fields are those of no size")
-    for place, expected in zip(table, table_for(size), strict=False):
-        if place != expected:
+    for field, expected in zip(table, table_for(size), strict=False):
+        if field != expected:
             raise ContentsError(f"its field {expected.name} is not as size {name_of(size)} has it")
     if len(table) != len(table_for(size)):
         raise ContentsError(f"it has not the fields of size {name_of(size)}")

@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from experts.config import RECORD_STEPS
-from pipeline.store.schema import ALONG_TIME, PACKED, FieldPlace
+from pipeline.store.schema import ALONG_TIME, PACKED, FieldSpec
 
 
-def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldPlace]) -> dict[str, np.ndarray]:
+def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[str, np.ndarray]:
     """Packed arrays: (level, component, 256) for what changes along time, (level, component) for the rest.
 
     `arrays` have the level axis last, and time first for `record/` fields.
@@ -18,46 +18,46 @@ def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldPlace]) -> dict[
     """
     parts: dict[str, list[np.ndarray]] = {name: [] for name in PACKED}
     levels = next(iter(arrays.values())).shape[-1]
-    for place in table:
-        values = _unsigned(arrays[place.name], place)
-        if place.array in ALONG_TIME:
-            parts[place.array].append(np.moveaxis(values, (-1, 0), (0, -1)).reshape(levels, place.count, RECORD_STEPS))
+    for field in table:
+        values = _unsigned(arrays[field.name], field)
+        if field.array in ALONG_TIME:
+            parts[field.array].append(np.moveaxis(values, (-1, 0), (0, -1)).reshape(levels, field.count, RECORD_STEPS))
         else:
-            parts[place.array].append(np.moveaxis(values, -1, 0).reshape(levels, place.count))
+            parts[field.array].append(np.moveaxis(values, -1, 0).reshape(levels, field.count))
     return {name: np.ascontiguousarray(np.concatenate(part, 1)) for name, part in parts.items() if part}
 
 
-def unpack(packed: Mapping[str, np.ndarray], table: Sequence[FieldPlace]) -> dict[str, np.ndarray]:
+def unpack(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[str, np.ndarray]:
     """The inverse of `pack`, with the arrays that `packed` has.
 
     Raises:
         ValueError: a flag is neither 0 nor 1.
     """
     arrays = {}
-    for place in table:
-        if place.array not in packed:
+    for field in table:
+        if field.array not in packed:
             continue
-        part = packed[place.array][:, place.first : place.first + place.count]
-        if place.array in ALONG_TIME:
-            shaped = np.moveaxis(part.reshape(len(part), *place.shape, RECORD_STEPS), (0, -1), (-1, 0))
+        part = packed[field.array][:, field.first : field.first + field.count]
+        if field.array in ALONG_TIME:
+            shaped = np.moveaxis(part.reshape(len(part), *field.shape, RECORD_STEPS), (0, -1), (-1, 0))
         else:
-            shaped = np.moveaxis(part.reshape(len(part), *place.shape), 0, -1)
-        arrays[place.name] = _original(np.ascontiguousarray(shaped), place)
+            shaped = np.moveaxis(part.reshape(len(part), *field.shape), 0, -1)
+        arrays[field.name] = _original(np.ascontiguousarray(shaped), field)
     return arrays
 
 
-def _unsigned(values: np.ndarray, place: FieldPlace) -> np.ndarray:
+def _unsigned(values: np.ndarray, field: FieldSpec) -> np.ndarray:
     """The same bits as unsigned integers; small integers as 8 bits."""
-    bits = PACKED[place.array]
+    bits = PACKED[field.array]
     if values.dtype.itemsize * 8 == bits:
         return np.ascontiguousarray(values).view(f"u{bits // 8}")
     if values.size and not (values.min() >= 0 and values.max() < 2**bits):
-        raise ValueError(f"{place.name} has values from {values.min()} to {values.max()}: they do not fit {bits} bits")
+        raise ValueError(f"{field.name} has values from {values.min()} to {values.max()}: they do not fit {bits} bits")
     return values.astype(f"u{bits // 8}")
 
 
-def _original(values: np.ndarray, place: FieldPlace) -> np.ndarray:
-    dtype = np.dtype(place.dtype)
+def _original(values: np.ndarray, field: FieldSpec) -> np.ndarray:
+    dtype = np.dtype(field.dtype)
     if dtype.kind == "b" and values.size and values.max() > 1:  # no bool for numpy, XLA and kernels
-        raise ValueError(f"{place.name} has flags that are neither 0 nor 1")
+        raise ValueError(f"{field.name} has flags that are neither 0 nor 1")
     return values.view(dtype) if dtype.itemsize == values.dtype.itemsize else values.astype(dtype)

@@ -85,7 +85,7 @@ SMALL = frozenset(
 
 
 @dataclass(frozen=True)
-class FieldPlace:
+class FieldSpec:
     """Where one field lies in the packed arrays."""
 
     name: str  # record/... (changes along time) or level/... (constant)
@@ -102,7 +102,7 @@ class FieldPlace:
         return asdict(self) | {"shape": list(self.shape)}
 
     @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> "FieldPlace":
+    def from_json(cls, entry: Mapping[str, Any]) -> "FieldSpec":
         return cls(**{**entry, "shape": tuple(entry["shape"])})
 
 
@@ -116,14 +116,14 @@ def array_for(name: str, dtype: np.dtype) -> str:
     return f"{'dyn' if name.startswith('record/') else 'lvl'}{bits}"
 
 
-def field_table(arrays: Mapping[str, np.ndarray]) -> list[FieldPlace]:
-    """The places of all fields, in the order of `arrays` (level axis last; time first for `record/` fields)."""
+def field_table(arrays: Mapping[str, np.ndarray]) -> list[FieldSpec]:
+    """Where all fields lie, in the order of `arrays` (level axis last; time first for `record/` fields)."""
     used = dict.fromkeys(PACKED, 0)
     table = []
     for name, values in arrays.items():
         target = array_for(name, values.dtype)
         shape = values.shape[1:-1] if name.startswith("record/") else values.shape[:-1]
-        place = FieldPlace(name, str(values.dtype), shape, target, used[target])
-        used[target] += place.count
-        table.append(place)
+        field = FieldSpec(name, str(values.dtype), shape, target, used[target])
+        used[target] += field.count
+        table.append(field)
     return table

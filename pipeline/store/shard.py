@@ -26,7 +26,7 @@ from pipeline.store.contents import ContentsError, check_level_ids, check_number
 from pipeline.store.disk import flush
 from pipeline.store.layout import data_path, fragment_of
 from pipeline.store.packing import pack, unpack
-from pipeline.store.schema import ALONG_TIME, PACKED, SHARD_VERSION, FieldPlace, field_table
+from pipeline.store.schema import ALONG_TIME, PACKED, SHARD_VERSION, FieldSpec, field_table
 
 FORMAT = "levelproof.shard"
 LEVEL = 5  # of zstd; 9 saves 2% and encodes at 3 MB/s
@@ -46,7 +46,7 @@ def write_shard(path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.nd
         "format": FORMAT,
         "version": SHARD_VERSION,
         "level_ids": [int(level_id) for level_id in level_ids],
-        "fields": [place.as_json() for place in table],
+        "fields": [field.as_json() for field in table],
     }
     with zarr.config.set({"json_indent": None}):  # of a small shard, half would be blanks
         group = zarr.create_group(path, attributes=attributes)
@@ -84,7 +84,7 @@ class Shard:
                     f"The shard {path} has version {str(version)[:20]}, this program reads {SHARD_VERSION}: "
                     "use the levelproof that wrote it."
                 )
-            self.size = size_in([FieldPlace.from_json(entry) for entry in attributes["fields"]])  # type: ignore[union-attr, arg-type]
+            self.size = size_in([FieldSpec.from_json(entry) for entry in attributes["fields"]])  # type: ignore[union-attr, arg-type]
             self.table = table_for(self.size)
             check_level_ids(attributes["level_ids"])
             self.level_ids: list[int] = list(attributes["level_ids"])  # type: ignore[arg-type]
@@ -104,12 +104,12 @@ class Shard:
             Failure: a chunk is missing or damaged, or holds what a level or a record of this size cannot.
         """
         wanted = None if fields is None else set(fields)
-        table = [place for place in self.table if wanted is None or place.name in wanted]
+        table = [field for field in self.table if wanted is None or field.name in wanted]
         index = list(range(len(self.level_ids))) if rows is None else [int(row) for row in rows]
         try:
             if not all(0 <= row < len(self.level_ids) for row in index):
                 raise ContentsError(f"it has {len(self.level_ids)} rows, and others were asked for")
-            packed = {name: self._array(name, index) for name in dict.fromkeys(place.array for place in table)}
+            packed = {name: self._array(name, index) for name in dict.fromkeys(field.array for field in table)}
             arrays = unpack(packed, table)
             check_numbers(arrays, self.size)
         except Exception as error:  # zarr and its codecs raise many kinds
@@ -119,7 +119,7 @@ class Shard:
     def _array(self, name: str, rows: list[int]) -> np.ndarray:
         self._require_file(f"{name}/zarr.json")
         array, dtype = self._group[name], np.dtype(f"u{PACKED[name] // 8}")
-        components = sum(place.count for place in self.table if place.array == name)
+        components = sum(field.count for field in self.table if field.array == name)
         shape = (len(self.level_ids), components, *((RECORD_STEPS,) if name in ALONG_TIME else ()))
         if not isinstance(array, zarr.Array) or (array.shape, array.dtype) != (shape, dtype):
             raise ContentsError(f"its array {name} has not the shape and type that its fields need")
