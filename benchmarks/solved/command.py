@@ -89,6 +89,7 @@ def report_of(results: list[Results], whole: bool) -> Report:
         notes=[
             *([f"![How the unsolved share falls with budget]({PLOT})"] if curves else []),
             tables.variants_of(results),
+            "Success rates are of first episodes; where there is none (-), it was not measured so.",
         ],
         plots={PLOT: lambda path: plot.draw(curves, path)} if curves else {},
         made=made(results),
