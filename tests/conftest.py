@@ -52,10 +52,15 @@ def reference() -> Path:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What runs the reference is a campaign: golden states stand for it in the other tests."""
+    """What runs the reference is a campaign: golden states stand for it in the other tests.
+
+    Files with slow tests come first, so that no process is left alone with one of them at the end.
+    """
     for item in items:
         if "reference" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.campaign)
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 def pytest_deselected(items: list[pytest.Item]) -> None:

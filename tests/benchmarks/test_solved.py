@@ -250,7 +250,7 @@ def test_results_under_other_settings_are_left_alone(tmp_path: Path, ours: Resul
         measure(other, VARIANTS["ours"], range(0), 1, work, file=file)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process dies, which leaves the lines of units that were done; the next run trains the others only."""
     variant, file, scratch = Variant("small", SMALL), tmp_path / "solved.parquet", tmp_path / "scratch.jsonl"

@@ -42,7 +42,7 @@ def test_samples_keep_every_number_at_its_place() -> None:
         np.testing.assert_array_equal(mine, theirs.reshape(-1))
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize("kind", Network)
 def test_learns_a_bandit(kind: Network, seed: int) -> None:
     """One action entry pays when it is 2: after a few updates it is chosen nearly always."""

@@ -13,7 +13,7 @@ from experts.networks.entity import EntityNetwork
 from experts.policy import Params, forward, initial
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
-from levelgen.sampling.shuffle import OrderDraws, places, shuffle
+from levelgen.sampling.shuffle import OrderDraws, shuffle, shuffled_rows
 from levelgen.task.observe.entities import EntityObservation, entities
 from levelgen.task.observe.flat import BODY_ROWS, LIMIT, UNSEEN_WALLS, state_features
 from physics.types import FIXED_POLYGONS, State
@@ -101,7 +101,7 @@ def test_is_the_plain_formula_on_entities(name: str) -> None:
 def test_the_order_of_things_does_not_matter(name: str, seed: int) -> None:
     network, params = network_of(name)
     level = sample_levels(jnp.arange(LEVELS), network.size)
-    draws = jax.random.uniform(jax.random.key(seed), (places(network.size), LEVELS))
+    draws = jax.random.uniform(jax.random.key(seed), (shuffled_rows(network.size), LEVELS))
     other = jax.jit(shuffle)(level, OrderDraws(draws))
     ours, others = (outputs(network, params, x, x.state) for x in (level, other))
     np.testing.assert_allclose(ours, others, atol=FROM_TANH)

@@ -22,6 +22,7 @@ def trained(network: Network, at: list[int]) -> list[Trained]:
     return train(take(levels, np.array(at)), IDS[at], UPDATES, config, SOLVED)[0]
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("network", Network)
 def test_learns_real_levels_in_any_slot(network: Network) -> None:
     every = trained(network, [0, 1, 2, 3])

@@ -68,8 +68,12 @@ def assert_same(ours: LevelFile, theirs: LevelFile) -> None:
         assert a.dtype == b.dtype
 
 
+OWN_SIZE = Size(polygons=7, circles=1, joints=3, thrusters=4)
+ROUND_TRIPS = [*(pytest.param(size, marks=pytest.mark.campaign) for size in SIZES.values()), OWN_SIZE]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [*SIZES.values(), Size(polygons=7, circles=1, joints=3, thrusters=4)], ids=str)
+@pytest.mark.parametrize("size", ROUND_TRIPS, ids=str)
 def test_a_sampled_level_survives_a_round_trip(size: Size, tmp_path: Path) -> None:
     for lane in range(8):
         file = LevelFile(one(levels(size), lane), RULES)

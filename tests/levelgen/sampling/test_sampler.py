@@ -29,7 +29,7 @@ from tests.golden.load import HERE, load
 COUNTS = {"s": 1024, "m": 1024, "l": 512}  # levels
 MANY = {"s": 4096, "m": 4096, "l": 2048}  # in a campaign
 MORE = pytest.mark.campaign
-CUSTOM = [Size(4, 3, 2, 2), Size(8, 0, 3, 0)]
+CUSTOM = [Size(4, 3, 2, 2), pytest.param(Size(8, 0, 3, 0), marks=MORE)]
 SIGNIFICANT = 1e-3  # over all statistics of a size together
 RARE = 10  # values seen less often, in both samples together, are counted as one
 
@@ -281,7 +281,10 @@ def test_wheels_follow_their_chance(chance: float) -> None:
     assert circles.min() == chance  # of the levels whose green and blue are rectangles
 
 
-@pytest.mark.parametrize("name", distributions())
+PRESETS = [pytest.param(name, marks=() if name == "vehicles" else MORE) for name in distributions()]
+
+
+@pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_what_they_say(name: str) -> None:
     level = sampled(SIZES["m"], CHUNK, distributions()[name])
     model = level.model

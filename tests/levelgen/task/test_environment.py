@@ -72,6 +72,7 @@ def test_a_mapped_step_is_the_tasks_step(levels: Level, keys, actions) -> None:
     np.testing.assert_allclose(seen[-1].T, symbolic_flat(levels, world.state), rtol=1e-6)
 
 
+@pytest.mark.campaign
 def test_one_environment_is_a_lane_of_many(levels: Level, made, keys, actions) -> None:
     env, params = made
     many = jax.vmap(env.step, (0, 0, 0, None))(keys, starts(levels), actions[0], params)
@@ -80,6 +81,7 @@ def test_one_environment_is_a_lane_of_many(levels: Level, made, keys, actions) -
     np.testing.assert_allclose(many[0][5], one[0], rtol=1e-6)
 
 
+@pytest.mark.campaign
 def test_mapped_twice_is_mapped_once(levels: Level, made, keys, actions) -> None:
     env, params = made
     fold = lambda tree: jax.tree.map(lambda x: x.reshape(4, 6, *x.shape[1:]), tree)
@@ -96,6 +98,7 @@ def test_mapped_twice_is_mapped_once(levels: Level, made, keys, actions) -> None
     assert_same(fold(alone[1:]), shared[1:])
 
 
+@pytest.mark.campaign
 def test_a_mapped_loop_is_a_loop_of_mapped_steps(levels: Level, made, keys, actions) -> None:
     env, params = made
 
@@ -113,6 +116,7 @@ def test_a_mapped_loop_is_a_loop_of_mapped_steps(levels: Level, made, keys, acti
     assert_same((reward.T, done.T), (rewards, ends))
 
 
+@pytest.mark.campaign
 def test_levels_may_differ_between_mapped_parameters(levels: Level, made, keys) -> None:
     """Mapping over the parameters too: each environment draws from its own levels."""
     env, _ = made
@@ -154,7 +158,11 @@ def test_parameters_are_those_of_make_where_none_are_given(levels: Level, made) 
     assert_same(env.reset(jax.random.key(1), first)[1], EnvState.start(lane(levels, 0)))
 
 
-@pytest.mark.parametrize("observation_type", list(ObservationType))
+MORE = (ObservationType.PIXELS, ObservationType.SYMBOLIC_ENTITY)
+OBSERVATIONS = [pytest.param(kind, marks=pytest.mark.campaign if kind in MORE else ()) for kind in ObservationType]
+
+
+@pytest.mark.parametrize("observation_type", OBSERVATIONS)
 def test_observations_are_in_their_space(levels: Level, observation_type: str) -> None:
     env, params = make(levels, observation_type=observation_type)
     seen, state = env.reset(jax.random.key(0), params)

@@ -67,6 +67,7 @@ def test_continuous_actions_train_without_ado() -> None:
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.actor_ts.params))
 
 
+@pytest.mark.campaign
 def test_seeds_train_side_by_side() -> None:
     """`vmap` of a whole training run, as people do for error bars: here of one rollout."""
     env, params = make(sample_levels(jnp.arange(2), SIZES["s"]), ActionType.DISCRETE)

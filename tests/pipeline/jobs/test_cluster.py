@@ -25,6 +25,7 @@ def fragile(deadly: int, cwd: Path) -> subprocess.CompletedProcess[str]:
     return run([str(deadly), *SETTINGS], cwd, module="tests.pipeline.fragile")
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_level_that_kills_its_worker_takes_no_other_with_it(tmp_path: Path) -> None:
     done = fragile(DEADLY, tmp_path)
@@ -42,6 +43,7 @@ def test_a_level_that_kills_its_worker_takes_no_other_with_it(tmp_path: Path) ->
     assert deaths[-1].endswith(": given up.")
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_workers_that_cannot_start_stop_the_run(tmp_path: Path) -> None:
     done = fragile(-1, tmp_path)
@@ -89,6 +91,7 @@ def test_there_are_as_many_workers_as_a_cluster_has_room_for_now(monkeypatch: py
     assert cluster._room(True, 6) == [cluster.Resources(gpus=1)] * 2
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
     """Ray's own nodes: a head without a core, one that joins a waiting run, and one more before the first is lost.

@@ -19,7 +19,7 @@ from tests.pipeline.command import assert_refused, run
 SIZE = "5-3-2-2"
 SPLIT = f"data/5k/{SIZE}"
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.campaign
 
 
 @pytest.fixture(scope="module")

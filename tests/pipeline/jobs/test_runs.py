@@ -72,6 +72,7 @@ def test_without_ray_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> No
     assert_same_content(tmp_path / SPLIT, undisturbed)
 
 
+@pytest.mark.campaign
 def test_in_other_units_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
     assert run(["generate", "levels=1", "first_level=2", "budget=5k", "executor=inline"], tmp_path).returncode == 0
     assert run(["generate", f"levels={LEVELS}", "unit=16", "budget=5k", "executor=inline"], tmp_path).returncode == 0
@@ -105,7 +106,7 @@ def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
     assert not (tmp_path / SPLIT / "quarantine").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.campaign), signal.SIGTERM])
 def test_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
     process = start(COMMAND, tmp_path, preexec_fn=heed_ctrl_c)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
