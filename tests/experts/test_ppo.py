@@ -43,7 +43,7 @@ def test_samples_keep_every_number_at_its_place() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.campaign)])
-@pytest.mark.parametrize("kind", Network)
+@pytest.mark.parametrize("kind", [Network.FLAT, pytest.param(Network.ENTITY, marks=pytest.mark.campaign)])
 def test_learns_a_bandit(kind: Network, seed: int) -> None:
     """One action entry pays when it is 2: after a few updates it is chosen nearly always."""
     config = ExpertConfig(network=kind, width=16, encoding=16, environments=32, horizon=8, learning_rate=3e-3)

@@ -129,6 +129,7 @@ def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) ->
     assert all("at a rung the best return had not grown" in reasons[i] for i in never)
 
 
+@pytest.mark.campaign
 def test_a_success_of_training_is_a_witness_if_wanted(levels: Level) -> None:
     config = replace(CONFIG, exploration=True)
     result = train_levels(levels, IDS, UPDATES * 512, config, StopConfig(successes=4))
@@ -140,6 +141,7 @@ def test_a_success_of_training_is_a_witness_if_wanted(levels: Level) -> None:
     assert Source.EXPLORATION in {verdict.witness for verdict in result.verdicts}
 
 
+@pytest.mark.campaign
 def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[Trained]) -> None:
     polished, _ = train(levels, IDS, UPDATES, CONFIG, replace(SOLVED, polish=4 * 512))
     early = [i for i, of in enumerate(solved) if len(of.curve) < UPDATES - 4]
@@ -202,6 +204,7 @@ def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level
         assert f"its network's numbers stopped being finite after {verdict.env_steps} env steps" in verdict.label_reason
 
 
+@pytest.mark.campaign
 def test_all_slots_at_once_as_on_an_accelerator(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same course and nearly the same numbers: sums are taken in another order."""
     queue = queue_of(levels, 3)

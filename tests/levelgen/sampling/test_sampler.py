@@ -90,7 +90,8 @@ def test_statistics_of_the_reference(size: str, count: int) -> None:
     assert min(p.values()) > SIGNIFICANT / len(p), f"differs from the reference: {worst}"
 
 
-@pytest.mark.parametrize(("chance", "count"), [(0.7, COUNTS["s"]), pytest.param(0.75, MANY["s"], marks=MORE)])
+@MORE
+@pytest.mark.parametrize(("chance", "count"), [(0.7, COUNTS["s"]), (0.75, MANY["s"])])
 def test_the_statistics_notice_a_change(chance: float, count: int) -> None:
     """Fewer motors than four in five are on; no other statistic."""
     changed = Distribution(motor_chance=chance)

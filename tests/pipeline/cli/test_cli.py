@@ -134,6 +134,7 @@ def test_a_damaged_fragment_is_named(split: Path, command: list[str]) -> None:
     assert_refused(done, 1, "000000000001-000000000001.parquet is damaged", "delete it")
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_deleted_fragment_is_made_again_with_the_same_rows(split: Path) -> None:
     before = read_manifest(split).table.drop(["shard"]).to_pylist()

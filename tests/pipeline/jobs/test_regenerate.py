@@ -17,7 +17,7 @@ from pipeline.store.manifest import begin_fragment, read_manifest
 from tests.pipeline.command import run
 from tests.pipeline.made import made_job
 
-SETTINGS = ["levels=12", "executor=inline", "expert.width=16", "expert.environments=24"]
+SETTINGS = ["levels=12", "executor=inline"]
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_what_cannot_go_on_is_refused(folder: Path, tmp_path: Path) -> None:
         return str(error.value)
 
     assert "give a larger budget" in refused("budget=8k")
-    assert "expert.width was 16, now 32" in refused("budget=24k", "expert.width=32")
+    assert "expert.width was 64, now 32" in refused("budget=24k", "expert.width=32")
     without = tmp_path / "data"
     assert run(["generate", *SETTINGS, "levels=2", "budget=2k", f"out={without}"], tmp_path).returncode == 0
     with pytest.raises(UserError, match="has kept no experts: make it with keep_experts=true"):
