@@ -171,7 +171,8 @@ class TestFile:
         results = read()
         assert len(results) == 51
         assert sum(len(each.rows) for each in results) == 12_496
-        assert made(results).startswith("2026-11-21, on cpu: AMD EPYC; levelproof")
+        assert made(results).startswith("2026-11-21")
+        assert "on cpu: AMD EPYC; levelproof" in made(results)
 
 
 def test_unsolved_falls_with_budget(ours: Results, theirs: Results) -> None:
