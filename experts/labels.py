@@ -26,6 +26,7 @@ class Source(StrEnum):
 
 DIVERGED = "stopped being finite"  # in the reasons of levels whose experts diverged
 WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that stand on a witness
+TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels that an expert's training gives
 
 
 @dataclass(frozen=True)

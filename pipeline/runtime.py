@@ -20,8 +20,7 @@ XLA_FLAGS = (
     "--xla_cpu_multi_thread_eigen=false",
     "--xla_cpu_prefer_vector_width=512",  # where the processor has it
 )
-# NPROC and PJRT_NPROC size XLA's pool. With two or more threads, QR factorisations side by side (the experts'
-# orthogonal weights) can hold every thread while each waits for parts of its work to get one: a deadlock of jaxlib.
+# NPROC and PJRT_NPROC size XLA's pool; the others are those of numpy's libraries.
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MIN_COMPILE_SECONDS = 0.2  # what compiles faster is not worth a file
 

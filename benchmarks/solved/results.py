@@ -13,11 +13,10 @@ import pyarrow.parquet as pq
 from benchmarks.oracle import alone
 from benchmarks.statistics import wilson
 from experts.config import Rule
-from experts.labels import Label
+from experts.labels import TRAINED, Label
 from pipeline.errors import UserError
 
 FILE = Path(__file__).parents[1] / "results" / "solved.parquet"
-EXPERT = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels of levels that get an expert
 SIZES = ("s", "m", "l")  # in this order; others follow
 WORD = pa.dictionary(pa.int32(), pa.string())
 SCHEMA = pa.schema(
@@ -71,7 +70,7 @@ class Results:
     @property
     def trained(self) -> dict[int, dict[str, Any]]:
         """Rows of levels that got an expert."""
-        return {level_id: row for level_id, row in self.rows.items() if row["label"] in EXPERT}
+        return {level_id: row for level_id, row in self.rows.items() if row["label"] in TRAINED}
 
     def solved(self, within: float = math.inf) -> set[int]:
         """Levels that left their slots as solved after at most so many env steps."""

@@ -15,7 +15,7 @@ import pyarrow as pa
 from jaxtyping import Bool, Int
 
 from experts.before import decide
-from experts.labels import WITNESSED, Label
+from experts.labels import TRAINED, WITNESSED, Label
 from experts.witness import LANES, Record, replay, steps_to_goal, succeeds
 from levelgen.identity.content import content_hashes
 from levelgen.identity.signature import signatures
@@ -31,7 +31,6 @@ COLUMNS = (
     "label", "label_reason", "failed_by_noop", "content_hash", "signature", "size", "steps_to_goal", "shard", "row",
     "versions", "device",
 )  # fmt: skip
-TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels that an expert's training gives
 
 Mask = Bool[np.ndarray, " level"]
 

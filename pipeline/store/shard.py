@@ -8,7 +8,7 @@
 
 One trajectory is one chunk (larger chunks save under 1% and cost random reads a factor of 3), all chunks of an
 array lie in one file (zarr's sharding codec), compressed with Blosc-zstd 5 after a byte shuffle, each with a
-CRC-32C. The group's attributes hold the field table. Measurements: docs/storage.md.
+CRC-32C. The group's attributes hold the field table.
 """
 
 import stat
