@@ -3,42 +3,25 @@
 Pixels for agents are elsewhere: these pictures are drawn on the host and are not meant to be fast.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import io
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import IO
 
 import numpy as np
+import resvg_py
 from jaxtyping import Int
-from PIL import Image, ImageDraw
+from PIL import Image
 
-from levelgen.level import WORLD_SIDE, Level
+from levelgen.level import Level
 from levelgen.pictures.scene import scene_of
-from levelgen.pictures.shapes import (
-    Disc,
-    Line,
-    Part,
-    Point,
-    Polygon,
-    Rectangle,
-    Scene,
-    Shape,
-    Text,
-    font,
-    placed,
-)
-from levelgen.pictures.style import (
-    BORDER,
-    EDGE,
-    HATCH_PITCH,
-    HATCH_WIDTH,
-    PAPER,
-    Colour,
-)
+from levelgen.pictures.shapes import Scene, font
+from levelgen.pictures.style import PAPER, PIXELS
+from levelgen.pictures.svg import svg_of
 from levelgen.pictures.words import Caption
 from physics.types import State
-
-SUPERSAMPLING = 4  # drawn this much larger, then averaged
-PIXELS = 480  # width of a picture
 
 
 def draw(
@@ -64,85 +47,18 @@ def draw(
 
 def rasterised(scene: Scene, pixels: int = PIXELS) -> Image.Image:
     """A scene as a picture that is `pixels` wide."""
-    canvas = _Canvas(scene, pixels)
-    for part in scene.parts:
-        for shape in part.shapes:
-            canvas.draw(shape, part)
-    return canvas.finish()
-
-
-class _Canvas:
-    """Drawing in metres, y upwards, on a picture that `finish` shrinks to its size."""
-
-    def __init__(self, scene: Scene, pixels: int) -> None:
-        self.scale = SUPERSAMPLING * pixels / (WORLD_SIDE + 2 * BORDER)
-        self.top = scene.top
-        height = round(pixels * (scene.top + scene.footer) / (WORLD_SIDE + 2 * BORDER))
-        self.image = Image.new("RGB", (SUPERSAMPLING * pixels, SUPERSAMPLING * height), PAPER)
-        self.pen = ImageDraw.Draw(self.image)
-
-    def finish(self) -> Image.Image:
-        width, height = self.image.size
-        return self.image.resize((width // SUPERSAMPLING, height // SUPERSAMPLING), Image.Resampling.BOX)
-
-    def draw(self, shape: Shape, part: Part) -> None:
-        match shape:
-            case Polygon():
-                self._polygon(shape, part)
-            case Disc():
-                self._disc(shape, part)
-            case Line(points, colour, width):
-                self._line(self._at(points, part), colour, width)
-            case Rectangle(low, high, fill, corner):
-                (left, bottom), (right, top) = self._at((low, high), part)
-                self.pen.rounded_rectangle([left, top, right, bottom], corner * self.scale, fill)
-            case Text(position, words, colour, size, ends):
-                anchor = "rm" if ends else "lm"
-                self.pen.text(self._at((position,), part)[0], words, colour, font(round(size * self.scale)), anchor)
-
-    def _at(self, points: Sequence[Point], part: Part) -> list[Point]:
-        """Pixels of a part's points."""
-        x, y = placed(points, part).T
-        return list(zip(((x + BORDER) * self.scale).tolist(), ((self.top - y) * self.scale).tolist(), strict=True))
-
-    def _line(self, points: Sequence[Point], colour: Colour, width: float) -> None:
-        self.pen.line(points, colour, max(1, round(width * self.scale)), joint="curve")
-
-    def _polygon(self, shape: Polygon, part: Part) -> None:
-        corners = self._at(shape.points, part)
-        self.pen.polygon(corners, shape.fill)
-        if shape.edge is None:
-            return
-        if shape.hatched:
-            self._hatch(lambda pen: pen.polygon(corners, 255), shape.edge)
-        self._line([*corners, *corners[:2]], shape.edge, shape.width)
-
-    def _disc(self, shape: Disc, part: Part) -> None:
-        (x, y), r = self._at((shape.centre,), part)[0], shape.radius * self.scale
-        box = [(x - r, y - r), (x + r, y + r)]
-        self.pen.ellipse(box, shape.fill)
-        if shape.hatched:
-            self._hatch(lambda pen: pen.ellipse(box, 255), shape.edge)
-        self.pen.ellipse(box, None, shape.edge, max(1, round(EDGE * self.scale)))
-
-    def _hatch(self, shape: Callable[[ImageDraw.ImageDraw], None], colour: Colour) -> None:
-        mask = Image.new("L", self.image.size)
-        shape(ImageDraw.Draw(mask))
-        box = mask.getbbox()
-        if box:
-            lines = _hatching(self.image.size, HATCH_PITCH * self.scale, max(1, round(HATCH_WIDTH * self.scale)))
-            mask = Image.composite(mask.crop(box), Image.new("L", mask.crop(box).size), lines.crop(box))
-            self.image.paste(colour, box, mask)
+    drawing = svg_of([scene], [1.0], pixels)
+    png = resvg_py.svg_to_bytes(svg_string=drawing, skip_system_fonts=True, font_files=[_letters().name])
+    return Image.open(io.BytesIO(png)).convert("RGB")
 
 
 @cache
-def _hatching(size: tuple[int, int], pitch: float, width: int) -> Image.Image:
-    """Diagonal lines all over a picture, as a mask: where x + y is a multiple of the pitch."""
-    lines = Image.new("L", size)
-    pen = ImageDraw.Draw(lines)
-    for number in range(int((size[0] + size[1]) / pitch) + 1):
-        pen.line([(number * pitch - size[1], size[1]), (number * pitch, 0)], 255, width)
-    return lines
+def _letters() -> IO[bytes]:
+    """The letters as a file, because resvg reads no others; it lasts as long as the process."""
+    file = NamedTemporaryFile(suffix=".ttf")  # noqa: SIM115
+    file.write(font().font_bytes)
+    file.flush()
+    return file
 
 
 def sheet(pictures: Sequence[Image.Image], columns: int) -> Image.Image:

@@ -5,11 +5,10 @@ a revolute joint, a crossed square a fixed one. A motor's ring has the colour of
 runs, a thruster is a nozzle with a flame while it fires; the row below shows the live entries of the action,
 M1 to M4 for motors and T1, T2 for thrusters.
 
-`raster.py` makes pixels of a scene and `svg.py` makes vectors. All scenes of a level have the same parts in the same
-order, so a film is what its parts do. Lengths are metres, y is upwards, angles are radians.
+All scenes of a level have the same parts in the same order, so a film is what its parts do. Lengths are metres, y is
+upwards, angles are radians.
 """
 
-from collections.abc import Sequence
 from functools import cache
 
 import jax
@@ -17,19 +16,7 @@ import numpy as np
 from jaxtyping import Int
 
 from levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
-from levelgen.pictures.shapes import (
-    Disc,
-    Host,
-    Line,
-    Part,
-    Point,
-    Points,
-    Polygon,
-    Rectangle,
-    Scene,
-    Shape,
-    turned,
-)
+from levelgen.pictures.shapes import Host, Part, Point, Scene, disc, line, polygon, rectangle, turned
 from levelgen.pictures.style import (
     BINDING_COLOUR,
     BORDER,
@@ -42,13 +29,14 @@ from levelgen.pictures.style import (
     INK,
     PAPER,
     ROLE_COLOUR,
+    SHADE,
     SKY,
     Colour,
 )
 from levelgen.pictures.words import Caption, caption_parts, key_parts, printable
 from physics.types import State
 
-NOZZLE: Points = ((0.06, 0.045), (0.06, -0.045), (-0.12, -0.1), (-0.12, 0.1))
+NOZZLE = ((0.06, 0.045), (0.06, -0.045), (-0.12, -0.1), (-0.12, 0.1))
 
 
 def scene_of(
@@ -79,10 +67,6 @@ def _lane(values: Host, index: int) -> np.ndarray:
     return values[..., index if values.shape[-1] > 1 else 0]
 
 
-def _points(values: Sequence[Point] | Host) -> Points:
-    return tuple((float(x), float(y)) for x, y in np.asarray(values))
-
-
 def _point(values: Host) -> Point:
     return float(values[0]), float(values[1])
 
@@ -92,23 +76,21 @@ def _shade(colour: Colour, factor: float) -> Colour:
     return red, green, blue
 
 
-def _room() -> tuple[Shape, ...]:
+def _room() -> str:
     """Walls, then the air with a grid of metres."""
     side = WORLD_SIDE
-    shapes: list[Shape] = [
-        Rectangle((-BORDER, 0), (side + BORDER, side + BORDER), FIXED_PLAIN),
-        Rectangle((0, 0), (side, side), SKY),
-    ]
+    shapes = rectangle((-BORDER, 0), (side + BORDER, side + BORDER), FIXED_PLAIN)
+    shapes += rectangle((0, 0), (side, side), SKY)
     for metre in range(1, int(side)):
-        shapes += [Line(((metre, 0), (metre, side)), GRID, 0.01), Line(((0, metre), (side, metre)), GRID, 0.01)]
-    return tuple(shapes)
+        shapes += line([(metre, 0), (metre, side)], GRID, 0.01) + line([(0, metre), (side, metre)], GRID, 0.01)
+    return shapes
 
 
-def _paper(footer: float) -> tuple[Shape, ...]:
+def _paper(footer: float) -> str:
     """What hides all that leaves the world upwards or downwards."""
     top, right = WORLD_SIDE + BORDER, WORLD_SIDE + BORDER
-    above = Rectangle((-BORDER, top), (right, top + HEADER), PAPER)
-    return (above, Rectangle((-BORDER, -footer), (right, 0), PAPER)) if footer else (above,)
+    above = rectangle((-BORDER, top), (right, top + HEADER), PAPER)
+    return above + rectangle((-BORDER, -footer), (right, 0), PAPER) if footer else above
 
 
 def _body_colours(level: Level, body: int) -> tuple[Colour, Colour, bool]:
@@ -117,7 +99,7 @@ def _body_colours(level: Level, body: int) -> tuple[Colour, Colour, bool]:
     fill = ROLE_COLOUR[role]
     if fixed:
         fill = FIXED_PLAIN if role == Role.PLAIN else _shade(fill, 0.72)
-    return fill, _shade(fill, 0.62), bool(fixed)
+    return fill, _shade(fill, SHADE), bool(fixed)
 
 
 def _body(level: Level, state: State, body: int) -> Part:
@@ -125,10 +107,10 @@ def _body(level: Level, state: State, body: int) -> Part:
     circle = body - level.size.polygons
     if circle >= 0:
         radius = float(level.model.radius[circle])
-        shapes = (Disc((0.0, 0.0), radius, fill, edge, fixed), Line(((0.0, 0.0), (radius, 0.0)), edge, EDGE))
+        shapes = disc((0.0, 0.0), radius, fill, edge, fixed) + line([(0.0, 0.0), (radius, 0.0)], edge, EDGE)
     else:
         corners = level.model.vertices[body][: level.model.n_vertices[body]]
-        shapes = (Polygon(_points(corners), fill, edge, hatched=fixed),)
+        shapes = polygon(corners, fill, edge, hatched=fixed)
     return Part(shapes, _point(state.position[body]), float(state.rotation[body]))
 
 
@@ -150,26 +132,26 @@ def _joint(level: Level, state: State, joint: int, action: np.ndarray | None) ->
     model = level.model
     position = _attachment(state, int(model.joint_a[joint]), model.joint_anchor_a[joint])
     if model.joint_fixed[joint]:
-        a, b, c, d = corners = _points(0.065 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]))
-        return [Part((Polygon(corners, PAPER, INK), Line((a, c), INK, EDGE), Line((b, d), INK, EDGE)), position)]
+        corners = 0.065 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+        cross = line(corners[::2], INK, EDGE) + line(corners[1::2], INK, EDGE)
+        return [Part(polygon(corners, PAPER, INK) + cross, position)]
     motor = bool(model.motor_on[joint])
     colour = BINDING_COLOUR[int(level.motor_binding[joint])] if motor else PAPER
-    ring = Disc((0.0, 0.0), 0.085 if motor else 0.07, colour, INK)
-    axle = Disc((0.0, 0.0), 0.025, INK if level.motor_auto[joint] and motor else PAPER, INK)
-    return [Part((ring, axle), position), Part(_arrow(_motor_turn(level, joint, action), colour), position)]
+    ring = disc((0.0, 0.0), 0.085 if motor else 0.07, colour, INK)
+    axle = disc((0.0, 0.0), 0.025, INK if level.motor_auto[joint] and motor else PAPER, INK)
+    return [Part(ring + axle, position), Part(_arrow(_motor_turn(level, joint, action), colour), position)]
 
 
-def _arrow(turn: int, colour: Colour) -> tuple[Shape, ...]:
+def _arrow(turn: int, colour: Colour) -> str:
     """Three quarters of a circle around a joint, with an arrow head at its end."""
     if not turn:
-        return ()
+        return ""
     radius, angles = 0.17, np.linspace(0.25 * np.pi, 1.75 * np.pi, 25)
     arc = radius * np.stack([np.cos(angles), np.sin(angles)], -1)[::turn]
     outward = arc[-1] / radius
     along = turn * turned(outward, np.pi / 2)
-    head = _points([arc[-1] + 0.12 * along, arc[-1] + 0.07 * outward, arc[-1] - 0.07 * outward])
-    around, inner = Line(_points(arc), INK, 0.035 + EDGE), Line(_points(arc), colour, 0.035)
-    return around, inner, Polygon(head, colour, INK, 0.014)
+    head = np.array([arc[-1] + 0.12 * along, arc[-1] + 0.07 * outward, arc[-1] - 0.07 * outward])
+    return line(arc, INK, 0.035 + EDGE) + line(arc, colour, 0.035) + polygon(head, colour, INK, 0.014)
 
 
 def _thruster(level: Level, state: State, thruster: int, action: np.ndarray | None) -> list[Part]:
@@ -178,15 +160,15 @@ def _thruster(level: Level, state: State, thruster: int, action: np.ndarray | No
     body = int(model.thruster_body[thruster])
     position = _attachment(state, body, model.thruster_position[thruster])
     angle = float(model.thruster_rotation[thruster] + state.rotation[body])
-    flame = _flame() if action is not None and action[binding] else ()
-    return [Part(flame, position, angle), Part((Polygon(NOZZLE, BINDING_COLOUR[binding], INK),), position, angle)]
+    flame = _flame() if action is not None and action[binding] else ""
+    return [Part(flame, position, angle), Part(polygon(NOZZLE, BINDING_COLOUR[binding], INK), position, angle)]
 
 
 @cache
-def _flame() -> tuple[Shape, ...]:
-    def tongue(length: float, colour: Colour) -> Polygon:
+def _flame() -> str:
+    def tongue(length: float, colour: Colour) -> str:
         half = 0.075 * (0.5 + length / 2)
         waist, tip = -0.1 - 0.16 * length, -0.1 - 0.34 * length
-        return Polygon(((-0.1, half), (waist, half * 0.8), (tip, 0.0), (waist, -half * 0.8), (-0.1, -half)), colour)
+        return polygon([(-0.1, half), (waist, half * 0.8), (tip, 0.0), (waist, -half * 0.8), (-0.1, -half)], colour)
 
-    return tuple(tongue(*flame) for flame in FLAMES)
+    return "".join(tongue(*flame) for flame in FLAMES)

@@ -7,7 +7,14 @@ Colour = tuple[int, int, int]
 BORDER = 0.08  # m of the walls and the ceiling that shows
 HEADER, FOOTER = 0.36, 0.30  # m of picture above and below the world
 EDGE = 0.022  # m, width of the line around a shape
-HATCH_PITCH, HATCH_WIDTH = 0.1, 0.018  # m; measured along x
+PIXELS = 480  # width of a picture
+SHADE = 0.62  # times a body's colour: its edge
+HATCHING = "hatching"
+HATCH = (  # diagonal lines over a body, as dark as its edge
+    f'<linearGradient id="{HATCHING}" gradientUnits="userSpaceOnUse" x2="0.05" y2="-0.05" spreadMethod="repeat">'
+    f'<stop stop-opacity="0"/><stop offset="0.15" stop-opacity="{1 - SHADE:.2f}"/>'
+    f'<stop offset="0.25" stop-opacity="{1 - SHADE:.2f}"/><stop offset="0.4" stop-opacity="0"/></linearGradient>'
+)
 
 SKY: Colour = (247, 247, 243)
 GRID: Colour = (234, 235, 230)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
-from levelgen.pictures.shapes import Disc, Part, Rectangle, Shape, Text, text_width
+from levelgen.pictures.shapes import Part, disc, rectangle, text, text_width
 from levelgen.pictures.style import (
     BINDING_COLOUR,
     BORDER,
@@ -39,17 +39,16 @@ def caption_parts(caption: Caption) -> list[Part]:
     title, clock, outcome = (printable(words) for words in (caption.title, caption.clock, caption.outcome))
     badge = text_width(outcome, size) + 0.3 if outcome else 0.0
     title = _fitted(title, right - left - badge - text_width(clock, size) - 0.1, size)
-    shapes: tuple[Shape, ...] = ()
+    shapes = ""
     if outcome:
         start = left + (text_width(title, size) + 0.2 if title else 0.09)
         end = start + text_width(outcome, size)
         colour = ROLE_COLOUR[Role.GREEN] if caption.good else ROLE_COLOUR[Role.RED]
-        box = Rectangle((start - 0.09, middle - 0.12), (end + 0.09, middle + 0.12), colour, corner=0.1)
-        shapes = (box, Text((start, middle), outcome, PAPER, size))
-    of = lambda words, *rest: (Text(*rest),) if words else ()
+        shapes = rectangle((start - 0.09, middle - 0.12), (end + 0.09, middle + 0.12), colour, corner=0.1)
+        shapes += text((start, middle), outcome, PAPER, size)
     return [
-        Part(of(title, (left, middle), title, INK, size)),
-        Part(of(clock, (right, middle), clock, MUTED, size, True)),
+        Part(text((left, middle), title, INK, size) if title else ""),
+        Part(text((right, middle), clock, MUTED, size, ends=True) if clock else ""),
         Part(shapes),
     ]
 
@@ -76,8 +75,8 @@ def key_parts(level: Level, action: Int[np.ndarray, "6"]) -> list[Part]:
         name = f"M{entry + 1}" if is_motor else f"T{entry - MOTOR_BINDINGS + 1}"
         state = ("off", "forward" if is_motor else "on", "back")[int(action[entry])]
         lit, colour = int(action[entry]) != 0, BINDING_COLOUR[entry]
-        key = Disc((left + 0.07, middle), 0.07, colour if lit else PAPER, colour)
-        parts.append(Part((key, Text((left + 0.2, middle), f"{name} {state}", INK if lit else MUTED, KEY_SIZE))))
+        key = disc((left + 0.07, middle), 0.07, colour if lit else PAPER, colour)
+        parts.append(Part(key + text((left + 0.2, middle), f"{name} {state}", INK if lit else MUTED, KEY_SIZE)))
         left += 0.2 + text_width(f"{name} forward", KEY_SIZE) + 0.06
     return parts
 
