@@ -1,10 +1,8 @@
-"""Experts on the disk, so that a larger budget goes on instead of starting again: one Orbax checkpoint per unit."""
+"""Experts on the disk, so that a larger budget goes on instead of starting again: one numpy archive per unit."""
 
-import os
 import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -17,10 +15,10 @@ from experts.slots import begin
 from levelgen.level import size_of
 from levelgen.sampling.sampler import sample_levels
 from pipeline.errors import Failure, UserError
-from pipeline.store.disk import flush, refusal
+from pipeline.store.disk import flush
+from pipeline.store.fields import arrays_of
 from pipeline.store.layout import MANIFEST, data_path
 from pipeline.store.manifest import differences, read_manifest, require_manifest, told
-from pipeline.store.quiet import quiet_failures
 
 
 class SourceUnseen(Failure):
@@ -33,22 +31,13 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
     Raises:
         OSError: the disk refuses.
     """
-    import orbax.checkpoint as ocp  # takes seconds, and most jobs keep no experts
-
     rows = [experts[level_id] for level_id in sorted(experts)]
-    longest = max(len(row.curve) for row in rows)
-    curves = np.full((len(rows), longest), np.nan, np.float32)
+    curves = np.full((len(rows), max(len(row.curve) for row in rows)), np.nan, np.float32)
     for i, row in enumerate(rows):
         curves[i, : len(row.curve)] = row.curve
     begun = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows))
-    tree = {"level_id": np.array(sorted(experts)), "curve": curves, "begun": begun}
-    try:
-        with quiet_failures(), ocp.StandardCheckpointer() as checkpointer:
-            checkpointer.save(path.absolute(), tree)
-    except Exception as error:  # Orbax and TensorStore raise many kinds
-        if number := refusal(error):
-            raise OSError(number, os.strerror(number), str(path)) from error
-        raise
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, allow_pickle=False, level_id=np.array(sorted(experts)), curve=curves, **arrays_of(begun, "begun/"))
     flush(path)
 
 
@@ -58,30 +47,26 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
     Raises:
         Failure: it is damaged or gone, or of another version of this program.
     """
-    import orbax.checkpoint as ocp
-
     level = sample_levels([0], size_of(job.size), job.distribution)
     like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), job.expert), level)
+    like = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            found = checkpointer.metadata(path.absolute()).item_metadata.tree
-            count, longest = found["curve"].shape
-            shaped = {
-                "level_id": np.zeros(count, found["level_id"].dtype),
-                "curve": np.zeros((count, longest), np.float32),
-                "begun": jax.tree.map(lambda x: np.zeros((count, *x.shape[1:]), x.dtype), like),
-            }
-            tree: Any = checkpointer.restore(path.absolute(), shaped)
-    except Exception as error:  # Orbax and TensorStore raise many kinds
+        with np.load(path) as file:  # whole files only: each array has a checksum; never what is pickled
+            arrays = {name: file[name] for name in file.files}
+        level_ids, curves = arrays.pop("level_id"), arrays.pop("curve")
+        for name, one in arrays_of(like, "begun/").items():
+            if (arrays[name].shape, arrays[name].dtype) != ((len(level_ids), *one.shape[1:]), one.dtype):
+                raise ValueError(f"{name} has another shape or type")
+    except Exception as error:  # numpy and zipfile raise many kinds
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise Failure(
             f"The experts in {path} cannot be read ({reason}): leave out continue_from to train them from the start."
         ) from error
     experts = {}
-    for i, level_id in enumerate(tree["level_id"].tolist()):
-        begun = jax.tree.map(lambda x, i=i: x[i], tree["begun"])
-        curve = tree["curve"][i, : int(begun.training.course.updates)]
-        experts[level_id] = Kept(begun, curve.tolist())
+    leaves = [arrays[name] for name in arrays_of(like, "begun/")]
+    for i, level_id in enumerate(level_ids.tolist()):
+        begun = jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves])
+        experts[level_id] = Kept(begun, curves[i, : int(begun.training.course.updates)].tolist())
     return experts
 
 

@@ -2,7 +2,6 @@
 
 import errno
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 # The disk refuses: whoever tries again works for nothing.
@@ -37,27 +36,3 @@ def flush_entry(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def refusal(error: BaseException) -> int | None:
-    """The disk's refusal that an exception of a library tells of, in whatever words, as an errno of `REFUSALS`.
-
-    To be asked about exceptions of writing only: TensorStore and XLA call full memory what they call a full disk.
-    """
-    for link in _chain(error):
-        if isinstance(link, OSError) and link.errno in REFUSALS:
-            return link.errno
-        for number in REFUSALS:
-            if os.strerror(number) in str(link):
-                return number
-        if "RESOURCE_EXHAUSTED" in str(link):
-            return errno.ENOSPC
-    return None
-
-
-def _chain(error: BaseException) -> Iterator[BaseException]:
-    """An exception, those in it, and those it came from."""
-    yield error
-    for link in (error.__cause__ or error.__context__, *getattr(error, "exceptions", ())):
-        if link is not None:
-            yield from _chain(link)

@@ -3,7 +3,7 @@
 manifest/000000000000-000000000015.parquet          a fragment: the commit marker of a work unit
 manifest/.000000000000-000000000015-5f0c2a9b.begun  the fragment of one attempt at that unit, until it is whole
 shards/000000000000-000000000015-5f0c2a9b.zarr      data of that attempt
-experts/000000000000-000000000015-5f0c2a9b          its experts, if they are kept
+experts/000000000000-000000000015-5f0c2a9b.npz      its experts, if they are kept
 quarantine/000000000000-000000000015.txt            why a unit was given up
 job.json                                            what the last command wanted
 .writer.lock, .commit.lock                          see pipeline/store/locks.py
@@ -26,8 +26,7 @@ ATTEMPT = rf"{UNIT}-[0-9a-f]{{8}}"
 # Paths below the split:
 FRAGMENT = re.compile(rf"{MANIFEST}/{UNIT}\.parquet")
 BEGUN = re.compile(rf"{MANIFEST}/\.{ATTEMPT}\.begun")
-DATA = re.compile(rf"{SHARDS}/{ATTEMPT}\.zarr|{EXPERTS}/{ATTEMPT}")
-MADE = re.compile(rf"({DATA.pattern})(\.orbax-checkpoint-tmp.*)?")  # as Orbax calls experts until all is there
+DATA = re.compile(rf"{SHARDS}/{ATTEMPT}\.zarr|{EXPERTS}/{ATTEMPT}\.npz")
 JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # by the process of this number
 
 
@@ -59,12 +58,12 @@ def new_attempt(split: Path, unit: str) -> Attempt:
         fragment_path(split, unit),
         split / MANIFEST / f".{name}.begun",
         split / SHARDS / f"{name}.zarr",
-        split / EXPERTS / name,
+        split / EXPERTS / f"{name}.npz",
     )
 
 
 def attempt_of(path: Path) -> str:
-    """Name of the attempt that made this, by a path of `BEGUN` or `MADE`."""
+    """Name of the attempt that made this, by a path of `BEGUN` or `DATA`."""
     found = re.search(ATTEMPT, path.name)
     assert found, path
     return found[0]

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from os import DirEntry
 from pathlib import Path
 
-from pipeline.store.layout import BEGUN, EXPERTS, JOB_BEGUN, MADE, MANIFEST, SHARDS, attempt_of, entries
+from pipeline.store.layout import BEGUN, DATA, EXPERTS, JOB_BEGUN, MANIFEST, SHARDS, attempt_of, entries
 from pipeline.store.locks import nobody_commits
 from pipeline.store.manifest import DATA_COLUMNS, Manifest, read_manifest
 
@@ -27,12 +27,15 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
     with nobody_commits(split, say):
         manifest = read_manifest(split, ["label", *DATA_COLUMNS])
         named = manifest.shards | manifest.experts
-        made = [path for folder in (SHARDS, EXPERTS) for path in entries(split, folder, MADE, DirEntry.is_dir)]
+        made = [*entries(split, SHARDS, DATA, DirEntry.is_dir), *entries(split, EXPERTS, DATA, DirEntry.is_file)]
         unnamed = [path for path in made if path.relative_to(split).as_posix() not in named]
         begun = {attempt_of(path): path for path in entries(split, MANIFEST, BEGUN, DirEntry.is_file)}
         dead = [path for path in unnamed if attempt_of(path) in begun]
         for path in dead:
-            shutil.rmtree(path, ignore_errors=True)
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink()
         stuck = {attempt_of(path) for path in dead if path.exists()}  # open files, on NFS: the next run tries again
         for path in (path for attempt, path in begun.items() if attempt not in stuck):
             path.unlink()

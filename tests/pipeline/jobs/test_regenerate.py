@@ -91,13 +91,14 @@ def test_what_cannot_go_on_is_refused(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_damaged_checkpoint_is_named(folder: Path, tmp_path: Path) -> None:
     path = next((folder / "data/8k/s/experts").iterdir())
-    copy = tmp_path / "damaged"
-    shutil.copytree(path, copy)
-    for file in copy.rglob("*"):
-        if file.is_file() and file.stat().st_size > 1000:
-            file.write_bytes(file.read_bytes()[:500])
-    with pytest.raises(Failure, match=r"experts in .*damaged cannot be read .* leave out continue_from"):
-        load_experts(copy, made_job("data", *SETTINGS, "budget=8k"))
+    copy, whole = tmp_path / "damaged", path.read_bytes()
+    middle = len(whole) // 2
+    for damaged in (whole[:middle], whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :], b""):
+        copy.write_bytes(damaged)
+        with pytest.raises(Failure, match=r"experts in .*damaged cannot be read .* leave out continue_from"):
+            load_experts(copy, made_job("data", *SETTINGS, "budget=8k"))
+    with pytest.raises(Failure, match=r"cannot be read \(.* has another shape or type\)"):
+        load_experts(path, made_job("data", *SETTINGS, "budget=8k", "expert.width=32"))
 
 
 @pytest.mark.slow
@@ -107,7 +108,7 @@ def test_experts_that_a_dead_attempt_left_are_removed(folder: Path, tmp_path: Pa
     named = set(experts.iterdir())
     dead = new_attempt(tmp_path / "data/8k/s", "000000000000-000000000011")
     begin_fragment(dead)
-    shutil.copytree(min(named), dead.experts)
+    shutil.copy(min(named), dead.experts)
     assert run(["generate", *SETTINGS, "budget=8k", "keep_experts=true"], tmp_path).returncode == 0
     assert set(experts.iterdir()) == named
 

@@ -28,9 +28,9 @@ def test_each_unit_s_experts_come_back_bit_for_bit(tmp_path: Path) -> None:
     begun = jax.tree.map(np.asarray, begin(levels, jnp.asarray(ids), job.expert))
     kept = [Kept(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(UNITS)]
     for i in range(UNITS):
-        save_experts(tmp_path / str(i), {i: kept[i]})
+        save_experts(tmp_path / f"{i}.npz", {i: kept[i]})
     for i in range(UNITS):
-        back = load_experts(tmp_path / str(i), job)[i].begun
+        back = load_experts(tmp_path / f"{i}.npz", job)[i].begun
         pairs = zip(jax.tree.leaves(kept[i].begun), jax.tree.leaves(back), strict=True)
         assert all(np.asarray(before).tobytes() == np.asarray(after).tobytes() for before, after in pairs)
 

@@ -32,7 +32,7 @@ def committed(split: Path, first: int) -> None:
 
 @pytest.fixture
 def dead(split: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """An attempt that died between its shard and its fragment, while Orbax was writing; its name."""
+    """An attempt that died between its shard and its fragment; its name."""
 
     def die(*_: object) -> None:
         raise MemoryError
@@ -44,7 +44,8 @@ def dead(split: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     (begun,) = (split / "manifest").glob("*.begun")
     attempt = attempt_of(begun)
     assert (split / f"shards/{attempt}.zarr").is_dir()
-    (split / f"experts/{attempt}.orbax-checkpoint-tmp").mkdir(parents=True)
+    (split / "experts").mkdir()
+    (split / f"experts/{attempt}.npz").touch()
     return attempt
 
 
@@ -74,7 +75,7 @@ def test_what_others_put_there_stays(split: Path, tmp_path_factory: pytest.TempP
     attempt = "000000000004-000000000005-5f0c2a9b"
     folders = (
         "experts/mine",
-        f"experts/{attempt}-mine",
+        f"experts/{attempt}.npz.mine",
         f"shards/{attempt}.zarr.mine",
         "manifest/.ipynb_checkpoints",
         f"manifest/.{attempt[:-1]}0.begun",
@@ -84,7 +85,7 @@ def test_what_others_put_there_stays(split: Path, tmp_path_factory: pytest.TempP
         (split / name / "file").touch()
     for name in ("manifest/.DS_Store", "manifest/.nfs0000000000003a1b00000002", ".job.json.swp"):
         (split / name).touch()
-    for name in (f"experts/{attempt}", f"shards/{attempt}.zarr", "manifest/.linked"):
+    for name in (f"experts/{attempt}.npz", f"shards/{attempt}.zarr", "manifest/.linked"):
         (split / name).symlink_to(elsewhere)
     before = everything(split)
     (split / f"manifest/.{attempt}.begun").touch()  # it is the links that keep their target from going
