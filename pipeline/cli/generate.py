@@ -3,10 +3,10 @@
 import argparse
 import shutil
 
-from pipeline.cli.command import Commands, add_command
 from pipeline.errors import Exit
 
-EXAMPLES = """\
+DOES = "make levels and their experts"
+EXAMPLE = """\
 levelproof generate                                 64 small levels into data
 levelproof generate size=m levels=1k budget=1M      more, larger, for longer
 levelproof generate distribution=vehicles out=cars  other levels
@@ -27,17 +27,12 @@ OFTEN = (
 )
 
 
-def add(commands: Commands) -> None:
-    parser = add_command(commands, "generate", run, "make levels and their experts", EXAMPLES, add_help=False)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("settings", nargs="*", metavar="NAME=VALUE", help="settings to change")
-    parser.add_argument("-h", "--help", action="store_true", help="show this help message and exit")
-    parser.set_defaults(parser=parser)
+    parser.format_help = lambda: _help(parser)
 
 
 def run(arguments: argparse.Namespace) -> Exit:
-    if arguments.help:
-        return _help(arguments.parser)
-
     from rich.console import Console
 
     from configs.compose import compose_job
@@ -47,7 +42,7 @@ def run(arguments: argparse.Namespace) -> Exit:
     return generate(job, ["levelproof", "generate", *arguments.settings], Console(stderr=True))
 
 
-def _help(parser: argparse.ArgumentParser) -> Exit:
+def _help(parser: argparse.ArgumentParser) -> str:
     """argparse's help, with the settings that people change before the examples: on one screen."""
     from configs.meanings import every_setting
     from pipeline.cli.settings import rows
@@ -55,5 +50,4 @@ def _help(parser: argparse.ArgumentParser) -> Exit:
     settings = {setting.name: setting for setting in every_setting()}
     often = "\n".join(rows((settings[name] for name in OFTEN), shutil.get_terminal_size().columns, INDENT))
     parser.epilog = f"settings and their defaults (all of them: levelproof settings):\n{often}\n\n{parser.epilog}"
-    parser.print_help()
-    return Exit.DONE
+    return argparse.ArgumentParser.format_help(parser)

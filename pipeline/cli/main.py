@@ -21,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; its exit code."""
     arguments = _parser().parse_args(argv)
     try:
-        return int(arguments.run(arguments))
+        return int(arguments.run(arguments) or Exit.DONE)
     except (LevelproofError, ConfigError) as error:
         if arguments.debug:
             raise
@@ -56,5 +56,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"levelproof {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for command in COMMANDS:
-        command.add(commands)
+        examples = "\n  ".join(["examples:", *command.EXAMPLE.splitlines()])
+        added = commands.add_parser(
+            command.__name__.rpartition(".")[2],
+            help=command.DOES,
+            description=f"{command.DOES[0].upper()}{command.DOES[1:]}.",
+            epilog=f"{examples}\n{EXITS}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.add_arguments(added)
+        added.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        added.set_defaults(run=command.run)
     return parser

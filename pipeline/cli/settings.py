@@ -9,12 +9,14 @@ from dataclasses import asdict
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from pipeline.cli.command import Commands, add_command, add_json
-from pipeline.errors import Exit, UserError
+from pipeline.cli.command import add_json
+from pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from configs.meanings import Setting
 
+DOES = "list settings with their meanings, units and defaults"
+EXAMPLE = "levelproof settings thruster"
 INDENT = 34  # where meanings start
 INTRODUCTION = """# Settings
 
@@ -25,21 +27,14 @@ fields of the dataclasses.
 """
 
 
-def add(commands: Commands) -> None:
-    parser = add_command(
-        commands,
-        "settings",
-        run,
-        "list settings with their meanings, units and defaults",
-        "levelproof settings thruster",
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("word", nargs="?", default="", metavar="WORD", help="only settings that have this word")
     shape = parser.add_mutually_exclusive_group()
     add_json(shape)
     shape.add_argument("--markdown", action="store_true", help="print the page docs/settings.md")
 
 
-def run(arguments: argparse.Namespace) -> Exit:
+def run(arguments: argparse.Namespace) -> None:
     from configs.meanings import every_setting
 
     has_word = lambda text: arguments.word.lower() in text.lower()
@@ -52,7 +47,6 @@ def run(arguments: argparse.Namespace) -> Exit:
         print(as_markdown(found), end="")
     else:
         print(as_text(found, shutil.get_terminal_size().columns))
-    return Exit.DONE
 
 
 def as_text(settings: Iterable["Setting"], columns: int) -> str:

@@ -2,18 +2,18 @@
 
 import argparse
 
-from pipeline.cli.command import Commands, add_command, add_json, add_split
-from pipeline.errors import Exit
+from pipeline.cli.command import add_json, add_split
+
+DOES = "tell how far a split is"
+EXAMPLE = "levelproof status data/128k/s"
 
 
-def add(commands: Commands) -> None:
-    parser = add_command(commands, "status", run, "tell how far a split is", "levelproof status data/128k/s")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
     add_json(parser)
 
 
-def run(arguments: argparse.Namespace) -> Exit:
+def run(arguments: argparse.Namespace) -> None:
     from pipeline.look.status import status
 
     status(arguments.split, arguments.json)
-    return Exit.DONE

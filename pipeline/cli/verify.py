@@ -2,18 +2,14 @@
 
 import argparse
 
-from pipeline.cli.command import Commands, add_command, add_json, add_split
+from pipeline.cli.command import add_json, add_split
 from pipeline.errors import Exit
 
+DOES = "make every level of a split again, read every shard, replay every witness"
+EXAMPLE = "levelproof verify data/128k/s"
 
-def add(commands: Commands) -> None:
-    parser = add_command(
-        commands,
-        "verify",
-        run,
-        "make every level of a split again, read every shard, replay every witness",
-        "levelproof verify data/128k/s",
-    )
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
     add_json(parser)
 
