@@ -1,7 +1,8 @@
 """Locks between processes, held by open files: the system frees them when a process dies, however it dies.
 
 Lock files are opened for reading and writing: NFS makes these locks out of others, and takes a shared one only of a
-file that may be read, an exclusive one only of a file that may be written.
+file that may be read, an exclusive one only of a file that may be written. Whoever takes one gets LockRefused where
+the file system has no locks.
 """
 
 import fcntl
@@ -19,10 +20,6 @@ NOTICE = 2.0  # s of waiting after which people are told for what
 POLL = 0.05  # s between two tries
 
 
-class Locked(Exception):
-    """Another process holds the lock."""
-
-
 class LockRefused(UserError):
     """The file system has no locks."""
 
@@ -32,23 +29,18 @@ def only_writer(split: Path) -> Iterator[None]:
     """Held by the one `levelproof generate` that may write to a split.
 
     Raises:
-        Locked: another one is at work.
-        LockRefused: the file system has no locks.
+        UserError: another one is at work.
     """
-    with _opened(split / WRITER_LOCK) as file:
+    with (split / WRITER_LOCK).open("a+") as file:
         if not _taken_within(PATIENCE, file):
-            raise Locked
+            raise UserError(f"Another `levelproof generate` is writing to {split}: wait for it, or stop it first.")
         yield
 
 
 @contextmanager
 def committing(split: Path) -> Iterator[None]:
-    """Held while a unit writes its shard and its fragment; many units may at once.
-
-    Raises:
-        LockRefused: the file system has no locks.
-    """
-    with _opened(split / COMMIT_LOCK) as file:
+    """Held while a unit writes its shard and its fragment; many units may at once."""
+    with (split / COMMIT_LOCK).open("a+") as file:
         _take(file, fcntl.LOCK_SH)
         yield
 
@@ -60,12 +52,9 @@ def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
     Args:
         split: the folder `{out}/{budget}/{size}`.
         say: told what is waited for, when that takes long.
-
-    Raises:
-        LockRefused: the file system has no locks.
     """
     path = split / COMMIT_LOCK
-    with _opened(path) as file:
+    with path.open("a+") as file:
         if not _taken_within(NOTICE, file):
             say(
                 f"Waiting for a worker of an earlier run, which still writes and holds {path}: "
@@ -73,16 +62,6 @@ def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
             )
             _take(file, fcntl.LOCK_EX)
         yield
-
-
-def require_locks(split: Path) -> None:
-    """Take the locks that workers take: a file system that refuses them is named before anything trains.
-
-    Raises:
-        LockRefused: it does.
-    """
-    with committing(split):
-        pass
 
 
 def is_written(split: Path) -> bool:
@@ -95,10 +74,6 @@ def is_written(split: Path) -> bool:
     except OSError:  # never written to, or not ours to ask
         return False
     return False
-
-
-def _opened(path: Path) -> IO[str]:
-    return path.open("a+")
 
 
 def _taken_within(seconds: float, file: IO[str]) -> bool:

@@ -11,7 +11,7 @@ from configs.schema import JobConfig
 from pipeline.errors import UserError
 from pipeline.store.layout import FOLDERS, JOB, split_path
 from pipeline.store.leftovers import clean
-from pipeline.store.locks import Locked, only_writer, require_locks
+from pipeline.store.locks import committing, only_writer
 from pipeline.store.manifest import Manifest, differences, told
 
 
@@ -30,16 +30,12 @@ def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, 
     split = split_path(job.out, job.budget, job.size)
     _make_writable(split)
     _require_own_folders(split)
-    try:
-        with only_writer(split):
-            require_locks(split)
-            manifest = clean(split, say)
-            require_same(manifest, job)
-            yield split, manifest
-    except Locked:
-        raise UserError(
-            f"Another `levelproof generate` is writing to {split}: wait for it, or stop it first."
-        ) from None
+    with only_writer(split):
+        with committing(split):
+            pass  # as workers do: a file system that refuses their lock is named before anything trains
+        manifest = clean(split, say)
+        require_same(manifest, job)
+        yield split, manifest
 
 
 def require_same(manifest: Manifest, job: JobConfig) -> None:

@@ -18,7 +18,7 @@ from pipeline.jobs.schedule import UnitOutcome, WorkUnit
 from pipeline.jobs.worker import Worker
 from pipeline.store import locks
 from pipeline.store.layout import COMMIT_LOCK
-from pipeline.store.locks import Locked, LockRefused, committing, is_written, nobody_commits, only_writer
+from pipeline.store.locks import LockRefused, committing, is_written, nobody_commits, only_writer
 from pipeline.store.split import writing
 from tests.pipeline.command import ROOT, heed_ctrl_c, start
 from tests.pipeline.made import made_job
@@ -57,7 +57,7 @@ def test_locks_exclude_on_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(locks, "NOTICE", 0.1)
     with held_elsewhere("only_writer", tmp_path):
         assert is_written(tmp_path)
-        with pytest.raises(Locked), only_writer(tmp_path):
+        with pytest.raises(UserError, match="Another `levelproof generate`"), only_writer(tmp_path):
             pass
     assert not is_written(tmp_path)
     with only_writer(tmp_path):
