@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from loky import cpu_count
+
 from pipeline.compiled import remove_damaged
-from pipeline.quota import cpu_quota
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
 # One process per core, each with one thread, is twice as fast as one process with XLA's own threads; and a sum
@@ -70,9 +71,7 @@ def interruptible() -> Iterator[None]:
 
 def own_cores() -> list[int]:
     """The CPU cores that this process may keep busy: a container's quota may be smaller than their number."""
-    cores = _allowed_cores()
-    quota = cpu_quota()
-    return cores if quota is None else cores[: max(1, int(quota))]
+    return _allowed_cores()[: cpu_count()]
 
 
 def cores_for(workers: int) -> list[int | None]:

@@ -12,6 +12,7 @@ from levelgen.level import size_of
 from levelgen.pictures.raster import Caption, draw, sheet, write_png
 from levelgen.sampling.sampler import sample_levels
 from pipeline.errors import UserError
+from pipeline.read.levels import writing_to
 from pipeline.runtime import prepare_jax
 
 LEVELS = 15  # unless the command says how many
@@ -33,11 +34,8 @@ def sample(job: JobConfig, out: Path) -> None:
         raise UserError(f"levels is {job.levels}: a sheet has room for {MOST_LEVELS}.")
     prepare_jax()
     page = sheet_of(job)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+    with writing_to(out):
         write_png(page, out)
-    except OSError as error:
-        raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another file with -o.") from None
     name, _ = identified(job.distribution)
     print(f"{out}: levels {ids[0]} to {ids[-1]} of size {job.size}, distribution {name or 'of your own'}")
 

@@ -24,7 +24,7 @@ from levelgen.pictures.words import Caption
 from levelgen.task.rules import StepResult, TaskParams, TaskState, advance, has_nan, reset
 from physics.types import State
 from pipeline.errors import Failure, UserError
-from pipeline.read.levels import find_level, is_level_file, level_file, level_of
+from pipeline.read.levels import find_level, is_level_file, level_file, level_of, writing_to
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
@@ -53,11 +53,8 @@ def show(source: Path, level_id: int | None, out: Path) -> None:
     if write is None:
         raise UserError(f"Cannot draw to {out}: its name has to end in {', '.join(WRITERS)}.")
     film = film_of(source, level_id, plays=suffix != ".png")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+    with writing_to(out):
         write(film, out)
-    except OSError as error:
-        raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another file with -o.") from None
     print(f"{out}: {film.told}")
 
 

@@ -6,7 +6,7 @@ from configs.convert import typed
 from levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
 from levelgen.task.rules import TaskParams
 from pipeline.errors import UserError
-from pipeline.read.levels import find_level, level_of
+from pipeline.read.levels import find_level, level_of, writing_to
 
 
 def export(split: Path, level_id: int, out: Path) -> None:
@@ -21,10 +21,8 @@ def export(split: Path, level_id: int, out: Path) -> None:
     manifest, row = find_level(split, level_id)
     file = LevelFile(level_of(manifest, row), typed(TaskParams, (manifest.config or {})["task"], "task"))
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_level_file(file, out)
+        with writing_to(out):
+            write_level_file(file, out)
     except LevelFileError as error:
         raise UserError(f"Cannot export level {level_id} of {split}: {error}.") from None
-    except OSError as error:
-        raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another file with -o.") from None
     print(f"{out}: level {level_id} of size {row['size']}, for Kinetix")

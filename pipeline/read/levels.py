@@ -1,5 +1,7 @@
-"""One level that a user names: by its id in a split, or by a level file."""
+"""One level that a user names, by its id in a split or by a level file, and the file that is made of it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +45,20 @@ def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
     prepare_jax()
     distribution = typed(Distribution, (manifest.config or {})["distribution"])
     return sample_levels([row["level_id"]], size_of(row["size"]), distribution)
+
+
+@contextmanager
+def writing_to(out: Path) -> Iterator[None]:
+    """A file that a user named is written meanwhile, in a folder that is made where it is not there.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another file with -o.") from None
 
 
 def is_level_file(source: Path) -> bool:

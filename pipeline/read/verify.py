@@ -6,13 +6,10 @@ be the one that its row's content hash says, and its witness has to reach the go
 """
 
 import json
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
-import pyarrow as pa
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import track
 
 from configs.convert import typed
 from configs.errors import ConfigError
@@ -25,8 +22,6 @@ from pipeline.read.evidence import COLUMNS, Evidence, Findings, Making
 from pipeline.runtime import prepare_jax
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.shard import Shard, open_shard
-
-PATIENCE = 2.0  # s before a bar is shown
 
 
 def verify(split: Path, as_json: bool) -> Exit:
@@ -55,7 +50,9 @@ def examine(split: Path) -> Findings:
     making = _making(manifest)
     prepare_jax()
     shards: dict[str, Shard | None] = {}
-    for block in _with_bar(manifest.table):
+    console, rows = Console(stderr=True), range(0, manifest.table.num_rows, CHUNK)  # as many as the sampler makes
+    for first in track(rows, "levels looked at", console=console, transient=True, disable=not console.is_terminal):
+        block = manifest.table.slice(first, CHUNK)
         names = block.column("shard").drop_null().unique().to_pylist()
         shards = {name: shards[name] if name in shards else _opened(name, making, findings) for name in names}
         Evidence(block, making, shards, findings).examine()
@@ -86,18 +83,3 @@ def _opened(name: str, making: Making, findings: Findings) -> Shard | None:
         return None
     findings.shards += 1
     return shard
-
-
-def _with_bar(table: pa.Table) -> Iterator[pa.Table]:
-    """The rows, as many at once as the sampler makes, with a bar on stderr where it takes long."""
-    console, began = Console(stderr=True), time.monotonic()
-    bar = Progress(console=console, transient=True, disable=not console.is_terminal)
-    task = bar.add_task("levels looked at", total=table.num_rows)
-    try:
-        for first in range(0, table.num_rows, CHUNK):
-            yield table.slice(first, CHUNK)
-            bar.update(task, completed=min(first + CHUNK, table.num_rows))
-            if time.monotonic() - began > PATIENCE:
-                bar.start()
-    finally:
-        bar.stop()

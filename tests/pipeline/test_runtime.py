@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline import runtime
 from pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder, own_cores
 from tests.pipeline.command import ROOT
 
@@ -76,3 +77,15 @@ def test_the_cache_is_in_the_user_s_cache_folder(monkeypatch: pytest.MonkeyPatch
         assert cache_folder() == Path("/somewhere/levelproof")
     monkeypatch.setenv(CACHE_VARIABLE, "~/here")
     assert cache_folder() == Path.home() / "here"
+
+
+@pytest.mark.parametrize("quota", [64, 4, 1])
+def test_workers_are_as_many_as_the_quota_of_a_container_keeps_busy(
+    monkeypatch: pytest.MonkeyPatch, quota: int
+) -> None:
+    monkeypatch.setattr(runtime, "_allowed_cores", lambda: list(range(64)))
+    monkeypatch.setattr(runtime, "cpu_count", lambda: quota)
+    assert len(own_cores()) == quota
+    pinned = quota == 64  # under a quota, neighbours of other containers would be on the same cores
+    assert runtime.cores_for(1000) == (list(range(64)) if pinned else [None] * quota)
+    assert runtime.cores_for(2) == [None] * min(2, quota)
