@@ -50,7 +50,8 @@ def run(given: argparse.Namespace) -> Report:
     from benchmarks.parity.report import report_of
 
     python = oracle.oracle_python()
-    with Board(Console(stderr=True)).shown() as board:
+    board = Board(Console(stderr=True))
+    with board.shown():
         of = (given.states, given.episodes, board, given.level_file, given.keep)
         sizes = [campaign(python, size, *of) for size in given.size]
     settings = {"states": given.states, "episodes": given.episodes, "stickiness": STICKINESS}

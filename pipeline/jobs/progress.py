@@ -2,10 +2,8 @@
 
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -33,9 +31,6 @@ class Tally:
     def __post_init__(self) -> None:
         self.at_start = self.share
         self.first = time.monotonic()
-
-    def progress(self, unit: WorkUnit, env_steps: int, levels: float, solved: int) -> None:
-        self.running[unit] = env_steps, levels, solved
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
         """A unit was committed, or an attempt at it failed (`None`)."""
@@ -111,13 +106,8 @@ class Display:
         )
         self._task = self._bar.add_task("starting", total=1)
 
-    @contextmanager
-    def shown(self) -> Iterator[Self]:
-        if not self._console.is_terminal:
-            yield self
-            return
-        with self._bar:
-            yield self
+    def shown(self) -> AbstractContextManager[object]:
+        return self._bar if self._console.is_terminal else nullcontext()
 
     def draw(self, completed: float, total: float, text: str, line: str, every: float = LINE_EVERY) -> None:
         """Bring the bar up to date, or say `line`, if none was said in the last `every` seconds."""

@@ -4,7 +4,7 @@ Told by the annotations of `Level` and `Record` alone, so that a shard can be re
 engines and pictures look things up by these numbers and check no bounds.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -20,12 +20,12 @@ from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
 from pipeline.store.fields import annotated
 from pipeline.store.schema import FieldSpec, field_table
 
-COUNTED = {  # fields with one entry for each thing of a kind
-    "polygons": "level/model/n_vertices",
-    "circles": "level/model/radius",
-    "joints": "level/model/joint_active",
-    "thrusters": "level/model/thruster_active",
-}
+COUNTED = (  # fields with one entry for each thing of a kind, in the order of Size
+    "level/model/n_vertices",
+    "level/model/radius",
+    "level/model/joint_active",
+    "level/model/thruster_active",
+)
 FEWEST = Size(FIXED_POLYGONS, 0, 0, 0)
 
 
@@ -45,24 +45,20 @@ def table_for(size: Size) -> tuple[FieldSpec, ...]:
     return tuple(field_table(level | record))
 
 
-def size_in(table: Sequence[FieldSpec]) -> Size:
-    """The size of which a shard with this table is, the whole of which has to be that size's.
+def size_in(fields: Any) -> Size:
+    """The size whose fields, all of them, are these, as a shard's attributes have them.
 
     Raises:
-        ContentsError: it is of none.
+        ContentsError: they are those of none.
     """
-    shapes = {field.name: field.shape for field in table}
     try:
-        size = Size(*(shapes[name][0] for name in COUNTED.values()))
-    except (KeyError, IndexError):
+        shapes = {field["name"]: field["shape"] for field in fields}
+        size = Size(*(shapes[name][0] for name in COUNTED))
+        fits = all(type(n) is int and low <= n <= MOST_THINGS for low, n in zip(FEWEST, size, strict=True))
+    except (KeyError, IndexError, TypeError):
         raise ContentsError("its fields are those of no size") from None
-    if not all(type(n) is int and low <= n <= MOST_THINGS for low, n in zip(FEWEST, size, strict=True)):
+    if not fits or fields != [field.as_json() for field in table_for(size)]:
         raise ContentsError("its fields are those of no size")
-    for field, expected in zip(table, table_for(size), strict=False):
-        if field != expected:
-            raise ContentsError(f"its field {expected.name} is not as size {name_of(size)} has it")
-    if len(table) != len(table_for(size)):
-        raise ContentsError(f"it has not the fields of size {name_of(size)}")
     return size
 
 

@@ -26,7 +26,7 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
     """
     with nobody_commits(split, say):
         manifest = read_manifest(split, ["label", *DATA_COLUMNS])
-        named = manifest.shards | manifest.experts
+        named = manifest.shards | manifest.named["experts"]
         made = [*entries(split, SHARDS, DATA, DirEntry.is_dir), *entries(split, EXPERTS, DATA, DirEntry.is_file)]
         unnamed = [path for path in made if path.relative_to(split).as_posix() not in named]
         begun = {attempt_of(path): path for path in entries(split, MANIFEST, BEGUN, DirEntry.is_file)}

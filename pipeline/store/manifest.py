@@ -141,11 +141,6 @@ class Manifest:
         return self.named["shard"]
 
     @property
-    def experts(self) -> frozenset[str]:
-        """Likewise."""
-        return self.named["experts"]
-
-    @property
     def config(self) -> dict[str, Any] | None:
         """The settings that made it; None while it is empty."""
         return self.fragments[0].config if self.fragments else None

@@ -101,10 +101,6 @@ class FieldSpec:
     def as_json(self) -> dict[str, Any]:
         return asdict(self) | {"shape": list(self.shape)}
 
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> "FieldSpec":
-        return cls(**{**entry, "shape": tuple(entry["shape"])})
-
 
 def array_for(name: str, dtype: np.dtype) -> str:
     """Which packed array holds a field."""

@@ -26,7 +26,7 @@ from pipeline.store.contents import ContentsError, check_level_ids, check_number
 from pipeline.store.disk import flush
 from pipeline.store.layout import data_path, fragment_of
 from pipeline.store.packing import pack, unpack
-from pipeline.store.schema import ALONG_TIME, PACKED, SHARD_VERSION, FieldSpec, field_table
+from pipeline.store.schema import ALONG_TIME, PACKED, SHARD_VERSION, field_table
 
 FORMAT = "levelproof.shard"
 LEVEL = 5  # of zstd; 9 saves 2% and encodes at 3 MB/s
@@ -84,7 +84,7 @@ class Shard:
                     f"The shard {path} has version {str(version)[:20]}, this program reads {SHARD_VERSION}: "
                     "use the levelproof that wrote it."
                 )
-            self.size = size_in([FieldSpec.from_json(entry) for entry in attributes["fields"]])  # type: ignore[union-attr, arg-type]
+            self.size = size_in(attributes["fields"])
             self.table = table_for(self.size)
             check_level_ids(attributes["level_ids"])
             self.level_ids: list[int] = list(attributes["level_ids"])  # type: ignore[arg-type]

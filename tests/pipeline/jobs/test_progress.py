@@ -18,10 +18,10 @@ def tally(done: int = 0) -> Tally:
 def test_the_share_grows_with_the_levels() -> None:
     now = tally()
     assert now.share == 0
-    now.progress(UNIT, 8_000, 7.5, 3)
+    now.running[UNIT] = (8_000, 7.5, 3)
     assert now.share == pytest.approx(7.5 / 64)
     assert (now.trained, now.solved_so_far) == (7, 3)
-    now.progress(UNIT, 9_000, 16, 3)
+    now.running[UNIT] = (9_000, 16, 3)
     assert now.share == pytest.approx(16 / 64)
     now.ended(UNIT, Summary(levels=16, solved=5, env_steps=16_000, evaluated=0, idle=0))
     assert (now.share, now.done, now.solved_so_far) == (pytest.approx(16 / 64), 16, 5)
@@ -29,7 +29,7 @@ def test_the_share_grows_with_the_levels() -> None:
 
 def test_a_failed_attempt_takes_its_progress_back() -> None:
     now = tally()
-    now.progress(UNIT, 8_000, 8.0, 3)
+    now.running[UNIT] = (8_000, 8.0, 3)
     now.ended(UNIT, None)
     assert (now.share, now.solved_so_far) == (0, 0)
 
@@ -40,7 +40,7 @@ def test_rate_and_time_left_do_not_count_the_compiling() -> None:
         now.tick(float(second))
         assert "compiling" in now.text(second)
     for second in range(100, 110):
-        now.progress(UNIT, (second - 99) * 800, (second - 99) * 0.8, 0)
+        now.running[UNIT] = ((second - 99) * 800, (second - 99) * 0.8, 0)
         now.tick(float(second))
     assert now.rate == pytest.approx(800)
     left = now.left(109.0)
@@ -80,7 +80,7 @@ def test_commits_are_told_when_the_last_line_is_old(monkeypatch: pytest.MonkeyPa
 
 def test_what_is_trained_is_still_to_be_written() -> None:
     now = Tally(levels=16, done=0, solved=0)
-    now.progress(UNIT, 16_000, 16.0, 5)
+    now.running[UNIT] = (16_000, 16.0, 5)
     now.tick(1.0)
     assert now.text(1.0) == "16/16 levels · 5 solved · writing"
 
