@@ -10,38 +10,24 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 from levelgen.level import Level
 from physics.pairs import pairs_of
-from physics.types import MAX_VERTICES, Manifold, Model, Size, State
+from physics.types import MAX_VERTICES, Model, Size, State
 
 Fields = dict[str, np.ndarray]
 
+BODIES = ("polygon", "circle")
 MANIFOLDS = ("acc_rr_manifolds", "acc_cr_manifolds", "acc_cc_manifolds")
-# our name of a body's attribute -> theirs; polygons and circles share them
-BODY_CONSTANTS = {
-    "active": "active",
-    "inverse_mass": "inverse_mass",
-    "inverse_inertia": "inverse_inertia",
-    "friction": "friction",
-    "restitution": "restitution",
-    "collision_mode": "collision_mode",
-}
-BODY_DYNAMICS = ("position", "rotation", "velocity", "angular_velocity")
-CONTACTS = {
-    "contact_active": "active",
-    "contact_normal_impulse": "acc_impulse_normal",
-    "contact_tangent_impulse": "acc_impulse_tangent",
-}
-MANIFOLD_FIELDS = {
-    "normal": "normal",
-    "penetration": "penetration",
-    "point": "collision_point",
-    "restitution_velocity": "restitution_velocity_target",
-}
-MODEL_FIELDS = {
+# Our name -> theirs; `*` stands for each of BODIES, `@` for each of MANIFOLDS
+MODEL = {
     "gravity": "gravity",
+    "active": "*/active",
+    "inverse_mass": "*/inverse_mass",
+    "inverse_inertia": "*/inverse_inertia",
+    "friction": "*/friction",
+    "restitution": "*/restitution",
+    "collision_mode": "*/collision_mode",
     "collides": "collision_matrix",
     "vertices": "polygon/vertices",
     "n_vertices": "polygon/n_vertices",
@@ -65,121 +51,93 @@ MODEL_FIELDS = {
     "thruster_rotation": "thruster/rotation",
     "thruster_power": "thruster/power",
 }
-JOINT_IMPULSES = {"joint_impulse": "joint/acc_impulse", "joint_angular_impulse": "joint/acc_r_impulse"}
-BINDINGS = {"motor_binding": "motor_bindings", "motor_auto": "motor_auto", "thruster_binding": "thruster_bindings"}
+STATE = {
+    "position": "*/position",
+    "rotation": "*/rotation",
+    "velocity": "*/velocity",
+    "angular_velocity": "*/angular_velocity",
+    "contact_active": "@/active",
+    "contact_normal_impulse": "@/acc_impulse_normal",
+    "contact_tangent_impulse": "@/acc_impulse_tangent",
+    "joint_impulse": "joint/acc_impulse",
+    "joint_angular_impulse": "joint/acc_r_impulse",
+}
+TASK = {
+    "role": "*_shape_roles",
+    "density": "*_densities",
+    "motor_binding": "motor_bindings",
+    "motor_auto": "motor_auto",
+    "thruster_binding": "thruster_bindings",
+}
 
 
 def level_from_kinetix(fields: Mapping[str, np.ndarray]) -> Level:
     """Levels whose initial state is the reference's state (impulses included), level axis last."""
-    constants = {ours: _bodies(fields, theirs) for ours, theirs in BODY_CONSTANTS.items()}
-    constants |= {ours: _last(fields[theirs]) for ours, theirs in MODEL_FIELDS.items()}
-    return Level(
-        model=Model(**constants),
-        state=state_from_kinetix(fields),
-        role=_last(np.concatenate([fields["polygon_shape_roles"], fields["circle_shape_roles"]], 1)),
-        density=_last(np.concatenate([fields["polygon_densities"], fields["circle_densities"]], 1)),
-        **{ours: _last(fields[theirs]) for ours, theirs in BINDINGS.items()},
-    )
+    return Level(model=Model(**_ours(fields, MODEL)), state=state_from_kinetix(fields), **_ours(fields, TASK))
 
 
 def state_from_kinetix(fields: Mapping[str, np.ndarray]) -> State:
     """Only what evolves, level axis last."""
-    values = {name: _bodies(fields, name) for name in BODY_DYNAMICS}
-    values |= {ours: _contacts(fields, theirs) for ours, theirs in CONTACTS.items()}
-    values |= {ours: _last(fields[theirs]) for ours, theirs in JOINT_IMPULSES.items()}
-    return State(**values)
+    return State(**_ours(fields, STATE))
 
 
 def state_to_kinetix(
-    level: Level,
-    state: State,
-    timestep: Int[np.ndarray, "level"],
-    last_distance: Float[np.ndarray, "level"],
-    manifold: Manifold | None = None,
-    joint_point: Float[np.ndarray, "joint 2 level"] | None = None,
-    thruster_point: Float[np.ndarray, "thruster 2 level"] | None = None,
+    level: Level, state: State, timestep: Int[np.ndarray, "level"], last_distance: Float[np.ndarray, "level"]
 ) -> Fields:
     """Every field of the reference's state, level axis first.
 
-    What its next step does not depend on (manifold geometry, cached points) is zero where not given.
+    What its next step does not depend on (manifold geometry, cached points, an editor's flags) is zero.
     """
-    size, lanes = level.size, len(timestep)
-    fields = {theirs: _first(getattr(level.model, ours)) for ours, theirs in MODEL_FIELDS.items()}
-    fields |= {theirs: _first(getattr(level, ours)) for ours, theirs in BINDINGS.items()}
-    fields |= {theirs: _first(getattr(state, ours)) for ours, theirs in JOINT_IMPULSES.items()}
-    for ours, theirs in BODY_CONSTANTS.items():
-        fields |= _split_bodies(size, getattr(level.model, ours), theirs)
-    for name in BODY_DYNAMICS:
-        fields |= _split_bodies(size, getattr(state, name), name)
-    for ours, theirs in CONTACTS.items():
-        fields |= _split_contacts(size, getattr(state, ours), theirs)
-    for ours, theirs in MANIFOLD_FIELDS.items():
-        fields |= _split_contacts(size, getattr(manifold or _no_manifold(size, lanes), ours), theirs)
-    fields |= _roles_and_densities(level)
+    size, fields = level.size, {}
+    for of, names in ((level.model, MODEL), (level, TASK), (state, STATE)):
+        for ours, theirs in names.items():
+            fields |= _theirs(size, theirs, np.moveaxis(np.asarray(getattr(of, ours)), -1, 0))
+    zero = lambda *shape: np.zeros((len(timestep), *shape), np.float32)
+    for kind in MANIFOLDS:
+        contacts = fields[f"{kind}/active"].shape[1:]
+        fields |= {f"{kind}/{name}": zero(*contacts) for name in ("penetration", "restitution_velocity_target")}
+        fields |= {f"{kind}/{name}": zero(*contacts, 2) for name in ("normal", "collision_point")}
     return fields | {
-        "joint/global_position": _point(joint_point, size.joints, lanes),
-        "thruster/global_position": _point(thruster_point, size.thrusters, lanes),
-        "polygon/radius": np.zeros((lanes, size.polygons), np.float32),
-        "circle/vertices": np.zeros((lanes, size.circles, MAX_VERTICES, 2), np.float32),
-        "circle/n_vertices": np.zeros((lanes, size.circles), np.int32),
+        "polygon_highlighted": zero(size.polygons).astype(bool),
+        "circle_highlighted": zero(size.circles).astype(bool),
+        "joint/global_position": zero(size.joints, 2),
+        "thruster/global_position": zero(size.thrusters, 2),
+        "polygon/radius": zero(size.polygons),
+        "circle/vertices": zero(size.circles, MAX_VERTICES, 2),
+        "circle/n_vertices": zero(size.circles).astype(np.int32),
         "timestep": np.asarray(timestep, np.int32),
         "last_distance": np.asarray(last_distance, np.float32),
     }
 
 
-def _last(values: np.ndarray) -> Any:
-    """Level axis from first to last, in the engine's 32-bit types, contiguous (numpy, where types say jax)."""
-    values = np.moveaxis(np.asarray(values), 0, -1)
-    kind = values.dtype.kind
-    return np.ascontiguousarray(values, bool if kind == "b" else np.int32 if kind in "iu" else np.float32)
+def _ours(fields: Mapping[str, np.ndarray], names: Mapping[str, str]) -> dict[str, Any]:
+    """Level axis last, in the engine's 32-bit types, contiguous (numpy, where types say jax)."""
+    found = {}
+    for ours, theirs in names.items():
+        values = np.moveaxis(np.concatenate(_parts(fields, theirs), 1), 0, -1)
+        kind = values.dtype.kind
+        found[ours] = np.ascontiguousarray(values, bool if kind == "b" else np.int32 if kind in "iu" else np.float32)
+    return found
 
 
-def _first(values: ArrayLike) -> np.ndarray:
-    return np.ascontiguousarray(np.moveaxis(np.asarray(values), -1, 0))
+def _parts(fields: Mapping[str, np.ndarray], name: str) -> list[np.ndarray]:
+    """In our order: physics/pairs.py has all first points before all second ones, they have a pair's side by side."""
+    if "@" in name:
+        polygons, *others = (fields[name.replace("@", kind)] for kind in MANIFOLDS)
+        return [polygons[:, :, 0], polygons[:, :, 1], *others]
+    return [fields[name.replace("*", kind)] for kind in (BODIES if "*" in name else BODIES[:1])]
 
 
-def _bodies(fields: Mapping[str, np.ndarray], name: str) -> Any:
-    return _last(np.concatenate([fields[f"polygon/{name}"], fields[f"circle/{name}"]], 1))
-
-
-def _contacts(fields: Mapping[str, np.ndarray], name: str) -> Any:
-    """In the numbering of physics/pairs.py; the reference keeps a polygon pair's two points side by side."""
-    polygon, circle_polygon, circle = (fields[f"{manifold}/{name}"] for manifold in MANIFOLDS)
-    return _last(np.concatenate([polygon[:, :, 0], polygon[:, :, 1], circle_polygon, circle], 1))
-
-
-def _split_bodies(size: Size, values: ArrayLike, name: str) -> Fields:
-    first = _first(values)
-    return {f"polygon/{name}": first[:, : size.polygons], f"circle/{name}": first[:, size.polygons :]}
-
-
-def _split_contacts(size: Size, values: ArrayLike, name: str) -> Fields:
-    pairs = pairs_of(size)
-    polygon, circle_polygon = len(pairs.polygon), len(pairs.circle_polygon)
-    ends = np.cumsum([polygon, polygon, circle_polygon])
-    first, second, *others = np.split(_first(values), ends, axis=1)
-    return {
-        f"{kind}/{name}": part for kind, part in zip(MANIFOLDS, [np.stack([first, second], 2), *others], strict=True)
-    }
-
-
-def _no_manifold(size: Size, lanes: int) -> Manifold:
-    contacts = pairs_of(size).contacts
-    scalar: Any = np.zeros((contacts, lanes), np.float32)
-    vector: Any = np.zeros((contacts, 2, lanes), np.float32)
-    return Manifold(scalar.astype(bool), vector, scalar, vector, scalar)
-
-
-def _roles_and_densities(level: Level) -> Fields:
-    """The reference keeps them outside its bodies, with an editor's `highlighted` flag that levels never set."""
-    fields, polygons = {}, level.size.polygons
-    for ours, theirs in (("role", "shape_roles"), ("density", "densities")):
-        values = _first(getattr(level, ours))
-        fields |= {f"polygon_{theirs}": values[:, :polygons], f"circle_{theirs}": values[:, polygons:]}
-    fields["polygon_highlighted"] = np.zeros(fields["polygon_shape_roles"].shape, bool)
-    fields["circle_highlighted"] = np.zeros(fields["circle_shape_roles"].shape, bool)
-    return fields
-
-
-def _point(values: np.ndarray | None, count: int, lanes: int) -> np.ndarray:
-    return np.zeros((lanes, count, 2), np.float32) if values is None else _first(values)
+def _theirs(size: Size, name: str, values: np.ndarray) -> Fields:
+    """One of our arrays, level axis first."""
+    if "*" in name:
+        parts = dict(zip(BODIES, np.split(values, [size.polygons], 1), strict=True))
+    elif "@" in name:
+        pairs = pairs_of(size)
+        polygons = len(pairs.polygon)
+        ends = np.cumsum([polygons, polygons, len(pairs.circle_polygon)])
+        first, second, *others = np.split(values, ends, 1)
+        parts = dict(zip(MANIFOLDS, [np.stack([first, second], 2), *others], strict=True))
+    else:
+        parts = {"": values}
+    return {name.replace("*", kind).replace("@", kind): np.ascontiguousarray(part) for kind, part in parts.items()}

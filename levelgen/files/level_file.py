@@ -37,19 +37,17 @@ from levelgen.files.entries import (
 )
 from levelgen.files.kinetix import MANIFOLDS, Fields, level_from_kinetix, state_to_kinetix
 from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
+from levelgen.sampling.scenery import empty_level
 from levelgen.sampling.shuffle import separate
 from levelgen.task.rules import NO_DISTANCE, TaskParams
-from physics.pairs import pairs_of
 from physics.types import FIXED_POLYGONS, Params, Size
 
 MOST_BYTES = 4_000_000  # of a file; the reference's own have at most 52,438
 PATHS = {  # where levelgen.files.kinetix has what a file keeps with a thing
-    ("polygon", "role"): "polygon_shape_roles",
-    ("polygon", "density"): "polygon_densities",
-    ("circle", "role"): "circle_shape_roles",
-    ("circle", "density"): "circle_densities",
-    ("joint", "motor_binding"): "motor_bindings",
-    ("thruster", "thruster_binding"): "thruster_bindings",
+    "role": "{}_shape_roles",
+    "density": "{}_densities",
+    "motor_binding": "motor_bindings",
+    "thruster_binding": "thruster_bindings",
 }
 
 
@@ -141,24 +139,24 @@ def to_document(file: LevelFile) -> dict[str, Any]:
     Raises:
         LevelFileError: such a file cannot hold the level.
     """
-    level, size = file.level, file.level.size
+    level, rules, size = file.level, file.rules, file.level.size
     if (levels := level.state.rotation.shape[-1]) != 1:
         raise LevelFileError(f"these are {levels} levels, and a file holds one")
     if np.any(np.asarray(level.state.contact_active)):
         raise LevelFileError("the level starts with contacts, and a file's levels start without")
     if np.any(np.asarray(level.motor_auto) & np.asarray(level.model.joint_active)):
         raise LevelFileError("the level has a motor that runs by itself, and a file cannot say so")
-    pairs, fields = pairs_of(size), _with_points(level)
-    contacts = (2 * len(pairs.polygon), len(pairs.circle_polygon), len(pairs.circle))
+    fields, counts = _with_points(level), dict(zip(COUNTS, size, strict=True))
+    physics = {theirs: getattr(rules.physics, ours) for ours, theirs in PHYSICS.items()}
     document = {
         "env_state": {
             **{kind: _things(fields, kind, entries) for kind, entries in entries_of(size).items()},
             "collision_matrix": _nested(fields["collision_matrix"][0]),
-            **{kind: [NO_CONTACT] * count for kind, count in zip(MANIFOLDS, contacts, strict=True)},
+            **{kind: [NO_CONTACT] * fields[f"{kind}/active"].size for kind in MANIFOLDS},
             "gravity": _nested(fields["gravity"][0]),
         },
-        "env_params": _params(file.rules),
-        "static_env_params": _static(file.rules, size),
+        "env_params": {**physics, **{name: getattr(rules, name) for name in TASK}, **EXTRA},
+        "static_env_params": {**counts, **STATIC_CONSTANTS, "frame_skip": rules.frame_skip, **STATIC_EXTRA},
     }
     from_document(document)  # nothing is written that cannot be read
     return document
@@ -166,7 +164,7 @@ def to_document(file: LevelFile) -> dict[str, Any]:
 
 def _fields(world: object, size: Size) -> Fields:
     """The things of a world as the reference's arrays; no contacts, and no collision matrix yet."""
-    fields = {}
+    fields = _with_points(empty_level(size, 1))
     for (kind, entries), count in zip(entries_of(size).items(), size, strict=True):
         things = item(world, kind, "env_state")
         if not isinstance(things, list) or len(things) != count:
@@ -176,16 +174,7 @@ def _fields(world: object, size: Size) -> Fields:
             values = [entry.read(thing, name, f"env_state.{kind}[{i}]") for i, thing in enumerate(things)]
             dtype = {float: np.float32, int: np.int32, bool: np.bool_}[entry.kind]
             fields[_path(kind, name)] = np.array(values, dtype).reshape(1, count, *entry.shape)
-    pairs = pairs_of(size)
-    shapes = ((len(pairs.polygon), 2), (len(pairs.circle_polygon),), (len(pairs.circle),))
-    for kind, shape in zip(MANIFOLDS, shapes, strict=True):
-        fields[f"{kind}/active"] = np.zeros((1, *shape), bool)
-        fields |= {f"{kind}/acc_impulse_{way}": np.zeros((1, *shape), np.float32) for way in ("normal", "tangent")}
-    return fields | {
-        "gravity": np.array([GRAVITY.read(world, "gravity", "env_state")], np.float32),
-        "collision_matrix": np.zeros((1, size.bodies, size.bodies), bool),
-        "motor_auto": np.zeros((1, size.joints), bool),  # files do not have it
-    }
+    return fields | {"gravity": np.array([GRAVITY.read(world, "gravity", "env_state")], np.float32)}
 
 
 def _check(level: Level) -> None:
@@ -220,16 +209,6 @@ def _rules(params: object, static: object) -> TaskParams:
     return TaskParams(frame_skip=frame_skip, physics=Params(**physics), **task)
 
 
-def _params(rules: TaskParams) -> dict[str, Any]:
-    physics = {theirs: getattr(rules.physics, ours) for ours, theirs in PHYSICS.items()}
-    return {**physics, **{name: getattr(rules, name) for name in TASK}, **EXTRA}
-
-
-def _static(rules: TaskParams, size: Size) -> dict[str, Any]:
-    counts = dict(zip(COUNTS, size, strict=True))
-    return {**counts, **STATIC_CONSTANTS, "frame_skip": rules.frame_skip, **STATIC_EXTRA}
-
-
 def _things(fields: Fields, kind: str, entries: Mapping[str, Entry]) -> list[dict[str, Any]]:
     """All things of a kind as objects."""
     columns = {name: fields[_path(kind, name)][0] for name in entries}
@@ -239,7 +218,7 @@ def _things(fields: Fields, kind: str, entries: Mapping[str, Entry]) -> list[dic
 
 
 def _path(kind: str, name: str) -> str:
-    return PATHS.get((kind, name), f"{kind}/{name}")
+    return PATHS.get(name, f"{{}}/{name}").format(kind)
 
 
 def _nested(values: Any) -> Any:
@@ -251,15 +230,15 @@ def _nested(values: Any) -> Any:
 def _with_points(level: Level) -> Fields:
     """The reference's arrays, with the positions of joints and thrusters that its first picture shows."""
     model = level.model
-    joint_point = _in_world(level, model.joint_a, model.joint_anchor_a)
-    thruster_point = _in_world(level, model.thruster_body, model.thruster_position)
-    start = (np.zeros(1, np.int32), np.full(1, NO_DISTANCE, np.float32))
-    return state_to_kinetix(level, level.state, *start, None, joint_point, thruster_point)
+    return state_to_kinetix(level, level.state, np.zeros(1), np.full(1, NO_DISTANCE)) | {
+        "joint/global_position": _in_world(level, model.joint_a, model.joint_anchor_a),
+        "thruster/global_position": _in_world(level, model.thruster_body, model.thruster_position),
+    }
 
 
 def _in_world(level: Level, body: Any, anchor: Any) -> np.ndarray:
-    """Positions, m, (thing, 2, 1), of points in the frames of bodies."""
+    """Positions, m, (1, thing, 2), of points in the frames of bodies."""
     body, anchor = np.asarray(body)[:, 0], np.asarray(anchor)
     position, angle = np.asarray(level.state.position)[body], np.asarray(level.state.rotation)[body]
     cos, sin, x, y = np.cos(angle), np.sin(angle), anchor[:, 0], anchor[:, 1]
-    return position + np.stack([x * cos - y * sin, x * sin + y * cos], 1)
+    return np.moveaxis(position + np.stack([x * cos - y * sin, x * sin + y * cos], 1), -1, 0)
