@@ -20,7 +20,8 @@ from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task import rules as task
 from levelgen.task.actions import CHOICES, controls
-from physics.block import Block, Given, scratch_buffers
+from physics.block import Block, Given, Scratch
+from physics.buffers import buffers_of
 from physics.codegen.buffers import LANES
 from physics.codegen.primitives import ELEMENTWISE
 from physics.engine import STAGES, step_block
@@ -73,7 +74,7 @@ def count(given: Given, stages: tuple) -> Counter:
         step_block(block, DEFAULT_PARAMS, stages)
 
     table = table_of(size, True)
-    scratch = jax.tree.map(lambda buffer: np.zeros(buffer.array().shape, buffer.dtype), scratch_buffers(size))
+    scratch = jax.tree.map(lambda buffer: np.zeros(buffer.array().shape, buffer.dtype), buffers_of(Scratch, size))
     for first in range(0, COUNTED, LANES):
         mine = jax.tree.map(lambda x, at=first: np.array(x[..., at : at + LANES]), given)
         handed = mine, table, jax.tree.map(np.zeros_like, mine.before), scratch

@@ -1,16 +1,15 @@
 """What a step of a block of lanes works on: references to the worlds before and after, and to scratch memory.
 
-The annotations say shapes and dtypes, and nothing else does: the scratch memory is made from them (`scratch_buffers`).
+The annotations say shapes and dtypes, and nothing else does: the scratch memory is made from them (`physics.buffers`).
 """
 
 from typing import NamedTuple
 
 from jaxtyping import Bool, Float, Int
 
-from physics.buffers import buffers_of
 from physics.lanes import Ref
-from physics.pairs import GROUPS, KINDS, Table, pairs_of
-from physics.types import MAX_VERTICES, Manifold, Model, Size, State
+from physics.pairs import Table
+from physics.types import Manifold, Model, State
 
 
 class Given(NamedTuple):
@@ -94,31 +93,3 @@ class Block(NamedTuple):
     @property
     def model(self) -> Model:
         return self.given.model
-
-
-def axes_of(size: Size) -> dict[str, int]:
-    """Lengths of the axes that annotations name, but for the lanes."""
-    pairs = pairs_of(size)
-    return {
-        "body": size.bodies,
-        "polygon": size.polygons,
-        "vertex": MAX_VERTICES,
-        "circle": size.circles,
-        "joint": size.joints,
-        "thruster": size.thrusters,
-        "contact": pairs.contacts,
-        "kind": KINDS,
-        "group": GROUPS,
-        "listing": sum(len(kind) * kind.batches for kind in pairs.by_group) + 1,  # one more: see `contact.share_out`
-        "boundary": sum(kind.batches for kind in pairs.by_group) + 1,
-    }
-
-
-def scratch_buffers(size: Size) -> Scratch:
-    """What a step of worlds of this size works in."""
-    return buffers_of(Scratch, axes_of(size))
-
-
-def manifold_buffers(size: Size) -> Manifold:
-    """What a step writes its contacts into."""
-    return buffers_of(Manifold, axes_of(size))

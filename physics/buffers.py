@@ -1,37 +1,58 @@
 """Buffers with the shapes and dtypes that a type's annotations say, `motion: Float[Ref, "body 5 lane"]`."""
 
-from collections.abc import Mapping
 from typing import Any, TypeVar, get_type_hints
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import AbstractArray, Bool, Float, Int
 
 from physics.codegen.buffers import Buffer
+from physics.pairs import GROUPS, KINDS, pairs_of
+from physics.types import MAX_VERTICES, Size
 
 T = TypeVar("T")
 DTYPES: dict[Any, str] = {Float: "float32", Int: "int32", Bool: "bool"}
 LANE = "lane"  # the last axis of what differs between lanes
 
 
-def buffers_of(cls: type[T], axes: Mapping[str, int]) -> T:
-    """A `cls`, and whatever types are in it, with a Buffer for each array.
+def axes_of(size: Size) -> dict[str, int]:
+    """Lengths of the axes that annotations name, but for the lanes."""
+    pairs = pairs_of(size)
+    return {
+        "body": size.bodies,
+        "polygon": size.polygons,
+        "vertex": MAX_VERTICES,
+        "circle": size.circles,
+        "joint": size.joints,
+        "thruster": size.thrusters,
+        "contact": pairs.contacts,
+        "kind": KINDS,
+        "group": GROUPS,
+        "listing": sum(len(kind) * kind.batches for kind in pairs.by_group) + 1,  # one more: see `contact.share_out`
+        "boundary": sum(kind.batches for kind in pairs.by_group) + 1,
+    }
 
-    Args:
-        cls: a NamedTuple or dataclass of annotated arrays, or of such types.
-        axes: length of each axis that an annotation names.
-    """
-    return cls(**{name: _buffer(hint, axes) for name, hint in get_type_hints(cls).items()})
 
+def buffers_of(cls: type[T], size: Size) -> T:
+    """A `cls`, a NamedTuple or dataclass of annotated arrays or of such types, with a Buffer for each array."""
+    axes = axes_of(size)
 
-def _buffer(hint: Any, axes: Mapping[str, int]) -> Any:
-    if not issubclass(hint, AbstractArray):
-        return buffers_of(hint, axes)
-    names = hint.dim_str.split()
-    lanes = names[-1] == LANE
-    shape = tuple(int(name) if name.isdigit() else axes[name] for name in (names[:-1] if lanes else names))
-    return Buffer(shape, DTYPES[hint.dtype], lanes)
+    def buffer(hint: Any) -> Any:
+        if not issubclass(hint, AbstractArray):
+            return buffers_of(hint, size)
+        names = hint.dim_str.split()
+        lanes = names[-1] == LANE
+        shape = tuple(int(name) if name.isdigit() else axes[name] for name in (names[:-1] if lanes else names))
+        return Buffer(shape, DTYPES[hint.dtype], lanes)
+
+    return cls(**{name: buffer(hint) for name, hint in get_type_hints(cls).items()})
 
 
 def buffers_like(arrays: Any) -> Any:
     """The buffers of a tree of arrays that have lanes."""
     return jax.tree.map(lambda x: Buffer(x.shape[:-1], str(x.dtype)), arrays)
+
+
+def zeros_of(cls: type[T], size: Size, lanes: int) -> T:
+    """The same arrays, full of zeros."""
+    return jax.tree.map(lambda buffer: jnp.zeros_like(buffer.array(lanes)), buffers_of(cls, size))

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from physics.block import Block, Given, manifold_buffers, scratch_buffers
-from physics.buffers import buffers_like
+from physics.block import Block, Given, Scratch
+from physics.buffers import buffers_like, buffers_of
 from physics.codegen.buffers import LANES, Buffer
 from physics.codegen.compile import compile_kernel
 from physics.engine import STAGES, Stage, step_block
@@ -82,8 +82,8 @@ def on_all_lanes(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
     table = jax.tree.map(lambda x: jax.new_ref(x.astype(dtype) if x.dtype == jnp.float32 else x), table)
     read = jax.tree.map(jax.new_ref, given)
     after = jax.tree.map(lambda x: jax.new_ref(jnp.zeros_like(x)), given.before)
-    contacts = jax.tree.map(empty, manifold_buffers(size)) if seen else None
-    step_block(Block(table, read, after, contacts, jax.tree.map(empty, scratch_buffers(size))), params)
+    contacts = jax.tree.map(empty, buffers_of(Manifold, size)) if seen else None
+    step_block(Block(table, read, after, contacts, jax.tree.map(empty, buffers_of(Scratch, size))), params)
     return jax.tree.map(lambda ref: ref[...], (after, contacts))
 
 
@@ -135,8 +135,8 @@ def trace(size: Size, params: Params, seen: bool, given: Given, stages: tuple[St
         of a function of one reference for each of their leaves.
     """
     table = jax.tree.map(lambda x: Buffer(x.shape, str(x.dtype), lanes=False), table_of(size, params.faithful_padding))
-    results = given.before, manifold_buffers(size) if seen else None
-    buffers = given, table, results, scratch_buffers(size)
+    results = given.before, buffers_of(Manifold, size) if seen else None
+    buffers = given, table, results, buffers_of(Scratch, size)
 
     def kernel(*arrays):
         given, table, (after, contacts), scratch = jax.tree.map(jax.new_ref, arrays)

@@ -137,27 +137,3 @@ class Manifold:
     penetration: Float[Array, "contact lane"]  # m
     point: Float[Array, "contact 2 lane"]  # m, in the world
     restitution_velocity: Float[Array, "contact lane"]  # m/s along the normal that restitution asks for
-
-
-def initial_state(
-    position: Float[Array, "body 2 lane"],
-    rotation: Float[Array, "body lane"],
-    velocity: Float[Array, "body 2 lane"],
-    angular_velocity: Float[Array, "body lane"],
-    contacts: int,
-    joints: int,
-) -> State:
-    """A state with no impulses remembered: how every level starts."""
-    lanes = rotation.shape[-1:]
-    zeros = jax.numpy.zeros
-    return State(
-        position=position,
-        rotation=rotation,
-        velocity=velocity,
-        angular_velocity=angular_velocity,
-        contact_active=zeros((contacts, *lanes), bool),
-        contact_normal_impulse=zeros((contacts, *lanes)),
-        contact_tangent_impulse=zeros((contacts, *lanes)),
-        joint_impulse=zeros((joints, 2, *lanes)),
-        joint_angular_impulse=zeros((joints, *lanes)),
-    )

@@ -72,11 +72,6 @@ def sample_levels(level_ids: ArrayLike, size: Size, distribution: Distribution =
     of ids, they go through one compiled program in chunks of CHUNK. So call it outside `jax.jit`.
 
     Args:
-        level_ids: whole numbers, [level].
-        size: of every level.
-        distribution: what random levels are like.
-
-    Args:
         level_ids: whole numbers from 0 to MAX_LEVEL_ID, in any order.
         size: how many things a level has room for: one of SIZES, or a Size of your own.
         distribution: what random levels are like.

@@ -3,34 +3,23 @@
 Facts: `kinetix.environment.utils.permute_state` 3.0.2 and `jax2d.engine.calculate_collision_matrix` 1.0.1.
 """
 
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import is_dataclass, replace
+from typing import NamedTuple, TypeVar, get_type_hints
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from levelgen.level import Level
 from physics.types import FIXED_POLYGONS, Model, Size
 
-BODY = ("active", "inverse_mass", "inverse_inertia", "friction", "restitution", "collision_mode")
-MOTION = ("position", "rotation", "velocity", "angular_velocity")
-JOINT = ("joint_active", "joint_a", "joint_b", "joint_anchor_a", "joint_anchor_b", "joint_fixed", "joint_rotation")
-JOINT += ("joint_limited", "joint_min", "joint_max", "motor_on", "motor_speed", "motor_power")
-THRUSTER = ("thruster_active", "thruster_body", "thruster_position", "thruster_rotation", "thruster_power")
+T = TypeVar("T")
 
 
 class OrderDraws(NamedTuple):
     """One number for each row of every kind."""
 
     order: Float[Array, "row lane"]
-
-
-class Order(NamedTuple):
-    """For each row of a kind, the row its content comes from."""
-
-    bodies: Int[Array, "body lane"]
-    joints: Int[Array, "joint lane"]
-    thrusters: Int[Array, "thruster lane"]
 
 
 def shuffled_rows(size: Size) -> int:
@@ -40,41 +29,38 @@ def shuffled_rows(size: Size) -> int:
 
 def shuffle(level: Level, draws: OrderDraws) -> Level:
     """Movable polygons, circles, joints and thrusters in a random order each; the scenery stays."""
-    order = draw_order(level.size, draws.order)
-    row_of = jnp.argsort(order.bodies, 0)  # where each body went
-    model, state, polygons = level.model, level.state, level.size.polygons
+    model, order = level.model, draw_order(level.size, draws.order)
+    row_of = jnp.argsort(order["body"], 0)  # where each body went
     model = replace(
         model,
         joint_a=_take(row_of, model.joint_a),
         joint_b=_take(row_of, model.joint_b),
         thruster_body=_take(row_of, model.thruster_body),
     )
-    moved = {name: _take(getattr(model, name), order.bodies) for name in BODY}
-    moved |= {name: _take(getattr(model, name), order.joints) for name in JOINT}
-    moved |= {name: _take(getattr(model, name), order.thrusters) for name in THRUSTER}
-    moved |= {name: _take(getattr(model, name), order.bodies[:polygons]) for name in ("vertices", "n_vertices")}
-    model = replace(model, radius=_take(model.radius, order.bodies[polygons:] - polygons), **moved)
-    return Level(
-        model=replace(model, collides=separate(model)),
-        state=replace(state, **{name: _take(getattr(state, name), order.bodies) for name in MOTION}),
-        role=_take(level.role, order.bodies),
-        density=_take(level.density, order.bodies),
-        motor_binding=_take(level.motor_binding, order.joints),
-        motor_auto=_take(level.motor_auto, order.joints),
-        thruster_binding=_take(level.thruster_binding, order.thrusters),
-    )
+    level = _in_order(replace(level, model=model), order)
+    return replace(level, model=replace(level.model, collides=separate(level.model)))
 
 
-def draw_order(size: Size, numbers: Float[Array, "row lane"]) -> Order:
-    parts, start = [], 0
-    for count in _rows_of_kinds(size):
-        parts.append(jnp.argsort(numbers[start : start + count], 0).astype(jnp.int32))
-        start += count
-    polygons, circles, joints, thrusters = parts
-    scenery = jnp.broadcast_to(
-        jnp.arange(FIXED_POLYGONS, dtype=jnp.int32)[:, None], (FIXED_POLYGONS, numbers.shape[-1])
-    )
-    return Order(jnp.concatenate([scenery, polygons + FIXED_POLYGONS, circles + size.polygons]), joints, thrusters)
+def draw_order(size: Size, numbers: Float[Array, "row lane"]) -> dict[str, Int[Array, "row lane"]]:
+    """For each row of an axis, by its name in annotations, the row its content comes from."""
+    drawn = jnp.split(numbers, np.cumsum(_rows_of_kinds(size))[:-1])
+    polygons, circles, joints, thrusters = (jnp.argsort(part, 0).astype(jnp.int32) for part in drawn)
+    scenery = jnp.broadcast_to(jnp.arange(FIXED_POLYGONS)[:, None], (FIXED_POLYGONS, numbers.shape[-1]))
+    polygons = jnp.concatenate([scenery, polygons + FIXED_POLYGONS])
+    bodies = jnp.concatenate([polygons, circles + size.polygons])
+    return {"body": bodies, "polygon": polygons, "circle": circles, "joint": joints, "thruster": thrusters}
+
+
+def _in_order(things: T, order: dict[str, Int[Array, "row lane"]]) -> T:
+    """The same dataclass, the rows of every array whose first axis is in `order` exchanged."""
+    moved = {}
+    for name, hint in get_type_hints(type(things)).items():
+        values = getattr(things, name)
+        if is_dataclass(values):
+            moved[name] = _in_order(values, order)
+        elif (axis := hint.dim_str.split()[0]) in order:
+            moved[name] = _take(values, order[axis])
+    return replace(things, **moved)  # pyright: ignore[reportArgumentType]
 
 
 def _rows_of_kinds(size: Size) -> tuple[int, int, int, int]:

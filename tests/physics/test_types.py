@@ -8,7 +8,7 @@ import jax
 import pytest
 from jaxtyping import AbstractArray
 
-from physics.block import axes_of, manifold_buffers, scratch_buffers
+from physics.block import Scratch
 from physics.buffers import buffers_of
 from physics.codegen.buffers import Buffer
 from physics.pairs import pairs_of
@@ -33,7 +33,7 @@ def test_worlds_have_the_shapes_that_the_types_say() -> None:
     model, state = room(lanes)
     after, manifold = jax.eval_shape(lambda: step(model, state, *idle(lanes), Params()))
     for value in (model, state, after, manifold):
-        said = buffers_of(type(value), axes_of(ROOM))
+        said = buffers_of(type(value), ROOM)
         for field in dataclasses.fields(value):
             array, buffer = getattr(value, field.name), getattr(said, field.name)
             assert (array.shape, str(array.dtype)) == ((*buffer.shape, lanes), buffer.dtype), field.name
@@ -41,7 +41,7 @@ def test_worlds_have_the_shapes_that_the_types_say() -> None:
 
 def test_scratch_memory_has_the_shapes_that_annotations_say() -> None:
     """With lanes and without, of all dtypes, of axes named and numbered."""
-    scratch = scratch_buffers(FEW)
+    scratch = buffers_of(Scratch, FEW)
     contacts = 2 * (6 * 5 // 2 - 4 * 3 // 2) + 3 * 6 + 3
     assert scratch.bodies.motion == Buffer((9, 5))
     assert scratch.outlines.vertex == Buffer((2, 6, 4))
@@ -49,7 +49,7 @@ def test_scratch_memory_has_the_shapes_that_annotations_say() -> None:
     assert scratch.constraints.impulse == Buffer((contacts, 2))
     assert scratch.constraints.acting == Buffer((contacts,), "int32", lanes=False)
     assert scratch.constraints.ends == Buffer((5 + 1,), "int32", lanes=False)  # circle-polygon pairs: two batches
-    assert manifold_buffers(FEW).normal == Buffer((contacts, 2))
+    assert buffers_of(Manifold, FEW).normal == Buffer((contacts, 2))
 
 
 def test_types_are_trees_of_arrays() -> None:

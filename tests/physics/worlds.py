@@ -5,8 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 
+from physics.buffers import zeros_of
 from physics.pairs import pairs_of
-from physics.types import FIXED_POLYGONS, Model, Params, Size, State, initial_state
+from physics.types import FIXED_POLYGONS, Model, Params, Size, State
 
 ROOM = Size(polygons=5, circles=2, joints=1, thrusters=1)  # one movable polygon (4) and two circles (5, 6)
 BOX, BALL, OTHER = 4, 5, 6
@@ -63,10 +64,7 @@ def room(lanes: int = LANES, gravity: float = -9.81) -> tuple[Model, State]:
         thruster_power=full((thrusters,), np.ones(thrusters)),
     )
     position = full((bodies, 2), np.array([*WALLS, (1.0, 2.0), (2.5, 2.0), (4.0, 2.0)]))
-    zeros = full((bodies,), np.zeros(bodies))
-    state = initial_state(
-        position, zeros, full((bodies, 2), np.zeros((bodies, 2))), zeros, pairs_of(ROOM).contacts, joints
-    )
+    state = dataclasses.replace(zeros_of(State, ROOM, lanes), position=position)
     return jax.tree.map(np.asarray, (model, state))
 
 
