@@ -27,5 +27,3 @@ class UserError(LevelproofError):
 
 class Failure(LevelproofError):
     """The command was fine; the disk, the data or the machine was not."""
-
-    exit_code = Exit.FAILED

@@ -1,7 +1,7 @@
 """The job of `levelproof generate`: what is left to do, done by workers or in this process, and said to the user."""
 
 import shlex
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
@@ -36,12 +36,13 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
     with writing(job, partial(say, console)) as (split, manifest):
         wanted = set(job.level_ids if level_ids is None else map(int, level_ids))
         done = wanted.intersection(manifest.level_ids.tolist())
-        queue = UnitQueue.of(plan_units(sorted(wanted), done, job.levels_per_unit))
+        queue = UnitQueue(deque(plan_units(sorted(wanted), done, job.levels_per_unit)))
         note_job(split, job, command, runs(sorted(wanted)))
         if queue.waiting:
             solved = _labels(manifest, wanted)["solved"]
             board = Board(Tally(len(wanted), len(done), solved), console)
-            board.say(_opening(job, split, len(wanted), len(done)))
+            there = f", {len(done)} are there already" if done else ""
+            board.say(f"{len(wanted)} levels of size {job.size}, {job.budget} env steps each, into {split}{there}")
             try:
                 with board.shown():
                     _work(job, split, queue, board)
@@ -90,11 +91,6 @@ def _work(job: JobConfig, split: Path, queue: UnitQueue, board: Board) -> None:
 def _labels(manifest: Manifest, wanted: Collection[int]) -> Counter[str]:
     """How many of these levels have which label."""
     return Counter(manifest.labels[np.isin(manifest.level_ids, list(wanted))].tolist())
-
-
-def _opening(job: JobConfig, split: Path, levels: int, done: int) -> str:
-    there = f", {done} are there already" if done else ""
-    return f"{levels} levels of size {job.size}, {job.budget} env steps each, into {split}{there}"
 
 
 def _spent(manifest: Manifest, made: Collection[int], tally: Tally) -> str:

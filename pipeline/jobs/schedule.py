@@ -79,10 +79,6 @@ class UnitQueue:
     attempts: dict[WorkUnit, int] = field(default_factory=dict)
     quarantined: list[WorkUnit] = field(default_factory=list)
 
-    @classmethod
-    def of(cls, units: Iterable[WorkUnit]) -> "UnitQueue":
-        return cls(deque(units))
-
     def take(self, running: Collection[WorkUnit] = ()) -> WorkUnit | None:
         """The next unit for a worker that has these; None when none may join them (see `COMPANY`)."""
         failures = {self.attempts.get(unit, 0) for unit in running}  # one number at most

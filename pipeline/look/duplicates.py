@@ -24,29 +24,17 @@ ALIKE_WITHIN = "CREATE TABLE alike AS SELECT * FROM levels WHERE " + " OR ".join
 ALIKE_BETWEEN = "CREATE TABLE {alike} AS SELECT * FROM {levels} WHERE " + " OR ".join(
     f"hash({half}) IN (SELECT hash({half}) FROM {{others}})" for half in HALVES
 )
-SAME_WITHIN = """
+FIRST = "SELECT min(name) AS name, first(signature) AS signature FROM alike GROUP BY content_hash"
+OTHERS = "FROM alike ANTI JOIN there USING (content_hash)"
+SAME = """
     SELECT name, partner FROM alike
-    JOIN (SELECT content_hash, min(name) AS partner FROM alike GROUP BY content_hash) USING (content_hash)
-    WHERE partner < name
-"""
-SAME_BETWEEN = """
-    SELECT name, partner FROM alike
-    JOIN (SELECT content_hash, min(name) AS partner FROM there GROUP BY content_hash) USING (content_hash)
+    JOIN (SELECT content_hash, min(name) AS partner FROM {theirs} GROUP BY content_hash) USING (content_hash)
 """
 NEAR = """
-    one AS (SELECT signature[1] AS half, min(name) AS partner FROM theirs GROUP BY half),
-    two AS (SELECT signature[2] AS half, min(name) AS partner FROM theirs GROUP BY half)
-    SELECT name, least(one.partner, two.partner) AS partner FROM ours
-    LEFT JOIN one ON signature[1] = one.half
-    LEFT JOIN two ON signature[2] = two.half
-"""
-NEAR_WITHIN = f"""
-    WITH ours AS (SELECT min(name) AS name, first(signature) AS signature FROM alike GROUP BY content_hash),
-    theirs AS (FROM ours), {NEAR} WHERE least(one.partner, two.partner) < name
-"""
-NEAR_BETWEEN = f"""
-    WITH ours AS (FROM alike ANTI JOIN there USING (content_hash)),
-    theirs AS (FROM there), {NEAR} WHERE least(one.partner, two.partner) IS NOT NULL
+    WITH ours AS (SELECT name, unnest(signature) AS half, generate_subscripts(signature, 1) AS which FROM ({ours})),
+    theirs AS (SELECT name, unnest(signature) AS half, generate_subscripts(signature, 1) AS which FROM ({theirs})),
+    firsts AS (SELECT half, which, min(name) AS partner FROM theirs GROUP BY ALL)
+    SELECT name, min(partner) AS partner FROM ours JOIN firsts USING (half, which) GROUP BY name
 """
 
 Found = dict[str, dict[str, Any]]  # same, near -> levels (how many), pairs (the first: a level and its partner)
@@ -78,7 +66,8 @@ def within(levels: pa.Table, shown: int) -> Found:
     with duckdb.connect() as connection:
         connection.register("levels", levels)
         connection.execute(ALIKE_WITHIN)
-        return {"same": _pairs(connection, SAME_WITHIN, shown), "near": _pairs(connection, NEAR_WITHIN, shown)}
+        queries = {"same": SAME.format(theirs="alike"), "near": NEAR.format(ours=FIRST, theirs=FIRST)}
+        return {name: _pairs(connection, f"FROM ({of}) WHERE partner < name", shown) for name, of in queries.items()}
 
 
 def between(levels: pa.Table, others: pa.Table, shown: int) -> Found:
@@ -88,7 +77,8 @@ def between(levels: pa.Table, others: pa.Table, shown: int) -> Found:
         connection.register("others", others)
         connection.execute(ALIKE_BETWEEN.format(alike="alike", levels="levels", others="others"))
         connection.execute(ALIKE_BETWEEN.format(alike="there", levels="others", others="alike"))
-        return {"same": _pairs(connection, SAME_BETWEEN, shown), "near": _pairs(connection, NEAR_BETWEEN, shown)}
+        queries = {"same": SAME.format(theirs="there"), "near": NEAR.format(ours=OTHERS, theirs="FROM there")}
+        return {name: _pairs(connection, of, shown) for name, of in queries.items()}
 
 
 def told(found: Found) -> str:

@@ -23,7 +23,7 @@ from levelgen.sampling.distribution import Distribution
 from pipeline.look import duplicates
 from pipeline.read.select import columns_in, select
 from pipeline.store.layout import data_path
-from pipeline.store.manifest import Manifest, require_manifest
+from pipeline.store.manifest import require_manifest
 from pipeline.store.shard import stored_bytes
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
@@ -59,10 +59,12 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
     levels, shown = duplicates.compared(chosen), max(rows, 0)
     stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards)
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
+    distribution = typed(Distribution, (manifest.config or {})["distribution"], "distribution")
+    first = chosen.column("level_id").slice(0, shown).to_pylist()
     return {
         "split": str(split),
         "config_hash": manifest.config_hash,
-        "distribution": dict(zip(("name", "hash"), _distribution(manifest), strict=True)),
+        "distribution": dict(zip(("name", "hash"), identified(distribution), strict=True)),
         "levels": chosen.num_rows,
         "labels": _counts(chosen, "label"),
         "unsolvable": _counts(select(chosen, "label = 'unsolvable'"), "label_reason"),
@@ -78,17 +80,8 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
         "env_steps_unsolved": total(select(chosen, "label = 'unsolved'"), "env_steps"),
         "split_bytes": stored,  # of all the split's shards, whatever the condition
         "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
-        "rows": _rows(split, chosen.column("level_id").slice(0, shown).to_pylist()),
+        "rows": require_manifest(split, level_ids=first).table.to_pylist() if first else [],  # with all columns
     }
-
-
-def _rows(split: Path, level_ids: list[int]) -> list[dict[str, Any]]:
-    """All columns of a few levels."""
-    return require_manifest(split, level_ids=level_ids).table.to_pylist() if level_ids else []
-
-
-def _distribution(manifest: Manifest) -> tuple[str | None, str]:
-    return identified(typed(Distribution, (manifest.config or {})["distribution"], "distribution"))
 
 
 def total(table: pa.Table, expression: str) -> int:

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from configs.convert import typed
 from levelgen.level import ACTIONS, Level, name_of
 from levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
 from levelgen.pictures.scene import scene_of
@@ -24,7 +23,7 @@ from levelgen.pictures.words import Caption
 from levelgen.task.rules import StepResult, TaskParams, TaskState, advance, has_nan, reset
 from physics.types import State
 from pipeline.errors import Failure, UserError
-from pipeline.read.levels import find_level, is_level_file, level_file, level_of, writing_to
+from pipeline.read.levels import find_level, is_level_file, level_file, level_of, rules_of, writing_to
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
@@ -77,21 +76,28 @@ def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
     if is_level_file(source):
         if level_id is not None:
             raise UserError(f"{source} is a level file, which has one level: leave out the id {level_id}.")
-        return file_film(source, plays)
+        file = level_file(source)
+        size = name_of(file.level.size)
+        caption = Caption(f"{' '.join(source.stem.split())} · size {size}")
+        told = f"{source.name}, a level of size {size}: a level file has no witness"
+        return _without_witness(file.level, file.rules, caption, told, plays)
     if level_id is None:
         raise UserError(f"Which level of {source}? Add its id, such as {require_manifest(source, []).level_ids[0]}.")
     manifest, row = find_level(source, level_id)
-    return witness_film(manifest, row) if row["shard"] else row_film(manifest, row, plays)
+    if row["shard"]:
+        return witness_film(manifest, row)
+    caption = Caption(_title(row), outcome=row["label"], good=False)
+    told = f"level {level_id} of size {row['size']} is {row['label']} ({row['label_reason']}): there is no witness"
+    return _without_witness(level_of(manifest, row), rules_of(manifest), caption, told, plays)
 
 
 def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
     """The first successful episode of a solved level's record."""
     arrays = open_shard(manifest.split, row["shard"], row["size"]).read([row["row"]])
-    level = tree_of(Level, _below(arrays, "level/"))
-    states = tree_of(State, _below(arrays, "record/state/"))
+    level, states = tree_of(Level, arrays, "level/"), tree_of(State, arrays, "record/state/")
     done, goal, action = (arrays[f"record/{name}"][..., 0] for name in ("done", "goal", "action"))
     first, last = first_success(done, goal)
-    rules = _rules(manifest)
+    rules = rules_of(manifest)
     second = rules.frame_skip * rules.physics.dt  # of an env step
     shown = [*range(first, last + 1, STEPS_A_PICTURE), last + 1]
     scenes = []
@@ -103,22 +109,6 @@ def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
     steps = last - first + 1
     told = f"solved in {steps} step{'s' if steps > 1 else ''} ({steps * second:.1f} s)"
     return Film(scenes, seconds, f"level {row['level_id']} of size {row['size']}, {told}")
-
-
-def row_film(manifest: Manifest, row: dict[str, Any], plays: bool) -> Film:
-    """A level without a witness."""
-    caption = Caption(_title(row), outcome=row["label"], good=False)
-    told = f"level {row['level_id']} of size {row['size']} is {row['label']} ({row['label_reason']})"
-    return _without_witness(level_of(manifest, row), _rules(manifest), caption, f"{told}: there is no witness", plays)
-
-
-def file_film(path: Path, plays: bool) -> Film:
-    """A level file."""
-    file = level_file(path)
-    size = name_of(file.level.size)
-    caption = Caption(f"{' '.join(path.stem.split())} · size {size}")
-    told = f"{path.name}, a level of size {size}: a level file has no witness"
-    return _without_witness(file.level, file.rules, caption, told, plays)
 
 
 def _without_witness(level: Level, rules: TaskParams, caption: Caption, told: str, plays: bool) -> Film:
@@ -183,19 +173,11 @@ def first_success(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time
     return (int(before[-1]) + 1 if len(before) else 0), last
 
 
-def write_film(film: Film, path: Path) -> None:
-    write_gif(map(rasterised, film.scenes), path, film.seconds)
-
-
 def write_sheet(film: Film, path: Path) -> None:
     """A few of the film's pictures, the first and the last among them."""
     columns, rows = SHEET
     chosen = np.unique(np.linspace(0, len(film.scenes) - 1, columns * rows).round().astype(int))
     write_png(sheet([rasterised(film.scenes[i]) for i in chosen], columns), path)
-
-
-def write_vectors(film: Film, path: Path) -> None:
-    write_svg(film.scenes, path, film.seconds)
 
 
 def write_mp4(film: Film, path: Path) -> None:
@@ -233,23 +215,15 @@ def packaged_ffmpeg() -> str | None:
 
 
 WRITERS: dict[str, Callable[[Film, Path], None]] = {
-    ".gif": write_film,
+    ".gif": lambda film, path: write_gif(map(rasterised, film.scenes), path, film.seconds),
     ".png": write_sheet,
     ".mp4": write_mp4,
-    ".svg": write_vectors,
+    ".svg": lambda film, path: write_svg(film.scenes, path, film.seconds),
 }
 
 
-def _rules(manifest: Manifest) -> TaskParams:
-    return typed(TaskParams, (manifest.config or {})["task"])
-
-
-def _below(arrays: dict[str, np.ndarray], path: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(path): values for name, values in arrays.items() if name.startswith(path)}
-
-
 def _at(states: State, step: int) -> State:
-    return State(**{name: values[step] for name, values in vars(states).items()})
+    return jax.tree.map(lambda x: x[step], states)
 
 
 def _touch(state: State, rules: TaskParams) -> State:

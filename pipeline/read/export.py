@@ -2,11 +2,9 @@
 
 from pathlib import Path
 
-from configs.convert import typed
 from levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
-from levelgen.task.rules import TaskParams
 from pipeline.errors import UserError
-from pipeline.read.levels import find_level, level_of, writing_to
+from pipeline.read.levels import find_level, level_of, rules_of, writing_to
 
 
 def export(split: Path, level_id: int, out: Path) -> None:
@@ -19,7 +17,7 @@ def export(split: Path, level_id: int, out: Path) -> None:
     if out.suffix.lower() != ".json":
         raise UserError(f"Cannot export to {out}: its name has to end in .json.")
     manifest, row = find_level(split, level_id)
-    file = LevelFile(level_of(manifest, row), typed(TaskParams, (manifest.config or {})["task"], "task"))
+    file = LevelFile(level_of(manifest, row), rules_of(manifest))
     try:
         with writing_to(out):
             write_level_file(file, out)

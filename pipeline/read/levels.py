@@ -9,6 +9,7 @@ from configs.convert import typed
 from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelgen.level import Level, size_of
 from levelgen.sampling.sampler import Distribution, sample_levels
+from levelgen.task.rules import TaskParams
 from pipeline.errors import UserError
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
@@ -45,6 +46,11 @@ def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
     prepare_jax()
     distribution = typed(Distribution, (manifest.config or {})["distribution"])
     return sample_levels([row["level_id"]], size_of(row["size"]), distribution)
+
+
+def rules_of(manifest: Manifest) -> TaskParams:
+    """The rules that a split's levels are played by."""
+    return typed(TaskParams, (manifest.config or {})["task"], "task")
 
 
 @contextmanager

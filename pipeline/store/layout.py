@@ -1,13 +1,4 @@
-"""Names of files and folders of a split `{out}/{budget}/{size}`. Knows nothing of what is in them.
-
-manifest/000000000000-000000000015.parquet          a fragment: the commit marker of a work unit
-manifest/.000000000000-000000000015-5f0c2a9b.begun  the fragment of one attempt at that unit, until it is whole
-shards/000000000000-000000000015-5f0c2a9b.zarr      data of that attempt
-experts/000000000000-000000000015-5f0c2a9b.npz      its experts, if they are kept
-quarantine/000000000000-000000000015.txt            why a unit was given up
-job.json                                            what the last command wanted
-.writer.lock, .commit.lock                          see pipeline/store/locks.py
-"""
+"""Names of files and folders of a split, as docs/storage.md shows them. Knows nothing of what is in them."""
 
 import os
 import re

@@ -67,21 +67,7 @@ COLUMNS = pa.schema(
 # Packed arrays of a shard; the number is the bits of a component. What changes along time: (level, component, 256).
 PACKED = {"dyn32": 32, "dyn8": 8, "act": 8, "lvl32": 32, "lvl8": 8}
 ALONG_TIME = ("dyn32", "dyn8", "act")
-
-# Integer fields whose values fit 8 bits by what they are (counts, indices and enumerations of one level).
-SMALL = frozenset(
-    {
-        "record/action",
-        "level/role",
-        "level/motor_binding",
-        "level/thruster_binding",
-        "level/model/n_vertices",
-        "level/model/collision_mode",
-        "level/model/joint_a",
-        "level/model/joint_b",
-        "level/model/thruster_body",
-    }
-)
+WIDE = "record/timestep"  # the integers that do not fit 8 bits; others count, index or enumerate things of one level
 
 
 @dataclass(frozen=True)
@@ -106,7 +92,7 @@ def array_for(name: str, dtype: np.dtype) -> str:
     """Which packed array holds a field."""
     if name == "record/action":
         return "act"
-    bits = 8 if dtype.kind == "b" or name in SMALL else 32
+    bits = 8 if dtype.kind in "bi" and name != WIDE else 32
     if bits == 32 and dtype.itemsize != 4:
         raise TypeError(f"{name} is {dtype}: fields are bool, int32 or float32")
     return f"{'dyn' if name.startswith('record/') else 'lvl'}{bits}"

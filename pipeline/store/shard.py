@@ -1,14 +1,6 @@
-"""A work unit's solved levels as one zarr v3 group of packed arrays.
+"""A work unit's solved levels as one zarr v3 group of packed arrays, as docs/storage.md shows them.
 
-    dyn32 (level, component, 256) uint32   floats and integers that change along time, as bits
-    dyn8  (level, component, 256) uint8    flags that change along time
-    act   (level, 6, 256)         uint8    actions
-    lvl32 (level, component)      uint32   constant within a level
-    lvl8  (level, component)      uint8
-
-One trajectory is one chunk (larger chunks save under 1% and cost random reads a factor of 3), all chunks of an
-array lie in one file (zarr's sharding codec), compressed with Blosc-zstd 5 after a byte shuffle, each with a
-CRC-32C. The group's attributes hold the field table.
+One trajectory is one chunk: larger chunks save under 1% and cost random reads a factor of 3.
 """
 
 import stat

@@ -1,5 +1,6 @@
 """What is left to do: everything wanted and not done, once; attempts and quarantine."""
 
+from collections import deque
 from collections.abc import Collection
 
 from hypothesis import given
@@ -71,7 +72,7 @@ def drain(queue: UnitQueue, workers: int, kills: Collection[int]) -> tuple[list[
 def test_units_that_kill_their_worker_are_given_up_and_no_other(
     levels: int, unit: int, workers: int, kills: set[int]
 ) -> None:
-    queue = UnitQueue.of(plan_units(range(levels), set(), unit))
+    queue = UnitQueue(deque(plan_units(range(levels), set(), unit)))
     done, deaths = drain(queue, workers, kills)
     given_up = {level_id for unit in queue.quarantined for level_id in unit.level_ids}
     assert all(kills.intersection(unit.level_ids) for unit in queue.quarantined)
@@ -81,7 +82,7 @@ def test_units_that_kill_their_worker_are_given_up_and_no_other(
 
 
 def test_company() -> None:
-    queue = UnitQueue.of(plan_units(range(100), set(), 1))
+    queue = UnitQueue(deque(plan_units(range(100), set(), 1)))
     running = [unit for _ in range(COMPANY[0]) if (unit := queue.take([]))]
     assert queue.take(running) is None
     fresh = queue.take(running[1:])
@@ -95,7 +96,7 @@ def test_company() -> None:
 
 
 def test_a_worker_gets_units_while_it_has_room() -> None:
-    queue, assignment = UnitQueue.of(plan_units(range(12), set(), 4)), Assignment()
+    queue, assignment = UnitQueue(deque(plan_units(range(12), set(), 4))), Assignment()
     assert assignment.take(queue)  # however little room there is
     assert not assignment.take(queue)
     (first,) = assignment.hand_over()
@@ -111,7 +112,7 @@ def test_a_worker_gets_units_while_it_has_room() -> None:
 
 
 def test_a_unit_that_fails_waits_behind_the_others_until_it_is_given_up() -> None:
-    queue = UnitQueue.of(plan_units(range(4), set(), 2))
+    queue = UnitQueue(deque(plan_units(range(4), set(), 2)))
     bad = queue.take()
     assert bad is not None
     assert not queue.failed(bad)
