@@ -6,6 +6,7 @@ from experts.advance import advance
 from experts.config import ExpertConfig, Rule, StopConfig
 from experts.queue import empty_queue, enter
 from experts.slots import LevelQueue, Report, Slots
+from experts.stop import rules_of
 from levelgen.level import Level
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
@@ -22,4 +23,4 @@ def go_on(
     slots: Slots, queue: LevelQueue, config: ExpertConfig, rules: TaskParams = DEFAULT_RULES
 ) -> tuple[Slots, Report]:
     """An update in every slot (`slots` are used up)."""
-    return advance(slots, queue, config, StopConfig(rule=Rule.BUDGET), rules)
+    return advance(slots, queue, config, rules_of(StopConfig(rule=Rule.BUDGET), config), rules)

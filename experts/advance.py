@@ -17,11 +17,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts import ppo, progress, stop
-from experts.config import ExpertConfig, StopConfig
+from experts.config import ExpertConfig
 from experts.policy import ActorCritic, network_of
 from experts.ppo import LevelConstants, Samples
 from experts.rollout import Acting, Manner, Trajectory, repeat, rollout, start
 from experts.slots import LevelQueue, Mode, Report, Slot, Slots, Training, Trial, lanes_of
+from experts.stop import StopRules
 from experts.success import find, remember
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
@@ -39,9 +40,9 @@ def over_slots(function: Callable, *slots: Any) -> Any:
     return jax.vmap(function)(*slots)
 
 
-@partial(jax.jit, static_argnames=("config", "stopping", "rules"), donate_argnames="slots")
+@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="slots")
 def advance(
-    slots: Slots, queue: LevelQueue, config: ExpertConfig, stopping: StopConfig, rules: TaskParams
+    slots: Slots, queue: LevelQueue, config: ExpertConfig, stopping: StopRules, rules: TaskParams
 ) -> tuple[Slots, Report]:
     """A rollout in every slot, and what follows from it: an update, a part of an evaluation, another level.
 
@@ -146,7 +147,7 @@ def _split(
 
 
 def _follow(
-    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopConfig
+    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopRules
 ) -> tuple[Slot, Float[Array, ""], Int[Array, ""]]:
     """What follows from a slot's rollout; also the share of successes, and the mode it was in."""
     nothing = jnp.float32(jnp.nan)
@@ -160,7 +161,7 @@ def _follow(
 
 
 def _learn(
-    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopConfig
+    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopRules
 ) -> tuple[Slot, Float[Array, ""]]:
     """One update, and whether an evaluation comes next."""
     training = slot.training
@@ -178,7 +179,7 @@ def _learn(
     return slot._replace(mode=jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share
 
 
-def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) -> Slot:
+def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopRules) -> Slot:
     """A part of an evaluation; after the last, whether the level leaves."""
     first = slot.trial.part * config.horizon
     put = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, first, 0)
@@ -190,7 +191,7 @@ def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopConfig) 
     solved = ended & ~hopeless & stop.solves(done, goal, stopping, config)
     trial = Trial(part, slot.trial.due, slot.trial.final, solved, action, done, goal)
     course, leaves, deadline = stop.after_evaluation(
-        slot.training.course, solved, trial.due, trial.final, slot.deadline, config, stopping
+        slot.training.course, solved, trial.due, trial.final, slot.deadline, stopping
     )
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, old)
     mode = jnp.where(leaves, Mode.EMPTY, Mode.TRAIN)

@@ -114,7 +114,7 @@ class ExpertConfig:
 
 @dataclass(frozen=True)
 class StopConfig:
-    """When a level leaves its slot (hashable: pass as a static argument)."""
+    """When a level leaves its slot."""
 
     rule: Rule = Rule.SOLVED  # when a level leaves its slot
     successes: int = 1  # attempts of an evaluation that must succeed for a level to be solved

@@ -19,6 +19,7 @@ from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
 from experts.judge import Evaluation, Kept, Trained, Witness, witness_of
 from experts.queue import GROUP, empty_queue, enter, next_indices
 from experts.slots import Begun, LevelQueue, Mode, Report, Slots, empty_slots
+from experts.stop import rules_of
 from experts.witness import take
 from levelgen.level import Level
 from levelgen.task.rules import TaskParams
@@ -71,7 +72,8 @@ class Pool:
     """Slots and the queue before them. All that trains in it has one configuration and one budget."""
 
     def __init__(self, updates: int, config: ExpertConfig, stopping: StopConfig, rules: TaskParams) -> None:
-        self.updates, self.config, self.stopping, self.rules = updates, config, stopping, rules
+        self.updates, self.config, self.rules = updates, config, rules
+        self._stopping = rules_of(stopping, config)
         self._shaped = replace(rules, dense_reward_scale=config.dense_reward_scale)
         self._slots: Slots | None = None  # these two are there once the first levels have come
         self._queue: LevelQueue | None = None
@@ -131,7 +133,7 @@ class Pool:
         self._fill()
         assert self._queue is not None
         assert self._slots is not None
-        self._slots, report = advance(self._slots, self._queue, self.config, self.stopping, self._shaped)
+        self._slots, report = advance(self._slots, self._queue, self.config, self._stopping, self._shaped)
         seen = jax.device_get(report)
         self._taken = int(seen.taken)
         self._submissions[-1].rollouts[Mode.EMPTY] += int((seen.mode == Mode.EMPTY).sum())

@@ -3,10 +3,38 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from experts.config import MOST_DOUBLINGS, RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.progress import NEVER, Progress
+
+
+class StopRules(NamedTuple):
+    """A StopConfig as data of a compiled program: one program serves all."""
+
+    evaluates: np.bool_  # success of training asks for an evaluation
+    halves: np.bool_  # there are rungs
+    enough: np.int32  # attempts that have to succeed
+    share: np.float32  # of finished episodes that must reach the goal before an evaluation
+    wait: np.int32  # updates between an evaluation that failed and the next; doubles each time
+    polish: np.int32  # updates after the level is solved
+    first_rung: np.int32  # updates
+    gain: np.float32  # of the best return between rungs
+
+
+def rules_of(stopping: StopConfig, config: ExpertConfig) -> StopRules:
+    """The rules for experts of this configuration."""
+    return StopRules(
+        evaluates=np.bool_(stopping.rule != Rule.BUDGET),
+        halves=np.bool_(stopping.rule == Rule.HALVING),
+        enough=np.int32(min(stopping.successes, config.attempts)),
+        share=np.float32(stopping.share),
+        wait=np.int32(config.updates_in(stopping.wait)),
+        polish=np.int32(config.updates_in(stopping.polish) if stopping.polish else 0),
+        first_rung=np.int32(config.updates_in(stopping.first_rung)),
+        gain=np.float32(stopping.gain),
+    )
 
 
 class Course(NamedTuple):
@@ -31,7 +59,7 @@ def after_update(
     share: Float[Array, ""],
     deadline: Int[Array, ""],
     config: ExpertConfig,
-    stopping: StopConfig,
+    rules: StopRules,
 ) -> tuple[Course, Bool[Array, ""], Bool[Array, ""]]:
     """What one more update means.
 
@@ -42,23 +70,18 @@ def after_update(
         share: of the update's finished episodes that reached the goal.
         deadline: updates after which the last evaluation comes.
         config: what an expert is.
-        stopping: when a level leaves.
+        rules: when a level leaves.
 
     Returns:
         The course, whether an evaluation is due, and whether the level leaves after one, due or not.
     """
     updates = course.updates + 1
-    over = progress.diverged != NEVER
-    evaluate = jnp.bool_(False)
-    rung_return = course.rung_return
-    if stopping.rule != Rule.BUDGET:
-        evaluate = (share >= stopping.share) & (updates >= course.next_evaluation) & ~course.solved
-        over |= jnp.bool_(config.exploration) & usable
-    if stopping.rule == Rule.HALVING:
-        at_rung = is_rung(updates, config.updates_in(stopping.first_rung))
-        moves = (progress.first_success != NEVER) | (progress.best_return >= rung_return + stopping.gain)
-        over |= at_rung & ~moves
-        rung_return = jnp.where(at_rung, progress.best_return, rung_return)
+    worth_it = (share >= rules.share) & (updates >= course.next_evaluation) & ~course.solved
+    evaluate = rules.evaluates & worth_it
+    at_rung = rules.halves & is_rung(updates, rules.first_rung)
+    moves = (progress.first_success != NEVER) | (progress.best_return >= course.rung_return + rules.gain)
+    over = (progress.diverged != NEVER) | (rules.evaluates & config.exploration & usable) | (at_rung & ~moves)
+    rung_return = jnp.where(at_rung, progress.best_return, course.rung_return)
     course = course._replace(updates=updates, rung_return=rung_return, over=over)
     return course, evaluate, over | (updates >= deadline)
 
@@ -69,14 +92,12 @@ def after_evaluation(
     due: Bool[Array, ""],
     final: Bool[Array, ""],
     deadline: Int[Array, ""],
-    config: ExpertConfig,
-    stopping: StopConfig,
+    rules: StopRules,
 ) -> tuple[Course, Bool[Array, ""], Int[Array, ""]]:
     """The course, whether the level leaves, and its deadline."""
-    polish = config.updates_in(stopping.polish) if stopping.polish else 0
-    leaves = final | solved if not polish else final
-    deadline = jnp.where(solved & ~final, jnp.minimum(deadline, course.updates + polish), deadline)
-    wait = config.updates_in(stopping.wait) << jnp.minimum(course.failed, MOST_DOUBLINGS)
+    leaves = final | (solved & (rules.polish == 0))
+    deadline = jnp.where(solved & ~final, jnp.minimum(deadline, course.updates + rules.polish), deadline)
+    wait = rules.wait << jnp.minimum(course.failed, MOST_DOUBLINGS)
     tried = course._replace(
         next_evaluation=course.updates + wait,
         failed=course.failed + ~solved,
@@ -90,33 +111,28 @@ def after_evaluation(
 def solves(
     done: Bool[Array, "... time environment"],
     goal: Bool[Array, "... time environment"],
-    stopping: StopConfig,
+    rules: StopRules,
     config: ExpertConfig,
 ) -> Bool[Array, "..."]:
     """Whether enough attempts succeed: every episode that ended, ended in the goal."""
     done, goal = (x[..., :RECORD_STEPS, : config.attempts] for x in (done, goal))
     succeed = done.any(-2) & (goal | ~done).all(-2)
-    return succeed.sum(-1) >= enough(stopping, config)
+    return succeed.sum(-1) >= rules.enough
 
 
 def fails(
     done: Bool[Array, "time environment"],
     goal: Bool[Array, "time environment"],
     steps: Int[Array, ""],
-    stopping: StopConfig,
+    rules: StopRules,
     config: ExpertConfig,
 ) -> Bool[Array, ""]:
     """Whether an evaluation can no longer solve its level, after so many steps: too many attempts have failed."""
     failed = (done & ~goal & (jnp.arange(len(done)) < steps)[:, None])[:, : config.attempts].any(0)
-    return config.attempts - failed.sum() < enough(stopping, config)
+    return config.attempts - failed.sum() < rules.enough
 
 
-def enough(stopping: StopConfig, config: ExpertConfig) -> int:
-    """How many attempts have to succeed."""
-    return min(stopping.successes, config.attempts)
-
-
-def is_rung(updates: Int[Array, ""], first: int) -> Bool[Array, ""]:
+def is_rung(updates: Int[Array, ""], first: int | np.int32) -> Bool[Array, ""]:
     """Whether it is `first` times a power of two."""
     times = updates // first
     return (updates % first == 0) & (times > 0) & ((times & (times - 1)) == 0)

@@ -11,7 +11,8 @@ from experts.witness import take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
-from tests.experts.test_slots import CONFIG, SOLVED, same
+from tests.experts.small import CONFIG
+from tests.experts.test_slots import SOLVED, same
 
 IDS = np.arange(100, 136)
 UPDATES = 6

@@ -12,21 +12,18 @@ from experts.advance import advance
 from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.judge import Trained
 from experts.labels import Label, Source
-from experts.pool import Pool, Spent
+from experts.pool import Pool, Spent, capacity_of
 from experts.queue import empty_queue, enter
 from experts.slots import LevelQueue, Mode, empty_slots
+from experts.stop import rules_of
 from experts.train import train_levels
 from experts.witness import take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
+from tests.experts.small import CONFIG, IDS, SHAPED, WHOLE
 
-IDS = np.array([0, 2, 3, 4, 6, 7, 9])  # levels that need an expert
-CONFIG = ExpertConfig(
-    environments=16, horizon=32, width=16, attempts=4, sticky_attempts=4, moved_attempts=4, slots=2, rehearsals=2
-)
 SOLVED = StopConfig(successes=2, share=0.6, wait=2048)
-WHOLE = StopConfig(rule=Rule.BUDGET)
 HALVED = StopConfig(rule=Rule.HALVING, successes=4, first_rung=4 * 512, gain=10.0)
 UPDATES = 24  # 12,288 env steps
 
@@ -42,7 +39,8 @@ def train(
 
 
 def queue_of(levels: Level, updates: int) -> LevelQueue:
-    return enter(empty_queue(levels, 16, updates, CONFIG), levels, IDS, CONFIG)
+    """As in a pool, so that it uses the same program."""
+    return enter(empty_queue(levels, capacity_of(CONFIG), updates, CONFIG), levels, IDS, CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +55,7 @@ def solved(levels: Level) -> list[Trained]:
 
 @pytest.fixture(scope="module")
 def whole(levels: Level) -> list[Trained]:
-    return train(levels, IDS, UPDATES, CONFIG, WHOLE)[0]
+    return train(levels, IDS, UPDATES, CONFIG, WHOLE, keep=True)[0]
 
 
 def same(a, b) -> None:
@@ -93,7 +91,7 @@ def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
     slots = empty_slots(2, queue, CONFIG)
     modes, indices = [], []
     for _ in range(400):
-        slots, seen = advance(slots, queue, CONFIG, WHOLE, DEFAULT_RULES)
+        slots, seen = advance(slots, queue, CONFIG, rules_of(WHOLE, CONFIG), SHAPED)
         modes.append(np.asarray(seen.mode))
         indices.append(np.where(modes[-1] == Mode.EMPTY, -1, np.asarray(seen.queue_index)))
         if (modes[-1] == Mode.EMPTY).all():
@@ -110,10 +108,11 @@ def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
 
 
 def test_nothing_is_compiled_again(levels: Level) -> None:
-    """Another number of levels and another budget use the same program."""
+    """Another number of levels, another budget and another rule use the same program."""
     train(take(levels, np.arange(3)), IDS[:3], 2, CONFIG, SOLVED)
     before = advance._cache_size()
-    train(levels, IDS, 3, CONFIG, SOLVED)
+    for stopping in (SOLVED, WHOLE, HALVED):
+        train(levels, IDS, 3, CONFIG, stopping)
     assert advance._cache_size() == before
 
 
@@ -190,17 +189,24 @@ def test_only_a_success_that_a_record_can_hold_ends_training(levels: Level, monk
             timestep=np.full(shape, length - 1),  # type: ignore[arg-type]
             rehearsing=np.zeros(config.environments, bool),  # type: ignore[arg-type]
         )
-        after, _ = advance_module._learn(slot, now, None, config, SOLVED)  # type: ignore[arg-type]
+        after, _ = advance_module._learn(slot, now, None, config, rules_of(SOLVED, config))  # type: ignore[arg-type]
         assert int(after.training.progress.first_success) == 4 * config.environments
         assert after.mode == mode
 
 
-def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level) -> None:
-    config = replace(CONFIG, learning_rate=1e30)
-    verdicts = train_levels(take(levels, np.arange(2)), IDS[:2], UPDATES * 512, config, WHOLE).verdicts
-    for verdict in verdicts:
+def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level, whole: list[Trained]) -> None:
+    begun = {}
+    for i, weight in enumerate((np.inf, np.nan)):
+        kept = whole[i].expert
+        assert kept
+        training = kept.begun.training
+        params = jax.tree.map(lambda x, weight=weight: np.full_like(x, weight), training.train_state.params)
+        training = training._replace(train_state=training.train_state._replace(params=params))
+        begun[int(IDS[i])] = kept._replace(begun=kept.begun._replace(training=training))
+    some, budget = take(levels, np.arange(2)), 2 * UPDATES * 512
+    for verdict in train_levels(some, IDS[:2], budget, CONFIG, WHOLE, begun=begun).verdicts:
         assert verdict.label is Label.UNSOLVED
-        assert verdict.env_steps < UPDATES * 512
+        assert verdict.env_steps == (UPDATES + 1) * 512
         assert f"its network's numbers stopped being finite after {verdict.env_steps} env steps" in verdict.label_reason
 
 
@@ -212,13 +218,13 @@ def test_all_slots_at_once_as_on_an_accelerator(levels: Level, monkeypatch: pyte
     def go(advance) -> list:
         slots, seen = empty_slots(2, queue, CONFIG), []
         for _ in range(3 + CONFIG.record_rollouts + 2):  # an update of the second levels is among them
-            slots, report = advance(slots, queue, CONFIG, WHOLE, DEFAULT_RULES)
+            slots, report = advance(slots, queue, CONFIG, rules_of(WHOLE, CONFIG), SHAPED)
             seen.append(report)
         return [jax.device_get(seen), jax.device_get(slots.slot.training)]
 
     one_by_one, ours = go(advance)
     monkeypatch.setattr(advance_module, "over_slots", lambda function, *slots: jax.vmap(function)(*slots))
-    together, theirs = go(jax.jit(advance.__wrapped__, static_argnums=(2, 3, 4)))
+    together, theirs = go(jax.jit(advance.__wrapped__, static_argnums=(2, 4)))
     same([(r.queue_index, r.mode, r.left) for r in one_by_one], [(r.queue_index, r.mode, r.left) for r in together])
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), ours.train_state.params, theirs.train_state.params

@@ -8,6 +8,7 @@ import pytest
 
 from experts import progress, stop
 from experts.config import ExpertConfig, Rule, StopConfig
+from experts.stop import rules_of
 
 CONFIG = ExpertConfig(environments=16, horizon=64, sticky_attempts=4, moved_attempts=4)  # 1024 env steps an update
 SOLVED, HALVING = StopConfig(wait=2048, share=0.9), StopConfig(rule=Rule.HALVING, first_rung=4096, gain=0.1)
@@ -17,7 +18,7 @@ def after(updates: int, share: float, stopping: StopConfig, best: float = 0.0, f
     now = stop.begin()._replace(updates=jnp.int32(updates - 1), **course)
     totals = progress.start(16)._replace(best_return=jnp.float32(best), first_success=jnp.int32(first))
     usable, share_, deadline = jnp.bool_(first != progress.NEVER), jnp.float32(share), jnp.int32(100)
-    now, due, final = stop.after_update(now, totals, usable, share_, deadline, CONFIG, stopping)
+    now, due, final = stop.after_update(now, totals, usable, share_, deadline, CONFIG, rules_of(stopping, CONFIG))
     assert int(now.updates) == updates
     assert bool(now.over) == (bool(final) and updates < 100)
     return now, bool(due), bool(final)
@@ -42,7 +43,13 @@ def test_a_success_of_training_ends_it_where_it_is_a_witness() -> None:
     whole = StopConfig(rule=Rule.BUDGET)
     for usable, stopping, ends in ((True, SOLVED, True), (False, SOLVED, False), (True, whole, False)):
         course, due, final = stop.after_update(
-            stop.begin(), totals, jnp.bool_(usable), jnp.float32(0.1), jnp.int32(100), config, stopping
+            stop.begin(),
+            totals,
+            jnp.bool_(usable),
+            jnp.float32(0.1),
+            jnp.int32(100),
+            config,
+            rules_of(stopping, config),
         )
         assert (bool(due), bool(final), bool(course.over)) == (False, ends, ends)
 
@@ -51,7 +58,13 @@ def test_a_success_of_training_ends_it_where_it_is_a_witness() -> None:
 def test_an_expert_that_diverged_leaves(stopping: StopConfig) -> None:
     totals = progress.start(16)._replace(diverged=jnp.int32(1024))
     course, _, final = stop.after_update(
-        stop.begin(), totals, jnp.bool_(False), jnp.float32(0.0), jnp.int32(100), CONFIG, stopping
+        stop.begin(),
+        totals,
+        jnp.bool_(False),
+        jnp.float32(0.0),
+        jnp.int32(100),
+        CONFIG,
+        rules_of(stopping, CONFIG),
     )
     assert (bool(final), bool(course.over)) == (True, True)
 
@@ -59,7 +72,7 @@ def test_an_expert_that_diverged_leaves(stopping: StopConfig) -> None:
 def test_a_level_that_its_last_update_brings_to_a_rung_is_over_with_any_budget() -> None:
     totals, course = progress.start(16), stop.begin()._replace(updates=jnp.int32(7), rung_return=jnp.float32(0.5))
     course, _, final = stop.after_update(
-        course, totals, jnp.bool_(False), jnp.float32(0.0), jnp.int32(8), CONFIG, HALVING
+        course, totals, jnp.bool_(False), jnp.float32(0.0), jnp.int32(8), CONFIG, rules_of(HALVING, CONFIG)
     )
     assert (bool(final), bool(course.over)) == (True, True)
 
@@ -82,7 +95,12 @@ def test_rungs() -> None:
 def test_what_follows_from_an_evaluation() -> None:
     course = stop.begin()._replace(updates=jnp.int32(10))
     decide = lambda solved, final, stopping: stop.after_evaluation(
-        course, jnp.bool_(solved), jnp.bool_(not final), jnp.bool_(final), jnp.int32(100), CONFIG, stopping
+        course,
+        jnp.bool_(solved),
+        jnp.bool_(not final),
+        jnp.bool_(final),
+        jnp.int32(100),
+        rules_of(stopping, CONFIG),
     )
     failed, leaves, deadline = decide(False, False, SOLVED)
     assert (int(failed.next_evaluation), bool(leaves), int(deadline)) == (12, False, 100)
@@ -97,23 +115,23 @@ def test_a_last_evaluation_leaves_no_trace_in_what_goes_on() -> None:
     """So that more budget later continues as if there had been none."""
     course = stop.begin()._replace(updates=jnp.int32(10), next_evaluation=jnp.int32(9))
     yes, no = jnp.bool_(True), jnp.bool_(False)
-    ended, leaves, _ = stop.after_evaluation(course, no, no, yes, jnp.int32(10), CONFIG, SOLVED)
+    ended, leaves, _ = stop.after_evaluation(course, no, no, yes, jnp.int32(10), rules_of(SOLVED, CONFIG))
     assert bool(leaves)
     np.testing.assert_equal(tuple(map(np.asarray, ended)), tuple(map(np.asarray, course)))
-    due, _, _ = stop.after_evaluation(course, no, yes, yes, jnp.int32(10), CONFIG, SOLVED)
+    due, _, _ = stop.after_evaluation(course, no, yes, yes, jnp.int32(10), rules_of(SOLVED, CONFIG))
     assert (int(due.failed), int(due.next_evaluation)) == (1, 12), "it would have been made with more budget, too"
 
 
 def test_solving_takes_enough_attempts() -> None:
-    stopping = StopConfig(successes=7)
+    rules = rules_of(StopConfig(successes=7), CONFIG)
     done = np.zeros((256, 16), bool)
     goal = done.copy()
     done[[9, 255]] = goal[[9, 255]] = True
     goal[255, 7:] = False  # one of the attempts, and all that are sticky or moved
-    assert bool(stop.solves(done, goal, stopping, CONFIG))
-    assert not bool(stop.fails(done, goal, 256, stopping, CONFIG))
+    assert bool(stop.solves(done, goal, rules, CONFIG))
+    assert not bool(stop.fails(done, goal, 256, rules, CONFIG))
     goal[255, 1] = False
-    assert not bool(stop.solves(done, goal, stopping, CONFIG))
-    assert bool(stop.fails(done, goal, 256, stopping, CONFIG))
-    assert not bool(stop.fails(done, goal, 255, stopping, CONFIG)), "what follows is of an earlier evaluation"
-    assert not bool(stop.solves(done & False, goal & False, stopping, CONFIG)), "no episode has ended"
+    assert not bool(stop.solves(done, goal, rules, CONFIG))
+    assert bool(stop.fails(done, goal, 256, rules, CONFIG))
+    assert not bool(stop.fails(done, goal, 255, rules, CONFIG)), "what follows is of an earlier evaluation"
+    assert not bool(stop.solves(done & False, goal & False, rules, CONFIG)), "no episode has ended"

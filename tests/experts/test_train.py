@@ -5,18 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
 from experts.labels import Label
 from experts.train import UnitResult, new_pool, train_levels
 from experts.witness import LANES, replay, steps_to_goal, succeeds
 from levelgen.level import SIZES, Level
 from levelgen.sampling.distribution import Distribution
 from levelgen.sampling.sampler import sample_levels
+from tests.experts.small import CONFIG, IDS, WHOLE
 
-IDS = np.array([0, 2, 3, 4, 6, 7])  # levels that need an expert
-CONFIG = ExpertConfig(environments=16, horizon=64, width=32, attempts=4, sticky_attempts=4, moved_attempts=4, slots=4)
-WHOLE = StopConfig(rule=Rule.BUDGET)
-BUDGET = 20_000  # 19 updates
+UPDATES = 24
+BUDGET = UPDATES * CONFIG.steps_per_update + 100
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +42,8 @@ def test_verdicts(result: UnitResult) -> None:
     labels = {v.label for v in result.verdicts}
     assert labels == {Label.SOLVED, Label.UNSOLVED}, "these levels should show both"
     for verdict in result.verdicts:
-        assert verdict.env_steps == 19 * 1024 <= BUDGET
-        assert len(verdict.learning_curve) == 19
+        assert verdict.env_steps == UPDATES * 512 <= BUDGET
+        assert len(verdict.learning_curve) == UPDATES
         assert np.isnan(verdict.success_rate) or 0 <= verdict.success_rate <= 1
         assert (verdict.steps_to_goal is not None) == (verdict.label is Label.SOLVED)
         if verdict.steps_to_first_success is not None:
@@ -75,7 +74,7 @@ def test_progress_is_reported(reports: list[tuple[int, float, int]], result: Uni
     for totals in zip(*reports, strict=True):
         assert list(totals) == sorted(totals)
     solved = sum(v.label is Label.SOLVED for v in result.verdicts)
-    assert reports[-1] == (len(IDS) * 19 * 1024, len(IDS), solved)
+    assert reports[-1] == (len(IDS) * UPDATES * 512, len(IDS), solved)
     assert result.spent.trained == reports[-1][0]
 
 
@@ -118,7 +117,7 @@ def test_levels_that_all_need_no_expert() -> None:
 @pytest.mark.parametrize(
     ("budget", "stopping", "words"),
     [
-        (1023, StopConfig(), "budget is 1023: one update of an expert takes 1024 env steps"),
+        (511, StopConfig(), "budget is 511: one update of an expert takes 512 env steps"),
         (2**31, StopConfig(), "budget is 2147483648: an expert can count no more than 2147483647 env steps"),
         (2**31 - 1, StopConfig(wait=2**35), "stop.wait is 34359738368: with a budget of 2147483647"),
         (1024, StopConfig(polish=2**41), "stop.polish is"),
@@ -131,7 +130,7 @@ def test_a_budget_that_cannot_be_used_is_refused(budget: int, stopping: StopConf
 
 
 def test_the_largest_budget_is_accepted() -> None:
-    assert new_pool(2**31 - 1, CONFIG, StopConfig(wait=2**24)).updates == 2**21 - 1
+    assert new_pool(2**31 - 1, CONFIG, StopConfig(wait=2**24)).updates == 2**22 - 1
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ from experts.judge import Trained, witness_of
 from experts.witness import take
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
-from tests.experts.test_slots import CONFIG, SOLVED, UPDATES, same, train
+from tests.experts.small import CONFIG
+from tests.experts.test_slots import SOLVED, UPDATES, same, train
 
 IDS = np.array([0, 2, 6, 7])
 
