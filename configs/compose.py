@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from importlib.resources import files
@@ -117,16 +118,14 @@ def _composed(overrides: list[str]) -> dict[str, Any]:
 def _parsed(text: str) -> Override:
     """One `key=value`; what Hydra's grammar cannot read (`out=my data/é`) is taken as a plain word."""
     key, equals, value = text.partition("=")
-    if not equals or not key:
-        raise ConfigError(f"cannot read {text!r}: write settings as NAME=VALUE, as in levels=64.")
     quoted = f"{key}={QuotedString(value, Quote.single).with_quotes()}"
-    try:
-        override = OverridesParser.create().parse_override(quoted if key in WORDS and value[:1] not in "'\"" else text)
-    except HydraException:
-        try:
-            override = OverridesParser.create().parse_override(quoted)
-        except HydraException:
-            raise ConfigError(f"cannot read {text!r}: write settings as NAME=VALUE, as in levels=64.") from None
+    as_word = key in WORDS and value[:1] not in "'\""
+    for written in (quoted if as_word else text, quoted) if key and equals else ():
+        with suppress(HydraException):
+            override = OverridesParser.create().parse_override(written)
+            break
+    else:
+        raise ConfigError(f"cannot read {text!r}: write settings as NAME=VALUE, as in levels=64.")
     if override.is_add() or override.is_force_add() or override.is_delete():
         raise ConfigError(f"cannot use {text!r}: settings can be changed, not added or removed.")
     if override.is_sweep_override():

@@ -30,10 +30,7 @@ SCALARS = {  # with the types of values that may be written for them: 1000 is a 
 def typed(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     """An instance of the dataclass `cls` from nested mappings; what is missing takes its default.
 
-    Args:
-        cls: the dataclass.
-        values: settings by name, groups of them as mappings.
-        path: name of the group that they are, for messages.
+    `path` is the name of the group that they are, for messages.
 
     Raises:
         ConfigError: an unknown key, a value of the wrong type, or one that the dataclass refuses.

@@ -50,10 +50,7 @@ class JobConfig:
         last = self.first_level + parse_count(self.levels, "levels") - 1
         if self.first_level < 0 or last > MAX_LEVEL_ID:
             raise ConfigError(f"level ids {self.first_level} to {last} do not fit: they run from 0 to {MAX_LEVEL_ID}.")
-        try:
-            check_budget(self.env_steps, self.expert, self.stop)
-        except ValueError as error:
-            raise ConfigError(f"{error}.") from None
+        check_budget(self.env_steps, self.expert, self.stop)
         if self.unit is not None and self.unit < 1:
             raise ConfigError(f"unit is {self.unit}: a work unit needs at least 1 level.")
         if self.workers < 0:
@@ -62,11 +59,8 @@ class JobConfig:
             raise ConfigError("out is empty: name a folder, as in out=data.")
 
     def _check_size(self) -> None:
-        try:
-            size = size_of(self.size)
-            check_size(size)
-        except ValueError as error:
-            raise ConfigError(f"{error}.") from None
+        size = size_of(self.size)
+        check_size(size)
         if size.bodies > MOST_BODIES:
             raise ConfigError(f"size is {self.size}: experts train among at most {MOST_BODIES} polygons and circles.")
         if not control_weights(size, self.distribution):

@@ -36,11 +36,7 @@ def cache_folder() -> Path:
 
 
 def prepare_jax(core: int | None = None) -> None:
-    """Set this process up to run work units.
-
-    Args:
-        core: the CPU core to stay on; None leaves that to the system.
-    """
+    """Set this process up to run work units, on one CPU core or, with None, where the system likes."""
     flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = " ".join([flags, *(flag for flag in XLA_FLAGS if flag not in flags)]).strip()
     os.environ.update(dict.fromkeys(THREADS, "1"))

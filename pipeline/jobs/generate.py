@@ -22,11 +22,7 @@ from pipeline.store.split import note_job, writing
 def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids: Sequence[int] | None = None) -> Exit:
     """Make what is missing of the job's levels, and commit it unit by unit.
 
-    Args:
-        job: what to make.
-        command: as typed, for the hint of how to go on.
-        console: where progress is shown.
-        level_ids: which levels, if not those of the job.
+    `command` is as typed, for the hint of how to go on; `level_ids` are which levels, if not those of the job.
 
     Raises:
         UserError, Failure: see `store.split.writing` and `store.checkpoints.require_same_experts`; or the disk refuses.

@@ -20,9 +20,7 @@ HINT = "as in levelproof regenerate manifest=data/256k/s budget=1M where=\"label
 def regenerate(words: Sequence[str], console: Console) -> Exit:
     """Train the levels of a manifest, all or those for which a condition holds, at another budget.
 
-    Args:
-        words: `manifest=SPLIT`, `budget=N`, and if wanted `where=SQL`, `continue=true` and settings of `generate`.
-        console: where progress is shown.
+    `words` are `manifest=SPLIT`, `budget=N`, and if wanted `where=SQL`, `continue=true` and settings of `generate`.
 
     Raises:
         UserError: a word is missing or wrong, no level is chosen, or as `generate`.

@@ -43,8 +43,6 @@ def sample(job: JobConfig, out: Path) -> None:
 def sheet_of(job: JobConfig) -> Image.Image:
     """The initial worlds of the job's levels, row after row."""
     levels = jax.tree.map(np.asarray, sample_levels(job.level_ids, size_of(job.size), job.distribution))
-    pictures = []
-    for lane, level_id in enumerate(job.level_ids):
-        level = jax.tree.map(lambda x, lane=lane: x[..., lane : lane + 1], levels)
-        pictures.append(draw(level, level.state, caption=Caption(f"level {level_id}"), pixels=PIXELS))
+    captions = [Caption(f"level {level_id}") for level_id in job.level_ids]
+    pictures = [draw(levels, levels.state, lane, caption=of, pixels=PIXELS) for lane, of in enumerate(captions)]
     return sheet(pictures, COLUMNS)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from experts.witness import steps_to_goal, succeeds
 from levelgen.level import ACTIONS, Level, name_of
 from levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
 from levelgen.pictures.scene import scene_of
@@ -92,21 +93,25 @@ def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
 
 
 def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
-    """The first successful episode of a solved level's record."""
+    """The first episode of a solved level's record.
+
+    Raises:
+        Failure: it does not reach the goal.
+    """
     arrays = open_shard(manifest.split, row["shard"], row["size"]).read([row["row"]])
     level, states = tree_of(Level, arrays, "level/"), tree_of(State, arrays, "record/state/")
     done, goal, action = (arrays[f"record/{name}"][..., 0] for name in ("done", "goal", "action"))
-    first, last = first_success(done, goal)
-    rules = rules_of(manifest)
+    if not succeeds(done, goal):
+        raise Failure("The record of this level does not reach the goal: run `levelproof verify` on its split.")
+    steps, rules = int(steps_to_goal(done)), rules_of(manifest)
     second = rules.frame_skip * rules.physics.dt  # of an env step
-    shown = [*range(first, last + 1, STEPS_A_PICTURE), last + 1]
+    shown = [*range(0, steps, STEPS_A_PICTURE), steps]
     scenes = []
     for step in shown:
-        state = _at(states, step) if step <= last else _touch(_at(states, last), rules)
-        caption = Caption(_title(row), f"{(step - first) * second:.1f} s", "goal reached" if step > last else "")
-        scenes.append(scene_of(level, state, action=action[min(step, last)], caption=caption))
+        state = _at(states, step) if step < steps else _touch(_at(states, steps - 1), rules)
+        caption = Caption(_title(row), f"{step * second:.1f} s", "goal reached" if step == steps else "")
+        scenes.append(scene_of(level, state, action=action[min(step, steps - 1)], caption=caption))
     seconds = [second * (after - step) for step, after in pairwise(shown)] + [LAST_SECONDS]
-    steps = last - first + 1
     told = f"solved in {steps} step{'s' if steps > 1 else ''} ({steps * second:.1f} s)"
     return Film(scenes, seconds, f"level {row['level_id']} of size {row['size']}, {told}")
 
@@ -157,20 +162,6 @@ def do_nothing(level: Level, rules: TaskParams) -> tuple[list[State], str]:
 def _idle_frame(level: Level, now: TaskState, frame: TaskParams) -> tuple[TaskState, StepResult, Bool[Array, " lane"]]:
     after, outcome = advance(level, now, jnp.zeros((ACTIONS, 1), jnp.int32), frame)
     return after, outcome, has_nan(after.state)
-
-
-def first_success(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time"]) -> tuple[int, int]:
-    """First and last step of the first episode that ends in the goal.
-
-    Raises:
-        Failure: none does.
-    """
-    ends = np.flatnonzero(goal)
-    if not len(ends):
-        raise Failure("The record of this level never reaches the goal: run `levelproof verify` on its split.")
-    last = int(ends[0])
-    before = np.flatnonzero(done[:last])
-    return (int(before[-1]) + 1 if len(before) else 0), last
 
 
 def write_sheet(film: Film, path: Path) -> None:

@@ -60,14 +60,7 @@ class Evidence:
     """What there is to ask about some rows. A level of which something is wrong is asked no more."""
 
     def __init__(self, rows: pa.Table, making: Making, shards: dict[str, Shard | None], findings: Findings) -> None:
-        """Look at nothing yet.
-
-        Args:
-            rows: with COLUMNS and the level ids.
-            making: of their split.
-            shards: those that rows name; None: nothing of it can be used, and that is told.
-            findings: where to tell.
-        """
+        """Of rows with COLUMNS and level ids, and the shards that they name; None: one that is told to be unusable."""
         self.making, self.shards, self.findings = making, shards, findings
         self.ids: np.ndarray = rows.column("level_id").to_numpy()
         self.of: dict[str, list[Any]] = {name: rows.column(name).to_pylist() for name in COLUMNS if name != "versions"}

@@ -15,7 +15,7 @@ from experts.witness import Record
 from levelgen.identity.keys import MAX_LEVEL_ID
 from levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
 from levelgen.task.actions import CHOICES
-from physics.pairs import pairs_of
+from physics.buffers import axes_of
 from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
 from pipeline.store.fields import annotated
 from pipeline.store.schema import FieldSpec, field_table
@@ -36,9 +36,7 @@ class ContentsError(ValueError):
 @cache
 def table_for(size: Size) -> tuple[FieldSpec, ...]:
     """The field table of a shard of this size."""
-    counts = {"body": size.bodies, "polygon": size.polygons, "circle": size.circles, "joint": size.joints}
-    counts |= {"thruster": size.thrusters, "vertex": MAX_VERTICES, "contact": pairs_of(size).contacts}
-    counts |= {"lane": 0, "level": 0}
+    counts = axes_of(size) | {"lane": 0, "level": 0}
     level, record = annotated(Level, counts, "level/"), annotated(Record, counts, "record/")
     for name in ("record/state/", "record/manifold/"):  # of the engine, which knows one moment only
         record |= {of: np.stack([x] * RECORD_STEPS) for of, x in record.items() if of.startswith(name)}

@@ -9,10 +9,10 @@ from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
-from jaxtyping import Bool, Float, Int
+
+from physics.buffers import DTYPES
 
 T = TypeVar("T")
-DTYPES = {Bool: np.bool_, Int: np.int32, Float: np.float32}  # of arrays that are annotated so
 
 
 def arrays_of(tree: Any, path: str = "") -> dict[str, np.ndarray]:

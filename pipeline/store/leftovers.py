@@ -14,11 +14,7 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
     """Remove data of attempts that began and were not committed, and half-written files; nothing else goes.
 
     Done while nobody commits: a worker of a killed run may still be about to name its shard. Data that no fragment
-    names without being left by a dead attempt stays and is told: its fragment may be kept elsewhere.
-
-    Args:
-        split: the folder `{out}/{budget}/{size}`.
-        say: told what people should know, in sentences.
+    names without being left by a dead attempt stays and `say` is told: its fragment may be kept elsewhere.
 
     Raises:
         Failure: a fragment is damaged.

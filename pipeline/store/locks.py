@@ -49,9 +49,7 @@ def committing(split: Path) -> Iterator[None]:
 def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
     """Waits until no unit is between its shard and its fragment, such as one of a killed run that is still ending.
 
-    Args:
-        split: the folder `{out}/{budget}/{size}`.
-        say: told what is waited for, when that takes long.
+    `say` is told what is waited for, when that takes long.
     """
     path = split / COMMIT_LOCK
     with path.open("a+") as file:

@@ -5,11 +5,11 @@ A fragment is written last and appears at once or not at all; readers see only w
 
 import json
 import os
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import compress
 from os import DirEntry
 from pathlib import Path
 from typing import Any
@@ -164,7 +164,10 @@ def read_manifest(
         Failure: a fragment is damaged, or fragments of several configurations lie side by side.
     """
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
-    paths = fragment_paths(split) if level_ids is None else _covering(fragment_paths(split), level_ids)
+    paths = fragment_paths(split)
+    if level_ids is not None:
+        wanted = np.unique(np.asarray(level_ids, np.int64)).tolist()
+        paths = [path for path in paths if bisect_left(wanted, ids_of(path)[0]) < bisect_right(wanted, ids_of(path)[1])]
     with ThreadPoolExecutor(THREADS) as threads:
         read = list(threads.map(lambda path: read_fragment(path, names), paths))
     fragments = tuple(fragment for fragment, _ in read)
@@ -186,15 +189,6 @@ def read_manifest(
         table = table.filter(np.isin(table.column("level_id").to_numpy(), np.asarray(level_ids, np.int64)))
     _, first = np.unique(table.column("level_id").to_numpy(), return_index=True)  # sorts; a level counts once
     return Manifest(split, fragments, table.take(first), named)
-
-
-def _covering(fragments: Sequence[Path], level_ids: Sequence[int]) -> list[Path]:
-    """The fragments that, by their names, may have one of these levels."""
-    wanted = np.unique(np.asarray(level_ids, np.int64))
-    ranges = [ids_of(path) for path in fragments]
-    first, last = np.array(ranges, np.int64).reshape(-1, 2).T
-    has = np.searchsorted(wanted, first) < np.searchsorted(wanted, last, side="right")
-    return list(compress(fragments, has))
 
 
 def require_manifest(

@@ -19,10 +19,6 @@ from pipeline.store.manifest import Manifest, differences, told
 def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, Manifest]]:
     """The job's split, locked, cleaned, and of this configuration; with what is committed.
 
-    Args:
-        job: whose split.
-        say: told what people should know meanwhile, in sentences.
-
     Raises:
         UserError: it cannot be written or locked, is being written, or was made with another configuration.
         Failure: a fragment is damaged.

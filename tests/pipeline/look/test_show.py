@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from experts.witness import succeeds
 from levelgen.level import SIZES
 from levelgen.pictures.raster import draw, rasterised
 from levelgen.proofs import examine
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import TaskParams, advance, reset
 from pipeline.errors import Failure, UserError
-from pipeline.look.show import MOST_FRAMES, MOST_STEPS, do_nothing, first_success, show, witness_film
+from pipeline.look import show as show_module
+from pipeline.look.show import MOST_FRAMES, MOST_STEPS, do_nothing, show, witness_film
 from pipeline.read.levels import find_level
 from pipeline.store.manifest import require_manifest
 from tests.pipeline.made import PLAYED, made_job, played_split
@@ -167,9 +169,7 @@ def test_mp4_needs_ffmpeg(split, tmp_path, monkeypatch) -> None:
         show(split, level_with(split, "solved"), tmp_path / "other.mp4")
 
 
-def test_the_first_episode_that_reaches_the_goal_is_shown() -> None:
-    done, goal = np.zeros(256, bool), np.zeros(256, bool)
-    done[[10, 30, 60]], goal[[30, 60]] = True, True
-    assert first_success(done, goal) == (11, 30)
-    with pytest.raises(Failure, match="never reaches the goal"):
-        first_success(done, np.zeros(256, bool))
+def test_a_record_that_does_not_reach_the_goal_is_refused(split, monkeypatch) -> None:
+    monkeypatch.setattr(show_module, "succeeds", lambda done, goal: succeeds(done, ~goal))
+    with pytest.raises(Failure, match="does not reach the goal"):
+        witness_film(*find_level(split, level_with(split, "solved")))
