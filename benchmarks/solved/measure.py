@@ -142,7 +142,7 @@ def follow(units: int, told: Any, processes: list, board: Board, scratch: Path) 
             board.ended(now.unit, now.summary)
             units -= 1
         else:
-            board.tally.progress(now.unit, *now.totals)
+            board.tally.running[now.unit] = now.totals
 
 
 def scratch_of(header: Header) -> Path:

@@ -1,7 +1,7 @@
 """What people see while a job runs: a bar on a terminal, plain lines elsewhere. On stderr. Knows nothing of workers."""
 
 import time
-from collections import deque
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
@@ -12,7 +12,7 @@ from pipeline.jobs.schedule import Summary, WorkUnit
 
 LINE_EVERY = 30.0  # s between plain lines
 LINE_AFTER = 2.0  # s between one and the next commit that is told; the last commit always is
-RATE_OVER = 20.0  # s over which env steps/s are averaged
+PACE_OVER = 60.0  # s over which env steps/s and the time left are estimated
 
 
 @dataclass
@@ -26,11 +26,6 @@ class Tally:
     env_steps: int = 0  # of this run's committed units, of training
     evaluated: int = 0  # env steps of their evaluations
     idle: int = 0  # env steps in their slots without a level
-    history: deque[tuple[float, int]] = field(default_factory=deque)  # time, env steps of this run
-
-    def __post_init__(self) -> None:
-        self.at_start = self.share
-        self.first = time.monotonic()
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
         """A unit was committed, or an attempt at it failed (`None`)."""
@@ -42,15 +37,10 @@ class Tally:
             self.evaluated += summary.evaluated
             self.idle += summary.idle
 
-    def tick(self, now: float) -> None:
-        """Note where the job is at time `now`, s. The clock starts with the first env step: compiling is no pace."""
-        steps = self.env_steps + sum(steps for steps, _, _ in self.running.values())
-        if not steps:  # nothing yet: the clock has not started
-            self.first = now
-            self.history.clear()
-        self.history.append((now, steps))
-        while now - self.history[0][0] > RATE_OVER and len(self.history) > 2:
-            self.history.popleft()
+    @property
+    def steps(self) -> int:
+        """Env steps of training in this run."""
+        return self.env_steps + sum(steps for steps, _, _ in self.running.values())
 
     @property
     def share(self) -> float:
@@ -66,26 +56,13 @@ class Tally:
     def solved_so_far(self) -> int:
         return self.solved + sum(solved for _, _, solved in self.running.values())
 
-    @property
-    def rate(self) -> float:
-        """Env steps per second, lately."""
-        (begin, low), (end, high) = self.history[0], self.history[-1]
-        return max(0.0, (high - low) / (end - begin)) if end > begin else 0.0
-
-    def left(self, now: float) -> float | None:
-        """Seconds left at this run's pace; None: unknown yet."""
-        gained = self.share - self.at_start
-        if gained <= 0 or now <= self.first:
-            return None
-        return (now - self.first) * (1 - self.share) / gained
-
-    def text(self, now: float) -> str:
-        left = self.left(now)
-        pace = f"{self.rate:,.0f} env steps/s"
+    def text(self, rate: float, left: float | None) -> str:
+        """In words, at `rate` env steps/s and with `left` s to go; None: unknown yet."""
+        pace = f"{rate:,.0f} env steps/s"
         if self.trained == self.levels:
             tail = "done" if self.done == self.levels else "writing"
         elif left is None:
-            tail = f"{pace} · {'...' if self.rate else 'compiling'}"
+            tail = f"{pace} · {'...' if rate else 'compiling'}"
         else:
             tail = f"{pace} · about {duration(left)} left"
         return f"{self.trained}/{self.levels} levels · {self.solved_so_far} solved · {tail}"
@@ -126,15 +103,21 @@ class Display:
 class Board(Display):
     """Shows a Tally."""
 
-    def __init__(self, tally: Tally, console: Console) -> None:
+    def __init__(self, tally: Tally, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(console, TaskProgressColumn())
         self.tally = tally
+        # Estimates only. They begin with the first env steps and levels of this run: compiling is no pace
+        self._pace = Progress(get_time=clock, speed_estimate_period=PACE_OVER, disable=True)
+        self._steps = self._pace.add_task("env steps", total=None)
+        self._levels = self._pace.add_task("levels", total=tally.levels, completed=tally.done)
 
     def refresh(self, every: float = LINE_EVERY) -> None:
         """Draw anew; cheap enough to call often."""
-        now = time.monotonic()
-        self.tally.tick(now)
-        text = self.tally.text(now)
+        steps, levels = self._pace.tasks
+        if self.tally.steps > steps.completed:
+            self._pace.update(self._steps, completed=self.tally.steps)
+            self._pace.update(self._levels, completed=self.tally.share * self.tally.levels)
+        text = self.tally.text(steps.speed or 0.0, levels.time_remaining)
         self.draw(self.tally.share, 1.0, text, text, every)
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:

@@ -34,25 +34,45 @@ def test_a_failed_attempt_takes_its_progress_back() -> None:
     assert (now.share, now.solved_so_far) == (0, 0)
 
 
+def board_at(now: Tally, time: list[float]) -> tuple[Board, io.StringIO]:
+    """A board that tells a line at every refresh, with a clock of its own."""
+    text = io.StringIO()
+    return Board(now, Console(file=text), clock=lambda: time[0]), text
+
+
 def test_rate_and_time_left_do_not_count_the_compiling() -> None:
-    now = tally()
+    now, time = tally(), [0.0]
+    board, text = board_at(now, time)
     for second in range(100):
-        now.tick(float(second))
-        assert "compiling" in now.text(second)
-    for second in range(100, 110):
+        time[0] = float(second)
+        board.refresh(0.0)
+        assert text.getvalue().endswith("compiling\n")
+    for second in range(100, 111):
+        time[0] = float(second)
         now.running[UNIT] = ((second - 99) * 800, (second - 99) * 0.8, 0)
-        now.tick(float(second))
-    assert now.rate == pytest.approx(800)
-    left = now.left(109.0)
-    assert left is not None
-    assert left == pytest.approx((64 - 8) / 0.8, rel=0.02)
+        board.refresh(0.0)
+    assert text.getvalue().endswith("800 env steps/s · about 69 s left\n")  # (64 - 8.8) / 0.8
 
 
 def test_levels_of_earlier_runs_are_no_pace() -> None:
     now = tally(done=32)
     assert now.share == 0.5
-    now.tick(0.0)
-    assert now.left(10.0) is None
+    board, text = board_at(now, [10.0])
+    board.refresh()
+    assert text.getvalue() == "32/64 levels · 16 solved · 0 env steps/s · compiling\n"
+
+
+def test_a_pause_is_no_compiling() -> None:
+    """An evaluation may take longer than the pace is averaged over."""
+    now, time = tally(), [0.0]
+    board, text = board_at(now, time)
+    for steps in (100, 200):
+        time[0] += 1.0
+        now.running[UNIT] = (steps, steps / 100, 0)
+        board.refresh()
+    time[0] += 1000.0
+    board.refresh(0.0)
+    assert "100 env steps/s · about 62 s left" in text.getvalue().splitlines()[-1]
 
 
 def test_lines_where_there_is_no_terminal() -> None:
@@ -81,8 +101,7 @@ def test_commits_are_told_when_the_last_line_is_old(monkeypatch: pytest.MonkeyPa
 def test_what_is_trained_is_still_to_be_written() -> None:
     now = Tally(levels=16, done=0, solved=0)
     now.running[UNIT] = (16_000, 16.0, 5)
-    now.tick(1.0)
-    assert now.text(1.0) == "16/16 levels · 5 solved · writing"
+    assert now.text(0.0, None) == "16/16 levels · 5 solved · writing"
 
 
 def test_a_bar_on_a_terminal() -> None:
