@@ -74,9 +74,8 @@ def again(job: JobConfig) -> str:
 def words_for(results: Mapping[str, Any]) -> list[str]:
     """The settings, but for the budget, that a job with these `JobConfig.results` has and the default has not."""
     default, known = flat(replace(_default(), size=results["size"]).results), flat(results)
-    changed = [name for name in known if name not in BY_HAND and known[name] != default.get(name, known[name])]
-    unknown = [name for name in known if name not in default]
-    return [f"size={results['size']}", *(typed_as(name, known[name]) for name in [*changed, *unknown])]
+    changed = [name for name in known if name not in BY_HAND and known[name] != default.get(name, ...)]
+    return [f"size={results['size']}", *(typed_as(name, known[name]) for name in changed)]
 
 
 def typed_as(name: str, value: Any) -> str:

@@ -38,14 +38,6 @@ PATIENCE = 60.0  # s without any worker after which people are told why
 STARTS = 3  # workers in a row that do not start, after which no further one is tried with these resources
 
 
-@dataclass(frozen=True)
-class Resources:
-    """What one worker occupies."""
-
-    core: int | None = None  # that it stays on; None: the system or the cluster chooses
-    gpus: int = 0
-
-
 class WorkerActor:
     """A worker in a process of its own. Calls are short (see `schedule.ROUND`), so that one thread suffices."""
 
@@ -68,7 +60,8 @@ class WorkerHandle:
 
     job: JobConfig
     split: Path
-    resources: Resources
+    core: int | None  # that it stays on; None: the system or the cluster chooses
+    gpus: int
     actor: Any = None
     starting: Any = None  # reference to the new worker's first answer
     failed_starts: int = 0  # in a row
@@ -78,8 +71,8 @@ class WorkerHandle:
 
     def start(self) -> None:
         """Ask for a worker. It gets no unit before it answers: a cluster may have no room for it now, or ever."""
-        options = {"num_cpus": 1, "num_gpus": self.resources.gpus, "max_restarts": 0}
-        self.actor = ray.remote(WorkerActor).options(**options).remote(self.job, self.split, self.resources.core)
+        options = {"num_cpus": 1, "num_gpus": self.gpus, "max_restarts": 0}
+        self.actor = ray.remote(WorkerActor).options(**options).remote(self.job, self.split, self.core)
         self.starting = self.actor.ready.remote()
 
     def started(self) -> None:
@@ -159,13 +152,13 @@ class Crew:
         self._job, self._split, self._board = job, split, board
         self._most = min(job.workers or units, units)
         self._gpus = _on_gpus()
-        self._handles = [self._handle(each) for each in _room(self._gpus, self._most)]
+        self._handles = list(map(self._handle, _room(self._gpus, self._most)))
         self._given_up = 0  # workers that cannot start
         self._rescan_at = time.monotonic() + RESCAN
         self._notice_at = time.monotonic() + PATIENCE
 
-    def _handle(self, resources: Resources) -> WorkerHandle:
-        return WorkerHandle(self._job, self._split, resources)
+    def _handle(self, core: int | None) -> WorkerHandle:
+        return WorkerHandle(self._job, self._split, core, int(self._gpus))
 
     @property
     def busy(self) -> bool:
@@ -178,7 +171,7 @@ class Crew:
         self._rescan_at = time.monotonic() + RESCAN
         room = _room(self._gpus, self._most)
         surplus = len(self._handles) + self._given_up - len(room)
-        self._handles += [self._handle(each) for each in room[: max(0, -surplus)]]
+        self._handles += map(self._handle, room[: max(0, -surplus)])
         gone = [handle for handle in self._handles if handle.actor is None or handle.starting is not None]
         for handle in gone[: max(0, min(surplus, len(self._handles) - 1))]:
             handle.stop()
@@ -305,16 +298,12 @@ def _on_gpus() -> bool:
     return ray.get(ray.remote(num_gpus=1, max_calls=1)(_jax_sees_a_gpu).remote())
 
 
-def _room(gpus: bool, most: int) -> list[Resources]:
-    """What each worker occupies now: one for each GPU, or else each core, and at most so many."""
-    now = ray.cluster_resources()
-    if gpus:
-        room = [Resources(gpus=1)] * int(now.get("GPU", 0))
-    elif _existing():  # which cores its machines have is theirs to know
-        room = [Resources()] * int(now.get("CPU", 0))
-    else:
-        return [Resources(core) for core in cores_for(most)]
-    return (room or [Resources(gpus=int(gpus))])[:most]  # one that waits: more machines may join
+def _room(gpus: bool, most: int) -> list[int | None]:
+    """The core of each worker for which there is room now: one for each GPU or core, and at most so many."""
+    if not (gpus or _existing()):
+        return cores_for(most)
+    room = ray.cluster_resources().get("GPU" if gpus else "CPU", 0)  # which cores a cluster has is its to know
+    return [None] * min(max(int(room), 1), most)  # one that waits: more machines may join
 
 
 def _jax_sees_a_gpu() -> bool:
