@@ -9,8 +9,14 @@ import numpy as np
 
 from levelgen.level import MOTOR_BINDINGS, SIZES, THRUSTER_BINDINGS, Level
 from levelgen.sampling.sampler import sample_levels
-from levelgen.sampling.shuffle import BODY, JOINT, MOTION, THRUSTER
 from physics.types import FIXED_POLYGONS
+
+# Fields with a row for each thing of a kind
+BODY = ("active", "inverse_mass", "inverse_inertia", "friction", "restitution", "collision_mode")
+MOTION = ("position", "rotation", "velocity", "angular_velocity")
+JOINT = ("joint_active", "joint_a", "joint_b", "joint_anchor_a", "joint_anchor_b", "joint_fixed", "joint_rotation")
+JOINT += ("joint_limited", "joint_min", "joint_max", "motor_on", "motor_speed", "motor_power")
+THRUSTER = ("thruster_active", "thruster_body", "thruster_position", "thruster_rotation", "thruster_power")
 
 COUNT = 256
 IMPULSES = ("joint_impulse", "joint_angular_impulse")
