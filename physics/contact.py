@@ -50,9 +50,8 @@ def clear(block: Block) -> None:
 
         return one
 
-    for ref in (after.contact_active, after.contact_normal_impulse, after.contact_tangent_impulse):
-        each(ref.shape[0], blank(ref))
-    for ref in (constraints.touching, constraints.counts):
+    contacts = after.contact_active, after.contact_normal_impulse, after.contact_tangent_impulse
+    for ref in (*contacts, constraints.touching, constraints.counts):
         each(ref.shape[0], blank(ref))
 
 

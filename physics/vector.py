@@ -92,16 +92,9 @@ def rows(x: Array, index: Sequence[int]) -> Array:
     return pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
 
 
-def gather(x: Float[Array, "source *row lane"], index: Int[Array, "thing lane"]) -> Float[Array, "thing *row lane"]:
-    """x[index[thing, lane], ..., lane], for an index in bounds. Flat, because XLA would transpose x otherwise."""
-    lanes, size = x.shape[-1], x[0].size
-    within = jnp.arange(size, dtype=jnp.int32).reshape(x.shape[1:])
-    flat = index.reshape(len(index), *[1] * (x.ndim - 2), lanes) * size + within
-    return x.reshape(-1).at[flat].get(mode="promise_in_bounds")
-
-
 def select(x: Float[Array, "thing *row lane"], number: Int[Array, " lane"]) -> Float[Array, "*row lane"]:
-    """x[number[lane], ..., lane]."""
+    """x[number[lane], ..., lane], for a number in bounds. Flat, because XLA would transpose x otherwise."""
     lanes = max(x.shape[-1], number.shape[-1])  # either may be the same in all lanes
     x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
-    return gather(x, jnp.broadcast_to(number, (1, lanes)))[0]
+    within = jnp.arange(x[0].size, dtype=jnp.int32).reshape(x.shape[1:])
+    return x.reshape(-1).at[number * x[0].size + within].get(mode="promise_in_bounds")

@@ -16,7 +16,6 @@ from jaxtyping import Array, Float
 
 from experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
 from levelgen.level import Level
-from levelgen.task.observe.entities import tables_of
 from levelgen.task.observe.flat import (
     BODY_ROWS,
     CIRCLE_ROWS,
@@ -27,6 +26,7 @@ from levelgen.task.observe.flat import (
     THRUSTER_ROWS,
     body_rows,
     level_features,
+    tables_of,
 )
 from physics.types import FIXED_POLYGONS, Size
 from physics.vector import rows

@@ -24,7 +24,6 @@ from levelgen.sampling.proposal import (
     draw_role,
     draw_shape,
     no_joint,
-    origin,
     shape_mass,
     turned,
 )
@@ -106,9 +105,7 @@ def propose_connected(level: Level, d: BodyDraws, revolute: Flag, dist: Distribu
     rotation = d.rotation * TURN
     meet = vec(at(level.state.position, target)) + turned(target_anchor, at(level.state.rotation, target))
     role = draw_role(level, d.role, at(level.role, target) == Role.PLAIN, dist)
-    joint = draw_joint(level, d, target, is_polygon & target_is_polygon, revolute, dist)._replace(
-        anchor=anchor, target_anchor=target_anchor
-    )
+    joint = draw_joint(level, d, (target, anchor, target_anchor), is_polygon & target_is_polygon, revolute, dist)
     partner = BodyShape(target_is_polygon, (high - low).scale(0.5), at(radii(level), target))
     possible = (room_polygon | room_circle) & model.active[FIXED_POLYGONS:].any(0) & ~model.joint_active.all(0)
     return Proposal(
@@ -159,9 +156,9 @@ def spot(x: Lane, y: Lane, low: Vec, high: Vec) -> Vec:
 
 
 def draw_joint(
-    level: Level, d: BodyDraws, target: Bool[Array, "body lane"], polygons: Flag, revolute: Flag, dist: Distribution
+    level: Level, d: BodyDraws, ends: tuple[Array, Vec, Vec], polygons: Flag, revolute: Flag, dist: Distribution
 ) -> Joint:
-    """Joint and motor; `polygons` where it joins two of them. Its anchors are not set."""
+    """Joint and motor at its `ends`, the first three of Joint; `polygons` where it joins two of them."""
     model = level.model
     enough = (model.joint_active & ~model.joint_fixed).sum(0) >= dist.min_revolute_joints
     fixed = (d.joint_fixed < dist.fixed_joint_chance) & enough & ~revolute
@@ -169,9 +166,7 @@ def draw_joint(
     limited = turns & polygons & (d.limited < dist.limit_chance)
     top = jnp.where(polygons, dist.max_motor_power, dist.max_wheel_power)
     return Joint(
-        target=target,
-        anchor=origin(d.x),
-        target_anchor=origin(d.x),
+        *ends,
         fixed=fixed,
         limited=limited,
         limit_min=jnp.where(limited, between(d.limit_min, -dist.max_limit, 0.0), 0.0),

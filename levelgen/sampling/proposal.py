@@ -198,9 +198,5 @@ def no_joint(level: Level) -> Joint:
     return Joint(nobody, Vec(zero, zero), Vec(zero, zero), no, no, zero, zero, no, zero, zero, no.astype(jnp.int32))
 
 
-def origin(like: Lane) -> Vec:
-    return Vec(jnp.zeros_like(like), jnp.zeros_like(like))
-
-
 def turned(v: Vec, angle: Lane) -> Vec:
     return v.rotate(jnp.cos(angle), jnp.sin(angle))

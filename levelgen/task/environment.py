@@ -25,7 +25,7 @@ from levelgen.task.observe.pixels import SIDE, pixels
 from levelgen.task.rules import TaskParams, TaskState
 from levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete, Space
 from levelgen.task.vmapped import single
-from physics.types import Model, Size
+from physics.types import Size
 
 
 class ActionType(StrEnum):
@@ -56,27 +56,25 @@ class EnvParams:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class EnvState:
-    """One environment, without an axis of lanes: what is constant in its level, and the episode under way."""
+    """One environment, without an axis of lanes: its level, and the episode under way."""
 
-    model: Model
-    role: Int[Array, " body"]
-    density: Float[Array, " body"]
-    motor_binding: Int[Array, " joint"]
-    motor_auto: Bool[Array, " joint"]
-    thruster_binding: Int[Array, " thruster"]
-    now: TaskState
+    level: Level  # its world as it is now
+    timestep: Int[Array, ""]
+    last_distance: Float[Array, ""]
 
     @property
-    def level(self) -> Level:
-        """The level, its world as it is now."""
-        constant = {name: value for name, value in vars(self).items() if name != "now"}
-        return Level(state=self.now.state, **constant)
+    def now(self) -> TaskState:
+        return TaskState(self.level.state, self.timestep, self.last_distance)
+
+    @staticmethod
+    def at(level: Level, now: TaskState) -> "EnvState":
+        """A level in an episode."""
+        return EnvState(replace(level, state=now.state), now.timestep, now.last_distance)
 
     @staticmethod
     def start(level: Level) -> "EnvState":
         """An episode's beginning."""
-        constant = {name: value for name, value in vars(level).items() if name != "state"}
-        return EnvState(now=task.reset(level), **constant)
+        return EnvState.at(level, task.reset(level))
 
 
 Step = tuple[Any, EnvState, Float[Array, ""], Bool[Array, ""], dict[str, Array]]
@@ -234,10 +232,10 @@ class Environment:
     def _advance(self, state: EnvState, action: Array) -> tuple[EnvState, Array, Array, dict[str, Array]]:
         driven = CONTROLS[self.action_type](state.level, action)
         now, result, distance = task.advance_driven(state.level, state.now, driven, self.rules)
-        return replace(state, now=now), result.reward, result.done, {"GoalR": result.goal, "distance": distance}
+        return EnvState.at(state.level, now), result.reward, result.done, {"GoalR": result.goal, "distance": distance}
 
     def _look(self, state: EnvState) -> Any:
-        return LOOKS[self.observation_type](state.level, state.now.state)
+        return LOOKS[self.observation_type](state.level, state.level.state)
 
 
 def _detached(*given: Any) -> Any:

@@ -22,49 +22,37 @@ class Space:
         raise NotImplementedError
 
 
-class Discrete(Space):
-    """0 .. n - 1."""
-
-    def __init__(self, n: int) -> None:
-        self.n, self.shape, self.dtype = n, (), jnp.int32
-
-    def sample(self, key: Key[Array, ""]) -> Array:
-        return jax.random.randint(key, (), 0, self.n, jnp.int32)
-
-    def contains(self, x: Any) -> Bool[Array, ""]:
-        x = jnp.asarray(x)
-        return (x >= 0) & (x < self.n)
-
-
-class MultiDiscrete(Space):
-    """Several numbers, each below its own bound; `n` is the sum of the bounds: logits a policy needs."""
-
-    def __init__(self, bounds: tuple[int, ...]) -> None:
-        self.number_of_dims_per_distribution = np.array(bounds, np.int32)
-        self.n, self.shape, self.dtype = sum(bounds), (len(bounds),), jnp.int32
-
-    def sample(self, key: Key[Array, ""]) -> Array:
-        return jax.random.randint(key, self.shape, 0, self.number_of_dims_per_distribution, jnp.int32)
-
-    def contains(self, x: Any) -> Bool[Array, ""]:
-        x = jnp.asarray(x)
-        return ((x >= 0) & (x < self.number_of_dims_per_distribution)).all()
-
-
 class Box(Space):
     """An array of numbers between two bounds; whole numbers include both, truth values are False and True."""
 
-    def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any = jnp.float32) -> None:
+    def __init__(self, low: Any, high: Any, shape: tuple[int, ...], dtype: Any = jnp.float32) -> None:
         self.low, self.high, self.shape, self.dtype = low, high, shape, dtype
 
     def sample(self, key: Key[Array, ""]) -> Array:
         if jnp.issubdtype(self.dtype, jnp.floating):
             return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
-        return jax.random.randint(key, self.shape, int(self.low), int(self.high) + 1).astype(self.dtype)
+        return jax.random.randint(key, self.shape, self.low, self.high + 1).astype(self.dtype)
 
     def contains(self, x: Any) -> Bool[Array, ""]:
         x = jnp.asarray(x)
         return ((x >= self.low) & (x <= self.high)).all()
+
+
+class Discrete(Box):
+    """0 .. n - 1."""
+
+    def __init__(self, n: int) -> None:
+        super().__init__(0, n - 1, (), jnp.int32)
+        self.n = n
+
+
+class MultiDiscrete(Box):
+    """Several numbers, each below its own bound; `n` is the sum of the bounds: logits a policy needs."""
+
+    def __init__(self, bounds: tuple[int, ...]) -> None:
+        self.number_of_dims_per_distribution = np.array(bounds, np.int32)
+        super().__init__(0, self.number_of_dims_per_distribution - 1, (len(bounds),), jnp.int32)
+        self.n = sum(bounds)
 
 
 class Dict(Space):

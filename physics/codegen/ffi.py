@@ -93,17 +93,6 @@ class CallFrame(ctypes.Structure):
     )
 
 
-HEADER_NAMES = {
-    ExtensionBase: "XLA_FFI_Extension_Base",
-    ApiVersion: "XLA_FFI_Api_Version",
-    Metadata: "XLA_FFI_Metadata",
-    MetadataExtension: "XLA_FFI_Metadata_Extension",
-    FrameBuffer: "XLA_FFI_Buffer",
-    Args: "XLA_FFI_Args",
-    Rets: "XLA_FFI_Rets",
-    CallFrame: "XLA_FFI_CallFrame",
-}
-
 BYTE, POINTER, INT = ir.IntType(8), ir.PointerType(), ir.IntType(32)
 NULL = ir.Constant(POINTER, None)
 

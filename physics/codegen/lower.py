@@ -83,8 +83,6 @@ def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
             return [primitives.broadcast_in_dim(b, operands[0], params["shape"], params["broadcast_dimensions"])]
         case "reshape" | "squeeze" | "expand_dims":
             return [primitives.reshape(operands[0], out.shape)]
-        case "integer_pow":
-            return [_power(b, operands[0], params["y"], str(out.dtype))]
         case "slice":
             return [_slice(operands[0], params)]
         case "concatenate":
@@ -95,8 +93,6 @@ def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
             return [primitives.reduction(b, name, operands[0], params["axes"], str(out.dtype))]
         case "iota":
             return [primitives.iota(params["shape"], params["dimension"], str(params["dtype"]))]
-        case "copy":
-            return operands
         case "new_ref" if isinstance(operands[0], Memory):  # to an argument: the argument itself
             return operands
     raise NotImplementedError(f"a kernel cannot use the primitive {name}")
@@ -105,21 +101,6 @@ def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
 def _join(b: ir.IRBuilder, how: Callable, operands: list[Value], axis: int) -> Value:
     pieces = [primitives.with_lanes(b, x) for x in operands] if any(x.lanes for x in operands) else operands
     return Value(how([x.rows for x in pieces], axis=axis), pieces[0].dtype, pieces[0].lanes)
-
-
-def _power(b: ir.IRBuilder, x: Value, y: int, dtype: str) -> Value:
-    """By repeated squaring, in JAX's order."""
-    multiply = lambda p, q: primitives.elementwise(b, "mul", [p, q], dtype)
-    one = _known(np.ones((1,) * len(x.shape), dtype))
-    result, factor, left = None, x, abs(y)
-    while left:
-        if left % 2:
-            result = factor if result is None else multiply(result, factor)
-        left //= 2
-        factor = multiply(factor, factor) if left else factor
-    if result is None:
-        return primitives.broadcast_in_dim(b, one, x.shape, tuple(range(len(x.shape))))
-    return primitives.elementwise(b, "div", [one, result], dtype) if y < 0 else result
 
 
 def _slice(x: Value, params: dict) -> Value:
@@ -202,16 +183,6 @@ def _swap(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
     for at in np.ndindex(*shape):
         _store(b, memory, address(at), rows[at])
     return [before]
-
-
-def _add(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
-    memory, axes = _indexed(params, operands, 2)
-    shape, address = _rows(axes)
-    rows = np.broadcast_to(_written(b, operands[1], memory).rows, shape)
-    for at in np.ndindex(*shape):
-        now = primitives.combine(b, "add", memory.dtype, _load(b, memory, address(at)), rows[at])
-        _store(b, memory, address(at), now)
-    return []
 
 
 def _written(b: ir.IRBuilder, x: Value, memory: Memory) -> Value:
@@ -318,4 +289,4 @@ CONTROL: dict[str, Callable[[ir.IRBuilder, core.JaxprEqn, list], list[Value]]] =
     "closed_call": _call("call_jaxpr"),
     "custom_jvp_call": _call("call_jaxpr"),
 }
-ACCESS: dict[str, Callable[[ir.IRBuilder, dict, list], list[Value]]] = {"get": _get, "swap": _swap, "addupdate": _add}
+ACCESS: dict[str, Callable[[ir.IRBuilder, dict, list], list[Value]]] = {"get": _get, "swap": _swap}

@@ -68,28 +68,8 @@ def _sign(b, x):
     return b.select(b.fcmp_unordered("==", x, _number(x, 0.0)), x, _call("copysign")(b, _number(x, 1.0), x))
 
 
-def _sign_int(b, x):
-    zero, one = _number(x, 0), _number(x, 1)
-    return b.select(b.icmp_signed(">", x, zero), one, b.select(b.icmp_signed("<", x, zero), _number(x, -1), zero))
-
-
-def _quotient(name: str) -> Emit:
-    """div and rem of integers: as XLA defines them where the processor would stop the program.
-
-    x / 0 is -1, the rest is x; the lowest integer over -1 is itself, the rest 0.
-    """
-
-    def emit(b, x, y):
-        none = b.icmp_signed("==", y, _number(y, 0))
-        too_large = b.and_(b.icmp_signed("==", x, _number(x, -(2**31))), b.icmp_signed("==", y, _number(y, -1)))
-        result = getattr(b, name)(x, b.select(b.or_(none, too_large), _number(y, 1), y))
-        return b.select(none, _number(x, -1) if name == "sdiv" else x, result)
-
-    return emit
-
-
-def _clamp(larger: Emit, smaller: Emit) -> Emit:
-    return lambda b, low, x, high: smaller(b, larger(b, x, low), high)
+def _clamp_int(b, low, x, high):
+    return _extreme_int("<")(b, _extreme_int(">")(b, x, low), high)
 
 
 def _select(b, which, x, y):
@@ -100,32 +80,26 @@ def _bits(name: str) -> dict[str, Emit]:
     return dict.fromkeys((INT, BOOL), lambda b, *xs: getattr(b, name)(*xs))
 
 
-_MAX, _MIN, _MAX_INT, _MIN_INT = _extreme(">"), _extreme("<"), _extreme_int(">"), _extreme_int("<")
-_ADD: dict[str, Emit] = {FLOAT: lambda b, x, y: b.fadd(x, y), INT: lambda b, x, y: b.add(x, y)}
-
 # By the dtype of the last operand
 ELEMENTWISE: dict[str, dict[str, Emit]] = {
-    "add": _ADD,
-    "add_any": _ADD,
+    "add": {FLOAT: lambda b, x, y: b.fadd(x, y), INT: lambda b, x, y: b.add(x, y)},
     "sub": {FLOAT: lambda b, x, y: b.fsub(x, y), INT: lambda b, x, y: b.sub(x, y)},
     "mul": {FLOAT: lambda b, x, y: b.fmul(x, y), INT: lambda b, x, y: b.mul(x, y)},
-    "div": {FLOAT: lambda b, x, y: b.fdiv(x, y), INT: _quotient("sdiv")},
-    "rem": {INT: _quotient("srem")},
-    "max": {FLOAT: _MAX, INT: _MAX_INT, BOOL: lambda b, x, y: b.or_(x, y)},
-    "min": {FLOAT: _MIN, INT: _MIN_INT, BOOL: lambda b, x, y: b.and_(x, y)},
+    "div": {FLOAT: lambda b, x, y: b.fdiv(x, y)},
+    "max": {FLOAT: _extreme(">"), INT: _extreme_int(">"), BOOL: lambda b, x, y: b.or_(x, y)},
+    "min": {FLOAT: _extreme("<"), INT: _extreme_int("<"), BOOL: lambda b, x, y: b.and_(x, y)},
     "neg": {FLOAT: lambda b, x: b.fneg(x), INT: lambda b, x: b.neg(x)},
-    "abs": {FLOAT: _call("fabs"), INT: lambda b, x: b.select(b.icmp_signed("<", x, _number(x, 0)), b.neg(x), x)},
-    "sign": {FLOAT: _sign, INT: _sign_int},
+    "abs": {FLOAT: _call("fabs")},
+    "sign": {FLOAT: _sign},
     "sqrt": {FLOAT: _call("sqrt")},
     "floor": {FLOAT: _call("floor")},
     "round": {FLOAT: _call("rint")},
     "square": {FLOAT: lambda b, x: b.fmul(x, x), INT: lambda b, x: b.mul(x, x)},
     "and": _bits("and_"),
     "or": _bits("or_"),
-    "xor": _bits("xor"),
     "not": _bits("not_"),
     "select_n": dict.fromkeys((FLOAT, INT, BOOL), _select),
-    "clamp": {FLOAT: _clamp(_MAX, _MIN), INT: _clamp(_MAX_INT, _MIN_INT)},
+    "clamp": {INT: _clamp_int},  # `lax.switch` does it to its index
     **{name: _compare(order) for name, order in COMPARE.items()},
 }
 

@@ -13,23 +13,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from levelgen.level import Level
 from levelgen.task.observe.flat import (
-    CIRCLE_ROWS,
     GRAVITY_UNIT,
-    JOINT_ROWS,
-    POLYGON_ROWS,
-    THRUSTER_ROWS,
-    UNSEEN_WALLS,
     body_rows,
     joint_rows,
     polygon_rows,
     symbolic_flat,
+    tables_of,
     thruster_rows,
 )
 from physics.pairs import PairKind, pairs_of
 from physics.types import Size, State
 
 KINDS = 4  # polygons, circles, joints, thrusters
-ATTENTION_MASKS = 4  # all to all, held together by joints, joined directly, in contact
 
 
 def padded_shape(size: Size) -> tuple[int, int]:
@@ -54,16 +49,6 @@ def symbolic_padded(level: Level, state: State) -> Float[Array, "thing column la
         seen += count * width
     gravity = jnp.broadcast_to(flat[-1], (things, 1, lanes))
     return jnp.concatenate([jnp.concatenate(rows), gravity], axis=1)
-
-
-def tables_of(size: Size) -> tuple[tuple[int, int], ...]:
-    """(how many, rows of each) in the order of the flat observation."""
-    return (
-        (size.polygons - len(UNSEEN_WALLS), POLYGON_ROWS),
-        (size.circles, CIRCLE_ROWS),
-        (size.joints, JOINT_ROWS + 2 * size.bodies),
-        (size.thrusters, THRUSTER_ROWS + size.bodies),
-    )
 
 
 @jax.tree_util.register_dataclass

@@ -34,9 +34,17 @@ THRUSTER_ROWS = 6 + THRUSTER_BINDINGS  # and a one-hot body
 
 def feature_count(size: Size) -> int:
     """Rows of the observation: 140 for size s."""
-    polygons = (size.polygons - len(UNSEEN_WALLS)) * POLYGON_ROWS
-    joints = size.joints * (JOINT_ROWS + 2 * size.bodies)
-    return polygons + size.circles * CIRCLE_ROWS + joints + size.thrusters * (THRUSTER_ROWS + size.bodies) + 1
+    return sum(count * rows for count, rows in tables_of(size)) + 1
+
+
+def tables_of(size: Size) -> tuple[tuple[int, int], ...]:
+    """(how many, rows of each) of polygons, circles, joints and thrusters, in the order of the observation."""
+    return (
+        (size.polygons - len(UNSEEN_WALLS), POLYGON_ROWS),
+        (size.circles, CIRCLE_ROWS),
+        (size.joints, JOINT_ROWS + 2 * size.bodies),
+        (size.thrusters, THRUSTER_ROWS + size.bodies),
+    )
 
 
 @cache
@@ -79,15 +87,13 @@ def _runs(size: Size) -> tuple[tuple[int, int, bool], ...]:
 def state_features(level: Level, state: State) -> Float[Array, "dynamic lane"]:
     """The rows `dynamic_features`: position, velocity, spin and heading of every movable body."""
     at = slice(FIXED_POLYGONS, None)
-    rotation = state.rotation[at]
-    rows = [
-        *_split(state.position[at]),
-        *_split(state.velocity[at]),
-        jnp.tanh(state.angular_velocity[at] / SPIN_UNIT),
-        jnp.sin(rotation),
-        jnp.cos(rotation),
-    ]
-    return _side_by_side(rows, level.model.active[at])
+    return _side_by_side(motion_rows(state, at), level.model.active[at])
+
+
+def motion_rows(state: State, at: slice) -> list[Array]:
+    """A body's DYNAMIC_ROWS."""
+    spin, rotation = jnp.tanh(state.angular_velocity[at] / SPIN_UNIT), state.rotation[at]
+    return [*_split(state.position[at]), *_split(state.velocity[at]), spin, jnp.sin(rotation), jnp.cos(rotation)]
 
 
 def level_features(level: Level) -> Float[Array, "feature lane"]:
@@ -115,17 +121,13 @@ def level_features(level: Level) -> Float[Array, "feature lane"]:
 
 def body_rows(level: Level, at: slice, constant: bool = False) -> list[Array]:
     """Rows of some bodies in `level.state`, each [body, lane]; if `constant`, zero where a state decides them."""
-    model, state = level.model, level.state
+    model = level.model
+    *motion, spin, sine, cosine = motion_rows(level.state, at)
     if constant:
-        nothing = jnp.zeros_like(model.friction[at])
-        motion, spin, turn = [nothing] * 4, nothing, [nothing] * 2
-    else:
-        motion = [*_split(state.position[at]), *_split(state.velocity[at])]
-        spin, heading = jnp.tanh(state.angular_velocity[at] / SPIN_UNIT), state.rotation[at]
-        turn = [jnp.sin(heading), jnp.cos(heading)]
+        *motion, spin, sine, cosine = [jnp.zeros_like(model.friction[at])] * len(DYNAMIC_ROWS)
     mass = [model.inverse_mass[at], model.inverse_inertia[at], level.density[at]]
     surface = [model.friction[at], model.restitution[at]]
-    return [*motion, *mass, spin, *_one_hot(level.role[at], len(Role)), *turn, *surface]
+    return [*motion, *mass, spin, *_one_hot(level.role[at], len(Role)), sine, cosine, *surface]
 
 
 def polygon_rows(model: Model, at: slice) -> list[Array]:

@@ -148,7 +148,7 @@ def test_an_end_resets(levels: Level, keys) -> None:
     _, drawn, _, done, _ = jax.vmap(env.step, (0, 0, 0, None))(keys, own, stop, params)
     assert done.all()
     assert (np.asarray(drawn.now.timestep) == 0).all()
-    assert not np.array_equal(drawn.model.inverse_mass, own.model.inverse_mass)  # other levels
+    assert not np.array_equal(drawn.level.model.inverse_mass, own.level.model.inverse_mass)  # other levels
 
 
 def test_parameters_are_those_of_make_where_none_are_given(levels: Level, made) -> None:
