@@ -49,21 +49,15 @@ def split_words(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     Raises:
         UserError: one is missing, or there is one that the manifest decides.
     """
-    own, settings, names = {}, [], []
-    for word in words:
-        name, _, value = word.partition("=")
-        names.append(name)
-        if name in OWN:
-            own[name] = value
-        else:
-            settings.append(word)
+    values = {name: value for name, _, value in (word.partition("=") for word in words)}
+    own = {name: values[name] for name in OWN if name in values}
     if "manifest" not in own:
         raise UserError(f"Which levels? Name the split they are in, {HINT}.")
-    if "budget" not in names:
+    if "budget" not in values:
         raise UserError(f"Which budget? Give one, {HINT}.")
     for name in NOT_OURS:
-        if name in names:
+        if name in values:
             raise UserError(f"{name} cannot be changed here, it is that of the manifest: choose levels with where=SQL.")
     if own.get("continue", "false") not in ("true", "false"):
         raise UserError(f"continue is {own['continue']}: it must be true or false.")
-    return own, settings
+    return own, [word for word in words if word.partition("=")[0] not in OWN]

@@ -180,9 +180,7 @@ def read_manifest(
                 "named after them."
             )
     schema = pa.schema([COLUMNS.field(name) for name in names])
-    table = (
-        pa.concat_tables([part for _, part in read]).select(names).cast(schema) if read else schema.empty_table()
-    ).replace_schema_metadata(None)
+    table = pa.concat_tables([schema.empty_table(), *(part.select(names).cast(schema) for _, part in read)])
     data = [name for name in DATA_COLUMNS if name in names]
     named = {name: frozenset(path for path in table.column(name).unique().to_pylist() if path) for name in data}
     if level_ids is not None:

@@ -30,23 +30,13 @@ def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, 
         with committing(split):
             pass  # as workers do: a file system that refuses their lock is named before anything trains
         manifest = clean(split, say)
-        require_same(manifest, job)
+        if manifest.config_hash not in (None, job.hash):
+            changes = told(differences(manifest.config or {}, job.results))
+            raise UserError(
+                f"The split {split} was made with another configuration ({changes}): "
+                "use the same settings, or another folder with out=NAME."
+            )
         yield split, manifest
-
-
-def require_same(manifest: Manifest, job: JobConfig) -> None:
-    """Refuse to mix configurations in one split.
-
-    Raises:
-        UserError: the split was made with another one; the message names each setting that differs.
-    """
-    if manifest.config_hash in (None, job.hash):
-        return
-    changes = told(differences(manifest.config or {}, job.results))
-    raise UserError(
-        f"The split {manifest.split} was made with another configuration ({changes}): "
-        "use the same settings, or another folder with out=NAME."
-    )
 
 
 def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[tuple[int, int]]) -> None:
