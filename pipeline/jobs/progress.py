@@ -114,7 +114,7 @@ class Board(Display):
     def refresh(self, every: float = LINE_EVERY) -> None:
         """Draw anew; cheap enough to call often."""
         steps, levels = self._pace.tasks
-        if self.tally.steps > steps.completed:
+        if self.tally.steps != steps.completed:
             self._pace.update(self._steps, completed=self.tally.steps)
             self._pace.update(self._levels, completed=self.tally.share * self.tally.levels)
         text = self.tally.text(steps.speed or 0.0, levels.time_remaining)
