@@ -1,17 +1,26 @@
-"""What people see while the campaign runs, on stderr."""
+"""What people see while the campaign runs, on stderr: a bar on a terminal, plain lines now and then elsewhere."""
+
+import time
+from contextlib import AbstractContextManager, nullcontext
 
 from rich.console import Console
-from rich.progress import MofNCompleteColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pipeline.jobs.progress import Display
+LINE_EVERY = 30.0  # s between plain lines
 
 
-class Board(Display):
+class Board:
     """Counts blocks of worlds."""
 
     def __init__(self, console: Console) -> None:
-        super().__init__(console, MofNCompleteColumn())
+        self._console, self._line_at = console, 0.0
+        columns = BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+        self._bar = Progress(*columns, console=console)
+        self._task = self._bar.add_task("starting", total=1)
         self._done = self._blocks = 0
+
+    def shown(self) -> AbstractContextManager[object]:
+        return self._bar if self._console.is_terminal else nullcontext()
 
     def more(self, blocks: int) -> None:
         """There are so many more blocks to do."""
@@ -24,4 +33,8 @@ class Board(Display):
         self._show(what)
 
     def _show(self, what: str) -> None:
-        self.draw(self._done, self._blocks, what, f"{self._done}/{self._blocks} blocks · {what}")
+        if self._console.is_terminal:
+            self._bar.update(self._task, completed=self._done, total=self._blocks, description=what)
+        elif time.monotonic() - self._line_at >= LINE_EVERY:
+            self._line_at = time.monotonic()
+            self._console.print(f"{self._done}/{self._blocks} blocks · {what}", highlight=False, markup=False)

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from pipeline.jobs.schedule import Summary, WorkUnit
 
@@ -73,52 +73,38 @@ def say(console: Console, text: str) -> None:
     console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
-class Display:
-    """A bar on a terminal, plain lines now and then elsewhere."""
-
-    def __init__(self, console: Console, *columns: ProgressColumn) -> None:
-        self._console, self._line_at = console, 0.0
-        self._bar = Progress(
-            BarColumn(), *columns, TextColumn("{task.description}"), TimeElapsedColumn(), console=console
-        )
-        self._task = self._bar.add_task("starting", total=1)
-
-    def shown(self) -> AbstractContextManager[object]:
-        return self._bar if self._console.is_terminal else nullcontext()
-
-    def draw(self, completed: float, total: float, text: str, line: str, every: float = LINE_EVERY) -> None:
-        """Bring the bar up to date, or say `line`, if none was said in the last `every` seconds."""
-        now = time.monotonic()
-        if self._console.is_terminal:
-            self._bar.update(self._task, completed=completed, total=total, description=text)
-        elif now - self._line_at >= every:
-            self._line_at = now
-            self.say(line)
-
-    def say(self, text: str) -> None:
-        """A line that stays."""
-        say(self._console, text)
-
-
-class Board(Display):
-    """Shows a Tally."""
+class Board:
+    """Shows a Tally: a bar on a terminal, plain lines now and then elsewhere."""
 
     def __init__(self, tally: Tally, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(console, TaskProgressColumn())
-        self.tally = tally
+        self.tally, self._console, self._line_at = tally, console, 0.0
+        columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+        self._bar = Progress(*columns, console=console)
+        self._task = self._bar.add_task("starting", total=1)
         # Estimates only. They begin with the first env steps and levels of this run: compiling is no pace
         self._pace = Progress(get_time=clock, speed_estimate_period=PACE_OVER, disable=True)
         self._steps = self._pace.add_task("env steps", total=None)
         self._levels = self._pace.add_task("levels", total=tally.levels, completed=tally.done)
 
+    def shown(self) -> AbstractContextManager[object]:
+        return self._bar if self._console.is_terminal else nullcontext()
+
     def refresh(self, every: float = LINE_EVERY) -> None:
-        """Draw anew; cheap enough to call often."""
+        """Bring the bar up to date, or say a line, if none was said in the last `every` seconds."""
         steps, levels = self._pace.tasks
         if self.tally.steps != steps.completed:
             self._pace.update(self._steps, completed=self.tally.steps)
             self._pace.update(self._levels, completed=self.tally.share * self.tally.levels)
-        text = self.tally.text(steps.speed or 0.0, levels.time_remaining)
-        self.draw(self.tally.share, 1.0, text, text, every)
+        text, now = self.tally.text(steps.speed or 0.0, levels.time_remaining), time.monotonic()
+        if self._console.is_terminal:
+            self._bar.update(self._task, completed=self.tally.share, description=text)
+        elif now - self._line_at >= every:
+            self._line_at = now
+            self.say(text)
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        say(self._console, text)
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
         self.tally.ended(unit, summary)
