@@ -112,7 +112,7 @@ def prepare(
     keep = lambda x: jnp.where(acts, x, 0.0)
 
     def constrain():
-        bodies, to = block.scratch.bodies, block.scratch.constraints
+        before, bodies, to = block.given.before, block.scratch.bodies, block.scratch.constraints
         excess = jnp.maximum(contact.penetration - params.slop, 0.0)
         target = params.contact_bias / params.dt * excess - bounce(block, a, b, contact)
         rough = lambda body: jnp.square(model.friction[body] * params.base_friction)
@@ -120,7 +120,9 @@ def prepare(
         inertia = [keep(model.inverse_inertia[body]) for body in (a, b)]
         to.geometry[c] = keep(jnp.stack([*contact.normal, *contact.point]))
         to.effort[c] = jnp.stack([keep(target), keep(friction), keep(mass_a + mass_b), *inertia])
-        impulse = _remembered(block, c, acts)
+        remembered = acts & before.contact_active[c]  # where the contact acted in the last step and does now
+        last = jnp.stack([before.contact_normal_impulse[c], before.contact_tangent_impulse[c]])
+        impulse = jnp.where(remembered, last, 0.0)
         to.impulse[c] = impulse
         to.batch[c] = jnp.where(acts, so_far, NONE)  # until `share_out` knows the batch
         to.acting[block.table.start[group] + to.counts[group]] = c
@@ -130,14 +132,6 @@ def prepare(
         _push(bodies, a, b, lever, acts, (impulse[0], impulse[1]))
 
     when(anywhere(acts), constrain)
-
-
-def _remembered(block: Block, c: Scalar, acts: Bool[Array, " lane"]) -> Float[Array, "2 lane"]:
-    """The last step's impulses, normal and tangent, where the contact acted then and does now."""
-    before = block.given.before
-    remembered = acts & before.contact_active[c]
-    last = jnp.stack([before.contact_normal_impulse[c], before.contact_tangent_impulse[c]])
-    return jnp.where(remembered, last, 0.0)
 
 
 def share_out(block: Block) -> None:

@@ -27,7 +27,8 @@ def step(
     motor: Float[Array, "joint lane"],
     thrust: Float[Array, "thruster lane"],
     params: Params = DEFAULT_PARAMS,
-) -> tuple[State, Manifold]:
+    seen: bool = True,
+) -> tuple[State, Any]:
     """Advance every lane by `params.dt`.
 
     Args:
@@ -36,25 +37,11 @@ def step(
         motor: control of each joint's motor, in [-1, 1].
         thrust: control of each thruster, in [0, 1].
         params: constants of the engine.
+        seen: whether the contacts are written down; which of them were active, `State.contact_active` tells anyway.
 
     Returns:
-        The worlds after the step, and the contacts found at its start.
+        The worlds after the step, and the contacts found at its start: a Manifold, or None if they are not `seen`.
     """
-    return _step(model, state, motor, thrust, params, seen=True)
-
-
-def step_unseen(
-    model: Model,
-    state: State,
-    motor: Float[Array, "joint lane"],
-    thrust: Float[Array, "thruster lane"],
-    params: Params = DEFAULT_PARAMS,
-) -> State:
-    """The same without writing the contacts down; which of them were active, `State.contact_active` tells."""
-    return _step(model, state, motor, thrust, params, seen=False)[0]
-
-
-def _step(model, state, motor, thrust, params: Params, seen: bool) -> tuple[State, Any]:
     given = _same_lanes(Given(model, state, motor, thrust))
     if state.position.dtype != jnp.float32:
         return on_all_lanes(given, params, seen)

@@ -37,15 +37,11 @@ def level_id_array(level_ids: ArrayLike) -> Int[np.ndarray, " level"]:
     return ids.astype(np.int32)
 
 
-def level_key(level_id: Int[Array, ""] | int) -> Key[Array, ""]:
-    """The key all of a level's streams derive from.
+def key_for(level_id: Int[Array, ""] | int, stream: Stream) -> Key[Array, ""]:
+    """The key of one named stream of a level.
 
     `level_id` is 0 .. MAX_LEVEL_ID; it may be traced, and mapped with `jax.vmap`.
     """
     root = jax.random.key(ROOT_SEED, impl=GENERATOR)
-    return jax.random.fold_in(jax.random.fold_in(root, SAMPLER_VERSION), level_id)
-
-
-def key_for(level_id: Int[Array, ""] | int, stream: Stream) -> Key[Array, ""]:
-    """The key of one named stream of a level."""
-    return jax.random.fold_in(level_key(level_id), int(stream))
+    level_key = jax.random.fold_in(jax.random.fold_in(root, SAMPLER_VERSION), level_id)
+    return jax.random.fold_in(level_key, int(stream))

@@ -16,23 +16,8 @@ import numpy as np
 from jaxtyping import Int
 
 from levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
+from levelgen.pictures import style
 from levelgen.pictures.shapes import Host, Part, Point, Scene, disc, line, polygon, rectangle, turned
-from levelgen.pictures.style import (
-    BINDING_COLOUR,
-    BORDER,
-    EDGE,
-    FIXED_PLAIN,
-    FLAMES,
-    FOOTER,
-    GRID,
-    HEADER,
-    INK,
-    PAPER,
-    ROLE_COLOUR,
-    SHADE,
-    SKY,
-    Colour,
-)
 from levelgen.pictures.words import Caption, caption_parts, key_parts, printable
 from physics.types import State
 
@@ -55,7 +40,7 @@ def scene_of(
         parts += _thruster(level, state, int(thruster), action)
     for joint in np.flatnonzero(level.model.joint_active):
         parts += _joint(level, state, int(joint), action)
-    footer = FOOTER if action is not None else 0.0
+    footer = style.FOOTER if action is not None else 0.0
     parts += [Part(_paper(footer)), *caption_parts(caption or Caption())]
     if action is not None:
         parts += key_parts(level, action)
@@ -71,7 +56,7 @@ def _point(values: Host) -> Point:
     return float(values[0]), float(values[1])
 
 
-def _shade(colour: Colour, factor: float) -> Colour:
+def _shade(colour: style.Colour, factor: float) -> style.Colour:
     red, green, blue = (round(part * factor) for part in colour)
     return red, green, blue
 
@@ -79,27 +64,29 @@ def _shade(colour: Colour, factor: float) -> Colour:
 def _room() -> str:
     """Walls, then the air with a grid of metres."""
     side = WORLD_SIDE
-    shapes = rectangle((-BORDER, 0), (side + BORDER, side + BORDER), FIXED_PLAIN)
-    shapes += rectangle((0, 0), (side, side), SKY)
+    shapes = rectangle((-style.BORDER, 0), (side + style.BORDER, side + style.BORDER), style.FIXED_PLAIN)
+    shapes += rectangle((0, 0), (side, side), style.SKY)
     for metre in range(1, int(side)):
-        shapes += line([(metre, 0), (metre, side)], GRID, 0.01) + line([(0, metre), (side, metre)], GRID, 0.01)
+        shapes += line([(metre, 0), (metre, side)], style.GRID, 0.01) + line(
+            [(0, metre), (side, metre)], style.GRID, 0.01
+        )
     return shapes
 
 
 def _paper(footer: float) -> str:
     """What hides all that leaves the world upwards or downwards."""
-    top, right = WORLD_SIDE + BORDER, WORLD_SIDE + BORDER
-    above = rectangle((-BORDER, top), (right, top + HEADER), PAPER)
-    return above + rectangle((-BORDER, -footer), (right, 0), PAPER) if footer else above
+    top, right = WORLD_SIDE + style.BORDER, WORLD_SIDE + style.BORDER
+    above = rectangle((-style.BORDER, top), (right, top + style.HEADER), style.PAPER)
+    return above + rectangle((-style.BORDER, -footer), (right, 0), style.PAPER) if footer else above
 
 
-def _body_colours(level: Level, body: int) -> tuple[Colour, Colour, bool]:
+def _body_colours(level: Level, body: int) -> tuple[style.Colour, style.Colour, bool]:
     """Fill, edge, and whether it is hatched because it cannot move."""
     role, fixed = Role(int(level.role[body])), level.model.inverse_mass[body] == 0
-    fill = ROLE_COLOUR[role]
+    fill = style.ROLE_COLOUR[role]
     if fixed:
-        fill = FIXED_PLAIN if role == Role.PLAIN else _shade(fill, 0.72)
-    return fill, _shade(fill, SHADE), bool(fixed)
+        fill = style.FIXED_PLAIN if role == Role.PLAIN else _shade(fill, 0.72)
+    return fill, _shade(fill, style.SHADE), bool(fixed)
 
 
 def _body(level: Level, state: State, body: int) -> Part:
@@ -107,7 +94,7 @@ def _body(level: Level, state: State, body: int) -> Part:
     circle = body - level.size.polygons
     if circle >= 0:
         radius = float(level.model.radius[circle])
-        shapes = disc((0.0, 0.0), radius, fill, edge, fixed) + line([(0.0, 0.0), (radius, 0.0)], edge, EDGE)
+        shapes = disc((0.0, 0.0), radius, fill, edge, fixed) + line([(0.0, 0.0), (radius, 0.0)], edge, style.EDGE)
     else:
         corners = level.model.vertices[body][: level.model.n_vertices[body]]
         shapes = polygon(corners, fill, edge, hatched=fixed)
@@ -133,16 +120,16 @@ def _joint(level: Level, state: State, joint: int, action: np.ndarray | None) ->
     position = _attachment(state, int(model.joint_a[joint]), model.joint_anchor_a[joint])
     if model.joint_fixed[joint]:
         corners = 0.065 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-        cross = line(corners[::2], INK, EDGE) + line(corners[1::2], INK, EDGE)
-        return [Part(polygon(corners, PAPER, INK) + cross, position)]
+        cross = line(corners[::2], style.INK, style.EDGE) + line(corners[1::2], style.INK, style.EDGE)
+        return [Part(polygon(corners, style.PAPER, style.INK) + cross, position)]
     motor = bool(model.motor_on[joint])
-    colour = BINDING_COLOUR[int(level.motor_binding[joint])] if motor else PAPER
-    ring = disc((0.0, 0.0), 0.085 if motor else 0.07, colour, INK)
-    axle = disc((0.0, 0.0), 0.025, INK if level.motor_auto[joint] and motor else PAPER, INK)
+    colour = style.BINDING_COLOUR[int(level.motor_binding[joint])] if motor else style.PAPER
+    ring = disc((0.0, 0.0), 0.085 if motor else 0.07, colour, style.INK)
+    axle = disc((0.0, 0.0), 0.025, style.INK if level.motor_auto[joint] and motor else style.PAPER, style.INK)
     return [Part(ring + axle, position), Part(_arrow(_motor_turn(level, joint, action), colour), position)]
 
 
-def _arrow(turn: int, colour: Colour) -> str:
+def _arrow(turn: int, colour: style.Colour) -> str:
     """Three quarters of a circle around a joint, with an arrow head at its end."""
     if not turn:
         return ""
@@ -151,7 +138,7 @@ def _arrow(turn: int, colour: Colour) -> str:
     outward = arc[-1] / radius
     along = turn * turned(outward, np.pi / 2)
     head = np.array([arc[-1] + 0.12 * along, arc[-1] + 0.07 * outward, arc[-1] - 0.07 * outward])
-    return line(arc, INK, 0.035 + EDGE) + line(arc, colour, 0.035) + polygon(head, colour, INK, 0.014)
+    return line(arc, style.INK, 0.035 + style.EDGE) + line(arc, colour, 0.035) + polygon(head, colour, style.INK, 0.014)
 
 
 def _thruster(level: Level, state: State, thruster: int, action: np.ndarray | None) -> list[Part]:
@@ -161,14 +148,17 @@ def _thruster(level: Level, state: State, thruster: int, action: np.ndarray | No
     position = _attachment(state, body, model.thruster_position[thruster])
     angle = float(model.thruster_rotation[thruster] + state.rotation[body])
     flame = _flame() if action is not None and action[binding] else ""
-    return [Part(flame, position, angle), Part(polygon(NOZZLE, BINDING_COLOUR[binding], INK), position, angle)]
+    return [
+        Part(flame, position, angle),
+        Part(polygon(NOZZLE, style.BINDING_COLOUR[binding], style.INK), position, angle),
+    ]
 
 
 @cache
 def _flame() -> str:
-    def tongue(length: float, colour: Colour) -> str:
+    def tongue(length: float, colour: style.Colour) -> str:
         half = 0.075 * (0.5 + length / 2)
         waist, tip = -0.1 - 0.16 * length, -0.1 - 0.34 * length
         return polygon([(-0.1, half), (waist, half * 0.8), (tip, 0.0), (waist, -half * 0.8), (-0.1, -half)], colour)
 
-    return "".join(tongue(*flame) for flame in FLAMES)
+    return "".join(tongue(*flame) for flame in style.FLAMES)

@@ -6,19 +6,8 @@ import numpy as np
 from jaxtyping import Int
 
 from levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
+from levelgen.pictures import style
 from levelgen.pictures.shapes import Part, disc, rectangle, text, text_width
-from levelgen.pictures.style import (
-    BINDING_COLOUR,
-    BORDER,
-    CAPTION_SIZE,
-    FOOTER,
-    HEADER,
-    INK,
-    KEY_SIZE,
-    MUTED,
-    PAPER,
-    ROLE_COLOUR,
-)
 
 ELLIPSIS = "…"
 
@@ -35,7 +24,12 @@ class Caption:
 
 def caption_parts(caption: Caption) -> list[Part]:
     """Title, badge and clock, each a part."""
-    middle, left, right, size = WORLD_SIDE + BORDER + HEADER / 2, 0.04, WORLD_SIDE - 0.04, CAPTION_SIZE
+    middle, left, right, size = (
+        WORLD_SIDE + style.BORDER + style.HEADER / 2,
+        0.04,
+        WORLD_SIDE - 0.04,
+        style.CAPTION_SIZE,
+    )
     title, clock, outcome = (printable(words) for words in (caption.title, caption.clock, caption.outcome))
     badge = text_width(outcome, size) + 0.3 if outcome else 0.0
     title = _fitted(title, right - left - badge - text_width(clock, size) - 0.1, size)
@@ -43,12 +37,12 @@ def caption_parts(caption: Caption) -> list[Part]:
     if outcome:
         start = left + (text_width(title, size) + 0.2 if title else 0.09)
         end = start + text_width(outcome, size)
-        colour = ROLE_COLOUR[Role.GREEN] if caption.good else ROLE_COLOUR[Role.RED]
+        colour = style.ROLE_COLOUR[Role.GREEN] if caption.good else style.ROLE_COLOUR[Role.RED]
         shapes = rectangle((start - 0.09, middle - 0.12), (end + 0.09, middle + 0.12), colour, corner=0.1)
-        shapes += text((start, middle), outcome, PAPER, size)
+        shapes += text((start, middle), outcome, style.PAPER, size)
     return [
-        Part(text((left, middle), title, INK, size) if title else ""),
-        Part(text((right, middle), clock, MUTED, size, ends=True) if clock else ""),
+        Part(text((left, middle), title, style.INK, size) if title else ""),
+        Part(text((right, middle), clock, style.MUTED, size, ends=True) if clock else ""),
         Part(shapes),
     ]
 
@@ -69,15 +63,17 @@ def _fitted(words: str, room: float, size: float) -> str:
 
 def key_parts(level: Level, action: Int[np.ndarray, "6"]) -> list[Part]:
     """A key for each live entry, lit in its binding's colour while it is used."""
-    middle, left, parts = -FOOTER / 2, 0.04, []
+    middle, left, parts = -style.FOOTER / 2, 0.04, []
     for entry in live_entries(level):
         is_motor = entry < MOTOR_BINDINGS
         name = f"M{entry + 1}" if is_motor else f"T{entry - MOTOR_BINDINGS + 1}"
         state = ("off", "forward" if is_motor else "on", "back")[int(action[entry])]
-        lit, colour = int(action[entry]) != 0, BINDING_COLOUR[entry]
-        key = disc((left + 0.07, middle), 0.07, colour if lit else PAPER, colour)
-        parts.append(Part(key + text((left + 0.2, middle), f"{name} {state}", INK if lit else MUTED, KEY_SIZE)))
-        left += 0.2 + text_width(f"{name} forward", KEY_SIZE) + 0.06
+        lit, colour = int(action[entry]) != 0, style.BINDING_COLOUR[entry]
+        key = disc((left + 0.07, middle), 0.07, colour if lit else style.PAPER, colour)
+        parts.append(
+            Part(key + text((left + 0.2, middle), f"{name} {state}", style.INK if lit else style.MUTED, style.KEY_SIZE))
+        )
+        left += 0.2 + text_width(f"{name} forward", style.KEY_SIZE) + 0.06
     return parts
 
 

@@ -231,7 +231,7 @@ class Environment:
 
     def _advance(self, state: EnvState, action: Array) -> tuple[EnvState, Array, Array, dict[str, Array]]:
         driven = CONTROLS[self.action_type](state.level, action)
-        now, result, distance = task.advance_driven(state.level, state.now, driven, self.rules)
+        now, result, distance, _ = task.advance_driven(state.level, state.now, driven, self.rules)
         return EnvState.at(state.level, now), result.reward, result.done, {"GoalR": result.goal, "distance": distance}
 
     def _look(self, state: EnvState) -> Any:

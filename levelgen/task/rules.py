@@ -4,7 +4,7 @@ Facts: `kinetix.environment.env` 3.0.2.
 """
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,6 @@ from levelgen.level import Level, Role
 from levelgen.task.actions import Controls, controls
 from physics.pairs import pairs_of
 from physics.step import step as physics_step
-from physics.step import step_unseen
 from physics.types import Manifold, Params, State
 from physics.vector import rows, select, vec
 
@@ -105,7 +104,7 @@ class Frame(NamedTuple):
     goal: Bool[Array, " lane"]
     fail: Bool[Array, " lane"]
     distance: Float[Array, " lane"]
-    seen: Manifold | None
+    manifold: Manifold | None
 
 
 def advance(
@@ -115,29 +114,28 @@ def advance(
     return advance_driven(level, now, controls(level, action), params)[:2]
 
 
-def advance_driven(
-    level: Level, now: TaskState, driven: Controls, params: TaskParams
-) -> tuple[TaskState, StepResult, Float[Array, " lane"]]:
-    """The same under controls, whatever kind of action they come from; and the distance of the goal at the end, m."""
-    return _advance(level, now, driven, params, lambda *given: (step_unseen(*given), None))[:3]
-
-
 def advance_seen(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
 ) -> tuple[TaskState, StepResult, Manifold]:
     """The same, and the contacts of the last physics step."""
-    after, result, _, seen = _advance(level, now, controls(level, action), params, physics_step)
-    return after, result, seen
+    after, result, _, manifold = advance_driven(level, now, controls(level, action), params, seen=True)
+    return after, result, manifold
 
 
-def _advance(level: Level, now: TaskState, driven: Controls, params: TaskParams, physics) -> tuple:
+def advance_driven(
+    level: Level, now: TaskState, driven: Controls, params: TaskParams, seen: bool = False
+) -> tuple[TaskState, StepResult, Float[Array, " lane"], Any]:
+    """The same under controls, whatever kind of action they come from.
+
+    Also returns the distance of the goal at the end, m, and the contacts of the last physics step, if `seen`.
+    """
     motor, thrust = driven
 
     def frame(state, _):
-        state, seen = physics(level.model, state, motor, thrust, params.physics)
+        state, manifold = physics_step(level.model, state, motor, thrust, params.physics, seen)
         fail = touches(level, state.contact_active, Role.GREEN, Role.RED)
         goal = touches(level, state.contact_active, Role.GREEN, Role.BLUE) & ~fail
-        return state, Frame(goal, fail, goal_distance(level, state), seen)
+        return state, Frame(goal, fail, goal_distance(level, state), manifold)
 
     state, frames = jax.lax.scan(frame, now.state, None, length=params.frame_skip)
     ended = frames.goal | frames.fail
@@ -152,7 +150,7 @@ def _advance(level: Level, now: TaskState, driven: Controls, params: TaskParams,
     shaping = jnp.where(now.last_distance == NO_DISTANCE, 0.0, params.dense_reward_scale * closer)
     reward = goal.astype(jnp.float32) - select(frames.fail, first).astype(jnp.float32) + shaping
     after = TaskState(state, timestep, jnp.where(done, NO_DISTANCE, distance))
-    return after, StepResult(reward, done, goal), distance, jax.tree.map(lambda x: x[-1], frames.seen)
+    return after, StepResult(reward, done, goal), distance, jax.tree.map(lambda x: x[-1], frames.manifold)
 
 
 def has_nan(state: State) -> Bool[Array, " lane"]:

@@ -19,79 +19,24 @@ VERSION_MAJOR, VERSION_MINOR = 0, 3
 METADATA_QUERY = 1  # XLA_FFI_Extension_Metadata: XLA asks which version the handler was made for
 
 
-class ExtensionBase(ctypes.Structure):
-    _fields_ = (("struct_size", c_size_t), ("type", c_int), ("next", c_void_p))
+START: dict[str, Any] = {"struct_size": c_size_t, "extension_start": c_void_p}  # how most structures begin
+ARRAY: dict[str, Any] = {**START, "size": c_int64, "types": c_void_p}
 
 
-class ApiVersion(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", c_size_t),
-        ("extension_start", c_void_p),
-        ("major_version", c_int),
-        ("minor_version", c_int),
-    )
+def _structure(name: str, **fields: Any) -> Any:
+    """A structure of the header, by its name there; its last fields may be left out, where they are not read."""
+    return type(name, (ctypes.Structure,), {"_fields_": tuple(fields.items())})
 
 
-class Metadata(ctypes.Structure):
-    """What XLA wants to know. It hands it over with no traits and no state, which is true of ours: not written."""
-
-    _fields_ = (
-        ("struct_size", c_size_t),
-        ("api_version", ApiVersion),
-        ("traits", c_uint32),
-    )
-
-
-class MetadataExtension(ctypes.Structure):
-    _fields_ = (("extension_base", ExtensionBase), ("metadata", c_void_p))
-
-
-class FrameBuffer(ctypes.Structure):
-    """An argument or a result."""
-
-    _fields_ = (
-        ("struct_size", c_size_t),
-        ("extension_start", c_void_p),
-        ("dtype", c_int),
-        ("data", c_void_p),
-        ("rank", c_int64),
-        ("dims", c_void_p),
-    )
-
-
-class Args(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", c_size_t),
-        ("extension_start", c_void_p),
-        ("size", c_int64),
-        ("types", c_void_p),
-        ("args", c_void_p),
-    )
-
-
-class Rets(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", c_size_t),
-        ("extension_start", c_void_p),
-        ("size", c_int64),
-        ("types", c_void_p),
-        ("rets", c_void_p),
-    )
-
-
-class CallFrame(ctypes.Structure):
-    """What XLA calls a handler with; its last fields are not read."""
-
-    _fields_ = (
-        ("struct_size", c_size_t),
-        ("extension_start", c_void_p),
-        ("api", c_void_p),
-        ("ctx", c_void_p),
-        ("stage", c_int),
-        ("args", Args),
-        ("rets", Rets),
-    )
-
+ExtensionBase = _structure("XLA_FFI_Extension_Base", struct_size=c_size_t, type=c_int, next=c_void_p)
+ApiVersion = _structure("XLA_FFI_Api_Version", **START, major_version=c_int, minor_version=c_int)
+# What XLA wants to know. It hands it over with no traits and no state, which is true of ours: not written
+Metadata = _structure("XLA_FFI_Metadata", struct_size=c_size_t, api_version=ApiVersion, traits=c_uint32)
+MetadataExtension = _structure("XLA_FFI_Metadata_Extension", extension_base=ExtensionBase, metadata=c_void_p)
+FrameBuffer = _structure("XLA_FFI_Buffer", **START, dtype=c_int, data=c_void_p, rank=c_int64, dims=c_void_p)
+Args = _structure("XLA_FFI_Args", **ARRAY, args=c_void_p)
+Rets = _structure("XLA_FFI_Rets", **ARRAY, rets=c_void_p)
+CallFrame = _structure("XLA_FFI_CallFrame", **START, api=c_void_p, ctx=c_void_p, stage=c_int, args=Args, rets=Rets)
 
 BYTE, POINTER, INT = ir.IntType(8), ir.PointerType(), ir.IntType(32)
 NULL = ir.Constant(POINTER, None)
@@ -117,14 +62,9 @@ def add_handler(
     results: Sequence[Buffer],
     scratch: Sequence[Buffer],
 ) -> None:
-    """Add `handler(frame)` to the module: `block(lanes, pointers ...)` for each block of lanes.
+    """Add `handler(frame)` to the module of the kernel `block`, which it calls as `block(lanes, pointers ...)`.
 
-    Args:
-        module: where `block` is.
-        block: the kernel; see `compile.compile_kernel`.
-        arguments: what XLA hands over; the first has lanes.
-        results: what XLA wants filled; after them it hands over one more, the scratch memory.
-        scratch: what the kernel works in.
+    For each block of lanes of the buffers, of which `compile.compile_kernel` tells.
     """
     function = ir.Function(module, ir.FunctionType(POINTER, [POINTER]), "handler")
     (frame,) = function.args

@@ -21,7 +21,7 @@ from levelgen.task.observe.flat import (
     tables_of,
     thruster_rows,
 )
-from physics.pairs import PairKind, pairs_of
+from physics.pairs import pairs_of
 from physics.types import Size, State
 
 KINDS = 4  # polygons, circles, joints, thrusters
@@ -115,14 +115,9 @@ def _attention_mask(level: Level, joint_index: Int[Array, "2 joint lane"]) -> Bo
 def _touching(level: Level) -> Bool[Array, "body body lane"]:
     """Contacts of the last physics step, at their pair's two numbers."""
     pairs, active = pairs_of(level.size), level.state.contact_active
-    n, m = len(pairs.polygon), len(pairs.circle_polygon)
-    kinds: list[tuple[PairKind, Array]] = [
-        (pairs.polygon, active[:n] | active[n : 2 * n]),
-        (pairs.circle_polygon, active[2 * n : 2 * n + m]),
-        (pairs.circle, active[2 * n + m :]),
-    ]
-    where = np.full((level.size.bodies, level.size.bodies), n + m + len(pairs.circle))  # the last row: no pair
-    for (kind, _), start in zip(kinds, (0, n, n + m), strict=True):
-        where[list(kind.a), list(kind.b)] = start + np.arange(len(kind))
+    n, kinds = len(pairs.polygon), (pairs.polygon, pairs.circle_polygon, pairs.circle)
+    first, second = sum((kind.a for kind in kinds), ()), sum((kind.b for kind in kinds), ())
+    where = np.full((level.size.bodies, level.size.bodies), len(first))  # the last row: no pair
+    where[first, second] = np.arange(len(first))
     none = jnp.zeros((1, active.shape[-1]), bool)
-    return jnp.concatenate([*(touch for _, touch in kinds), none])[where]
+    return jnp.concatenate([active[:n] | active[n : 2 * n], active[2 * n :], none])[where]
