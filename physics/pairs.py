@@ -35,11 +35,6 @@ class PairKind:
         """Solver batches that run one after another (Jax2D: ceil(pairs / 16))."""
         return -(-len(self) // SOLVER_BATCH)
 
-    @property
-    def padded(self) -> bool:
-        """True where the reference's last batch is padded, so that its defect resets the last pair."""
-        return self.batches * SOLVER_BATCH > len(self)
-
 
 @dataclass(frozen=True)
 class Pairs:
@@ -93,7 +88,8 @@ def table_of(size: Size, faithful_padding: bool) -> Table:
     kinds = pairs_of(size).by_group
     kept = [np.ones(len(pair), np.float32) for pair in kinds]
     for pair, row in zip(kinds, kept, strict=True):
-        row[len(pair) - 1 :] = not (faithful_padding and pair.padded)
+        padded = pair.batches * SOLVER_BATCH > len(pair)  # the reference's last batch: its defect resets the last pair
+        row[len(pair) - 1 :] = not (faithful_padding and padded)
     whole, number = (lambda x: np.array(x, np.int32)), (lambda x: np.array(x, np.float32))
     return Table(
         a=whole([body for pair in kinds for body in pair.a]),

@@ -28,8 +28,6 @@ from levelgen.sampling.scenery import empty_level
 from levelgen.sampling.shuffle import OrderDraws, shuffle, shuffled_rows
 from physics.types import FIXED_POLYGONS, Size
 
-__all__ = ["Distribution", "sample_levels"]
-
 CHUNK = 256  # levels sampled by one call of the compiled program, however many are asked for
 GOAL_BODIES = 2  # green and blue come first
 DEFAULT = Distribution()

@@ -178,7 +178,7 @@ class Environment:
     def step_env(self, key: Key[Array, ""], state: EnvState, action: Array, params: EnvParams | None = None) -> Step:
         """One env step without reset."""
         del key, params  # the world has no chance in it
-        return single(self._advance_lanes)((), 0, _detached(state, action))
+        return single(self._step_lanes)((), 0, (None, *_detached(state, action)))
 
     def reset_env(self, key: Key[Array, ""], params: EnvParams | None = None) -> tuple[Any, EnvState]:
         return self.reset(key, params)
@@ -218,21 +218,16 @@ class Environment:
         state = _first_state(levels, index, override)
         return self._look(state), state
 
-    def _advance_lanes(self, table: Any, index: Int[Array, " lane"], given: tuple[EnvState, Array]) -> Step:
-        after, reward, done, info = self._advance(*given)
-        return self._look(after), after, reward, done, info
-
     def _step_lanes(self, levels: Any, index: Int[Array, " lane"], given: tuple[Any, EnvState, Array]) -> Step:
+        """(what `_restart` gives, with the state and the action) to a step; without levels or a state, no reset."""
         override, state, action = given
-        after, reward, done, info = self._advance(state, action)
-        restart = _first_state(levels, index, override)
-        after = jax.tree.map(lambda fresh, x: jnp.where(done, fresh, x), restart, after)
-        return self._look(after), after, reward, done, info
-
-    def _advance(self, state: EnvState, action: Array) -> tuple[EnvState, Array, Array, dict[str, Array]]:
         driven = CONTROLS[self.action_type](state.level, action)
         now, result, distance, _ = task.advance_driven(state.level, state.now, driven, self.rules)
-        return EnvState.at(state.level, now), result.reward, result.done, {"GoalR": result.goal, "distance": distance}
+        after = EnvState.at(state.level, now)
+        if levels or override:
+            restart = _first_state(levels, index, override)
+            after = jax.tree.map(lambda fresh, x: jnp.where(result.done, fresh, x), restart, after)
+        return self._look(after), after, result.reward, result.done, {"GoalR": result.goal, "distance": distance}
 
     def _look(self, state: EnvState) -> Any:
         return LOOKS[self.observation_type](state.level, state.level.state)

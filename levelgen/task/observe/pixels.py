@@ -78,7 +78,7 @@ def _shapes(level: Level, state: State) -> list[Coverage]:
     """From the floor to the thrusters."""
     model, size = level.model, level.size
     centre = state.position * PIXELS_PER_METRE
-    colours = _body_colours(level)
+    colours = _role_colour(level.role, model.inverse_mass == 0)
     floor = centre[0] + model.vertices[0] * PIXELS_PER_METRE  # its rotation is not drawn
     floor_colour = _role_colour(level.role[0], jnp.array(True))
     shapes = [_shape(_polygon_planes(floor), floor_colour)]
@@ -192,10 +192,6 @@ def _shape(planes: Planes, colour: Int[Array, ""]) -> Coverage:
 
 def _if(shown: Array, shape: Coverage) -> Coverage:
     return shape._replace(low=jnp.where(shown, shape.low, jnp.inf))
-
-
-def _body_colours(level: Level) -> Int[Array, " body"]:
-    return _role_colour(level.role, level.model.inverse_mass == 0)
 
 
 def _role_colour(role: Int[Array, " *body"], fixed: Array) -> Int[Array, " *body"]:
