@@ -108,14 +108,7 @@ def _compiled(size: Size, params: Params, seen: bool, given: Given, stages: tupl
 
 
 def trace(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...] = STAGES) -> tuple[Any, Any]:
-    """The step of a block as a jaxpr.
-
-    Args:
-        size: of the worlds.
-        params: constants of the engine.
-        seen: whether contacts are written down.
-        given: buffers of what the step reads.
-        stages: which of its stages.
+    """The step of a block as a jaxpr, given the buffers of what it reads.
 
     Returns:
         Buffers of what it is given, of the lookup tables, of its results and of its scratch memory; and the jaxpr,

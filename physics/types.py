@@ -112,8 +112,7 @@ class Model:
 class State:
     """What evolves: enough to resume the simulation bit for bit.
 
-    Contacts are numbered as `pairs.py` says: first points of the polygon pairs, their second points,
-    circle-polygon pairs, circle-circle pairs.
+    Contacts are numbered as `pairs.py` says.
     """
 
     position: Float[Array, "body 2 lane"]  # m, of the centroid

@@ -18,23 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from levelgen.files.entries import (
-    COUNTS,
-    EXTRA,
-    GRAVITY,
-    NO_CONTACT,
-    PHYSICS,
-    RULES,
-    STATIC_CONSTANTS,
-    STATIC_EXTRA,
-    STEPS,
-    TASK,
-    Entry,
-    LevelFileError,
-    entries_of,
-    item,
-    told,
-)
+from levelgen.files import entries as layout
+from levelgen.files.entries import Entry, LevelFileError, entries_of, item, told
 from levelgen.files.kinetix import MANIFOLDS, Fields, level_from_kinetix, state_to_kinetix
 from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
 from levelgen.sampling.scenery import empty_level
@@ -120,11 +105,11 @@ def from_document(document: object) -> LevelFile:
         LevelFileError: there is none that can be used.
     """
     world, params, static = (item(document, name, "") for name in ("env_state", "env_params", "static_env_params"))
-    for name, needed in STATIC_CONSTANTS.items():
+    for name, needed in layout.STATIC_CONSTANTS.items():
         value = item(static, name, "static_env_params")
         if value != needed:
             raise LevelFileError(f"static_env_params.{name} is {told(value)}, this engine has {told(needed)} only")
-    size = Size(*(entry.read(static, name, "static_env_params") for name, entry in COUNTS.items()))
+    size = Size(*(entry.read(static, name, "static_env_params") for name, entry in layout.COUNTS.items()))
     if size.bodies == FIXED_POLYGONS:
         raise LevelFileError("static_env_params has no room for a body besides the scenery")
     level = level_from_kinetix(_fields(world, size))
@@ -146,17 +131,22 @@ def to_document(file: LevelFile) -> dict[str, Any]:
         raise LevelFileError("the level starts with contacts, and a file's levels start without")
     if np.any(np.asarray(level.motor_auto) & np.asarray(level.model.joint_active)):
         raise LevelFileError("the level has a motor that runs by itself, and a file cannot say so")
-    fields, counts = _with_points(level), dict(zip(COUNTS, size, strict=True))
-    physics = {theirs: getattr(rules.physics, ours) for ours, theirs in PHYSICS.items()}
+    fields, counts = _with_points(level), dict(zip(layout.COUNTS, size, strict=True))
+    physics = {theirs: getattr(rules.physics, ours) for ours, theirs in layout.PHYSICS.items()}
     document = {
         "env_state": {
             **{kind: _things(fields, kind, entries) for kind, entries in entries_of(size).items()},
             "collision_matrix": _nested(fields["collision_matrix"][0]),
-            **{kind: [NO_CONTACT] * fields[f"{kind}/active"].size for kind in MANIFOLDS},
+            **{kind: [layout.NO_CONTACT] * fields[f"{kind}/active"].size for kind in MANIFOLDS},
             "gravity": _nested(fields["gravity"][0]),
         },
-        "env_params": {**physics, **{name: getattr(rules, name) for name in TASK}, **EXTRA},
-        "static_env_params": {**counts, **STATIC_CONSTANTS, "frame_skip": rules.frame_skip, **STATIC_EXTRA},
+        "env_params": {**physics, **{name: getattr(rules, name) for name in layout.TASK}, **layout.EXTRA},
+        "static_env_params": {
+            **counts,
+            **layout.STATIC_CONSTANTS,
+            "frame_skip": rules.frame_skip,
+            **layout.STATIC_EXTRA,
+        },
     }
     from_document(document)  # nothing is written that cannot be read
     return document
@@ -174,7 +164,7 @@ def _fields(world: object, size: Size) -> Fields:
             values = [entry.read(thing, name, f"env_state.{kind}[{i}]") for i, thing in enumerate(things)]
             dtype = {float: np.float32, int: np.int32, bool: np.bool_}[entry.kind]
             fields[_path(kind, name)] = np.array(values, dtype).reshape(1, count, *entry.shape)
-    return fields | {"gravity": np.array([GRAVITY.read(world, "gravity", "env_state")], np.float32)}
+    return fields | {"gravity": np.array([layout.GRAVITY.read(world, "gravity", "env_state")], np.float32)}
 
 
 def _check(level: Level) -> None:
@@ -203,9 +193,9 @@ def _refuse(bad: Any, kind: str, why: str) -> None:
 
 
 def _rules(params: object, static: object) -> TaskParams:
-    physics = {ours: RULES[ours].read(params, theirs, "env_params") for ours, theirs in PHYSICS.items()}
-    task = {name: entry.read(params, name, "env_params") for name, entry in TASK.items()}
-    frame_skip = STEPS.read(static, "frame_skip", "static_env_params")
+    physics = {ours: layout.RULES[ours].read(params, theirs, "env_params") for ours, theirs in layout.PHYSICS.items()}
+    task = {name: entry.read(params, name, "env_params") for name, entry in layout.TASK.items()}
+    frame_skip = layout.STEPS.read(static, "frame_skip", "static_env_params")
     return TaskParams(frame_skip=frame_skip, physics=Params(**physics), **task)
 
 

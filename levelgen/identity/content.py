@@ -99,14 +99,19 @@ def _shape(rows: _Rows, i: int, body: int) -> bytes:
     return min((ring[start:] + ring[:start] for start in range(0, len(ring), one)), default=ring)
 
 
+def kinds(levels: Any) -> np.ndarray:
+    """(level, body): 0 scenery, 1 polygon, 2 circle."""
+    number = np.arange(levels.role.shape[1])
+    kind = np.where(number < FIXED_POLYGONS, 0, np.where(number < levels.model.n_vertices.shape[1], 1, 2))
+    return np.broadcast_to(kind, levels.role.shape)
+
+
 def _body_rows(levels: Any) -> np.ndarray:
     """Everything of a body but its shape. Which of the four scenery polygons it is, is a number only."""
-    model, state, size = levels.model, levels.state, levels.role.shape
-    number = np.arange(size[1])
-    kind = np.where(number < FIXED_POLYGONS, 0, np.where(number < model.n_vertices.shape[1], 1, 2))
+    model, state = levels.model, levels.state
     matter = model.inverse_mass, model.inverse_inertia, model.friction, model.restitution
     motion = state.position, state.rotation, state.velocity, state.angular_velocity
-    return _columns(np.broadcast_to(kind, size), levels.role, model.collision_mode, *matter, *motion)
+    return _columns(kinds(levels), levels.role, model.collision_mode, *matter, *motion)
 
 
 def acting_joints(levels: Any) -> np.ndarray:

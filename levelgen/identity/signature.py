@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from levelgen.identity.content import acting_joints, acting_thrusters, level_first
+from levelgen.identity.content import acting_joints, acting_thrusters, kinds, level_first
 from levelgen.level import Level
-from physics.types import FIXED_POLYGONS, MAX_VERTICES
+from physics.types import MAX_VERTICES
 
 VERSION = 1  # of the rules; signatures of different versions never compare equal
 DIGITS = 16  # of each hash, hexadecimal
@@ -53,14 +53,12 @@ def _of_grid(levels: Any, grid: int) -> list[str]:
 def _bodies(levels: Any, grid: int) -> np.ndarray:
     """(level, body, word): kind, role, whether it can move, position, sides; a circle looks the same at every angle."""
     model, state = levels.model, levels.state
-    count, polygons = model.n_vertices.shape
-    number = np.arange(model.active.shape[1])
-    kind = np.where(number < FIXED_POLYGONS, 0, np.where(number < polygons, 1, 2))
+    kind = kinds(levels)
     used = (np.arange(MAX_VERTICES) < model.n_vertices[..., None])[..., None]
     sides = np.where(used, model.vertices, -np.inf).max(2) - np.where(used, model.vertices, np.inf).min(2)
     sides = np.concatenate([sides, np.repeat(2 * model.radius[..., None], 2, -1)], 1)
     words = [
-        np.broadcast_to(kind, (count, len(number))),
+        kind,
         levels.role,
         model.inverse_mass != 0,
         np.concatenate([model.n_vertices, np.zeros_like(model.radius)], 1),

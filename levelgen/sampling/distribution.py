@@ -119,10 +119,7 @@ class Distribution:
             raise ValueError(
                 f"floor_red_chance is {self.floor_red_chance}: the floor's chances add up to {floor}, over 1"
             )
-        for names in (
-            ("connected_weight", "free_weight", "empty_weight"),
-            CONTROL_WEIGHTS,
-        ):
+        for names in (("connected_weight", "free_weight", "empty_weight"), CONTROL_WEIGHTS):
             if not any(getattr(self, name) for name in names):
                 raise ValueError(f"{names[-1]} is 0: one of {names[0]}, {names[1]} and {names[2]} must be more")
 

@@ -23,7 +23,6 @@ from levelgen.sampling.proposal import (
     Proposal,
     draw_role,
     draw_shape,
-    no_joint,
     shape_mass,
     turned,
 )
@@ -47,8 +46,8 @@ class ThrusterDraws(NamedTuple):
     binding: Lane
 
 
-def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, dist: Distribution) -> Proposal:
-    """A body somewhere in the world, above the floor."""
+def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, joint: Joint, dist: Distribution) -> Proposal:
+    """A body somewhere in the world, above the floor; the `joint`, that of any other proposal, is not joined."""
     room_polygon, room_circle = room(level)
     is_polygon = first_of_two(room_polygon, room_circle, d.is_polygon)
     role = draw_role(level, d.role, True, dist)
@@ -71,7 +70,7 @@ def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, dist: Distribut
         role=role,
         fixed=fixed,
         joined=no,
-        joint=no_joint(level),
+        joint=joint,
         hidden=no,
     )
 

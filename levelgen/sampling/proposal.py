@@ -191,12 +191,5 @@ def _insert_joint(level: Level, p: Proposal, body: Bool[Array, "body lane"]) -> 
     return replace(level, model=model, motor_binding=put(level.motor_binding, row, joint.motor_binding))
 
 
-def no_joint(level: Level) -> Joint:
-    lanes = level.role.shape[-1]
-    zero, no = jnp.zeros(lanes), jnp.zeros(lanes, bool)
-    nobody = jnp.zeros((level.size.bodies, lanes), bool)
-    return Joint(nobody, Vec(zero, zero), Vec(zero, zero), no, no, zero, zero, no, zero, zero, no.astype(jnp.int32))
-
-
 def turned(v: Vec, angle: Lane) -> Vec:
     return v.rotate(jnp.cos(angle), jnp.sin(angle))

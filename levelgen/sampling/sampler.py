@@ -182,8 +182,8 @@ def propose(level: Level, plan: Plan, draws: BodyDraws, dist: Distribution) -> P
     """The proposal that touches least, the first of equals. Draws are [proposal, lane]."""
 
     def one(d: BodyDraws) -> Proposal:
-        free = propose_free(level, d, plan.may_be_fixed, dist)
         connected = propose_connected(level, d, plan.revolute, dist)
+        free = propose_free(level, d, plan.may_be_fixed, connected.joint, dist)
         p: Proposal = jax.tree.map(lambda a, b: jnp.where(plan.connect, a, b), connected, free)
         return p._replace(possible=p.possible & plan.add, joined=p.joined & plan.connect & plan.add)
 

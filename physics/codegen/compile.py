@@ -34,7 +34,11 @@ def compile_kernel(
     Raises:
         NotImplementedError: the kernel uses what `lower` does not know.
     """
-    text = str(_module(jaxpr, arguments, results, scratch))
+    module = ir.Module("levelproof")
+    module.triple = binding.get_default_triple()
+    block = _block(module, jaxpr, [*arguments, *results, *scratch], len(arguments) + len(results))
+    add_handler(module, block, arguments, results, scratch)
+    text = str(module)
     name = "levelproof_" + hashlib.sha256(text.encode()).hexdigest()[:16]
     if name not in _libraries:
         library = _link(name, _object_code(text))
@@ -42,16 +46,6 @@ def compile_kernel(
         jax.ffi.register_ffi_target(name, handler, platform="cpu")
         _libraries[name] = library
     return name
-
-
-def _module(
-    jaxpr: core.ClosedJaxpr, arguments: Sequence[Buffer], results: Sequence[Buffer], scratch: Sequence[Buffer]
-) -> ir.Module:
-    module = ir.Module("levelproof")
-    module.triple = binding.get_default_triple()
-    block = _block(module, jaxpr, [*arguments, *results, *scratch], len(arguments) + len(results))
-    add_handler(module, block, arguments, results, scratch)
-    return module
 
 
 def _block(module: ir.Module, jaxpr: core.ClosedJaxpr, buffers: Sequence[Buffer], outside: int) -> ir.Function:

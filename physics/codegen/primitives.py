@@ -52,13 +52,9 @@ def _extreme_int(order: str) -> Emit:
 
 
 def _compare(order: str) -> dict[str, Emit]:
-    of_floats = (
-        (lambda b, x, y: b.fcmp_unordered(order, x, y))
-        if order == "!="
-        else (lambda b, x, y: b.fcmp_ordered(order, x, y))
-    )
+    of_floats = "fcmp_unordered" if order == "!=" else "fcmp_ordered"
     return {
-        FLOAT: of_floats,
+        FLOAT: lambda b, x, y: getattr(b, of_floats)(order, x, y),
         INT: lambda b, x, y: b.icmp_signed(order, x, y),
         BOOL: lambda b, x, y: b.icmp_unsigned(order, x, y),  # a signed True would be -1
     }
