@@ -39,8 +39,14 @@ def compose_job(overrides: Sequence[str]) -> JobConfig:
 def settings(overrides: Sequence[str]) -> dict[str, Any]:
     """The composed settings as nested plain mappings, not yet checked."""
     parsed = [_parsed(text) for text in overrides]
-    _check_keys(parsed, flat(_composed([])))
+    _check_keys(parsed, _known())
     return _composed([override.input_line or "" for override in parsed])
+
+
+@cache
+def _known() -> Mapping[str, Any]:
+    """Every setting, with its default."""
+    return flat(_composed([]))
 
 
 def chosen() -> dict[str, str]:

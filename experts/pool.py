@@ -8,7 +8,7 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -27,6 +27,7 @@ from levelgen.task.rules import TaskParams
 LANES_IN_CACHE = 128  # their physics and one minibatch fit the cache of a core
 LANES_ON_ACCELERATOR = 32_768
 QUEUED_PER_SLOT = 4  # levels: one that stays long keeps none from coming that could have a slot
+T = TypeVar("T")
 NOTHING_BEGUN: Mapping[int, Kept] = MappingProxyType({})
 
 
@@ -191,16 +192,19 @@ def capacity_of(config: ExpertConfig) -> int:
 def expert_of(slots: Slots, slot: int, config: ExpertConfig) -> Begun:
     """The expert that has just left a slot, on the host, as it would go on."""
     lanes = np.arange(slot * config.environments, (slot + 1) * config.environments)
-    training, acting = jax.tree.map(lambda x: x[slot], slots.slot.training), take(slots.acting, lanes)
-    return jax.device_get(Begun(training, acting))
+    return jax.device_get(Begun(_row(slots.slot.training, slot), take(slots.acting, lanes)))
 
 
 def evaluation_of(slots: Slots, slot: int, config: ExpertConfig) -> Evaluation:
     """What the evaluation that has just ended in a slot showed."""
-    mine = jax.tree.map(
-        lambda x: x[slot], (slots.slot.trial, slots.slot.training.progress, slots.slot.training.success)
-    )
-    trial, progress, success = jax.device_get(mine)
+    shown = slots.slot.trial, slots.slot.training.progress, slots.slot.training.success
+    trial, progress, success = jax.device_get(_row(shown, slot))
     record = slice(0, RECORD_STEPS)
     done, goal = trial.done[record], trial.goal[record]
     return Evaluation(trial.action[record].astype(np.int32), done, goal, progress, success)
+
+
+@jax.jit
+def _row(tree: T, index: int) -> T:
+    """This row of every array, by one program."""
+    return jax.tree.map(lambda x: x[index], tree)

@@ -19,15 +19,15 @@ NO_EXPERTS: Mapping[int, Begun] = MappingProxyType({})
 
 
 def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig) -> LevelQueue:
-    """A queue for levels of the size of these, without any."""
+    """A queue for levels of the size of these, without any: on the host, where zeros take no program each."""
     one = take(levels, np.zeros(1, int))
     begun = jax.eval_shape(partial(begin, config=config), one, jnp.zeros(1, jnp.int32))
     return LevelQueue(
-        jax.tree.map(lambda x: jnp.zeros((*x.shape[:-1], capacity), x.dtype), one),
-        jnp.zeros(capacity, jnp.int32),
+        jax.tree.map(lambda x: np.zeros((*x.shape[:-1], capacity), x.dtype), one),
+        np.zeros(capacity, np.int32),
         np.int32(0),
         np.int32(updates),
-        jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape[1:]), x.dtype), begun),
+        jax.tree.map(lambda x: np.zeros((capacity, *x.shape[1:]), x.dtype), begun),
     )
 
 

@@ -86,7 +86,7 @@ class LevelQueue(NamedTuple):
     """
 
     levels: Level  # [..., index]
-    level_ids: Int[Array, " index"]
+    level_ids: Int[Array, " index"] | Int[np.ndarray, " index"]
     come: Int[Array, ""] | np.int32  # levels that have come, ever
     updates: Int[Array, ""] | np.int32  # that an expert may use
     begun: Begun  # where their experts go on, index first

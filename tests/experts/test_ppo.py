@@ -48,8 +48,9 @@ def test_learns_a_bandit(kind: Network, seed: int) -> None:
     """One action entry pays when it is 2: after a few updates it is chosen nearly always."""
     config = ExpertConfig(network=kind, width=16, encoding=16, environments=32, horizon=8, learning_rate=3e-3)
     network, count = network_of(SIZE, config), config.steps_per_update
-    constant = jax.tree.map(lambda x: x[..., 0], network.constant(sample_levels(jnp.array([seed]), SIZE)))
-    train_state = ppo.init(jax.random.key(seed), network, constant, config)
+    features = jax.jit(network.constant)(sample_levels(np.array([seed]), SIZE))
+    constant = jax.tree.map(lambda x: np.asarray(x)[..., 0], features)
+    train_state = jax.jit(lambda key: ppo.init(key, network, constant, config))(jax.random.key(seed))
     constants, moving = LevelConstants(constant, jnp.ones(len(CHOICES), bool)), jnp.ones((DYNAMIC, count))
 
     @jax.jit
@@ -81,7 +82,8 @@ def test_shuffling(environments: int, horizon: int) -> None:
         sticky_attempts=0,
         moved_attempts=0,
     )
-    orders = [np.asarray(ppo.shuffled(jax.random.key(seed), config)) for seed in range(20)]
+    shuffle = jax.jit(lambda seed: ppo.shuffled(jax.random.key(seed), config))
+    orders = [np.asarray(shuffle(seed)) for seed in range(20)]
     for order in orders:
         assert sorted(order) == list(range(environments * horizon))
         for run in order.reshape(horizon, environments):
@@ -94,7 +96,8 @@ def test_every_sample_can_come_first() -> None:
     config = ExpertConfig(
         environments=4, horizon=4, minibatches=1, rehearsals=0, attempts=1, sticky_attempts=0, moved_attempts=0
     )
-    orders = jax.vmap(lambda key: ppo.shuffled(key, config))(jax.random.split(jax.random.key(0), 4000))
+    many = jax.jit(jax.vmap(lambda key: ppo.shuffled(key, config)))
+    orders = many(jax.random.split(jax.random.key(0), 4000))
     counts = np.bincount(np.asarray(orders)[:, 0], minlength=16)
     assert counts.min() > 250 - 5 * 16
     assert counts.max() < 250 + 5 * 16

@@ -1,5 +1,7 @@
-"""The command `levelproof` as people run it, in a process of its own."""
+"""The command `levelproof`: as people run it, in a process of its own, or in this one, which has compiled already."""
 
+import contextlib
+import io
 import os
 import signal
 import subprocess
@@ -8,6 +10,9 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
+
+from pipeline.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 240  # s
@@ -40,6 +45,19 @@ def run(arguments: Sequence[str], cwd: Path, **options: Any) -> subprocess.Compl
     process = start(arguments, cwd, **options)
     out, err = process.communicate(timeout=300)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def here(arguments: Sequence[str], cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The same in this process: for tests of what it does and says, not of how it starts and ends."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        contextlib.chdir(cwd),
+        patch.dict(os.environ, COLUMNS="200"),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        code = main(arguments)
+    return subprocess.CompletedProcess(["levelproof", *arguments], code, out.getvalue(), err.getvalue())
 
 
 def heed_ctrl_c() -> None:

@@ -15,11 +15,15 @@ SIZE = SIZES["s"]
 MOVING, STILL = dynamic_features(SIZE), resting_features(SIZE)
 
 
+def first(network: FlatNetwork) -> Params:
+    """The parameters with which training starts."""
+    return jax.jit(initial, static_argnums=1)(jax.random.key(0), network, np.zeros(len(STILL), np.float32))
+
+
 @pytest.fixture(scope="module")
 def network() -> tuple[FlatNetwork, Params]:
     network = FlatNetwork(SIZE, width=8, depth=2)
-    params = initial(jax.random.key(0), network, jnp.zeros(len(STILL)))
-    return network, jax.tree.map(lambda x: x + 0.1, params)  # biases count too
+    return network, jax.tree.map(lambda x: np.asarray(x) + np.float32(0.1), first(network))  # biases count too
 
 
 def whole_kernel(layer: dict) -> np.ndarray:
@@ -34,7 +38,7 @@ def test_folding_constant_features_is_the_network_of_the_whole_observation(netwo
     whole = rng.normal(size=(feature_count(SIZE), lanes)).astype(np.float32)
     whole[STILL] = whole[STILL, :1]
 
-    logits, value = forward(net, params, whole[STILL, 0], whole[MOVING])
+    logits, value = jax.jit(forward, static_argnums=0)(net, params, whole[STILL, 0], whole[MOVING])
 
     def plain(name):
         first, second, last = (params["params"][name][layer] for layer in ("FirstDense_0", "Dense_0", "Dense_1"))
@@ -47,19 +51,20 @@ def test_folding_constant_features_is_the_network_of_the_whole_observation(netwo
 
 
 def test_the_first_kernel_starts_with_orthogonal_rows_as_a_whole() -> None:
-    params = initial(jax.random.key(0), FlatNetwork(SIZE, width=8, depth=2), jnp.zeros(len(STILL)))
+    params = first(FlatNetwork(SIZE, width=8, depth=2))
     kernel = whole_kernel(params["params"]["policy"]["FirstDense_0"])  # type: ignore[index]
     np.testing.assert_allclose(kernel @ kernel.T, 2 * np.eye(8), atol=1e-5)
 
 
 def test_what_is_constant_of_a_level() -> None:
     levels = sample_levels(np.arange(3), SIZE)
-    np.testing.assert_array_equal(FlatNetwork.constant(levels), np.asarray(level_features(levels))[STILL])
-    assert not np.asarray(level_features(levels))[MOVING].any()
+    features = np.asarray(jax.jit(level_features)(levels))
+    np.testing.assert_array_equal(jax.jit(FlatNetwork.constant)(levels), features[STILL])
+    assert not features[MOVING].any()
 
 
 def test_gradient_reaches_kernels_of_constant_features(network) -> None:
     net, params = network
     loss = lambda p: forward(net, p, jnp.full(len(STILL), 0.01), jnp.full((len(MOVING), 3), 0.01))[1].sum()
-    kernel = whole_kernel(jax.grad(loss)(params)["params"]["value"]["FirstDense_0"])
+    kernel = whole_kernel(jax.jit(jax.grad(loss))(params)["params"]["value"]["FirstDense_0"])
     assert (np.abs(kernel) > 0).all()

@@ -197,6 +197,7 @@ def test_contacts_of_a_new_body() -> None:
     pairs, active = pairs_of(level.size), np.asarray(jax.jit(step)(still, state, *controls)[1].active)
     kinds = (pairs.polygon, pairs.polygon, pairs.circle_polygon, pairs.circle)
     a, b = (np.concatenate([getattr(kind, end) for kind in kinds]) for end in "ab")
+    count = jax.jit(count_contacts)
     for last in (polygons - 1, level.size.bodies - 1):
         there = model.active[last]
         expected = active[(a == last) | (b == last)].sum(0)
@@ -206,7 +207,7 @@ def test_contacts_of_a_new_body() -> None:
         cos, sin = np.cos(state.rotation[last]), np.sin(state.rotation[last])
         turned = np.stack([cos * corners[:, 0] - sin * corners[:, 1], sin * corners[:, 0] + cos * corners[:, 1]], 1)
         body = WorldCircles(Vec(*state.position[last][:, None]), model.radius[max(last - polygons, 0)][None])
-        found = count_contacts(rest, state, turned + state.position[last], body, jnp.full(there.shape, last < polygons))
+        found = count(rest, state, turned + state.position[last], body, np.full(there.shape, last < polygons))
         assert expected[there].sum() > 100
         np.testing.assert_array_equal(np.asarray(found)[there], expected[there])
 
@@ -263,6 +264,7 @@ def test_a_wrong_distribution_says_what_is_wrong(changes: dict[str, float], mess
     assert str(refused.value) == message
 
 
+@MORE
 def test_what_must_act_follows_its_weights() -> None:
     """A thruster always; a motor too in three levels of four. Size s has no bodies joined but for a motor's sake."""
     changed = Distribution(motor_only_weight=0.0, motor_and_thruster_weight=3.0)

@@ -129,7 +129,7 @@ def test_levels_may_differ_between_mapped_parameters(levels: Level, made, keys) 
 
 def test_resets_draw_from_all_levels(levels: Level, made) -> None:
     env, params = made
-    _, state = jax.vmap(env.reset, (0, None))(jax.random.split(jax.random.key(0), 300), params)
+    _, state = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 300), params)
     start = np.asarray(levels.state.position.reshape(-1, LEVELS).T)
     drawn = (np.asarray(state.now.state.position.reshape(300, -1))[:, None] == start).all(-1)
     assert (drawn.sum(1) == 1).all()
@@ -139,13 +139,13 @@ def test_resets_draw_from_all_levels(levels: Level, made) -> None:
 def test_an_end_resets(levels: Level, keys) -> None:
     env, params = make(levels, rules=task.TaskParams(max_timesteps=1))
     stop, own = jnp.zeros((LEVELS, 6), jnp.int32), starts(levels)
-    seen, state, _, done, info = jax.vmap(env.step, (0, 0, 0, None, 0))(keys, own, stop, params, own)
+    seen, state, _, done, info = jax.jit(jax.vmap(env.step, (0, 0, 0, None, 0)))(keys, own, stop, params, own)
     assert done.all()
     assert set(info) == {"GoalR", "distance"}
     assert (np.asarray(info["distance"]) > 0).all()
     assert_same(state, own)  # the given state, and what is seen of it
-    np.testing.assert_array_equal(seen, jax.vmap(env.get_obs)(own))
-    _, drawn, _, done, _ = jax.vmap(env.step, (0, 0, 0, None))(keys, own, stop, params)
+    np.testing.assert_array_equal(seen, jax.jit(jax.vmap(env.get_obs))(own))
+    _, drawn, _, done, _ = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, own, stop, params)
     assert done.all()
     assert (np.asarray(drawn.now.timestep) == 0).all()
     assert not np.array_equal(drawn.level.model.inverse_mass, own.level.model.inverse_mass)  # other levels
@@ -186,7 +186,7 @@ def test_actions_of_their_space_are_taken(levels: Level, keys, action_type: str)
     assert jax.vmap(space.contains)(action).all()
     kind = {"discrete": Discrete, "multi_discrete": MultiDiscrete, "continuous": Box}[action_type]
     assert isinstance(space, kind)
-    _, state, _, _, _ = jax.vmap(env.step, (0, 0, 0, None))(keys, starts(levels), action, params)
+    _, state, _, _, _ = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, starts(levels), action, params)
     assert np.isfinite(state.now.state.position).all()
 
 

@@ -54,7 +54,7 @@ def test_it_learns() -> None:
     assert after > before + 0.15, (before, after)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_continuous_actions_train_without_ado() -> None:
     env, params = make(sample_levels(jnp.arange(4), SIZES["s"]), ActionType.CONTINUOUS)
     algo = PPO.create(

@@ -1,4 +1,4 @@
-"""The command as people meet it: help, errors, questions. Everything through a process of its own."""
+"""The command as people meet it: help, errors, questions. How it starts and ends through a process of its own."""
 
 import json
 import os
@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.cli import main
 from pipeline.store.manifest import fragment_paths, read_manifest
-from tests.pipeline.command import ROOT, TINY, assert_refused, run
+from tests.pipeline.command import ROOT, TINY, assert_refused, here, run
 
 COMMANDS = [command.__name__.rpartition(".")[2] for command in main.COMMANDS]
 
@@ -77,7 +77,7 @@ def test_version(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_setting_is_refused_in_one_sentence(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
-    assert_refused(run(["generate", *arguments], tmp_path), 2, *words)
+    assert_refused(here(["generate", *arguments], tmp_path), 2, *words)
     assert not list(tmp_path.iterdir())
 
 
@@ -90,7 +90,7 @@ def test_a_command_that_is_none_gets_the_usage(tmp_path: Path, arguments: list[s
 
 @pytest.mark.parametrize("command", [["inspect"], ["status"], ["verify"]])
 def test_a_split_that_is_not_there_is_named(tmp_path: Path, command: list[str]) -> None:
-    assert_refused(run([*command, "data/1k/s"], tmp_path), 2, "no split at data/1k/s")
+    assert_refused(here([*command, "data/1k/s"], tmp_path), 2, "no split at data/1k/s")
 
 
 def test_an_out_that_cannot_be_written_is_named(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_an_out_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.getuid() == 0, reason="root may write anywhere")
 def test_an_out_without_permission_is_named(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir(mode=0o500)
-    assert_refused(run(["generate", *TINY], tmp_path), 2, "Cannot write to data/5k/s", "Permission denied")
+    assert_refused(here(["generate", *TINY], tmp_path), 2, "Cannot write to data/5k/s", "Permission denied")
 
 
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_debug_shows_the_traceback(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_second_run_says_that_all_is_there(made: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.suffix in (".parquet", ".zarr")}
-    done = run(["generate", *TINY, "executor=inline"], made)
+    done = here(["generate", *TINY, "executor=inline"], made)
     assert done.returncode == 0
     assert "Nothing to do: all 4 levels are there" in done.stdout
     assert "levelproof inspect data/5k/s" in done.stdout
@@ -122,7 +122,7 @@ def test_a_second_run_says_that_all_is_there(made: Path) -> None:
 
 @pytest.mark.slow
 def test_another_configuration_names_what_differs(made: Path) -> None:
-    done = run(["generate", *TINY, "expert.width=32", "expert.clip=0.1"], made)
+    done = here(["generate", *TINY, "expert.width=32", "expert.clip=0.1"], made)
     assert_refused(done, 2, "data/5k/s", "expert.clip was 0.2, now 0.1; expert.width was 64, now 32", "out=NAME")
 
 
@@ -130,7 +130,7 @@ def test_another_configuration_names_what_differs(made: Path) -> None:
 @pytest.mark.parametrize("command", [["generate", *TINY], ["inspect", "data/5k/s"], ["status", "data/5k/s"]])
 def test_a_damaged_fragment_is_named(split: Path, command: list[str]) -> None:
     fragment_paths(split)[1].write_bytes(b"PAR1 and then nothing")
-    done = run(command, split.parents[2])
+    done = here(command, split.parents[2])
     assert_refused(done, 1, "000000000001-000000000001.parquet is damaged", "delete it")
 
 
@@ -139,7 +139,7 @@ def test_a_damaged_fragment_is_named(split: Path, command: list[str]) -> None:
 def test_a_deleted_fragment_is_made_again_with_the_same_rows(split: Path) -> None:
     before = read_manifest(split).table.drop(["shard"]).to_pylist()
     fragment_paths(split)[1].unlink()
-    done = run(["generate", *TINY, "executor=inline"], split.parents[2])
+    done = here(["generate", *TINY, "executor=inline"], split.parents[2])
     assert done.returncode == 0, done.stderr
     assert "3 are there already" in done.stderr
     assert read_manifest(split).table.drop(["shard"]).to_pylist() == before
@@ -147,7 +147,7 @@ def test_a_deleted_fragment_is_made_again_with_the_same_rows(split: Path) -> Non
 
 @pytest.mark.slow
 def test_verify_passes_what_is_whole_and_names_what_is_not(split: Path) -> None:
-    done = run(["verify", "data/5k/s", "--json"], split.parents[2])
+    done = here(["verify", "data/5k/s", "--json"], split.parents[2])
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     kept = read_manifest(split).table.column("shard")
@@ -156,7 +156,7 @@ def test_verify_passes_what_is_whole_and_names_what_is_not(split: Path) -> None:
     shard = split / sorted(read_manifest(split).shards)[0]
     file = shard / "dyn32/c/0/0/0"
     file.write_bytes(file.read_bytes()[:-200] + bytes(200))
-    done = run(["verify", "data/5k/s"], split.parents[2])
+    done = here(["verify", "data/5k/s"], split.parents[2])
     assert done.returncode == 1
     assert f"{shard.name} is missing or damaged" in done.stdout
     assert "Traceback" not in done.stderr
@@ -165,11 +165,11 @@ def test_verify_passes_what_is_whole_and_names_what_is_not(split: Path) -> None:
 @pytest.mark.slow
 def test_inspect_tells_what_is_there(made: Path) -> None:
     manifest = read_manifest(made / "data/5k/s")
-    done = run(["inspect", "data/5k/s"], made)
+    done = here(["inspect", "data/5k/s"], made)
     assert done.returncode == 0, done.stderr
     for word in ("solve rate", "steps to goal", "bytes per transition", "level_id", "solved"):
         assert word in done.stdout
-    facts = json.loads(run(["inspect", "data/5k/s", "--json", "--rows", "2"], made).stdout)
+    facts = json.loads(here(["inspect", "data/5k/s", "--json", "--rows", "2"], made).stdout)
     assert facts["levels"] == 4
     assert facts["labels"]["solved"] == manifest.labels.tolist().count("solved")
     assert [row["level_id"] for row in facts["rows"]] == [0, 1]
@@ -178,20 +178,22 @@ def test_inspect_tells_what_is_there(made: Path) -> None:
 
 @pytest.mark.slow
 def test_inspect_takes_a_condition_and_refuses_what_is_none(made: Path) -> None:
-    facts = json.loads(run(["inspect", "data/5k/s", "--json", "--where", "level_id >= 2 -- the last two"], made).stdout)
+    facts = json.loads(
+        here(["inspect", "data/5k/s", "--json", "--where", "level_id >= 2 -- the last two"], made).stdout
+    )
     assert facts["levels"] == 2
-    done = run(["inspect", "data/5k/s", "--where", "no_such_column = 1"], made)
+    done = here(["inspect", "data/5k/s", "--where", "no_such_column = 1"], made)
     assert_refused(done, 2, "no_such_column", "columns level_id, content_hash")
-    done = run(["inspect", "data/5k/s", "--where", "label IN (SELECT content FROM read_text('/etc/passwd'))"], made)
+    done = here(["inspect", "data/5k/s", "--where", "label IN (SELECT content FROM read_text('/etc/passwd'))"], made)
     assert_refused(done, 2, "Cannot use the condition")
 
 
 @pytest.mark.slow
 def test_status_tells_how_far_it_is(split: Path) -> None:
-    facts = json.loads(run(["status", "data/5k/s", "--json"], split.parents[2]).stdout)
+    facts = json.loads(here(["status", "data/5k/s", "--json"], split.parents[2]).stdout)
     assert (facts["wanted"], facts["done"], facts["running"], facts["quarantined"]) == (4, 4, False, [])
     fragment_paths(split)[0].unlink()
-    text = run(["status", "data/5k/s"], split.parents[2]).stdout
+    text = here(["status", "data/5k/s"], split.parents[2]).stdout
     assert "3 of 4 levels committed" in text
     assert "To go on: levelproof generate levels=4 unit=1 budget=5k executor=inline" in text
 
@@ -216,7 +218,7 @@ def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(tmp_p
     done = run(command, tmp_path, preexec_fn=limited)
     assert_refused(done, 1, "Cannot write to data/5k/s", "run the same command again")
     assert fragment_paths(tmp_path / "data/5k/s") == []
-    assert run(command, tmp_path).returncode == 0
+    assert here(command, tmp_path).returncode == 0
     assert len(read_manifest(tmp_path / "data/5k/s").level_ids) == 4
     data = {path.stem for folder in ("shards", "experts") for path in (tmp_path / "data/5k/s" / folder).iterdir()}
     assert len(data) == 1
@@ -225,7 +227,7 @@ def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(tmp_p
 @pytest.mark.slow
 def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path) -> None:
     """Steps that a 32-bit counter cannot count: every attempt fails, the command says so and ends with 3."""
-    done = run(["generate", "levels=1", "budget=5k", "task.max_timesteps=3000000000", "executor=inline"], tmp_path)
+    done = here(["generate", "levels=1", "budget=5k", "task.max_timesteps=3000000000", "executor=inline"], tmp_path)
     assert done.returncode == 3, done.stderr
     assert done.stderr.count("trying again") == 2
     assert "given up" in done.stderr

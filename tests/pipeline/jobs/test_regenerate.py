@@ -14,7 +14,7 @@ from pipeline.read.verify import examine
 from pipeline.store.checkpoints import load_experts, require_same_experts
 from pipeline.store.layout import new_attempt
 from pipeline.store.manifest import begin_fragment, read_manifest
-from tests.pipeline.command import run
+from tests.pipeline.command import here, run
 from tests.pipeline.made import made_job
 
 SETTINGS = ["levels=12", "executor=inline"]
@@ -22,9 +22,9 @@ SETTINGS = ["levels=12", "executor=inline"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with data/8k/s, made with `keep_experts=true` by workers that save several units at once."""
+    """A folder with data/8k/s, made with `keep_experts=true` by a worker that saves several units at once."""
     folder = tmp_path_factory.mktemp("ladder")
-    done = run(["generate", *SETTINGS, "budget=8k", "keep_experts=true", "executor=ray", "unit=2"], folder)
+    done = run(["generate", *SETTINGS, "budget=8k", "keep_experts=true", "executor=ray", "workers=1", "unit=2"], folder)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -42,18 +42,19 @@ def test_going_on_equals_having_trained_through(folder: Path) -> None:
     unsolved = [row["level_id"] for row in rows_of(folder / "data/8k/s") if row["label"] == Label.UNSOLVED]
     assert unsolved
     where = "where=label = 'unsolved'"
-    done = run(["regenerate", "manifest=data/8k/s", "budget=24k", where, "continue=true", "unit=1"], folder)
+    words = ["manifest=data/8k/s", "budget=24k", where, "continue=true", "unit=1", "executor=inline"]
+    done = here(["regenerate", *words], folder)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"data/24k/s: {len(unsolved)} levels")
     again = ["regenerate", "manifest=data/8k/s", "budget=24k", where, "out=through", "executor=inline"]
-    assert run(again, folder).returncode == 0
+    assert here(again, folder).returncode == 0
     continued, through = rows_of(folder / "data/24k/s"), rows_of(folder / "through/24k/s")
     assert [row["level_id"] for row in continued] == unsolved
     assert continued == through
     assert any(int(row["env_steps"]) > 8_000 for row in through)
     assert not examine(folder / "data/24k/s").wrong
-    assert "levels committed" in run(["status", "data/24k/s"], folder).stdout
-    assert run(again, folder).stdout.startswith("Nothing to do")
+    assert "levels committed" in here(["status", "data/24k/s"], folder).stdout
+    assert here(again, folder).stdout.startswith("Nothing to do")
 
 
 @pytest.mark.slow
@@ -83,7 +84,7 @@ def test_what_cannot_go_on_is_refused(folder: Path, tmp_path: Path) -> None:
     assert "give a larger budget" in refused("budget=8k")
     assert "expert.width was 64, now 32" in refused("budget=24k", "expert.width=32")
     without = tmp_path / "data"
-    assert run(["generate", *SETTINGS, "levels=2", "budget=2k", f"out={without}"], tmp_path).returncode == 0
+    assert here(["generate", *SETTINGS, "levels=2", "budget=2k", f"out={without}"], tmp_path).returncode == 0
     with pytest.raises(UserError, match="has kept no experts: make it with keep_experts=true"):
         require_same_experts(made_job("x", "budget=24k", f"continue_from={without / '2k/s'}"))
 
@@ -109,7 +110,7 @@ def test_experts_that_a_dead_attempt_left_are_removed(folder: Path, tmp_path: Pa
     dead = new_attempt(tmp_path / "data/8k/s", "000000000000-000000000011")
     begin_fragment(dead)
     shutil.copy(min(named), dead.experts)
-    assert run(["generate", *SETTINGS, "budget=8k", "keep_experts=true"], tmp_path).returncode == 0
+    assert here(["generate", *SETTINGS, "budget=8k", "keep_experts=true"], tmp_path).returncode == 0
     assert set(experts.iterdir()) == named
 
 
@@ -128,6 +129,6 @@ def test_mistakes_are_named(words: list[str], sentence: str) -> None:
 
 
 def test_a_manifest_that_is_not_there_is_named(tmp_path: Path) -> None:
-    done = run(["regenerate", "manifest=data/8k/s", "budget=1M"], tmp_path)
+    done = here(["regenerate", "manifest=data/8k/s", "budget=1M"], tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("Error: There is no split at data/8k/s")

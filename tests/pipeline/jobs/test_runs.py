@@ -12,10 +12,11 @@ import pytest
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard
-from tests.pipeline.command import PATIENCE, ROOT, descendants, heed_ctrl_c, run, start, status, title, until
+from tests.pipeline.command import PATIENCE, ROOT, descendants, heed_ctrl_c, here, run, start, status, title, until
 
 LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
 COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
+ALONE = "workers=1"  # where it does not matter how many: each has to start
 SPLIT = Path("data/5k/s")
 
 pytestmark = pytest.mark.slow
@@ -67,7 +68,7 @@ def test_an_undisturbed_run_is_whole_and_leaves_no_process(undisturbed: Path) ->
 
 
 def test_without_ray_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
-    done = run([*COMMAND, "executor=inline"], tmp_path)
+    done = here([*COMMAND, "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert_same_content(tmp_path / SPLIT, undisturbed)
 
@@ -80,21 +81,21 @@ def test_in_other_units_the_same_comes_out(undisturbed: Path, tmp_path: Path) ->
 
 
 def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path) -> None:
-    process = start(COMMAND, tmp_path)
+    process = start([*COMMAND, ALONE], tmp_path)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
     family = {pid for pid in descendants(process.pid) if "Agent" not in title(pid)}
     process.kill()
     process.communicate()
     assert_all_gone(family)  # but for two idle helpers of Ray, which try for a minute to report that it died
     assert 1 <= len(fragment_paths(tmp_path / SPLIT)) < LEVELS
-    done = run(COMMAND, tmp_path)
+    done = here([*COMMAND, "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert "are there already" in done.stderr
     assert_same_content(tmp_path / SPLIT, undisturbed)
 
 
 def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
-    process = start(COMMAND, tmp_path)
+    process = start([*COMMAND, ALONE], tmp_path)
     found: list[int] = []
     until(lambda: found.extend(workers(process)) or found, process)
     os.kill(found[0], signal.SIGKILL)
@@ -108,7 +109,7 @@ def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.campaign), signal.SIGTERM])
 def test_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
-    process = start(COMMAND, tmp_path, preexec_fn=heed_ctrl_c)
+    process = start([*COMMAND, ALONE], tmp_path, preexec_fn=heed_ctrl_c)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
     family = descendants(process.pid)
     os.killpg(process.pid, number)  # as a terminal does
@@ -117,7 +118,7 @@ def test_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Sig
     assert "Stopped: " in err
     assert "Traceback" not in err
     assert_all_gone(family)
-    done = run([*COMMAND, "executor=inline"], tmp_path)
+    done = here([*COMMAND, "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert_same_content(tmp_path / SPLIT, undisturbed)
 

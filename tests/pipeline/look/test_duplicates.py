@@ -24,7 +24,7 @@ from pipeline.store.layout import split_path
 from pipeline.store.manifest import require_manifest
 from tests.levelgen.opened import handmade_levels
 from tests.levelgen.variants import edited, more_room, one, renamed, renumbered, turned
-from tests.pipeline.command import assert_refused, run
+from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_job, made_result
 
 NONE = {"levels": 0, "pairs": []}
@@ -122,15 +122,15 @@ def test_the_same_levels_are_found_in_splits_files_and_folders(split: Path, tmp_
     write_level_file(LevelFile(one("s", 7), TaskParams()), seven)
     write_level_file(LevelFile(one("m", 7), TaskParams()), folder / "other.json")
     words = [word for path in (other, folder, seven) for word in ("--against", str(path))]
-    facts = json.loads(run(["inspect", str(split), *words, "--json", "--rows", "0"], tmp_path).stdout)
+    facts = json.loads(here(["inspect", str(split), *words, "--json", "--rows", "0"], tmp_path).stdout)
     assert facts["duplicates"]["same"] == {"levels": 1, "pairs": []}
-    facts = json.loads(run(["inspect", str(split), *words, "--json"], tmp_path).stdout)
+    facts = json.loads(here(["inspect", str(split), *words, "--json"], tmp_path).stdout)
     assert facts["against"] == {
         str(other): {"same": {"levels": 2, "pairs": [[3, 1], [COPY, 1]]}, "near": NONE},
         str(folder): {"same": {"levels": 1, "pairs": [[7, str(seven)]]}, "near": NONE},
         str(seven): {"same": {"levels": 1, "pairs": [[7, str(seven)]]}, "near": NONE},
     }
-    shown = run(["inspect", str(split), *words], tmp_path).stdout
+    shown = here(["inspect", str(split), *words], tmp_path).stdout
     assert "1 same (such as 9 and 3), 1 near (such as 10 and 5)" in shown
     assert f"duplicates in {other}: 2 same (such as 3 and 1), 0 near" in shown
 
@@ -142,7 +142,7 @@ def test_where_there_is_nothing_to_look_in_that_is_said(split: Path, tmp_path: P
     with pytest.raises(UserError, match="There is no split"):
         compared_in(tmp_path / "missing")
     (tmp_path / "bad.json").write_text("{}")
-    assert_refused(run(["inspect", str(split), "--against", str(tmp_path)], tmp_path), 2, "bad.json")
+    assert_refused(here(["inspect", str(split), "--against", str(tmp_path)], tmp_path), 2, "bad.json")
 
 
 @pytest.fixture(scope="module")

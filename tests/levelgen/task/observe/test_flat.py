@@ -9,30 +9,32 @@ import pytest
 
 from levelgen.level import SIZES, Level, Role
 from levelgen.sampling.sampler import sample_levels
+from levelgen.task.observe import flat
 from levelgen.task.observe.flat import (
     CIRCLE_ROWS,
     LIMIT,
     POLYGON_ROWS,
     dynamic_features,
     feature_count,
-    level_features,
-    state_features,
-    symbolic_flat,
 )
 from physics.types import FIXED_POLYGONS, State
 
 LANES = 16
+level_features, state_features, symbolic_flat = map(
+    jax.jit, (flat.level_features, flat.state_features, flat.symbolic_flat)
+)
 
 
 @pytest.fixture(scope="module", params=["s", "m"])
 def level(request: pytest.FixtureRequest) -> Level:
-    return sample_levels(jnp.arange(LANES), SIZES[request.param])
+    return jax.device_get(sample_levels(np.arange(LANES), SIZES[request.param]))
 
 
+@jax.jit
 def moved(state: State) -> State:
     """Every movable body somewhere else."""
     later = jax.tree.map(lambda x: x, state)
-    change = lambda x, by: x.at[FIXED_POLYGONS:].add(by)
+    change = lambda x, by: jnp.asarray(x).at[FIXED_POLYGONS:].add(by)
     return dataclasses.replace(
         later,
         position=change(later.position, 0.5),
@@ -83,19 +85,19 @@ def test_rows_of_a_body_are_where_the_layout_says(level: Level) -> None:
 def test_what_is_not_active_is_zero(level: Level) -> None:
     model = dataclasses.replace(
         level.model,
-        active=jnp.zeros_like(level.model.active),
-        joint_active=jnp.zeros_like(level.model.joint_active),
-        thruster_active=jnp.zeros_like(level.model.thruster_active),
+        active=np.zeros_like(level.model.active),
+        joint_active=np.zeros_like(level.model.joint_active),
+        thruster_active=np.zeros_like(level.model.thruster_active),
     )
     seen = symbolic_flat(dataclasses.replace(level, model=model), level.state)
     assert not np.asarray(seen)[:-1].any()
 
 
 def test_values_are_clipped_and_nan_is_zero(level: Level) -> None:
-    model = dataclasses.replace(level.model, active=jnp.ones_like(level.model.active))
-    nan_x = level.state.position.at[FIXED_POLYGONS, 0].set(jnp.nan)
+    model = dataclasses.replace(level.model, active=np.ones_like(level.model.active))
+    nan_x = jnp.asarray(level.state.position).at[FIXED_POLYGONS, 0].set(jnp.nan)
     far_y = nan_x.at[FIXED_POLYGONS, 1].set(-14.0)
-    fast = level.state.velocity.at[FIXED_POLYGONS, 0].set(jnp.inf)
+    fast = jnp.asarray(level.state.velocity).at[FIXED_POLYGONS, 0].set(jnp.inf)
     state = dataclasses.replace(level.state, position=far_y, velocity=fast)
     seen = np.asarray(symbolic_flat(dataclasses.replace(level, model=model), state))
     assert np.isfinite(seen).all()
@@ -104,13 +106,13 @@ def test_values_are_clipped_and_nan_is_zero(level: Level) -> None:
 
 def test_one_level_may_serve_many_lanes(level: Level) -> None:
     one = jax.tree.map(lambda x: x[..., :1], level)
-    spread = jax.tree.map(lambda x: jnp.repeat(x, LANES, -1), one)
+    spread = jax.tree.map(lambda x: np.repeat(x, LANES, -1), one)
     np.testing.assert_array_equal(symbolic_flat(one, level.state), symbolic_flat(spread, level.state))
 
 
 def test_a_triangles_missing_vertex_is_marked(level: Level) -> None:
     model = dataclasses.replace(
-        level.model, n_vertices=jnp.full_like(level.model.n_vertices, 3), active=jnp.ones_like(level.model.active)
+        level.model, n_vertices=np.full_like(level.model.n_vertices, 3), active=np.ones_like(level.model.active)
     )
     seen = np.asarray(symbolic_flat(dataclasses.replace(level, model=model), level.state))
     np.testing.assert_array_equal(seen[POLYGON_ROWS - 3 : POLYGON_ROWS].T, np.tile([-1.0, -1.0, 1.0], (LANES, 1)))
