@@ -19,6 +19,7 @@ from pipeline.runtime import CACHE_VARIABLE, prepare_jax
 ROOT = Path(__file__).parent.parent
 DEMANDED = "LEVELPROOF_TEST_ORACLE"
 MOST_MAPS = 20_000
+FIRST, BESIDE = ROOT / "tests/pipeline/jobs/test_unit.py", ROOT / "tests/physics"
 DESELECTED = pytest.StashKey[int]()
 
 os.environ.setdefault(CACHE_VARIABLE, str(ROOT / ".pytest_cache" / "levelproof"))
@@ -54,13 +55,14 @@ def reference() -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What runs the reference is a campaign: golden states stand for it in the other tests.
 
-    Files with slow tests come first, so that no process is left alone with one of them at the end.
+    The first file compiles the programs of experts that all commands and workers load afterwards; physics, beside it,
+    uses none of them. Then files with slow tests, so that no process is left alone with one of them at the end.
     """
     for item in items:
         if "reference" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.campaign)
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: -slow[item.path])
+    items.sort(key=lambda item: (item.path != FIRST, BESIDE not in item.path.parents, -slow[item.path]))
 
 
 def pytest_deselected(items: list[pytest.Item]) -> None:

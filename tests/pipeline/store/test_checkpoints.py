@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -24,8 +23,11 @@ UNITS = 3
 def test_each_unit_s_experts_come_back_bit_for_bit(tmp_path: Path) -> None:
     job = made_job("data", "expert.width=8", "expert.environments=24")
     ids = np.arange(UNITS, dtype=np.int32)
-    levels = sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution)
-    begun = jax.tree.map(np.asarray, begin(levels, jnp.asarray(ids), job.expert))
+    levels = sample_levels(ids, SIZES["s"], job.distribution)
+    rng = np.random.default_rng(0)
+    shapes = jax.eval_shape(lambda: begin(levels, ids, job.expert))
+    random = lambda x: np.frombuffer(rng.bytes(x.size * x.dtype.itemsize), x.dtype).reshape(x.shape)
+    begun = jax.tree.map(lambda x: rng.random(x.shape) < 0.5 if x.dtype == bool else random(x), shapes)
     kept = [Kept(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(UNITS)]
     for i in range(UNITS):
         save_experts(tmp_path / f"{i}.npz", {i: kept[i]})
