@@ -23,6 +23,8 @@ class Stream(IntEnum):
     LEVEL = 0  # the sampler
     EXPERT = 1  # initial networks, exploration, minibatches
     EVALUATION = 2  # the record that labels the level
+    SCOUT = 3  # random play before training
+    SEARCH = 4  # exploration of a search
 
 
 def level_id_array(level_ids: ArrayLike) -> Int[np.ndarray, " level"]:

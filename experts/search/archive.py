@@ -1,0 +1,138 @@
+"""A level's archive: of each cell of its worlds one state that was reached, and the actions that reached it.
+
+Everything here has the level axis first and treats each level on its own. Weights of choices are whole numbers, so that
+sums of them have no rounding that could depend on how many levels are computed together.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
+
+from experts.search.cells import cell_key
+from experts.search.config import SearchConfig
+
+ONE = 65_536  # the weight of an entry that was never chosen
+
+
+class Reached(NamedTuple):
+    """States that were reached: entries of the archive, or what lanes have just come to."""
+
+    feature: Float[Array, "level thing feature"]  # what tells them apart (`experts.search.cells`)
+    state: Float[Array, "level thing word"]  # all that evolves (`experts.search.rows`)
+    code: UInt16[Array, "level thing step"]  # actions from the level's start, each as one number
+    steps: Int[Array, "level thing"]  # how many of them
+    distance: Float[Array, "level thing"]  # m, of green and blue
+
+
+class Archive(NamedTuple):
+    """Entries are numbered in no order; those not in use hold anything."""
+
+    entry: Reached
+    used: Bool[Array, "level entry"]
+    key: UInt32[Array, "level entry"]  # of its cell
+    visits: Int[Array, "level entry"]  # how often it was chosen
+    width: Float[Array, " level"]  # m, of a cell
+    cells: Int[Array, " level"]  # that entered it, ever
+
+
+def new_archive(start: Reached, config: SearchConfig) -> Archive:
+    """Archives with nothing but the levels' starts [level, 1, ...]."""
+    count, entries = len(start.steps), config.entries
+    widen = lambda x: jnp.pad(x, [(0, 0), (0, entries - 1)] + [(0, 0)] * (x.ndim - 2))
+    width, entry = jnp.full(count, config.width), jax.tree.map(widen, start)
+    used = jnp.broadcast_to(jnp.arange(entries) == 0, (count, entries))
+    ones = jnp.ones(count, jnp.int32)
+    return Archive(entry, used, keys_of(entry.feature, width), jnp.zeros((count, entries), jnp.int32), width, ones)
+
+
+def keys_of(
+    feature: Float[Array, "level thing feature"], width: Float[Array, " level"]
+) -> UInt32[Array, "level thing"]:
+    """Of the cells that things are in."""
+    return jax.vmap(cell_key)(feature, width)
+
+
+def choose(archive: Archive, uniform: Float[Array, "level 3 lane"], config: SearchConfig) -> Int[Array, "level lane"]:
+    """An entry for each lane: by novelty, and of two such sometimes the one nearer to the goal."""
+    weight = jnp.where(archive.used, jnp.maximum(ONE // (1 + archive.visits), 1), 0)
+    total = jnp.cumsum(weight, axis=-1)
+
+    def drawn(uniform: Float[Array, "level lane"]) -> Int[Array, "level lane"]:
+        at = (uniform * total[:, -1:]).astype(jnp.int32)
+        return jnp.minimum((at[:, :, None] >= total[:, None, :]).sum(-1), config.entries - 1)
+
+    one, other = drawn(uniform[:, 0]), drawn(uniform[:, 1])
+    distance = lambda chosen: jnp.take_along_axis(archive.entry.distance, chosen, axis=1)
+    return jnp.where((uniform[:, 2] < config.nearer) & (distance(other) < distance(one)), other, one)
+
+
+def visit(archive: Archive, chosen: Int[Array, "level lane"], active: Bool[Array, " level"]) -> Archive:
+    """Count who was chosen, in levels that are active."""
+    counts = (chosen[:, :, None] == jnp.arange(archive.used.shape[1])).sum(1)
+    return archive._replace(visits=archive.visits + jnp.where(active[:, None], counts, 0))
+
+
+def insert(
+    archive: Archive, new: Reached, valid: Bool[Array, "level lane"], config: SearchConfig
+) -> tuple[Archive, Bool[Array, " level"]]:
+    """Put in what is new, or reached in fewer env steps; and whether all of it fitted. If not, cells become wider."""
+    key = keys_of(new.feature, archive.width)
+    slot, fits = jax.vmap(slots_for)(archive.used, archive.key, archive.entry.steps, key, new.steps, valid)
+    level = jnp.arange(len(key))[:, None]
+    put = lambda old, new: old.at[level, slot].set(new, mode="drop")
+    used = put(archive.used, True)
+    archive = archive._replace(
+        entry=jax.tree.map(put, archive.entry, new),
+        used=used,
+        key=put(archive.key, key),
+        visits=put(archive.visits, 0),
+        cells=archive.cells + (used & ~archive.used).sum(-1),
+    )
+    return widen(archive, ~fits, config), fits
+
+
+def slots_for(
+    used: Bool[Array, " entry"],
+    known: UInt32[Array, " entry"],
+    known_steps: Int[Array, " entry"],
+    key: UInt32[Array, " lane"],
+    steps: Int[Array, " lane"],
+    valid: Bool[Array, " lane"],
+) -> tuple[Int[Array, " lane"], Bool[Array, ""]]:
+    """Where in one level's archive each lane's state goes, past the end for nowhere; and whether all new cells fit."""
+    number, nowhere = jnp.arange(len(used)), len(used)
+    same = used & (key[:, None] == known)
+    old = jnp.where(same, number, 0).sum(-1)
+    first = valid & ~beaten(key, steps, valid)
+    fresh = first & ~same.any(-1)
+    free = jnp.where(used, nowhere, jnp.cumsum(~used) - 1)
+    turn = jnp.cumsum(fresh) - 1
+    empty = jnp.where(free == turn[:, None], number, 0).sum(-1)
+    fits = turn < (~used).sum()
+    sooner = first & same.any(-1) & (steps < known_steps[old])
+    slot = jnp.where(fresh & fits, empty, jnp.where(sooner, old, nowhere))
+    return slot, (fits | ~fresh).all()
+
+
+def beaten(
+    key: UInt32[Array, " thing"], steps: Int[Array, " thing"], valid: Bool[Array, " thing"]
+) -> Bool[Array, " thing"]:
+    """Whether another one has the same cell in fewer env steps, or in as many and comes first."""
+    number = jnp.arange(len(key))
+    sooner = (steps < steps[:, None]) | ((steps == steps[:, None]) & (number < number[:, None]))
+    return ((key == key[:, None]) & sooner & valid).any(-1)
+
+
+def widen(archive: Archive, full: Bool[Array, " level"], config: SearchConfig) -> Archive:
+    """Wider cells in archives that are full; of entries that then share a cell the one reached first stays."""
+
+    def wider(archive: Archive) -> tuple:
+        width = jnp.where(full, archive.width * config.growth, archive.width)
+        key = keys_of(archive.entry.feature, width)
+        return archive.used & ~jax.vmap(beaten)(key, archive.entry.steps, archive.used), key, width
+
+    small = lambda archive: (archive.used, archive.key, archive.width)
+    used, key, width = jax.lax.cond(full.any(), wider, small, archive)
+    return archive._replace(used=used, key=key, width=width)

@@ -1,0 +1,50 @@
+"""Cells: what makes two states of a level different enough to keep both."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt32
+
+from experts.search.config import SearchConfig
+from levelgen.level import Level, Role
+from levelgen.proofs import driven
+from physics.types import FIXED_POLYGONS, State
+
+TURN = 2 * np.pi
+FARTHEST = 1e6  # cells from the start
+
+
+def features(level: Level, state: State, config: SearchConfig) -> Float[Array, "lane feature"]:
+    """Metres that tell states apart."""
+    model, moving = level.model, slice(FIXED_POLYGONS, None)
+    turns = (model.inverse_inertia > 0) & (model.inverse_mass > 0)
+    arm = jnp.sqrt(jnp.where(turns, model.inverse_mass / jnp.where(turns, model.inverse_inertia, 1.0), 0.0))
+    turned, place = state.rotation - level.state.rotation, state.position - level.state.position
+    angle = turned - TURN * jnp.round(turned / TURN)
+    seconds, weight = config.velocity_seconds, weights(level, config)
+    rows = [
+        place[:, 0] * weight,
+        place[:, 1] * weight,
+        angle * arm * weight,
+        state.velocity[:, 0] * weight * seconds,
+        state.velocity[:, 1] * weight * seconds,
+        state.angular_velocity * arm * weight * seconds,
+    ]
+    return jnp.concatenate([row[moving] for row in (rows if seconds else rows[:3])]).T
+
+
+def weights(level: Level, config: SearchConfig) -> Float[Array, "body lane"]:
+    goal = (level.role == Role.GREEN) | (level.role == Role.BLUE)
+    moves = level.model.active & (level.model.inverse_mass + level.model.inverse_inertia > 0)
+    weight = jnp.select([goal, driven(level)], [1.0, config.driven_weight], config.other_weight)
+    return jnp.where(moves, weight, 0.0)
+
+
+def cell_key(feature: Float[Array, "thing feature"], width: Float[Array, ""]) -> UInt32[Array, " thing"]:
+    """A number for each cell; that two cells share one is as good as impossible among so few."""
+    cell = jnp.round(jnp.clip(feature / width, -FARTHEST, FARTHEST)).astype(jnp.int32).astype(jnp.uint32)
+    factor = np.random.default_rng(0).integers(2**31, size=cell.shape[-1], dtype=np.uint32) * 2 + 1
+    mixed = cell * factor
+    mixed = (mixed ^ (mixed >> 15)) * np.uint32(2246822519)
+    total = mixed.sum(-1, dtype=jnp.uint32)
+    total = (total ^ (total >> 13)) * np.uint32(3266489917)
+    return total ^ (total >> 16)

@@ -1,0 +1,50 @@
+"""How a level is searched."""
+
+from dataclasses import dataclass
+
+from experts.config import MOST_COUNTED
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """Settings of a search (hashable: pass as a static argument)."""
+
+    env_steps: int = 1_048_576  # of one level, all lanes together; rounded up to whole rounds
+    # play
+    lanes: int = 64  # of one level
+    redrawn: tuple[float, ...] = (0.02, 0.05, 0.1, 0.3)  # chance of drawing an entry of the action anew, per env step
+    segment: int = 8  # env steps between visits to the archive
+    stretch: int = 4  # segments that a lane plays before it returns to a state of the archive
+    # archive
+    entries: int = 512  # states of one level
+    nearer: float = 0.5  # share of returns that go to the nearer to the goal of two states
+    # cells: bodies tell states apart by metres, weighted
+    width: float = 0.05  # m, of a cell, until the archive is full
+    growth: float = 1.5  # by which cells become wider each time it is
+    driven_weight: float = 0.5  # of bodies that actuators move; of green and blue ones it is 1
+    other_weight: float = 0.25  # of all others that move
+    velocity_seconds: float = 0.1  # s; metres for each metre a second
+    # a success
+    trials: int = 4  # rounds of attempts to make it shorter, one a lane; the first also verifies it
+    # machine
+    rounds: int = 8  # between looks of the host
+
+    def __post_init__(self) -> None:
+        for name in ("env_steps", "lanes", "segment", "stretch", "entries", "trials", "rounds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
+        if self.env_steps > MOST_COUNTED:
+            raise ValueError(f"env_steps is {self.env_steps}: a search can count no more than {MOST_COUNTED}")
+        if not self.redrawn or not all(0 < chance <= 1 for chance in self.redrawn):
+            raise ValueError(f"redrawn is {self.redrawn}: give chances above 0 and at most 1")
+        if self.lanes % len(self.redrawn):
+            raise ValueError(f"lanes is {self.lanes}: give a multiple of {len(self.redrawn)}, the chances in redrawn")
+        if not 0 <= self.nearer <= 1:
+            raise ValueError(f"nearer is {self.nearer}: it must be between 0 and 1")
+        if self.width <= 0:
+            raise ValueError(f"width is {self.width}: it must be above 0")
+        if self.growth <= 1:
+            raise ValueError(f"growth is {self.growth}: it must be above 1")
+        for name in ("driven_weight", "other_weight", "velocity_seconds"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")

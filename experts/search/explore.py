@@ -1,0 +1,167 @@
+"""The search of some levels side by side. Each round, every lane returns to a state of its level's archive, plays a
+segment from there, and puts what it came to into the archive.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
+
+from experts.config import RECORD_STEPS
+from experts.search.archive import Archive, Reached, choose, insert, new_archive, visit
+from experts.search.cells import features
+from experts.search.config import SearchConfig
+from experts.search.play import Arena, Walk, arena, decode, most_steps, play
+from experts.search.rows import from_rows, to_rows
+from experts.success import Success
+from levelgen.identity.keys import Stream, key_for
+from levelgen.level import ACTIONS, Level
+from levelgen.task.rules import TaskParams, goal_distance
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Search:
+    """Levels under search. The level axis is first, but for the levels themselves."""
+
+    levels: Level  # lane axis last
+    key: Key[Array, " level"]  # of the search's random stream
+    archive: Archive
+    env_steps: Int[Array, " level"]  # of all lanes
+    grew: Int[Array, " level"]  # env steps when the last cell entered the archive
+    full: Bool[Array, " level"]  # whether cells have ever been made wider, because the archive was full
+    code: UInt16[Array, "level step"]  # actions of the success, each as one number
+    length: Int[Array, " level"]  # of the success, env steps; 0: there is none
+
+
+@partial(jax.jit, static_argnames=("config", "rules"))
+def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, rules: TaskParams) -> Search:
+    """Levels of which nothing but the start is known.
+
+    Args:
+        levels: lane axis last.
+        level_ids: their ids, the seeds of all randomness.
+        config: how they are searched.
+        rules: of the task.
+    """
+    count, room = len(level_ids), -(-most_steps(rules) // config.segment) * config.segment
+    one = lambda x: x[:, None]
+    start = Reached(
+        one(features(levels, levels.state, config)),
+        one(to_rows(levels.state)),
+        jnp.zeros((count, 1, room), jnp.uint16),
+        jnp.zeros((count, 1), jnp.int32),
+        one(goal_distance(levels, levels.state)),
+    )
+    key = jax.vmap(lambda level_id: key_for(level_id, Stream.SEARCH))(level_ids)
+    none, code = jnp.zeros(count, jnp.int32), jnp.zeros((count, room), jnp.uint16)
+    return Search(levels, key, new_archive(start, config), none, none, none.astype(bool), code, none)
+
+
+@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="search")
+def explore(search: Search, config: SearchConfig, rules: TaskParams) -> Search:
+    """`config.rounds` rounds. Levels that have a success, or have had their env steps, stay as they are."""
+    ring = arena(search.levels, config.lanes, config.redrawn)
+    step = lambda search, _: (explore_round(search, ring, config, rules), None)
+    return jax.lax.scan(step, search, length=config.rounds)[0]
+
+
+def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: TaskParams) -> Search:
+    """One round; `ring` has the levels' lanes."""
+    active = under_way(search, config)
+    uniform, bits = jax.vmap(partial(draw, config=config))(search.key, search.env_steps)
+    bits = jnp.moveaxis(bits, 0, 3).reshape(config.stretch, config.segment, ACTIONS, -1)
+    chosen = choose(search.archive, uniform, config)
+    walk, code = back_to(search, chosen)
+
+    def one(carry: tuple[Archive, Walk, Array, Array], bits: Array) -> tuple[tuple, None]:
+        archive, walk, code, full = carry
+        before = walk.timestep
+        walk, played = play(ring, walk, bits, rules)
+        code = written(code, played, before // config.segment)
+        come, valid = reached_by(walk, code, ring, config)
+        archive, fits = insert(archive, come, valid & active[:, None], config)
+        return (archive, walk, code, full | ~fits), None
+
+    carry = visit(search.archive, chosen, active), walk, code, search.full
+    archive, walk, code, full = jax.lax.scan(one, carry, bits)[0]
+
+    env_steps = search.env_steps + jnp.where(active, config.lanes * config.stretch * config.segment, 0)
+    level, length = jnp.arange(len(active)), length_of(walk, rules).reshape(len(active), -1)
+    lane = jnp.argmin(length, axis=-1)
+    won = active & (length[level, lane] <= RECORD_STEPS)
+    return Search(
+        levels=search.levels,
+        key=search.key,
+        archive=archive,
+        env_steps=env_steps,
+        grew=jnp.where(archive.cells > search.archive.cells, env_steps, search.grew),
+        full=full,
+        code=jnp.where(won[:, None], code.reshape(len(active), config.lanes, -1)[level, lane], search.code),
+        length=jnp.where(won, length[level, lane], search.length),
+    )
+
+
+def under_way(search: Search, config: SearchConfig) -> Bool[Array, " level"]:
+    """Levels without a success that have env steps left."""
+    return (search.length == 0) & (search.env_steps < config.env_steps)
+
+
+def draw(
+    key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig
+) -> tuple[Float[Array, "3 lane"], UInt32[Array, "stretch time 6 lane"]]:
+    """All the chance in one level's round: what its lanes choose by, and what they play by."""
+    one, other = jax.random.split(jax.random.fold_in(key, env_steps))
+    bits = jax.random.bits(other, (config.stretch, config.segment, ACTIONS, config.lanes))
+    return jax.random.uniform(one, (3, config.lanes)), bits
+
+
+def back_to(search: Search, chosen: Int[Array, "level lane"]) -> tuple[Walk, UInt16[Array, "lane step"]]:
+    """Every lane in the state of the entry it has chosen, and the actions that lead there."""
+    level, entry = jnp.arange(len(chosen))[:, None], search.archive.entry
+    by_lane = lambda x: x[level, chosen].reshape(chosen.size, *x.shape[2:])
+    code, steps = by_lane(entry.code), by_lane(entry.steps)
+    last = jnp.where(steps > 0, code[jnp.arange(len(code)), jnp.maximum(steps - 1, 0)], 0)
+    none = jnp.zeros(len(steps), jnp.int32)
+    return Walk(
+        from_rows(by_lane(entry.state), search.levels.state), decode(last), steps, none, none.astype(bool)
+    ), code
+
+
+def written(
+    code: UInt16[Array, "lane step"], played: UInt16[Array, "time lane"], segment: Int[Array, " lane"]
+) -> UInt16[Array, "lane step"]:
+    """The actions with these in the lane's segment of this number."""
+    segments = code.reshape(len(code), -1, len(played))
+    now = jnp.arange(segments.shape[1]) == segment[:, None]
+    return jnp.where(now[:, :, None], played.T[:, None], segments).reshape(code.shape)
+
+
+def reached_by(
+    walk: Walk, code: UInt16[Array, "lane step"], ring: Arena, config: SearchConfig
+) -> tuple[Reached, Bool[Array, "level lane"]]:
+    """Where lanes are, by level, and which of them may go on."""
+    by_level = lambda x: x.reshape(-1, config.lanes, *x.shape[1:])
+    come = Reached(
+        feature=features(ring.lanes, walk.state, config),
+        state=to_rows(walk.state),
+        code=code,
+        steps=walk.timestep,
+        distance=goal_distance(ring.lanes, walk.state),
+    )
+    return jax.tree.map(by_level, come), by_level(~walk.ended)
+
+
+def length_of(walk: Walk, rules: TaskParams) -> Int[Array, " lane"]:
+    """Env steps from the level's start to the goal; RECORD_STEPS + 1 where it was not reached in time."""
+    goal = (walk.reached > 0) & (walk.reached <= most_steps(rules))
+    return jnp.where(goal, walk.reached, RECORD_STEPS + 1)
+
+
+def successes(search: Search) -> Success:
+    """What was found, level first."""
+    code = jnp.pad(search.code, [(0, 0), (0, max(0, RECORD_STEPS - search.code.shape[1]))])[:, :RECORD_STEPS]
+    action = decode(jnp.where(jnp.arange(RECORD_STEPS) < search.length[:, None], code, 0))
+    return Success(jnp.moveaxis(action, 0, -1).astype(jnp.int8), search.length)

@@ -1,0 +1,116 @@
+"""Random play at nearly the speed of bare physics: no reward, no distance of the goal, no observation.
+
+The goal is reached, and an episode over, where `levelgen.task.rules.advance` says so.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
+
+from experts.config import RECORD_STEPS
+from levelgen.level import ACTIONS, Level, Role
+from levelgen.task.actions import CHOICES, action_mask, controls
+from levelgen.task.rules import TaskParams, has_nan, has_roles
+from physics.pairs import pairs_of
+from physics.step import step_unseen
+from physics.types import State
+
+
+class Arena(NamedTuple):
+    """What is constant while lanes play."""
+
+    lanes: Level  # each level in as many neighbouring lanes
+    live: Bool[Array, "6 lane"]  # entries of an action that can have an effect
+    blue: Bool[Array, "contact lane"]  # contacts that reach the goal
+    red: Bool[Array, "contact lane"]  # contacts that end the episode without
+    redrawn: Float[Array, " lane"]  # chance that an entry of the action is drawn anew, per env step
+
+
+class Walk(NamedTuple):
+    """Episodes under way; one that is over goes on, and nothing of it counts."""
+
+    state: State
+    action: Int[Array, "6 lane"]  # the last one
+    timestep: Int[Array, " lane"]  # env steps since the level's start
+    reached: Int[Array, " lane"]  # env steps until the goal; 0: it was not reached
+    ended: Bool[Array, " lane"]  # the episode is over
+
+
+def most_steps(rules: TaskParams) -> int:
+    """Env steps within which the goal has to be reached: an episode's, and no more than a record holds."""
+    return min(RECORD_STEPS, rules.max_timesteps)
+
+
+def arena(levels: Level, lanes: int, redrawn: tuple[float, ...]) -> Arena:
+    """Each level in `lanes` neighbouring lanes, an equal share of them for each chance."""
+    count = levels.role.shape[-1]
+    spread = jax.tree.map(lambda x: jnp.repeat(x, lanes, axis=-1), levels)
+    chance = jnp.tile(jnp.repeat(jnp.array(redrawn, jnp.float32), lanes // len(redrawn)), count)
+    return Arena(spread, action_mask(spread), contacts(spread, Role.BLUE), contacts(spread, Role.RED), chance)
+
+
+def contacts(level: Level, second: Role) -> Bool[Array, "contact lane"]:
+    """Contacts of green and this role that `levelgen.task.rules.touches` counts."""
+    pairs = pairs_of(level.size)
+    of = lambda pair: has_roles(level, pair.a, pair.b, Role.GREEN, second)
+    polygon = of(pairs.polygon)
+    return jnp.concatenate([polygon, jnp.zeros_like(polygon), of(pairs.circle_polygon), of(pairs.circle)])
+
+
+def fresh_walk(lanes: Level) -> Walk:
+    """Every lane at its level's start."""
+    zeros = jnp.zeros(lanes.state.rotation.shape[-1], jnp.int32)
+    return Walk(lanes.state, jnp.zeros((ACTIONS, len(zeros)), jnp.int32), zeros, zeros, zeros.astype(bool))
+
+
+def play(
+    arena: Arena, walk: Walk, bits: UInt32[Array, "time 6 lane"], rules: TaskParams
+) -> tuple[Walk, UInt16[Array, "time lane"]]:
+    """An env step for each time, and the actions, each as one number. Random bits choose them (`persistent`)."""
+
+    def one(walk: Walk, bits: UInt32[Array, "6 lane"]) -> tuple[Walk, UInt16[Array, " lane"]]:
+        action = persistent(walk.action, bits, arena)
+        return act(arena, walk, action, rules), encode(action)
+
+    return jax.lax.scan(one, walk, bits)
+
+
+def persistent(action: Int[Array, "6 lane"], bits: UInt32[Array, "6 lane"], arena: Arena) -> Int[Array, "6 lane"]:
+    """The action, some of its entries drawn anew: one random number says whether, and if so which choice."""
+    choices = jnp.array(CHOICES, jnp.float32)[:, None]
+    uniform = (bits >> 8).astype(jnp.float32) * 2.0**-24
+    drawn = jnp.minimum(uniform / arena.redrawn * choices, choices - 1).astype(jnp.int32)
+    return jnp.where((uniform < arena.redrawn) & arena.live, drawn, action)
+
+
+def act(arena: Arena, walk: Walk, action: Int[Array, "6 lane"], rules: TaskParams) -> Walk:
+    """One env step."""
+    state, reached, ended, timestep = walk.state, walk.reached, walk.ended, walk.timestep + 1
+    driven = controls(arena.lanes, action)
+    for _ in range(rules.frame_skip):
+        state = step_unseen(arena.lanes.model, state, *driven, rules.physics)
+        fail = (arena.red & state.contact_active).any(0)
+        goal = (arena.blue & state.contact_active).any(0) & ~fail
+        reached = jnp.where(goal & ~ended, timestep, reached)
+        ended = ended | fail | goal
+    ended = ended | (timestep >= most_steps(rules)) | has_nan(state)
+    return Walk(state, action, timestep, reached, ended)
+
+
+def encode(action: Int[Array, "6 *lane"]) -> UInt16[Array, "*lane"]:
+    """An action as one number below 324."""
+    code = jnp.zeros(action.shape[1:], jnp.int32)
+    for entry, choices in zip(action, CHOICES, strict=True):
+        code = code * choices + entry
+    return code.astype(jnp.uint16)
+
+
+def decode(code: UInt16[Array, "*lane"]) -> Int[Array, "6 *lane"]:
+    """The action of a number."""
+    entries, rest = [], code.astype(jnp.int32)
+    for choices in reversed(CHOICES):
+        rest, entry = jnp.divmod(rest, choices)
+        entries.append(entry)
+    return jnp.stack(entries[::-1])

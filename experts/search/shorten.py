@@ -1,0 +1,109 @@
+"""A success made shorter: stretches of it are left out or held, and what then reaches the goal sooner is kept."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, UInt32
+
+from experts.config import RECORD_STEPS
+from experts.search.config import SearchConfig
+from experts.search.play import Arena, act, arena, fresh_walk
+from experts.success import Success
+from levelgen.identity.keys import Stream, key_for
+from levelgen.level import ACTIONS, Level
+from levelgen.task.rules import TaskParams
+
+MOST_HALVINGS = 6  # stretches are from a whole success to a 64th of it
+
+
+class Shortened(NamedTuple):
+    """What is left of successes, level first."""
+
+    success: Success  # length 0 where the success that was given does not reach the goal
+    env_steps: Int[Array, " level"]  # of all lanes
+
+
+class Edit(NamedTuple):
+    """A stretch that is left out, then one that does what its first step does; each by its first step and length."""
+
+    left_out: Int[Array, " lane"]
+    left_out_steps: Int[Array, " lane"]
+    held: Int[Array, " lane"]
+    held_steps: Int[Array, " lane"]
+
+
+@partial(jax.jit, static_argnames=("config", "rules"))
+def shorten(
+    levels: Level, level_ids: Int[Array, " level"], success: Success, config: SearchConfig, rules: TaskParams
+) -> Shortened:
+    """Try `config.trials` rounds of changes, one in every lane; each round starts from the shortest success so far.
+
+    In the first round, one lane plays the success as it is.
+
+    Args:
+        levels: lane axis last.
+        level_ids: their ids, the seeds of all randomness.
+        success: of each level, level first; length 0: there is none.
+        config: lanes of a level, and rounds.
+        rules: of the task.
+    """
+    ring = arena(levels, config.lanes, config.redrawn)
+    keys = jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, Stream.SEARCH), 1))(level_ids)
+    count = len(level_ids)
+
+    def trial(number: Int[Array, ""], so_far: tuple[Success, Array]) -> tuple[Success, Array]:
+        best, env_steps = so_far
+        bits = jax.vmap(lambda key: jax.random.bits(jax.random.fold_in(key, number), (6, config.lanes)))(keys)
+        edits = jax.vmap(drawn)(bits, best.length)
+        nothing = (number == 0) & (jnp.arange(config.lanes) == 0)
+        edits = jax.tree.map(lambda x: jnp.where(nothing, 0, x), edits)
+        action = jax.vmap(edited)(best.action, best.length, edits)
+        length = replayed(ring, action, best.length, rules)
+        lane = jnp.argmin(length, axis=-1)
+        level = jnp.arange(count)
+        shorter = (length[level, lane] < best.length) | (number == 0)
+        kept = jnp.where(shorter[:, None, None], action[level, lane], best.action)
+        steps = jnp.where(shorter, length[level, lane], best.length)
+        return Success(kept, steps), env_steps + config.lanes * best.length
+
+    best, env_steps = jax.lax.fori_loop(0, config.trials, trial, (success, jnp.zeros(count, jnp.int32)))
+    length = jnp.where(best.length > RECORD_STEPS, 0, best.length)
+    step = jnp.arange(RECORD_STEPS)
+    action = jnp.where((step < length[:, None])[:, :, None], best.action, 0)
+    return Shortened(Success(action, length), env_steps)
+
+
+def drawn(bits: UInt32[Array, "6 lane"], length: Int[Array, ""]) -> Edit:
+    """Random changes: a quarter leave out a beginning, half hold nothing."""
+    below = lambda bits, bound: (bits % jnp.maximum(bound, 1).astype(jnp.uint32)).astype(jnp.int32)
+    stretch = lambda bits: jnp.maximum(length >> below(bits, jnp.int32(MOST_HALVINGS + 1)), 1)
+    first = jnp.where(bits[0] >> 30 == 0, 0, below(bits[1], length))
+    holds = bits[0] >> 31 == 1
+    return Edit(first, stretch(bits[2]), below(bits[3], length), jnp.where(holds, stretch(bits[4]), 0))
+
+
+def edited(action: Int[Array, "256 6"], length: Int[Array, ""], edit: Edit) -> Int[Array, "lane 256 6"]:
+    """The actions of each lane; the last one goes on to the end."""
+    step = jnp.arange(RECORD_STEPS)
+    at = lambda x: x[:, None]
+    step = jnp.where((step >= at(edit.held)) & (step < at(edit.held + edit.held_steps)), at(edit.held), step)
+    step = jnp.where(step >= at(edit.left_out), step + at(edit.left_out_steps), step)
+    return action[jnp.minimum(step, jnp.maximum(length - 1, 0))]
+
+
+def replayed(
+    ring: Arena, action: Int[Array, "level lane 256 6"], most: Int[Array, " level"], rules: TaskParams
+) -> Int[Array, "level lane"]:
+    """Env steps until the goal, from the level's start; RECORD_STEPS + 1 where it is not reached within `most`."""
+    count, lanes = action.shape[:2]
+    by_step = jnp.moveaxis(action.reshape(count * lanes, RECORD_STEPS, ACTIONS), 0, -1).astype(jnp.int32)
+
+    def step(walk):
+        return act(ring, walk, by_step[walk.timestep[0]], rules)
+
+    going = lambda walk: (walk.timestep[0] < most.max()) & ~walk.ended.all()
+    walk = jax.lax.while_loop(going, step, fresh_walk(ring.lanes))
+    reached = walk.reached.reshape(count, lanes)
+    return jnp.where((reached > 0) & (reached <= most[:, None]), reached, RECORD_STEPS + 1)

@@ -1,0 +1,76 @@
+"""Random play beside the task's own rules."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experts.search.play import arena, decode, encode, fresh_walk, play
+from experts.search.rows import from_rows, to_rows
+from experts.witness import take
+from levelgen.task import rules as task
+from levelgen.task.actions import CHOICES
+from levelgen.task.rules import DEFAULT_RULES
+from tests.experts.search.worlds import broken, side_by_side, switchback, valley
+
+LANES, STEPS = 16, 256
+CHANCES = (0.02, 0.3)
+RULES = replace(DEFAULT_RULES, max_timesteps=200)
+
+
+def test_codes() -> None:
+    code = jnp.arange(np.prod(CHOICES), dtype=jnp.uint16)
+    np.testing.assert_array_equal(encode(decode(code)), code)
+    assert (np.asarray(decode(code)) < np.array(CHOICES)[:, None]).all()
+
+
+def test_rows_are_exact() -> None:
+    state = task.reset(take(side_by_side(switchback(), valley()), np.array([0, 1, 1]))).state
+    noisy = jax.tree.map(lambda x: x + np.arange(3, dtype=x.dtype) if x.dtype == jnp.float32 else ~x, state)
+    jax.tree.map(np.testing.assert_array_equal, from_rows(to_rows(noisy), state), noisy)
+
+
+def test_play_ends_as_the_task_says() -> None:
+    """Goal, failure, time limit and broken worlds at the same env step, and the same states until then."""
+    ring = arena(side_by_side(switchback(), valley(), broken()), LANES, CHANCES)
+    bits = jax.random.bits(jax.random.key(3), (STEPS, 6, 3 * LANES))
+    walk, code = jax.jit(play, static_argnums=3)(ring, fresh_walk(ring.lanes), bits, RULES)
+    actions = decode(code)
+
+    @jax.jit
+    def judged(now):
+        def step(now, action):
+            after, result = task.advance(ring.lanes, now, action, RULES)
+            return after, (result.done, result.goal)
+
+        return jax.lax.scan(step, now, jnp.moveaxis(actions, 0, 1))
+
+    last, (done, goal) = judged(task.reset(ring.lanes))
+    first, lane = np.argmax(done, axis=0), np.arange(3 * LANES)
+    assert np.asarray(done).any(0).all()
+    assert np.asarray(walk.ended).all()
+    expected = np.where(np.asarray(goal)[first, lane], first + 1, 0)
+    np.testing.assert_array_equal(walk.reached, expected)
+    jax.tree.map(np.testing.assert_array_equal, walk.state, last.state)
+    short = jax.jit(play, static_argnums=3)(ring, fresh_walk(ring.lanes), bits[:100], RULES)[0]
+    np.testing.assert_array_equal(short.ended, np.asarray(done)[:100].any(0))
+
+
+def test_chances() -> None:
+    """How often an entry stays, and that every choice comes."""
+    ring = arena(side_by_side(switchback(), valley()), LANES, CHANCES)
+    ring = ring._replace(live=jnp.ones_like(ring.live))
+    bits = jax.random.bits(jax.random.key(0), (4 * STEPS, 6, 2 * LANES))
+    actions = np.asarray(decode(jax.jit(play, static_argnums=3)(ring, fresh_walk(ring.lanes), bits, RULES)[1]))
+    for entry, choices in enumerate(CHOICES):
+        assert set(np.unique(actions[entry])) == set(range(choices))
+        moves = (actions[entry, 1:] != actions[entry, :-1]).mean(0).reshape(2, 2, -1).mean((0, 2))
+        np.testing.assert_allclose(moves, np.array(CHANCES) * (1 - 1 / choices), rtol=0.25)
+
+
+def test_dead_entries_stay_zero() -> None:
+    ring = arena(side_by_side(switchback(), valley()), LANES, CHANCES)
+    bits = jax.random.bits(jax.random.key(0), (STEPS, 6, 2 * LANES))
+    actions = np.asarray(decode(jax.jit(play, static_argnums=3)(ring, fresh_walk(ring.lanes), bits, RULES)[1]))
+    np.testing.assert_array_equal(actions.any((1, 2)), np.asarray(ring.live).any(1))

@@ -1,0 +1,189 @@
+"""Searching levels that random play does not solve: what is found, and that it depends on nothing but the level."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experts.search.config import SearchConfig
+from experts.search.explore import Search, begin, explore
+from experts.search.play import arena, fresh_walk, play
+from experts.search.search import Searched, search, side_by_side
+from experts.search.shorten import shorten
+from experts.success import Success
+from experts.witness import replay, take
+from levelgen.identity.keys import GENERATOR
+from levelgen.level import Level
+from levelgen.task.rules import DEFAULT_RULES
+from tests.experts.search.worlds import broken, switchback, valley
+from tests.experts.search.worlds import side_by_side as together
+
+CONFIG = SearchConfig(env_steps=262_144, lanes=32, entries=128)
+ROUND = CONFIG.lanes * CONFIG.stretch * CONFIG.segment  # env steps
+SWITCHBACK, VALLEY, BROKEN = range(3)
+KINDS = np.array([SWITCHBACK, VALLEY, BROKEN, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY])
+IDS = np.arange(700, 700 + len(KINDS), dtype=np.int32)
+SOLVABLE = np.flatnonzero(KINDS != BROKEN)
+
+
+@cache
+def levels() -> Level:
+    return take(together(switchback(), valley(), broken()), KINDS)
+
+
+@cache
+def found() -> Searched:
+    return search(levels(), IDS, CONFIG, DEFAULT_RULES)
+
+
+def same(one: Searched, other: Searched) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def begun() -> Search:
+    first = np.arange(side_by_side(CONFIG))
+    return begin(take(levels(), first), IDS[first], CONFIG, DEFAULT_RULES)
+
+
+@jax.jit
+def random_play(levels: Level, key: jax.Array) -> jax.Array:
+    """How often an episode in each lane reaches the goal."""
+    ring = arena(levels, 256, CONFIG.redrawn)
+    bits = jax.random.bits(key, (256, 6, 256 * levels.role.shape[-1]))
+    return play(ring, fresh_walk(ring.lanes), bits, DEFAULT_RULES)[0].reached.reshape(-1, 256) > 0
+
+
+def test_what_random_play_does_not_find() -> None:
+    """The search needs a fraction of its env steps in every level; as many of random play find next to nothing."""
+    assert (found().success.length[SOLVABLE] > 0).all()
+    assert (found().env_steps[SOLVABLE] < CONFIG.env_steps).all()
+    both = together(switchback(), valley())
+    episodes = CONFIG.env_steps // 256 // 256
+    wins = sum(random_play(both, jax.random.key(i)).sum(-1) for i in range(episodes))
+    np.testing.assert_array_equal(wins, 0)
+
+
+def test_what_is_found_replays() -> None:
+    """Through the engine's other program, with rewards and contacts: the goal at the last step, nothing before."""
+    length = found().success.length[SOLVABLE]
+    record = replay(take(levels(), SOLVABLE), np.moveaxis(np.asarray(found().success.action)[SOLVABLE], 0, -1))
+    lane = np.arange(len(SOLVABLE))
+    np.testing.assert_array_equal(np.argmax(record.done, axis=0) + 1, length)
+    assert record.goal[length - 1, lane].all()
+    ended = np.arange(256)[None] >= found().success.length[:, None]
+    assert (found().success.action[ended] == 0).all()
+
+
+def test_a_level_alone_gives_what_it_gives_among_others() -> None:
+    """Other neighbours, other rows, other company."""
+    for some in ([4], [8, 3, 2], list(range(len(KINDS)))[::-1]):
+        alone = search(take(levels(), np.array(some)), IDS[some], CONFIG, DEFAULT_RULES)
+        same(alone, jax.tree.map(lambda x, some=some: x[some], found()))
+
+
+def test_another_id_is_another_search() -> None:
+    one = search(take(levels(), np.array([0])), np.array([9], np.int32), CONFIG, DEFAULT_RULES)
+    assert (one.success.action[0] != found().success.action[0]).any()
+
+
+def test_an_interruption_changes_nothing() -> None:
+    """To the host and back, as a checkpoint does."""
+    twice = explore(explore(begun(), CONFIG, DEFAULT_RULES), CONFIG, DEFAULT_RULES)
+    key = jax.random.key_data(twice.key)
+    once = explore(begun(), CONFIG, DEFAULT_RULES)
+    plain = replace(once, key=jax.random.key_data(once.key))
+    back = jax.tree.map(jnp.array, jax.tree.map(np.array, plain))
+    resumed = explore(replace(back, key=jax.random.wrap_key_data(back.key, impl=GENERATOR)), CONFIG, DEFAULT_RULES)
+    jax.tree.map(np.testing.assert_array_equal, replace(resumed, key=key), replace(twice, key=key))
+
+
+def test_env_steps_add_up() -> None:
+    now = begun()
+    for calls in (1, 2):
+        now = explore(now, CONFIG, DEFAULT_RULES)
+        steps = np.asarray(now.env_steps)
+        assert (steps % ROUND == 0).all()
+        going = np.asarray(now.length) == 0
+        np.testing.assert_array_equal(steps[going], calls * CONFIG.rounds * ROUND)
+    assert found().env_steps[KINDS == BROKEN] == CONFIG.env_steps
+    assert (found().grew <= found().env_steps).all()
+
+
+def test_a_level_that_has_a_success_stays_as_it_is() -> None:
+    now, calls = begun(), -(-int(found().env_steps[SOLVABLE].min()) // (CONFIG.rounds * ROUND))
+    for _ in range(calls):
+        now = explore(now, CONFIG, DEFAULT_RULES)
+    solved = np.flatnonzero(now.length)
+    assert len(solved)
+    of = lambda now: jax.tree.map(lambda x: np.array(x)[solved], (now.archive, now.env_steps, now.code, now.length))
+    before = of(now)
+    jax.tree.map(np.testing.assert_array_equal, before, of(explore(now, CONFIG, DEFAULT_RULES)))
+
+
+def test_a_full_archive_goes_on() -> None:
+    """Cells become wider, entries stay distinct, every one is reached by the actions it is kept with."""
+    now = begun()
+    for _ in range(4):
+        now = explore(now, CONFIG, DEFAULT_RULES)
+    archive = jax.device_get(now.archive)
+    full = np.flatnonzero(now.full)
+    assert len(full)
+    assert (archive.width[full] > CONFIG.width * CONFIG.growth / 1.01).all()
+    assert (archive.cells[full] > CONFIG.entries).all()
+    assert not np.asarray(now.full)[KINDS[: len(now.full)] == BROKEN].any()
+    for level in range(len(now.full)):
+        keys = archive.key[level][archive.used[level]]
+        assert len(set(keys.tolist())) == len(keys)
+        assert archive.used[level].any()
+
+
+def test_a_world_that_breaks_down_leaves_its_start_alone() -> None:
+    at = np.flatnonzero(KINDS == BROKEN)
+    assert (found().success.length[at] == 0).all()
+    np.testing.assert_array_equal(found().cells[at], 1)
+
+
+def test_a_state_that_breaks_down_later_does_not_enter() -> None:
+    """A thruster too strong for the engine's numbers: what is kept are numbers."""
+    level = take(levels(), np.array([SWITCHBACK]))
+    level.model.thruster_power[...] = 3e38
+    now = explore(begin(take(level, np.zeros(side_by_side(CONFIG), int)), IDS[: side_by_side(CONFIG)], CONFIG,
+                        DEFAULT_RULES), CONFIG, DEFAULT_RULES)  # fmt: skip
+    archive = jax.device_get(now.archive)
+    assert np.isfinite(archive.entry.state[archive.used]).all()
+    assert np.isfinite(archive.entry.feature[archive.used]).all()
+
+
+def test_shortening() -> None:
+    """A success with idle steps before it becomes shorter; one that fails is none; nothing becomes longer."""
+    width = side_by_side(CONFIG)
+    at = np.resize(SOLVABLE, width)
+    known = jax.tree.map(lambda x: x[at], found().success)
+    given = Success(known.action.copy(), known.length.copy())
+    given.action[0, :20] = 0  # the ball lies on the floor, and waits
+    given.action[0, 20:] = known.action[0, :-20]
+    given.length[0] += 20
+    given.action[1] = 0
+    shorter = shorten(take(levels(), at), IDS[at], given, CONFIG, DEFAULT_RULES)
+    length = np.asarray(shorter.success.length)
+    assert 0 < length[0] < given.length[0]
+    assert length[1] == 0
+    assert (length <= given.length).all()
+    assert (np.asarray(shorter.env_steps)[2:] > 0).all()
+    left = np.flatnonzero(length)
+    record = replay(take(levels(), at[left]), np.moveaxis(np.asarray(shorter.success.action)[left], 0, -1))
+    np.testing.assert_array_equal(np.argmax(record.done, axis=0) + 1, length[left])
+    assert record.goal[length[left] - 1, np.arange(len(left))].all()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"redrawn": (0.5, 2.0)},
+     {"redrawn": ()}, {"env_steps": 2**31}, {"velocity_seconds": -1.0}],
+)  # fmt: skip
+def test_settings_that_cannot_be(wrong: dict) -> None:
+    with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
+        SearchConfig(**wrong)

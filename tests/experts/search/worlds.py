@@ -1,0 +1,69 @@
+"""Levels by hand that random play does not solve: all of one size, so that one kernel is compiled."""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from levelgen.level import Level, Role
+from levelgen.sampling.scenery import empty_level
+from physics.types import FIXED_POLYGONS, Size
+
+SIZE = Size(polygons=6, circles=2, joints=1, thrusters=2)
+BARS = slice(FIXED_POLYGONS, 6)
+BALL, GOAL = 6, 7
+WEIGHT = 0.16 * 9.81  # N, of the ball
+
+
+def switchback() -> Level:
+    """A ball that two thrusters lift, one to each side, has to fly around two red shelves to the goal above them."""
+    return world(
+        bars=[((1.8, 1.5), (1.8, 0.1), 0.0), ((3.2, 3.2), (1.8, 0.1), 0.0)],
+        bar_role=Role.RED,
+        ball=(0.6, 0.6),
+        goal=(4.5, 4.2),
+        angles=(np.pi / 3, 2 * np.pi / 3),
+        thrust=0.9,
+    )
+
+
+def valley() -> Level:
+    """A ball without friction has to swing up to the goal from a valley; its thrusters are weaker than the slopes."""
+    level = world(
+        bars=[((0.6, 0.9), (2.5, 0.5), -0.7), ((4.4, 0.9), (2.5, 0.5), 0.7)],
+        bar_role=Role.PLAIN,
+        ball=(2.5, 0.6),
+        goal=(0.4, 2.2),
+        angles=(0.0, np.pi),
+        thrust=0.4,
+    )
+    level.model.friction[:] = 0
+    return level
+
+
+def broken() -> Level:
+    """The valley, where the ball is nowhere."""
+    level = valley()
+    level.state.position[BALL] = np.nan
+    return level
+
+
+def side_by_side(*levels: Level) -> Level:
+    return jax.tree.map(lambda *xs: np.concatenate(xs, -1), *levels)
+
+
+def world(*, bars, bar_role, ball, goal, angles, thrust) -> Level:
+    """One level: fixed bars (centre, half sides, angle), a ball that does not turn, its two thrusters, a fixed goal."""
+    level = jax.tree.map(np.array, empty_level(SIZE, 1))
+    m = level.model
+    m.active[:] = True
+    for i, (centre, (x, y), angle) in enumerate(bars, FIXED_POLYGONS):
+        m.vertices[i, ..., 0] = [(x, y), (x, -y), (-x, -y), (-x, y)]
+        level.state.position[i, :, 0], level.state.rotation[i] = centre, angle
+    m.radius[:] = 0.2
+    m.inverse_mass[BALL] = 1 / 0.16
+    level.state.position[BALL, :, 0], level.state.position[GOAL, :, 0] = ball, goal
+    level.role[BARS], level.role[BALL], level.role[GOAL] = bar_role, Role.GREEN, Role.BLUE
+    m.thruster_active[:], m.thruster_body[:], m.thruster_power[:] = True, BALL, thrust * WEIGHT / 10
+    m.thruster_rotation[:, 0] = angles
+    return dataclasses.replace(level, thruster_binding=np.array([[0], [1]], np.int32))
