@@ -14,7 +14,7 @@ from levelgen.level import ACTIONS, Level, Role
 from levelgen.task.actions import CHOICES, action_mask, controls
 from levelgen.task.rules import TaskParams, has_nan, has_roles
 from physics.pairs import pairs_of
-from physics.step import step_unseen
+from physics.step import step
 from physics.types import State
 
 
@@ -90,7 +90,7 @@ def act(arena: Arena, walk: Walk, action: Int[Array, "6 lane"], rules: TaskParam
     state, reached, ended, timestep = walk.state, walk.reached, walk.ended, walk.timestep + 1
     driven = controls(arena.lanes, action)
     for _ in range(rules.frame_skip):
-        state = step_unseen(arena.lanes.model, state, *driven, rules.physics)
+        state = step(arena.lanes.model, state, *driven, rules.physics, seen=False)[0]
         fail = (arena.red & state.contact_active).any(0)
         goal = (arena.blue & state.contact_active).any(0) & ~fail
         reached = jnp.where(goal & ~ended, timestep, reached)
