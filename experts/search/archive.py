@@ -61,7 +61,7 @@ def choose(archive: Archive, uniform: Float[Array, "level 3 lane"], config: Sear
 
     def drawn(uniform: Float[Array, "level lane"]) -> Int[Array, "level lane"]:
         at = (uniform * total[:, -1:]).astype(jnp.int32)
-        return jnp.minimum((at[:, :, None] >= total[:, None, :]).sum(-1), config.entries - 1)
+        return jnp.minimum((at[:, None, :] >= total[:, :, None]).sum(1), config.entries - 1)
 
     one, other = drawn(uniform[:, 0]), drawn(uniform[:, 1])
     distance = lambda chosen: jnp.take_along_axis(archive.entry.distance, chosen, axis=1)
@@ -102,16 +102,15 @@ def slots_for(
     valid: Bool[Array, " lane"],
 ) -> tuple[Int[Array, " lane"], Bool[Array, ""]]:
     """Where in one level's archive each lane's state goes, past the end for nowhere; and whether all new cells fit."""
-    number, nowhere = jnp.arange(len(used)), len(used)
-    same = used & (key[:, None] == known)
-    old = jnp.where(same, number, 0).sum(-1)
+    nowhere, number = len(used), jnp.arange(len(used))[:, None]
+    old = jnp.where(used[:, None] & (known[:, None] == key), number + 1, 0).sum(0) - 1  # -1: the cell is new
     first = valid & ~beaten(key, steps, valid)
-    fresh = first & ~same.any(-1)
+    fresh = first & (old < 0)
     free = jnp.where(used, nowhere, jnp.cumsum(~used) - 1)
     turn = jnp.cumsum(fresh) - 1
-    empty = jnp.where(free == turn[:, None], number, 0).sum(-1)
+    empty = jnp.where(free[:, None] == turn, number, 0).sum(0)
     fits = turn < (~used).sum()
-    sooner = first & same.any(-1) & (steps < known_steps[old])
+    sooner = first & (old >= 0) & (steps < known_steps[old])
     slot = jnp.where(fresh & fits, empty, jnp.where(sooner, old, nowhere))
     return slot, (fits | ~fresh).all()
 
@@ -120,9 +119,9 @@ def beaten(
     key: UInt32[Array, " thing"], steps: Int[Array, " thing"], valid: Bool[Array, " thing"]
 ) -> Bool[Array, " thing"]:
     """Whether another one has the same cell in fewer env steps, or in as many and comes first."""
-    number = jnp.arange(len(key))
-    sooner = (steps < steps[:, None]) | ((steps == steps[:, None]) & (number < number[:, None]))
-    return ((key == key[:, None]) & sooner & valid).any(-1)
+    other, number = lambda x: x[:, None], jnp.arange(len(key))
+    sooner = (other(steps) < steps) | ((other(steps) == steps) & (other(number) < number))
+    return ((other(key) == key) & sooner & other(valid)).any(0)
 
 
 def widen(archive: Archive, full: Bool[Array, " level"], config: SearchConfig) -> Archive:

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from experts.config import MOST_COUNTED
 
+MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are counted in 32 bits
+
 
 @dataclass(frozen=True)
 class SearchConfig:
@@ -15,6 +17,7 @@ class SearchConfig:
     redrawn: tuple[float, ...] = (0.02, 0.05, 0.1, 0.3)  # chance of drawing an entry of the action anew, per env step
     segment: int = 8  # env steps between visits to the archive
     stretch: int = 4  # segments that a lane plays before it returns to a state of the archive
+    anew: float = 0.5  # share of returns after which all of the action is drawn anew; else it stays at first
     # archive
     entries: int = 512  # states of one level
     nearer: float = 0.5  # share of returns that go to the nearer to the goal of two states
@@ -23,7 +26,7 @@ class SearchConfig:
     growth: float = 1.5  # by which cells become wider each time it is
     driven_weight: float = 0.5  # of bodies that actuators move; of green and blue ones it is 1
     other_weight: float = 0.25  # of all others that move
-    velocity_seconds: float = 0.1  # s; metres for each metre a second
+    velocity_seconds: float = 0.3  # s; metres for each metre a second
     # a success
     trials: int = 4  # rounds of attempts to make it shorter, one a lane; the first also verifies it
     # machine
@@ -33,6 +36,8 @@ class SearchConfig:
         for name in ("env_steps", "lanes", "segment", "stretch", "entries", "trials", "rounds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
+        if self.entries > MOST_ENTRIES:
+            raise ValueError(f"entries is {self.entries}: an archive has at most {MOST_ENTRIES}")
         if self.env_steps > MOST_COUNTED:
             raise ValueError(f"env_steps is {self.env_steps}: a search can count no more than {MOST_COUNTED}")
         if not self.redrawn or not all(0 < chance <= 1 for chance in self.redrawn):
@@ -41,6 +46,8 @@ class SearchConfig:
             raise ValueError(f"lanes is {self.lanes}: give a multiple of {len(self.redrawn)}, the chances in redrawn")
         if not 0 <= self.nearer <= 1:
             raise ValueError(f"nearer is {self.nearer}: it must be between 0 and 1")
+        if not 0 <= self.anew <= 1:
+            raise ValueError(f"anew is {self.anew}: it must be between 0 and 1")
         if self.width <= 0:
             raise ValueError(f"width is {self.width}: it must be above 0")
         if self.growth <= 1:

@@ -1,9 +1,10 @@
-"""The search of some levels side by side. Each round, every lane returns to a state of its level's archive, plays a
-segment from there, and puts what it came to into the archive.
+"""The search of some levels side by side. Each round, every lane returns to a state of its level's archive, plays
+some segments from there, and after each puts what it came to into the archive.
 """
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from experts.config import RECORD_STEPS
 from experts.search.archive import Archive, Reached, choose, insert, new_archive, visit
 from experts.search.cells import features
 from experts.search.config import SearchConfig
-from experts.search.play import Arena, Walk, arena, decode, most_steps, play
+from experts.search.play import CODES, Arena, Walk, arena, decode, most_steps, play
 from experts.search.rows import from_rows, to_rows
 from experts.success import Success
 from levelgen.identity.keys import Stream, key_for
@@ -34,6 +35,15 @@ class Search:
     full: Bool[Array, " level"]  # whether cells have ever been made wider, because the archive was full
     code: UInt16[Array, "level step"]  # actions of the success, each as one number
     length: Int[Array, " level"]  # of the success, env steps; 0: there is none
+
+
+class Chance(NamedTuple):
+    """Random numbers of one level's round."""
+
+    choice: Float[Array, "3 lane"]  # of an entry of the archive
+    anew: Bool[Array, " lane"]  # whether a lane starts with an action of its own, not with the last one of the entry
+    code: UInt16[Array, " lane"]  # which
+    bits: UInt32[Array, "stretch time 6 lane"]  # what it does then
 
 
 @partial(jax.jit, static_argnames=("config", "rules"))
@@ -71,10 +81,12 @@ def explore(search: Search, config: SearchConfig, rules: TaskParams) -> Search:
 def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: TaskParams) -> Search:
     """One round; `ring` has the levels' lanes."""
     active = under_way(search, config)
-    uniform, bits = jax.vmap(partial(draw, config=config))(search.key, search.env_steps)
-    bits = jnp.moveaxis(bits, 0, 3).reshape(config.stretch, config.segment, ACTIONS, -1)
-    chosen = choose(search.archive, uniform, config)
+    chance = jax.vmap(partial(draw, config=config))(search.key, search.env_steps)
+    bits = jnp.moveaxis(chance.bits, 0, 3).reshape(config.stretch, config.segment, ACTIONS, -1)
+    chosen = choose(search.archive, chance.choice, config)
     walk, code = back_to(search, chosen)
+    drawn = jnp.where(ring.live, decode(chance.code.reshape(-1)), 0)
+    walk = walk._replace(action=jnp.where(chance.anew.reshape(-1), drawn, walk.action))
 
     def one(carry: tuple[Archive, Walk, Array, Array], bits: Array) -> tuple[tuple, None]:
         archive, walk, code, full = carry
@@ -109,13 +121,12 @@ def under_way(search: Search, config: SearchConfig) -> Bool[Array, " level"]:
     return (search.length == 0) & (search.env_steps < config.env_steps)
 
 
-def draw(
-    key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig
-) -> tuple[Float[Array, "3 lane"], UInt32[Array, "stretch time 6 lane"]]:
-    """All the chance in one level's round: what its lanes choose by, and what they play by."""
+def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> Chance:
+    """All the chance in one level's round."""
     one, other = jax.random.split(jax.random.fold_in(key, env_steps))
+    uniform = jax.random.uniform(one, (5, config.lanes))
     bits = jax.random.bits(other, (config.stretch, config.segment, ACTIONS, config.lanes))
-    return jax.random.uniform(one, (3, config.lanes)), bits
+    return Chance(uniform[:3], uniform[3] < config.anew, (uniform[4] * CODES).astype(jnp.uint16), bits)
 
 
 def back_to(search: Search, chosen: Int[Array, "level lane"]) -> tuple[Walk, UInt16[Array, "lane step"]]:

@@ -3,6 +3,7 @@
 The goal is reached, and an episode over, where `levelgen.task.rules.advance` says so.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -16,6 +17,8 @@ from levelgen.task.rules import TaskParams, has_nan, has_roles
 from physics.pairs import pairs_of
 from physics.step import step
 from physics.types import State
+
+CODES = math.prod(CHOICES)  # different actions
 
 
 class Arena(NamedTuple):
@@ -100,7 +103,7 @@ def act(arena: Arena, walk: Walk, action: Int[Array, "6 lane"], rules: TaskParam
 
 
 def encode(action: Int[Array, "6 *lane"]) -> UInt16[Array, "*lane"]:
-    """An action as one number below 324."""
+    """An action as one number below CODES."""
     code = jnp.zeros(action.shape[1:], jnp.int32)
     for entry, choices in zip(action, CHOICES, strict=True):
         code = code * choices + entry

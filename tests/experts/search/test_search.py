@@ -181,8 +181,8 @@ def test_shortening() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"redrawn": (0.5, 2.0)},
-     {"redrawn": ()}, {"env_steps": 2**31}, {"velocity_seconds": -1.0}],
+    [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"anew": -0.5},
+     {"redrawn": (0.5, 2.0)}, {"redrawn": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"velocity_seconds": -1.0}],
 )  # fmt: skip
 def test_settings_that_cannot_be(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
