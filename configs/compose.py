@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from importlib.resources import files
+from itertools import product
 from typing import Any
 
 from hydra import compose, initialize_config_module
@@ -49,6 +50,7 @@ def _known() -> Mapping[str, Any]:
     return flat(_composed([]))
 
 
+@cache
 def chosen() -> dict[str, str]:
     """The preset that each folder of configs/ stands for where no other is chosen."""
     with initialize_config_module("configs", version_base="1.3"):
@@ -67,11 +69,11 @@ def presets() -> dict[str, list[str]]:
 def again(job: JobConfig) -> str:
     """The shortest command, but for `first_level`, `levels` and `out`, with the same results as `job`."""
     fixed, wanted = [f"size={job.size}", f"budget={job.budget}"], flat(job.results)
-    default = replace(_default(), size=job.size)  # with its own budget: this one may be too small for its experts
     commands = []
-    for name, preset in distributions().items():
-        named = [] if preset == default.distribution else [f"distribution={name}"]
-        start = flat(replace(default, distribution=preset).results)
+    for words in product(*(_words(folder) for folder in ("procedure", "distribution"))):
+        named = [word for word in words if word]
+        # with its own budget: the job's may be too small for its experts
+        start = flat(replace(_started(words), size=job.size).results)
         changed = [typed_as(key, value) for key, value in wanted.items() if key not in BY_HAND and start[key] != value]
         commands.append(shlex.join(["levelproof", "generate", *fixed, *named, *changed]))
     return min(commands, key=len)
@@ -79,7 +81,7 @@ def again(job: JobConfig) -> str:
 
 def words_for(results: Mapping[str, Any]) -> list[str]:
     """The settings, but for the budget, that a job with these `JobConfig.results` has and the default has not."""
-    default, known = flat(replace(_default(), size=results["size"]).results), flat(results)
+    default, known = flat(replace(_started(()), size=results["size"]).results), flat(results)
     changed = [name for name in known if name not in BY_HAND and known[name] != default.get(name, ...)]
     return [f"size={results['size']}", *(typed_as(name, known[name]) for name in changed)]
 
@@ -90,8 +92,14 @@ def typed_as(name: str, value: Any) -> str:
 
 
 @cache
-def _default() -> JobConfig:
-    return compose_job([])
+def _started(words: tuple[str, ...]) -> JobConfig:
+    """The job that these words describe, some of which may be empty."""
+    return compose_job([word for word in words if word])
+
+
+def _words(folder: str) -> list[str]:
+    """What chooses each preset of a folder; for the one that is there already, nothing."""
+    return [f"{folder}={name}" if name != chosen()[folder] else "" for name in presets()[folder]]
 
 
 @cache

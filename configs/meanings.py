@@ -94,6 +94,9 @@ def _of(cls: type, defaults: Mapping[str, Any], path: str) -> Iterator[Setting]:
         groups.append((hints[field], name))
         if name in presets():
             yield Setting(name, chosen()[name], meaning, dict.fromkeys(presets()[name], ""), group)
+    if not path:
+        meaning = "one word for a set of settings"
+        yield Setting("procedure", chosen()["procedure"], meaning, dict.fromkeys(presets()["procedure"], ""), JOB)
     for nested, name in groups:
         yield from _of(nested, defaults, name)
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from configs.convert import plain
 from configs.errors import ConfigError
 from configs.numbers import parse_count
-from experts.config import ExpertConfig, StopConfig, check_budget
+from experts.config import ExpertConfig, Procedure, ScoutConfig, StopConfig, check_budget
 from levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION
 from levelgen.level import SIZES, size_of
 from levelgen.sampling.distribution import CONTROL_WEIGHTS, Distribution
@@ -42,6 +42,7 @@ class JobConfig:
     continue_from: str = ""  # a split made with keep_experts=true, whose experts go on; empty: none
     distribution: Distribution = field(default_factory=Distribution)  # what random levels are like
     task: TaskParams = field(default_factory=TaskParams)  # what a level asks for
+    scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first
     expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
     stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot
 
@@ -79,6 +80,11 @@ class JobConfig:
     @property
     def level_ids(self) -> range:
         return range(self.first_level, self.first_level + parse_count(self.levels, "levels"))
+
+    @property
+    def procedure(self) -> Procedure:
+        """How its levels get their labels."""
+        return Procedure(self.scout, self.expert, self.stop)
 
     @property
     def env_steps(self) -> int:

@@ -130,7 +130,10 @@ def _split(
     """By slot, slots first."""
     seen = trajectory
     advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
-    samples = Samples(seen.moving, seen.action, seen.log_probability, seen.value, advantage)
+    rehearsed = jnp.broadcast_to(manner.rehearsing.reshape(seen.value.shape[1:]), seen.value.shape)
+    samples = Samples(
+        seen.moving, seen.action, seen.log_probability, seen.value, advantage, rehearsed.astype(jnp.float32)
+    )
     rows = jax.vmap(ppo.as_rows, in_axes=-2)(samples)
     by_slot = lambda x: jnp.moveaxis(x, -2, 0)
     return _Now(
@@ -171,9 +174,7 @@ def _learn(
     shuffling = jax.random.fold_in(now.key, config.horizon)  # the rollout used 0 .. horizon - 1
     train_state = ppo.update(training.train_state, shuffling, network, now.constants, now.rows, config)
     totals = progress.watch(totals, train_state.params)
-    course, due, final = stop.after_update(
-        training.course, totals, success.length > 0, share, slot.deadline, config, stopping
-    )
+    course, due, final = stop.after_update(training.course, totals, success.length > 0, share, slot.deadline, stopping)
     training = Training(train_state, totals, course, success, recent[config.horizon :])
     trial = slot.trial._replace(part=jnp.int32(0), due=due, final=final)
     return slot._replace(mode=jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share

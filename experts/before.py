@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from experts.config import RECORD_STEPS
-from experts.labels import Label, Verdict, trivial_reason, unsolvable_reason, untrained
+from experts.labels import Label, Source, Verdict, trivial_reason, unsolvable_reason, untrained
 from experts.witness import blocks, replay, steps_to_goal, succeeds, take
 from levelgen.level import ACTIONS, Level
 from levelgen.proofs import Proof, examine
@@ -40,7 +40,7 @@ def decide(levels: Level, rules: TaskParams) -> Before:
         done = np.asarray(idle.done)
         for i, solved, steps in zip(falls, succeeds(done, idle.goal), steps_to_goal(done), strict=True):
             if solved:
-                verdicts[i] = untrained(Label.TRIVIAL, trivial_reason(int(steps)), False, int(steps))
+                verdicts[i] = untrained(Label.TRIVIAL, trivial_reason(int(steps)), False, Source.NOTHING, int(steps))
     for i in np.flatnonzero(facts.proof != Proof.NONE):
         fails = bool(facts.fails[i])
         verdicts[i] = untrained(Label.UNSOLVABLE, unsolvable_reason(Proof(int(facts.proof[i])), fails), fails)

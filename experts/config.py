@@ -1,6 +1,6 @@
 """What an expert is, how it learns, when it stops and what counts as a witness."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 RECORD_STEPS = 256  # env steps of a record, with automatic reset inside
@@ -18,6 +18,7 @@ class Network(StrEnum):
 class Rule(StrEnum):
     """When a level leaves its slot."""
 
+    NONE = "none"  # no expert is trained: labels rest on scout and search
     BUDGET = "budget"  # every expert gets its whole budget
     SOLVED = "solved"  # until its evaluation succeeds
     HALVING = "halving"  # until its evaluation succeeds or, at a rung, its learning does not move
@@ -36,12 +37,12 @@ class ExpertConfig:
 
     # network
     network: Network = Network.FLAT  # what an expert sees, and through which network
-    width: int = 64  # units of a hidden layer
+    width: int = 32  # units of a hidden layer
     depth: int = 2  # hidden layers of the policy and of the value function, which share none
     encoding: int = 16  # units of the first hidden layer of an entity network, of each kind of thing
     # experience
     environments: int = 32  # lanes an expert acts in
-    horizon: int = 32  # env steps in each lane between updates
+    horizon: int = 64  # env steps in each lane between updates
     dense_reward_scale: float = 0.2  # 1/m; shaping while training, in place of task.dense_reward_scale
     rehearsals: int = 8  # lanes that repeat the first success of training, once there is one
     persistence: float = 0.9  # probability that these lanes repeat their last action, before
@@ -56,13 +57,14 @@ class ExpertConfig:
     clip: float = 0.2  # of the probability ratio, and of the value's change, to either side
     value_weight: float = 0.5  # of the value function's loss
     entropy_weight: float = 0.01  # of the policy's entropy, which the loss rewards
+    imitation_weight: float = 2.0  # of the log-probability of rehearsed actions, which the loss rewards
     # evaluation: each lane rolls out one record
-    attempts: int = 8  # lanes as they are: the first by the most probable actions, the others sampled
+    attempts: int = 16  # lanes as they are: the first by the most probable actions, the others sampled
     sticky_attempts: int = 8  # lanes where an action is sometimes repeated against the expert's will
     moved_attempts: int = 8  # lanes that start with other velocities
     # witness
     witness: Choice = Choice.RECORD  # which of a level's successes becomes its witness
-    exploration: bool = False  # a success of training is a witness, too, where evaluation has none
+    exploration: bool = True  # a success of scout, search or training is a witness, too, where evaluation has none
     # machine
     slots: int = 0  # experts that train side by side in one program; 0: as many as suit the device
 
@@ -77,7 +79,7 @@ class ExpertConfig:
         for name in ("discount", "gae_lambda", "clip", "persistence"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be between 0 and 1")
-        not_negative = ("dense_reward_scale", "value_weight", "entropy_weight", "slots")
+        not_negative = ("dense_reward_scale", "value_weight", "entropy_weight", "imitation_weight", "slots")
         for name in (*not_negative, "rehearsals", "sticky_attempts", "moved_attempts"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
@@ -113,15 +115,26 @@ class ExpertConfig:
 
 
 @dataclass(frozen=True)
+class ScoutConfig:
+    """How long a level is scouted before its expert trains (hashable: pass as a static argument)."""
+
+    rounds: int = 4  # of 16,384 env steps of persistent random play, until one has a success; 0: none
+
+    def __post_init__(self) -> None:
+        if self.rounds < 0:
+            raise ValueError(f"rounds is {self.rounds}: it must not be negative")
+
+
+@dataclass(frozen=True)
 class StopConfig:
     """When a level leaves its slot."""
 
-    rule: Rule = Rule.SOLVED  # when a level leaves its slot
+    rule: Rule = Rule.HALVING  # when a level leaves its slot
     successes: int = 1  # attempts of an evaluation that must succeed for a level to be solved
     share: float = 0.25  # of an update's finished episodes that must reach the goal before an evaluation is worth it
     wait: int = 2048  # env steps of training between an evaluation that failed and the next; doubles each time
     polish: int = 0  # env steps of training after a level is solved, for a shorter way to the goal
-    first_rung: int = 16_384  # env steps of training at the first rung; each is twice the one before
+    first_rung: int = 8192  # env steps of training at the first rung; each is twice the one before
     gain: float = 0.05  # by which the best return must have grown since the rung before
 
     def __post_init__(self) -> None:
@@ -133,6 +146,15 @@ class StopConfig:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
         if not 0 <= self.share <= 1:
             raise ValueError(f"share is {self.share}: it must be between 0 and 1")
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """How a level gets its label (hashable)."""
+
+    scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first
+    expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
+    stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot
 
 
 def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from experts.config import RECORD_STEPS, Choice, ExpertConfig
-from experts.labels import Label, Source, Verdict, solved_reason, unsolved_reason
+from experts.labels import UNTRAINED, Label, Source, Verdict, solved_reason, unsolved_reason, untrained
 from experts.progress import NEVER, Progress
 from experts.slots import Begun
 from experts.success import Success
@@ -47,6 +47,7 @@ class Trained(NamedTuple):
     evaluations: list[Evaluation]  # those that solved it, and the last
     expert: Kept | None = None  # if it is kept
     witness: Witness | None = None  # the best, not yet replayed
+    evaluation_steps: int = 0  # env steps
 
 
 def judge(
@@ -70,13 +71,21 @@ def judge(
     return verdicts
 
 
-def witness_of(evaluations: Sequence[Evaluation], config: ExpertConfig) -> Witness | None:
-    """The best witness there is: of any evaluation, the one with the shortest way to the goal."""
+def witness_of(evaluations: Sequence[Evaluation], source: Source, config: ExpertConfig) -> Witness | None:
+    """The best witness there is: of any evaluation, the one with the shortest way to the goal.
+
+    Without one, the success that was rehearsed, which is of this source.
+    """
     found = [witness for e in evaluations for witness in witnesses_in(e, config)]
-    if not found and config.exploration and evaluations[-1].success.length:
-        action, steps = np.asarray(evaluations[-1].success.action), int(evaluations[-1].success.length)
-        found = [Witness(repeated(action, steps), Source.EXPLORATION, steps)]
+    if not found and config.exploration:
+        return repeating(evaluations[-1].success, source)
     return min(found, key=lambda witness: witness.steps, default=None)
+
+
+def repeating(success: Success, source: Source) -> Witness | None:
+    """A success again and again, if there is one."""
+    steps = int(success.length)
+    return Witness(repeated(np.asarray(success.action), steps), source, steps) if steps else None
 
 
 def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
@@ -116,6 +125,10 @@ def verdict_of(
     failed_by_noop: bool,
 ) -> Verdict:
     """A level's verdict: `episodes` are those of its record, `halted` tells that it left before its budget ended."""
+    if not trained.evaluations:
+        source, steps = (witness.source, witness.steps) if witness else (None, None)
+        reason = solved_reason(witness.source, episodes) if witness else UNTRAINED
+        return untrained(Label.SOLVED if witness else Label.UNSOLVED, reason, failed_by_noop, source, steps)
     last = trained.evaluations[-1]
     attempts, sticky, moved = shares(last, config)
     first, diverged = (int(x) for x in (last.progress.first_success, last.progress.diverged))
@@ -135,6 +148,7 @@ def verdict_of(
         steps_to_goal=None if witness is None else witness.steps,
         steps_to_first_success=None if first == NEVER else first,
         env_steps=int(last.progress.env_steps),
+        evaluation_steps=trained.evaluation_steps,
         learning_curve=trained.curve,
         best_return=float(last.progress.best_return),
         episodes=int(last.progress.episodes),

@@ -21,12 +21,23 @@ class Source(StrEnum):
     MOST_PROBABLE = "most probable"  # the expert's most probable actions
     SAMPLED = "sampled"  # actions sampled from the expert's policy in its evaluation
     EXPLORATION = "exploration"  # actions of an episode of training
+    SCOUT = "scout"  # persistent random play before training
+    SEARCH = "search"  # exploration from archived states, before training
     NOTHING = "nothing"  # a trivial level's
 
 
+MADE_BY = {
+    Source.EXPLORATION: "actions of training",
+    Source.SCOUT: "actions of random play",
+    Source.SEARCH: "actions of the search",
+}
+UNTRAINED = "neither random play nor the search reached the goal, and no expert was asked for"
 DIVERGED = "stopped being finite"  # in the reasons of levels whose experts diverged
 WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that stand on a witness
-TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels that an expert's training gives
+TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels of levels that could use an expert
+
+
+BY_EXPERT = frozenset({Source.MOST_PROBABLE, Source.SAMPLED})  # witnesses that an expert's policy found
 
 
 @dataclass(frozen=True)
@@ -45,13 +56,16 @@ class Verdict:
     steps_to_goal: int | None  # env steps of the witness's first episode
     steps_to_first_success: int | None  # env steps of training
     env_steps: int  # of training
+    evaluation_steps: int  # env steps of its evaluations
     learning_curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
     best_return: float  # of training's episodes, shaping included; -inf: none ended
     episodes: int  # of training
+    scout_steps: int = 0  # env steps
+    search_steps: int = 0  # env steps
 
 
 def solved_reason(source: Source, episodes: int) -> str:
-    how = "actions of training" if source is Source.EXPLORATION else f"{source} actions"
+    how = MADE_BY.get(source, f"{source} actions")
     return f"the witness, {how}, reaches the goal in all {episodes} of its finished episodes"
 
 
@@ -79,20 +93,24 @@ def unsolvable_reason(proof: Proof, fails: bool) -> str:
     return f"{ARGUMENTS[proof]}, and doing nothing {how}"
 
 
-def untrained(label: Label, reason: str, failed_by_noop: bool, steps_to_goal: int | None = None) -> Verdict:
-    """The verdict on a level that needs no expert: its evaluated episodes are those of doing nothing."""
+def untrained(
+    label: Label, reason: str, failed_by_noop: bool, witness: Source | None = None, steps_to_goal: int | None = None
+) -> Verdict:
+    """The verdict on a level without an expert. Where none is needed, doing nothing counts as the evaluation."""
+    decided = label not in TRAINED
     return Verdict(
         label=label,
         label_reason=reason,
         failed_by_noop=failed_by_noop,
-        witness=Source.NOTHING if label in WITNESSED else None,
-        success_rate=float(label in WITNESSED),
-        most_probable_succeeds=label in WITNESSED,
+        witness=witness,
+        success_rate=float(label in WITNESSED) if decided else float("nan"),
+        most_probable_succeeds=decided and label in WITNESSED,
         sticky_success_rate=float("nan"),
         moved_success_rate=float("nan"),
         steps_to_goal=steps_to_goal,
         steps_to_first_success=None,
         env_steps=0,
+        evaluation_steps=0,
         learning_curve=[],
         best_return=float("-inf"),
         episodes=0,

@@ -4,7 +4,7 @@ Levels are submitted together and finish together, and those of one submission t
 leave empty. A result depends on nothing but its level, so sharing changes none.
 """
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Int
 
 from experts.advance import advance
-from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
+from experts.config import RECORD_STEPS, ExpertConfig, Procedure
+from experts.found import Found, nothing_found
 from experts.judge import Evaluation, Kept, Trained, Witness, witness_of
 from experts.queue import GROUP, empty_queue, enter, next_indices
 from experts.slots import Begun, LevelQueue, Mode, Report, Slots, empty_slots
@@ -39,43 +40,42 @@ class Totals(NamedTuple):
     solved: int
 
 
-class Spent(NamedTuple):
-    """Env steps of all lanes."""
-
-    trained: int
-    evaluated: int
-    idle: int  # in slots that had no level
-
-
 class Submission:
-    """Levels that came together, and what has become of each so far. `begun` is by index among them."""
+    """Levels that came together, and what has become of each so far. The arguments are those of `Pool.submit`."""
 
-    def __init__(self, levels: Level, level_ids: Int[np.ndarray, " level"], begun: Mapping[int, Kept], keep: bool):
+    def __init__(
+        self,
+        levels: Level,
+        level_ids: Int[np.ndarray, " level"],
+        found: Found,
+        begun: Mapping[int, Kept],
+        keep: bool,
+    ) -> None:
         count = len(level_ids)
-        self.levels, self.level_ids, self.begun, self.keep = levels, level_ids, begun, keep
+        self.levels, self.level_ids, self.found, self.begun, self.keep = levels, level_ids, found, begun, keep
         self.curves = [list(begun[i].curve) if i in begun else [] for i in range(count)]
         self.evaluations: list[list[Evaluation]] = [[] for _ in range(count)]
         self.experts: list[Kept | None] = [None] * count
         self.witnesses: list[Witness | None] = [None] * count
         self.under_way = set(range(count))
         self.solved = 0
-        self.rollouts: Counter[int] = Counter()  # by mode
+        self.trained_rollouts = self.idle_rollouts = 0
+        self.evaluated_rollouts = np.zeros(count, int)
 
-    def trained(self) -> list[Trained]:
-        return [Trained(*of) for of in zip(self.curves, self.evaluations, self.experts, self.witnesses, strict=True)]
-
-    def spent(self, config: ExpertConfig) -> Spent:
-        modes = Mode.TRAIN, Mode.EVALUATE, Mode.EMPTY
-        return Spent(*(self.rollouts[mode] * config.steps_per_update for mode in modes))
+    def trained(self, config: ExpertConfig) -> list[Trained]:
+        evaluated = (self.evaluated_rollouts * config.steps_per_update).tolist()
+        of = self.curves, self.evaluations, self.experts, self.witnesses, evaluated
+        return [Trained(*level) for level in zip(*of, strict=True)]
 
 
 class Pool:
-    """Slots and the queue before them. All that trains in it has one configuration and one budget."""
+    """Slots and the queue before them. All that trains in it has one procedure and one budget."""
 
-    def __init__(self, updates: int, config: ExpertConfig, stopping: StopConfig, rules: TaskParams) -> None:
-        self.updates, self.config, self.rules = updates, config, rules
-        self._stopping = rules_of(stopping, config)
-        self._shaped = replace(rules, dense_reward_scale=config.dense_reward_scale)
+    def __init__(self, updates: int, procedure: Procedure, rules: TaskParams) -> None:
+        self.updates, self.procedure, self.rules = updates, procedure, rules
+        self.config = procedure.expert
+        self._stopping = rules_of(procedure.stop, self.config)
+        self._shaped = replace(rules, dense_reward_scale=self.config.dense_reward_scale)
         self._slots: Slots | None = None  # these two are there once the first levels have come
         self._queue: LevelQueue | None = None
         self._taken = 0  # levels that left the queue, ever
@@ -87,6 +87,7 @@ class Pool:
         self,
         levels: Level,
         level_ids: Int[np.ndarray, " level"],
+        found: Found | None = None,
         begun: Mapping[int, Kept] = NOTHING_BEGUN,
         keep: bool = False,
     ) -> Submission:
@@ -95,11 +96,12 @@ class Pool:
         Args:
             levels: on the host.
             level_ids: their ids.
+            found: what their experts rehearse from the start; None: nothing.
             begun: by index among them, experts that go on.
             keep: whether the result has the experts.
         """
-        submission = Submission(levels, level_ids, begun, keep)
         count = len(level_ids)
+        submission = Submission(levels, level_ids, found or nothing_found(count), begun, keep)
         self._submissions.append(submission)
         self._coming.extend((submission, range(i, min(i + GROUP, count))) for i in range(0, count, GROUP))
         return submission
@@ -125,7 +127,7 @@ class Pool:
     def totals(self, submission: Submission) -> Totals:
         """How far the levels of a submission are."""
         parts = sum(len(submission.curves[i]) for i in submission.under_way) / self.updates
-        steps = submission.rollouts[Mode.TRAIN] * self.config.steps_per_update
+        steps = submission.trained_rollouts * self.config.steps_per_update
         decided = len(submission.curves) - len(submission.under_way)
         return Totals(steps, decided + parts, submission.solved)
 
@@ -137,7 +139,7 @@ class Pool:
         self._slots, report = advance(self._slots, self._queue, self.config, self._stopping, self._shaped)
         seen = jax.device_get(report)
         self._taken = int(seen.taken)
-        self._submissions[-1].rollouts[Mode.EMPTY] += int((seen.mode == Mode.EMPTY).sum())
+        self._submissions[-1].idle_rollouts += int((seen.mode == Mode.EMPTY).sum())
         for slot in np.flatnonzero(seen.mode != Mode.EMPTY).tolist():
             self._note(slot, seen)
 
@@ -153,7 +155,9 @@ class Pool:
                 return
             begun = {i - some.start: submission.begun[i].begun for i in some if i in submission.begun}
             at = np.array(some)
-            self._queue = enter(self._queue, take(submission.levels, at), submission.level_ids[at], self.config, begun)
+            success = jax.tree.map(lambda x, at=at: x[at], submission.found.success)
+            levels, level_ids = take(submission.levels, at), submission.level_ids[at]
+            self._queue = enter(self._queue, levels, level_ids, success, self.config, begun)
             self._at.update({index: (submission, i) for index, i in zip(indices, some, strict=True)})
             self._coming.popleft()
 
@@ -162,15 +166,17 @@ class Pool:
         assert self._slots is not None
         index = int(seen.queue_index[slot])
         submission, i = self._at[index]
-        submission.rollouts[int(seen.mode[slot])] += 1
         if seen.mode[slot] == Mode.TRAIN:
+            submission.trained_rollouts += 1
             submission.curves[i].append(float(seen.share[slot]))
+        else:
+            submission.evaluated_rollouts[i] += 1
         if seen.evaluated[slot]:
             submission.evaluations[i].append(evaluation_of(self._slots, slot, self.config))
         if seen.left[slot]:
             if submission.keep:
                 submission.experts[i] = Kept(expert_of(self._slots, slot, self.config), submission.curves[i])
-            submission.witnesses[i] = witness_of(submission.evaluations[i], self.config)
+            submission.witnesses[i] = witness_of(submission.evaluations[i], submission.found.source[i], self.config)
             submission.solved += submission.witnesses[i] is not None
             del self._at[index]
             submission.under_way.remove(i)

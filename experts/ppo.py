@@ -39,6 +39,7 @@ class Samples(NamedTuple):
     log_probability: Float[Array, " sample"]
     value: Float[Array, " sample"]
     advantage: Float[Array, " sample"]
+    rehearsed: Float[Array, " sample"]  # 1 where a success was repeated, else 0
 
 
 def optimiser(config: ExpertConfig) -> optax.GradientTransformation:
@@ -78,10 +79,11 @@ def advantages(
 def loss(
     params: Params, network: ActorCritic, constants: LevelConstants, minibatch: Samples, config: ExpertConfig
 ) -> Float[Array, ""]:
-    """Clipped policy surrogate, clipped value error, entropy bonus; means over the minibatch."""
+    """Clipped policy surrogate, clipped value error, imitation, entropy bonus; means over the minibatch."""
     logits, value = forward(network, params, constants.features, minibatch.moving)
     live = constants.live[:, None]
-    ratio = jnp.exp(log_probability(logits, minibatch.action, live) - minibatch.log_probability)  # type: ignore[arg-type]
+    log_prob = log_probability(logits, minibatch.action, live)  # type: ignore[arg-type]
+    ratio = jnp.exp(log_prob - minibatch.log_probability)
     gain = (minibatch.advantage - minibatch.advantage.mean()) / (minibatch.advantage.std() + ADVANTAGE_EPSILON)
     clipped_ratio = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
     surrogate = jnp.minimum(ratio * gain, clipped_ratio * gain).mean()
@@ -89,7 +91,8 @@ def loss(
     target = minibatch.value + minibatch.advantage
     near = minibatch.value + jnp.clip(value - minibatch.value, -config.clip, config.clip)
     error = 0.5 * jnp.maximum(jnp.square(value - target), jnp.square(near - target)).mean()
-    return config.value_weight * error - surrogate - config.entropy_weight * entropy(logits, live).mean()
+    likely = config.imitation_weight * (minibatch.rehearsed * log_prob).mean()
+    return config.value_weight * error - surrogate - likely - config.entropy_weight * entropy(logits, live).mean()
 
 
 def update(
@@ -135,13 +138,13 @@ def as_rows(samples: Samples) -> Float[Array, "sample column"]:
 
     `samples` has [time, ..., environment] instead of an axis of samples, as a rollout gives them.
     """
-    singles = [x[:, None] for x in (samples.log_probability, samples.value, samples.advantage)]
+    singles = [x[:, None] for x in samples[2:]]
     columns = jnp.concatenate([samples.moving, samples.action.astype(jnp.float32), *singles], axis=1)
     return jnp.moveaxis(columns, 1, -1).reshape(-1, columns.shape[1])
 
 
 def from_rows(rows: Float[Array, "sample column"]) -> Samples:
     columns = rows.T
-    dynamic = columns.shape[0] - len(CHOICES) - 3
+    dynamic = columns.shape[0] - len(CHOICES) - 4
     action = columns[dynamic : dynamic + len(CHOICES)]
-    return Samples(columns[:dynamic], action, *columns[-3:])
+    return Samples(columns[:dynamic], action, *columns[-4:])

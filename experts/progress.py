@@ -17,7 +17,7 @@ class Progress(NamedTuple):
     best_return: Float[Array, ""]  # of the episodes that ended; -inf: none
     episodes: Int[Array, ""]  # that ended
     env_steps: Int[Array, ""]
-    first_success: Int[Array, ""]  # env steps taken until then; NEVER
+    first_success: Int[Array, ""]  # of the expert's own; env steps taken until then; NEVER
     diverged: Int[Array, ""]  # env steps taken until a parameter of the expert was not finite; NEVER
 
 
@@ -48,7 +48,7 @@ def follow(
 
     running, ended_returns = jax.lax.scan(add, progress.episode_return, (reward, done))
     ended, reached = (done & own).sum(), (goal & own).sum()
-    any_goal = goal.any(1)
+    any_goal = (goal & own).any(1)
     when = progress.env_steps + (jnp.argmax(any_goal) + 1) * environments
     first = jnp.where((progress.first_success == NEVER) & any_goal.any(), when, progress.first_success)
     after = Progress(

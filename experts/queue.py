@@ -11,6 +11,7 @@ from jaxtyping import Array, Int
 
 from experts.config import ExpertConfig
 from experts.slots import Begun, LevelQueue, begin
+from experts.success import Success, no_success
 from experts.witness import take
 from levelgen.level import Level
 
@@ -21,7 +22,7 @@ NO_EXPERTS: Mapping[int, Begun] = MappingProxyType({})
 def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig) -> LevelQueue:
     """A queue for levels of the size of these, without any: on the host, where zeros take no program each."""
     one = take(levels, np.zeros(1, int))
-    begun = jax.eval_shape(partial(begin, config=config), one, jnp.zeros(1, jnp.int32))
+    begun = jax.eval_shape(partial(begin, config=config), one, jnp.zeros(1, jnp.int32), no_success(1))
     return LevelQueue(
         jax.tree.map(lambda x: np.zeros((*x.shape[:-1], capacity), x.dtype), one),
         np.zeros(capacity, np.int32),
@@ -41,15 +42,25 @@ def enter(
     queue: LevelQueue,
     levels: Level,
     level_ids: Int[np.ndarray, " level"],
+    success: Success,
     config: ExpertConfig,
     begun: Mapping[int, Begun] = NO_EXPERTS,
 ) -> LevelQueue:
-    """The queue (used up) with more levels. `begun` has the experts that go on, by index among these levels."""
+    """The queue (used up) with more levels.
+
+    Args:
+        queue: before.
+        levels: on the host, as are the others.
+        level_ids: their ids.
+        success: what their experts rehearse from the start, level first.
+        config: what an expert is.
+        begun: experts that go on, by index among these levels; they have their own success.
+    """
     for first in range(0, len(level_ids), GROUP):
         some = range(first, min(first + GROUP, len(level_ids)))
         fill = np.minimum(np.arange(first, first + GROUP), some[-1])
         group, ids = take(levels, fill), level_ids[fill]
-        experts = begin(group, ids, config)
+        experts = begin(group, ids, jax.tree.map(lambda x, fill=fill: x[fill], success), config)
         if mine := {i - first: begun[i] for i in some if i in begun}:
             experts = jax.tree.map(np.array, experts)
             for i, expert in mine.items():

@@ -19,7 +19,7 @@ from experts.ppo import TrainState
 from experts.progress import Progress
 from experts.rollout import Acting, repeat, start
 from experts.stop import Course
-from experts.success import Success, no_success
+from experts.success import Success
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task.actions import CHOICES
@@ -37,7 +37,7 @@ class Training(NamedTuple):
     train_state: TrainState
     progress: Progress
     course: Course
-    success: Success  # the first
+    success: Success  # the first: a scout's or a search's, else training's
     recent: Int[Array, "time 6 environment"]  # the last actions, enough for an episode that ends in the next rollout
 
 
@@ -108,17 +108,17 @@ class Report(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="config")
-def begin(levels: Level, level_ids: Int[Array, " level"], config: ExpertConfig) -> Begun:
-    """Experts that have seen nothing, level axis first."""
+def begin(levels: Level, level_ids: Int[Array, " level"], success: Success, config: ExpertConfig) -> Begun:
+    """Experts that have seen nothing but a success, where there is one; level axis first."""
     network, lanes = network_of(levels.size, config), config.environments
 
-    def training(level_id, constant: Constant) -> Training:
+    def training(level_id, constant: Constant, success: Success) -> Training:
         key = jax.random.fold_in(key_for(level_id, Stream.EXPERT), 0)
         train_state = ppo.init(key, network, constant, config)
         recent = jnp.zeros((RECORD_STEPS, len(CHOICES), lanes), jnp.int8)
-        return Training(train_state, progress.start(lanes), stop.begin(), no_success(), recent)
+        return Training(train_state, progress.start(lanes), stop.begin(), success, recent)
 
-    experts = jax.vmap(training, in_axes=(0, -1))(level_ids, network.constant(levels))
+    experts = jax.vmap(training, in_axes=(0, -1, 0))(level_ids, network.constant(levels), success)
     return Begun(experts, _by_slot(start(repeat(levels, lanes)), lanes))
 
 

@@ -58,7 +58,6 @@ def after_update(
     usable: Bool[Array, ""],
     share: Float[Array, ""],
     deadline: Int[Array, ""],
-    config: ExpertConfig,
     rules: StopRules,
 ) -> tuple[Course, Bool[Array, ""], Bool[Array, ""]]:
     """What one more update means.
@@ -66,10 +65,9 @@ def after_update(
     Args:
         course: before the update.
         progress: after it.
-        usable: whether there is a success of training that a record can hold.
+        usable: whether there is a success to rehearse.
         share: of the update's finished episodes that reached the goal.
         deadline: updates after which the last evaluation comes.
-        config: what an expert is.
         rules: when a level leaves.
 
     Returns:
@@ -79,8 +77,8 @@ def after_update(
     worth_it = (share >= rules.share) & (updates >= course.next_evaluation) & ~course.solved
     evaluate = rules.evaluates & worth_it
     at_rung = rules.halves & is_rung(updates, rules.first_rung)
-    moves = (progress.first_success != NEVER) | (progress.best_return >= course.rung_return + rules.gain)
-    over = (progress.diverged != NEVER) | (rules.evaluates & config.exploration & usable) | (at_rung & ~moves)
+    moves = usable | (progress.first_success != NEVER) | (progress.best_return >= course.rung_return + rules.gain)
+    over = (progress.diverged != NEVER) | (at_rung & ~moves)
     rung_return = jnp.where(at_rung, progress.best_return, course.rung_return)
     course = course._replace(updates=updates, rung_return=rung_return, over=over)
     return course, evaluate, over | (updates >= deadline)

@@ -1,9 +1,10 @@
-"""Successes of training: the actions of an episode that reached the goal."""
+"""Successes: the actions of an episode that reached the goal, of scout, search or training."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from experts.config import RECORD_STEPS
@@ -13,12 +14,13 @@ from levelgen.task.actions import CHOICES
 class Success(NamedTuple):
     """A successful episode; episodes start in the level's own state, so its actions reach the goal again."""
 
-    action: Int[Array, "256 6"]  # zeros after its end
-    length: Int[Array, ""]  # env steps; 0: there is none
+    action: Int[Array, "256 6"] | Int[np.ndarray, "... 256 6"]  # zeros after its end
+    length: Int[Array, ""] | Int[np.ndarray, "..."]  # env steps; 0: there is none
 
 
-def no_success() -> Success:
-    return Success(jnp.zeros((RECORD_STEPS, len(CHOICES)), jnp.int8), jnp.int32(0))
+def no_success(count: int) -> Success:
+    """None for each of so many levels, on the host, level first."""
+    return Success(np.zeros((count, RECORD_STEPS, len(CHOICES)), np.int8), np.zeros(count, np.int32))
 
 
 def remember(known: Success, new: Success) -> Success:

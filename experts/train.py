@@ -1,10 +1,7 @@
-"""Training: levels go through the slots, then witnesses are chosen and verdicts given.
-
-Levels that need no expert (`experts.before`) get none, and use nothing of their budget.
-"""
+"""From levels to verdicts: they are decided without an expert, or scouted, trained and judged."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import jax
@@ -12,16 +9,19 @@ import numpy as np
 from jaxtyping import Int
 
 from experts.before import Before, decide
-from experts.config import RECORD_STEPS, ExpertConfig, StopConfig, check_budget
-from experts.judge import Kept, judge
+from experts.config import RECORD_STEPS, Procedure, Rule, check_budget
+from experts.found import Found, found_by_scouts
+from experts.judge import Kept, Trained, judge, repeating
 from experts.labels import WITNESSED, Label, Verdict
-from experts.pool import NOTHING_BEGUN, Pool, Spent, Submission, Totals
+from experts.pool import NOTHING_BEGUN, Pool, Submission, Totals
+from experts.scout import scout
+from experts.steps import EnvSteps
+from experts.success import Success
 from experts.witness import Record, replay, take
 from levelgen.identity.keys import level_id_array
 from levelgen.level import ACTIONS, Level
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
-DEFAULT_STOP = StopConfig()
 Tell = Callable[[int, float, int], None]  # totals so far: env steps, levels (parts count), solved levels
 
 
@@ -37,7 +37,7 @@ class UnitResult:
     levels: Level
     record: Record  # all zero where the level has no witness
     verdicts: list[Verdict]
-    spent: Spent
+    spent: EnvSteps
     experts: dict[int, Kept] = field(default_factory=dict)  # by level id, where they are kept
 
 
@@ -47,16 +47,16 @@ class TrainingRun(NamedTuple):
     level_ids: np.ndarray
     levels: Level
     before: Before
-    left: np.ndarray  # indices of the levels that need an expert
-    submission: Submission  # of those
+    left: np.ndarray  # indices of the levels that `before` has not decided
+    found: Found  # in those
+    submission: Submission  # those, or none where no expert is asked for
 
 
 def train_levels(
     levels: Level,
     level_ids: np.ndarray,
     budget: int,
-    config: ExpertConfig,
-    stopping: StopConfig = DEFAULT_STOP,
+    procedure: Procedure,
     rules: TaskParams = DEFAULT_RULES,
     tell: Tell = quiet,
     begun: Mapping[int, Kept] = NOTHING_BEGUN,
@@ -68,8 +68,7 @@ def train_levels(
         levels: the levels, as their ids rebuild them.
         level_ids: their ids; the seeds of all randomness.
         budget: env steps that each expert may use.
-        config: what an expert is.
-        stopping: when a level leaves its slot.
+        procedure: how a level gets its label.
         rules: of the task; records hold its rewards, training shapes with the configuration's.
         tell: called after each rollout with env steps, levels and solved levels so far.
         begun: as for `begin`.
@@ -78,13 +77,13 @@ def train_levels(
     Raises:
         ValueError: as `check_budget`.
     """
-    pool = new_pool(budget, config, stopping, rules)
+    pool = new_pool(budget, procedure, rules)
     run = begin(pool, levels, level_ids, begun, keep)
     while not pool.step():
         tell(*totals(pool, run))
     result = finish(pool, run)
     solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
-    tell(result.spent.trained, len(result.verdicts), solved)
+    tell(result.spent.shown, len(result.verdicts), solved)
     return result
 
 
@@ -95,7 +94,7 @@ def begin(
     begun: Mapping[int, Kept] = NOTHING_BEGUN,
     keep: bool = False,
 ) -> TrainingRun:
-    """Submit to the pool those levels that need an expert.
+    """Scout the levels that doing nothing does not decide, and submit them to the pool.
 
     Args:
         pool: where experts train, perhaps beside those of other runs.
@@ -104,46 +103,74 @@ def begin(
         begun: by level id, experts that go on with what they have left of the budget; the others begin.
         keep: whether the result has the experts.
     """
-    level_ids = level_id_array(level_ids)
+    level_ids, procedure = level_id_array(level_ids), pool.procedure
     levels = jax.tree.map(np.asarray, levels)
     before = decide(levels, pool.rules)
     left = np.array([i for i, verdict in enumerate(before.verdicts) if verdict is None], int)
-    mine = {index: begun[level_id] for index, level_id in enumerate(level_ids[left].tolist()) if level_id in begun}
-    return TrainingRun(level_ids, levels, before, left, pool.submit(take(levels, left), level_ids[left], mine, keep))
+    found = found_by_scouts(*scout(take(levels, left), level_ids[left], procedure.scout, pool.rules))
+    some = left if procedure.stop.rule != Rule.NONE else left[:0]
+    mine = {index: begun[level_id] for index, level_id in enumerate(level_ids[some].tolist()) if level_id in begun}
+    submission = pool.submit(take(levels, some), level_ids[some], found, mine, keep)
+    return TrainingRun(level_ids, levels, before, left, found, submission)
 
 
 def totals(pool: Pool, run: TrainingRun) -> Totals:
     """How far all levels of a run are, those that need no expert included."""
     now = pool.totals(run.submission)
-    return now._replace(levels=len(run.level_ids) - len(run.left) + now.levels)
+    waiting = len(run.submission.level_ids)
+    return now._replace(
+        env_steps=now.env_steps + int(run.found.scout_steps.sum() + run.found.search_steps.sum()),
+        levels=len(run.level_ids) - waiting + now.levels,
+    )
 
 
 def finish(pool: Pool, run: TrainingRun) -> UnitResult:
     """Choose witnesses and give verdicts, once the run's submission has finished."""
-    level_ids, levels, (before, failed), left, submission = run
-    trained = submission.trained()
+    level_ids, levels, (before, failed), left, found, submission = run
+    trained = submission.trained(pool.config) if len(submission.level_ids) else as_found(found)
     actions = np.zeros((RECORD_STEPS, ACTIONS, len(level_ids)), np.int32)  # doing nothing, where none are found
     for i, of in zip(left, trained, strict=True):
         if of.witness is not None:
             actions[..., i] = of.witness.action
     record = replay(levels, actions, pool.rules)
     judged = judge(trained, take(record, left), pool.updates, pool.config, failed[left])
-    verdicts = {int(i): verdict for i, verdict in zip(left, judged, strict=True)}
+    verdicts = {
+        i: replace(verdict, scout_steps=scouted, search_steps=searched)
+        for i, verdict, scouted, searched in zip(
+            left.tolist(), judged, found.scout_steps.tolist(), found.search_steps.tolist(), strict=True
+        )
+    }
     known = [verdict or verdicts[i] for i, verdict in enumerate(before)]
     witnessed = np.array([verdict.label in WITNESSED for verdict in known])
     record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
     ended = zip(level_ids[left].tolist(), trained, strict=True)
     experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
-    return UnitResult(level_ids, levels, record, known, submission.spent(pool.config), experts)
+    return UnitResult(level_ids, levels, record, known, spent_on(known, submission, pool), experts)
 
 
-def new_pool(
-    budget: int, config: ExpertConfig, stopping: StopConfig = DEFAULT_STOP, rules: TaskParams = DEFAULT_RULES
-) -> Pool:
+def as_found(found: Found) -> list[Trained]:
+    """Levels that no expert trained for: their witness is what was found before."""
+    each = zip(found.success.action, found.success.length, found.source, strict=True)
+    return [Trained([], [], witness=repeating(Success(action, length), source)) for action, length, source in each]
+
+
+def spent_on(verdicts: list[Verdict], submission: Submission, pool: Pool) -> EnvSteps:
+    """What the levels of a submission took, and the slots that had none."""
+    total = lambda name: sum(getattr(verdict, name) for verdict in verdicts)
+    return EnvSteps(
+        total("scout_steps"),
+        total("search_steps"),
+        submission.trained_rollouts * pool.config.steps_per_update,
+        total("evaluation_steps"),
+        submission.idle_rollouts * pool.config.steps_per_update,
+    )
+
+
+def new_pool(budget: int, procedure: Procedure, rules: TaskParams = DEFAULT_RULES) -> Pool:
     """A pool for experts of one budget, env steps.
 
     Raises:
         ValueError: as `check_budget`.
     """
-    check_budget(budget, config, stopping)
-    return Pool(config.updates_in(budget), config, stopping, rules)
+    check_budget(budget, procedure.expert, procedure.stop)
+    return Pool(procedure.expert.updates_in(budget), procedure, rules)

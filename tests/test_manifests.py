@@ -46,5 +46,5 @@ def test_three_levels_come_out_as_they_did() -> None:
     levels = jax.tree.map(np.asarray, sample_levels(chosen, SIZES["s"], job.distribution))
     for name, values in arrays_of(levels).items():
         np.testing.assert_allclose(values, WORLDS[name][..., chosen], rtol=1e-5, atol=1e-6, err_msg=name)
-    result = train_levels(levels, chosen, job.env_steps, job.expert, job.stop, job.task)
+    result = train_levels(levels, chosen, job.env_steps, job.procedure, job.task)
     assert [v.label for v in result.verdicts] == ["solved", "solved", "unsolved"]

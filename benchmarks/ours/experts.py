@@ -33,7 +33,7 @@ def main() -> None:
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
     no_evaluation = {"attempts": 1, "sticky_attempts": 0, "moved_attempts": 0}
-    config = replace(REFERENCE, environments=given.environments, horizon=given.horizon, **no_evaluation)
+    config = replace(REFERENCE.expert, environments=given.environments, horizon=given.horizon, **no_evaluation)
     rules = TaskParams(dense_reward_scale=config.dense_reward_scale)
     levels = load_levels(given.levels, given.first, given.count)
     slots = min(slot_count(config), given.count)

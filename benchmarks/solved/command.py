@@ -18,15 +18,15 @@ from experts.config import check_budget
 from levelgen.level import size_of
 from pipeline.errors import UserError
 
-DRAWN = ("s-1M-ours", "s-4M-ours", "m-1M-ours", "m-4M-ours", "l-4M-ours")  # curves, unless others are named
+DRAWN = ("s-1M-alone", "s-4M-alone", "m-1M-alone", "m-4M-alone", "l-4M-alone")  # curves, unless others are named
 PLOT = "solved.svg"
 
 
 def register(parser: argparse.ArgumentParser) -> None:
     names = "\n".join(f"  {name:16}{variant.text}" for name, variant in VARIANTS.items())
     parser.description = "Tables of the levels that variants solve. With --variant it trains first what is not known."
-    parser.epilog = f"variants:\n{names}\n\nexample: python -m benchmarks solved --variant ours --size s --budget 64k"
-    parser.add_argument("groups", nargs="*", metavar="SIZE-BUDGET-VARIANT", help="to show, such as s-64k-ours")
+    parser.epilog = f"variants:\n{names}\n\nexample: python -m benchmarks solved --variant default --size s"
+    parser.add_argument("groups", nargs="*", metavar="SIZE-BUDGET-VARIANT", help="to show, such as s-64k-default")
     parser.add_argument("--variant", choices=list(VARIANTS), metavar="NAME", help="to train; see below")
     parser.add_argument("--size", default="s", help="of the levels to train (default: s)")
     parser.add_argument("--budget", default="64k", help="env steps of an expert (default: 64k)")
@@ -61,7 +61,7 @@ def train(given: argparse.Namespace) -> Header:
     budget, levels = parse_count(given.budget, "--budget"), parse_count(given.levels, "--levels")
     variant = VARIANTS[given.variant]
     try:
-        check_budget(budget, variant.expert, variant.stop)
+        check_budget(budget, variant.procedure.expert, variant.procedure.stop)
     except ValueError as error:
         raise UserError(f"--{error}.") from None
     if given.first < 0:
@@ -70,8 +70,7 @@ def train(given: argparse.Namespace) -> Header:
         size_of(given.size)
     except ValueError as error:
         raise UserError(f"--{error}.") from None
-    settings = {"expert": plain(variant.expert), "stop": plain(variant.stop)}
-    header = Header(given.variant, given.size, budget, settings)
+    header = Header(given.variant, given.size, budget, plain(variant.procedure))
     worker = original.work if variant.original else measure.work
     wanted = range(given.first, given.first + levels)
     measure.measure(header, variant, wanted, given.jobs, worker, given.again, given.results)

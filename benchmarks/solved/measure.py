@@ -190,14 +190,14 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
             told.put(Progress(unit, totals))
 
         if not warm:
-            train_levels(levels, ids, variant.expert.steps_per_update, variant.expert, variant.stop)
+            train_levels(levels, ids, variant.procedure.expert.steps_per_update, variant.procedure)
             warm = True
         before = time.process_time()
-        result = train_levels(levels, ids, header.budget, variant.expert, variant.stop, tell=report)
+        result = train_levels(levels, ids, header.budget, variant.procedure, tell=report)
         seconds = (time.process_time() - before) / len(ids)
         rows = [row_of(int(i), v, seconds) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
         solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
-        told.put(Trained(unit, rows, Summary(len(ids), solved, *result.spent), versions(), device()))
+        told.put(Trained(unit, rows, Summary(len(ids), solved, result.spent), versions(), device()))
 
 
 def row_of(level_id: int, verdict: Verdict, seconds: float) -> dict[str, Any]:

@@ -22,7 +22,8 @@ from benchmarks.solved.measure import Progress, Trained, row_of
 from benchmarks.solved.results import Header
 from benchmarks.solved.variants import Variant
 from experts.config import RECORD_STEPS, ExpertConfig
-from experts.labels import Label, Verdict
+from experts.labels import Label, Source, Verdict
+from experts.steps import EnvSteps
 from levelgen.level import Level
 from pipeline.errors import LevelproofError
 from pipeline.jobs.schedule import Summary, WorkUnit
@@ -39,9 +40,9 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
     try:
         python = oracle.oracle_python()
         made_with = {**versions(), "reference": oracle.versions(python)}
-        with started(python, core, header, variant.expert) as reference:
+        with started(python, core, header, variant.procedure.expert) as reference:
             while (unit := tasks.get()) is not None:
-                rows, summary = train(reference, header, variant.expert, unit, told.put)
+                rows, summary = train(reference, header, variant.procedure.expert, unit, told.put)
                 told.put(Trained(unit, rows, summary, made_with, device()))
     except LevelproofError as error:
         told.put(error)
@@ -112,7 +113,8 @@ def train(
         rows += [row_of(int(ids[i]), verdict, seconds / WIDTH) for i, verdict in zip(batch, verdicts, strict=True)]
         solved += sum(verdict.label is Label.SOLVED for verdict in verdicts)
     steps, evaluated = updates * config.steps_per_update, config.attempts * RECORD_STEPS
-    summary = Summary(len(ids), solved, len(left) * steps, len(left) * evaluated, 0)
+    spent = EnvSteps(trained=len(left) * steps, evaluated=len(left) * evaluated)
+    summary = Summary(len(ids), solved, spent)
     return sorted(rows, key=lambda row: row["level_id"]), summary
 
 
@@ -156,7 +158,7 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
     import jax.numpy as jnp
 
     from experts import judge, progress
-    from experts.success import no_success
+    from experts.success import Success
     from experts.witness import succeeds
 
     done, goal = seen["trained_done"], seen["trained_goal"]
@@ -168,8 +170,9 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
         first_success=jnp.int32(first_success(goal)),
         diverged=jnp.int32(progress.NEVER),
     )
-    evaluation = judge.Evaluation(np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, no_success())
-    witness = judge.witness_of([evaluation], config)
+    nothing = Success(np.zeros(0), np.int32(0))
+    evaluation = judge.Evaluation(np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, nothing)
+    witness = judge.witness_of([evaluation], Source.EXPLORATION, config)
     of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))
     episodes = int(seen["done"][:, of_witness].sum())
     return judge.verdict_of(judge.Trained([], [evaluation]), witness, episodes, False, config, failed_by_noop)

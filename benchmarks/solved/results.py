@@ -27,16 +27,23 @@ SCHEMA = pa.schema(
         ("level_id", pa.int64()),
         ("label", WORD),
         ("env_steps", pa.int64()),  # of training
+        ("evaluation_steps", pa.int64()),  # env steps, as the next two; null: not counted
+        ("scout_steps", pa.int64()),
+        ("search_steps", pa.int64()),
+        ("witness", WORD),  # where it comes from; null: there is none, or it was not noted
         ("success_rate", pa.float64()),  # of the last evaluation's sampled episodes; null: none ended
         ("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: no witness
         ("core_seconds", pa.float64()),  # the level's part of what its unit took
-        ("settings", WORD),  # of the expert and of stopping, as JSON
+        ("settings", WORD),  # of the procedure, as JSON
         ("versions", WORD),  # as JSON
         ("device", WORD),
         ("date", WORD),
     ]
 )
-OF_LEVEL = ("label", "env_steps", "success_rate", "steps_to_goal", "core_seconds")
+OF_LEVEL = (
+    "label", "env_steps", "evaluation_steps", "scout_steps", "search_steps", "witness", "success_rate",
+    "steps_to_goal", "core_seconds",
+)  # fmt: skip
 OF_RUN = ("versions", "device", "date")
 
 
@@ -47,11 +54,11 @@ class Header:
     variant: str
     size: str
     budget: int
-    config: dict[str, Any]  # settings of the expert and of stopping
+    config: dict[str, Any]  # settings of the procedure
 
     @property
     def name(self) -> str:
-        """`s-64k-ours`."""
+        """`s-64k-default`."""
         return f"{self.size}-{count(self.budget)}-{self.variant}"
 
     @property

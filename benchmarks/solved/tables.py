@@ -1,17 +1,19 @@
 """Tables of how many levels each variant solves, and comparisons level by level."""
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from benchmarks.report import Table
 from benchmarks.solved.results import Results, by_size, count, mean, share
 from benchmarks.solved.variants import VARIANTS
 from benchmarks.statistics import mcnemar
+from experts.labels import BY_EXPERT
 
-QUARTER = "ours"  # the variant whose quarter of the budget is compared with the reference's whole
+QUARTER = "alone"  # the variant whose quarter of the budget is compared with the reference's whole
 HEAD = (
-    "variant", "levels with an expert", "solved (95% interval)", "at a quarter of the budget", "env steps a level",
-    "core-seconds a solved level", "success rate", "steps to goal",
+    "variant", "undecided levels", "solved (95% interval)", "by an expert's own witness", "at a quarter of the budget",
+    "env steps a level", "core-seconds a solved level", "success rate", "steps to goal",
 )  # fmt: skip
 PAIRED_HEAD = ("variant", "against", "levels of both", "only the first solves", "only the other solves", "p")
 
@@ -53,17 +55,25 @@ def line(results: Results) -> list[str]:
     rows = [trained[level_id] for level_id in solved]
     seconds = sum(row["core_seconds"] for row in results.rows.values())
     quarter = len(results.solved(header.budget / 4))
+    sources = [row["witness"] for row in rows]
+    own = sum(source in BY_EXPERT for source in sources)
     rate = mean([row["success_rate"] for row in rows])
     return [
         f"`{header.variant}`",
         f"{len(trained)} of {len(results.rows)}",
         share(len(solved), len(trained)),
+        f"{own / len(rows):.1%}" if rows and all(sources) else "-",
         share(quarter, len(trained)) if header.stops_early else "-",
-        f"{mean([row['env_steps'] for row in trained.values()]) or 0:,.0f}",
+        f"{mean([steps_of(row) for row in trained.values()]) or 0:,.0f}",
         f"{seconds / len(solved):.3g}" if solved else "-",
         f"{rate:.3f}" if rate is not None else "-",
         f"{statistics.median(row['steps_to_goal'] for row in rows):.0f}" if rows else "-",
     ]
+
+
+def steps_of(row: Mapping[str, Any]) -> int:
+    """Env steps that a level took: of training, of its evaluations and of looking before."""
+    return sum(row[name] or 0 for name in ("env_steps", "evaluation_steps", "scout_steps", "search_steps"))
 
 
 def paired(group: Sequence[Results]) -> list[list[str]]:

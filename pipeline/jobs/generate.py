@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from configs.schema import JobConfig
+from experts.steps import EnvSteps
 from pipeline.errors import Exit, Failure
 from pipeline.jobs.progress import Board, Tally, say
 from pipeline.jobs.schedule import UnitOutcome, UnitQueue, WorkUnit, levels_text, plan_units, runs
@@ -48,7 +49,7 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
                 )
                 raise
             manifest = read_manifest(split, ["label", "env_steps", "steps_to_first_success"])
-            spent = _spent(manifest, wanted - done, board.tally) if board.tally.env_steps else ""
+            spent = _spent(manifest, wanted - done, board.tally.spent) if board.tally.spent.shown else ""
         else:
             print(f"Nothing to do: all {len(wanted)} levels are there.")
             spent = ""
@@ -89,21 +90,22 @@ def _labels(manifest: Manifest, wanted: Collection[int]) -> Counter[str]:
     return Counter(manifest.labels[np.isin(manifest.level_ids, list(wanted))].tolist())
 
 
-def _spent(manifest: Manifest, made: Collection[int], tally: Tally) -> str:
+def _spent(manifest: Manifest, made: Collection[int], spent: EnvSteps) -> str:
     """What this run's env steps were for."""
     rows = manifest.table.filter(np.isin(manifest.level_ids, list(made)))
     steps, first, label = (rows.column(name).to_numpy() for name in ("env_steps", "steps_to_first_success", "label"))
-    total = tally.env_steps + tally.evaluated + tally.idle
+    total = sum(spent)
     after = np.nansum(np.where(label == "solved", steps - first.astype(float), 0.0))
     shares = {
-        "after a level's first success": after / total,
-        "of levels that stayed unsolved": steps[label == "unsolved"].sum() / total,
-        "of evaluations": tally.evaluated / total,
-        "in empty slots": tally.idle / total,
+        "of scouts": spent.scouted / total,
+        "of searches": spent.searched / total,
+        "of training after a level's first success": after / total,
+        "of training of levels that stayed unsolved": steps[label == "unsolved"].sum() / total,
+        "of evaluations": spent.evaluated / total,
+        "in empty slots": spent.idle / total,
     }
-    told = ", ".join(f"{share:.0%} {name}" for name, share in shares.items())
-    nothing = (after + tally.idle) / total
-    return f"{total:,} env steps: {told}. Decided nothing (after the first success, or empty): {nothing:.0%}."
+    told = ", ".join(f"{share:.0%} {name}" for name, share in shares.items() if share)
+    return f"{total:,} env steps: {told}."
 
 
 def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: UnitQueue, spent: str) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+from experts.steps import EnvSteps
 from pipeline.jobs.schedule import Summary, WorkUnit
 
 LINE_EVERY = 30.0  # s between plain lines
@@ -23,9 +24,7 @@ class Tally:
     done: int  # committed, those of earlier runs included
     solved: int
     running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
-    env_steps: int = 0  # of this run's committed units, of training
-    evaluated: int = 0  # env steps of their evaluations
-    idle: int = 0  # env steps in their slots without a level
+    spent: EnvSteps = field(default_factory=EnvSteps)  # on this run's committed units
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
         """A unit was committed, or an attempt at it failed (`None`)."""
@@ -33,14 +32,12 @@ class Tally:
         if summary:
             self.done += summary.levels
             self.solved += summary.solved
-            self.env_steps += summary.env_steps
-            self.evaluated += summary.evaluated
-            self.idle += summary.idle
+            self.spent = EnvSteps(*map(sum, zip(self.spent, summary.spent, strict=True)))
 
     @property
     def steps(self) -> int:
-        """Env steps of training in this run."""
-        return self.env_steps + sum(steps for steps, _, _ in self.running.values())
+        """Env steps of this run, as a bar counts them."""
+        return self.spent.shown + sum(steps for steps, _, _ in self.running.values())
 
     @property
     def share(self) -> float:

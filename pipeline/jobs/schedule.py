@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from experts.steps import EnvSteps
 from pipeline.store.layout import unit_name
 
 # How many units a worker may have at once, those included that failed as often: a unit that kills its worker takes
@@ -44,9 +45,7 @@ class Summary:
 
     levels: int
     solved: int
-    env_steps: int  # of training
-    evaluated: int  # env steps of evaluations
-    idle: int  # env steps in slots without a level
+    spent: EnvSteps
 
 
 @dataclass(frozen=True)

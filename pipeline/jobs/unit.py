@@ -37,7 +37,7 @@ from pipeline.store.shard import write_shard
 
 def pool_for(job: JobConfig) -> Pool:
     """Where a job's experts train, those of several units side by side."""
-    return new_pool(job.env_steps, job.expert, job.stop, job.task)
+    return new_pool(job.env_steps, job.procedure, job.task)
 
 
 def begin_unit(job: JobConfig, unit: WorkUnit, pool: Pool) -> TrainingRun:
@@ -62,7 +62,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool, run: Tr
     check_witnesses(result, job.task)
     commit(job, split, unit, result)
     labels = [verdict.label for verdict in result.verdicts]
-    return Summary(len(labels), labels.count(Label.SOLVED), *result.spent)
+    return Summary(len(labels), labels.count(Label.SOLVED), result.spent)
 
 
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:

@@ -10,8 +10,9 @@ import numpy as np
 from configs.schema import JobConfig
 from experts.config import Rule
 from experts.judge import Kept
-from experts.labels import Label
+from experts.labels import BY_EXPERT
 from experts.slots import begin
+from experts.success import no_success
 from levelgen.level import size_of
 from levelgen.sampling.sampler import sample_levels
 from pipeline.errors import Failure, UserError
@@ -48,7 +49,7 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
         Failure: it is damaged or gone, or of another version of this program.
     """
     level = sample_levels([0], size_of(job.size), job.distribution)
-    like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), job.expert), level)
+    like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), no_success(1), job.expert), level)
     like = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
     try:
         with np.load(path) as file:  # whole files only: each array has a checksum; never what is pickled
@@ -73,8 +74,8 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
 def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     """Experts of the split `job.continue_from` that can go on with these levels; others begin.
 
-    A level that is solved ends the same with any larger budget, unless experts get their whole budget, or the last
-    evaluation alone solved it: those begin again.
+    A level that its expert solved ends the same with any larger budget, unless experts get their whole budget, or the
+    last evaluation alone solved it: those begin again.
 
     Raises:
         SourceUnseen: that split is not there for this process.
@@ -86,8 +87,8 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     rows = _kept_in(source, level_ids)
     paths: dict[str, set[int]] = {}
     for level_id in level_ids:
-        label, path = rows.get(level_id, ("", None))
-        if path and (label == Label.UNSOLVED or job.stop.rule == Rule.BUDGET):
+        witness, path = rows.get(level_id, ("", None))
+        if path and (witness not in BY_EXPERT or job.stop.rule == Rule.BUDGET):
             paths.setdefault(path, set()).add(level_id)
     found: dict[int, Kept] = {}
     for path, ids in paths.items():
@@ -96,16 +97,16 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     return found
 
 
-def _kept_in(source: Path, level_ids: Sequence[int]) -> dict[int, tuple[str, str | None]]:
-    """Label and checkpoint of these levels: a worker asks for every unit, and reads the fragments of its levels."""
+def _kept_in(source: Path, level_ids: Sequence[int]) -> dict[int, tuple[str | None, str | None]]:
+    """Witness and checkpoint of these levels: a worker asks for every unit, and reads the fragments of its levels."""
     if not (source / MANIFEST).is_dir():
         raise SourceUnseen(
             f"The worker on {socket.gethostname()} finds no split at {source}, whose experts should go on: "
             "use a folder that all machines of the cluster share, or leave out continue_from."
         )
-    table = read_manifest(source, ["label", "experts"], level_ids).table
-    columns = (table.column(name).to_pylist() for name in ("level_id", "label", "experts"))
-    return {level_id: (label, path) for level_id, label, path in zip(*columns, strict=True)}
+    table = read_manifest(source, ["witness", "experts"], level_ids).table
+    columns = (table.column(name).to_pylist() for name in ("level_id", "witness", "experts"))
+    return {level_id: (witness, path) for level_id, witness, path in zip(*columns, strict=True)}
 
 
 def require_same_experts(job: JobConfig) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-MANIFEST_VERSION = 4
+MANIFEST_VERSION = 5
 SHARD_VERSION = 1
 
 # Keys of a fragment's metadata
@@ -28,7 +28,7 @@ COLUMNS = pa.schema(
         pa.field("label", pa.string(), nullable=False),  # solved, unsolved, unsolvable, trivial
         pa.field("label_reason", pa.string(), nullable=False),
         pa.field("failed_by_noop", pa.bool_(), nullable=False),  # doing nothing lets green touch red
-        pa.field("witness", pa.string()),  # most probable, sampled, exploration, nothing; null: there is none
+        pa.field("witness", pa.string()),  # experts.labels.Source; null: there is none
         # of the last evaluation, first episodes; null: there were no such attempts (SQL has NaN above every number)
         pa.field("success_rate", pa.float32()),  # of sampled attempts
         pa.field("most_probable_succeeds", pa.bool_(), nullable=False),
@@ -36,7 +36,10 @@ COLUMNS = pa.schema(
         pa.field("moved_success_rate", pa.float32()),
         pa.field("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: none
         pa.field("steps_to_first_success", pa.int64()),  # env steps of training; null: never
-        pa.field("env_steps", pa.int64(), nullable=False),  # used of the budget
+        pa.field("env_steps", pa.int64(), nullable=False),  # of training: used of the budget
+        pa.field("evaluation_steps", pa.int64(), nullable=False),  # env steps, as the next two
+        pa.field("scout_steps", pa.int64(), nullable=False),
+        pa.field("search_steps", pa.int64(), nullable=False),
         pa.field(
             "learning_curve", pa.list_(pa.float32()), nullable=False
         ),  # success rate per update, null: no episode ended

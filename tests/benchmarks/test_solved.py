@@ -18,11 +18,12 @@ from benchmarks.solved.measure import measure, rows_in, work
 from benchmarks.solved.results import Header, Results, count, made, merge, read, share
 from benchmarks.solved.variants import VARIANTS, Variant
 from benchmarks.statistics import mcnemar
-from configs.convert import plain
-from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from configs.convert import flat, plain
+from experts.config import RECORD_STEPS, ExpertConfig, Procedure, Rule, StopConfig
 from experts.labels import Label, Source
 from levelgen.task.actions import CHOICES
 from pipeline.errors import Exit, UserError
+from tests.experts.small import untouched
 
 SMALL = ExpertConfig(
     environments=16, width=16, rehearsals=4, attempts=4, sticky_attempts=4, moved_attempts=4, slots=4
@@ -30,14 +31,15 @@ SMALL = ExpertConfig(
 FIRST = 1_000_000
 
 
-def header(name: str = "ours", size: str = "s", budget: int = 64_000) -> Header:
+def header(name: str = "alone", size: str = "s", budget: int = 64_000) -> Header:
     variant = VARIANTS[name]
-    return Header(name, size, budget, {"expert": plain(variant.expert), "stop": plain(variant.stop)})
+    return Header(name, size, budget, plain(variant.procedure))
 
 
 def row(level_id: int, label: str, env_steps: int, steps: int | None = None) -> tuple[int, dict[str, Any]]:
     rate = 0.5 if label == "solved" else None
     values = {"label": label, "env_steps": env_steps, "success_rate": rate, "steps_to_goal": steps, "core_seconds": 1.5}
+    values |= {"witness": "sampled" if rate else None, "evaluation_steps": 10, "scout_steps": 20, "search_steps": 30}
     return level_id, values | {"versions": '{"python": "3"}', "device": "cpu: none", "date": "2026-01-01"}
 
 
@@ -87,23 +89,23 @@ def test_counts() -> None:
 
 
 def test_an_ablation_changes_one_thing() -> None:
-    default = plain(ExpertConfig()) | plain(StopConfig())
     for name, variant in VARIANTS.items():
-        settings = plain(variant.expert) | plain(variant.stop)
-        changed = {key for key, value in settings.items() if value != default[key]}
-        if name not in ("original", "reference", "ours"):
-            assert len(changed) == 1, f"{name} changes {changed}"
         assert set(variant.against) <= set(VARIANTS) - {name}
-    assert VARIANTS["ours"].expert == ExpertConfig()
-    reference = VARIANTS["reference"]
+        for base in ("alone", "default"):
+            default, settings = flat(plain(VARIANTS[base].procedure)), flat(plain(variant.procedure))
+            changed = {key for key, value in settings.items() if value != default[key]}
+            if variant.against == (base,) and not variant.text.startswith("procedure="):
+                assert 1 <= len(changed) <= 2, f"{name} changes {changed}"
+    assert VARIANTS["default"].procedure == Procedure()
+    reference = VARIANTS["reference"].procedure
     assert (reference.expert.horizon, reference.expert.learning_rate, reference.expert.rehearsals) == (64, 3e-4, 0)
-    assert reference.stop.rule == Rule.BUDGET
+    assert (reference.stop.rule, reference.scout.rounds) == (Rule.BUDGET, 0)
 
 
 def test_the_original_is_judged_as_its_reimplementation() -> None:
     there, here = VARIANTS["original"], VARIANTS["reference"]
-    assert replace(there.expert, sticky_attempts=8, moved_attempts=8) == here.expert
-    assert there.stop == here.stop
+    expert = replace(there.procedure.expert, sticky_attempts=8, moved_attempts=8)
+    assert replace(there.procedure, expert=expert) == here.procedure
 
 
 def text_of(results: list[Results]) -> str:
@@ -114,14 +116,14 @@ def test_table(ours: Results, theirs: Results) -> None:
     text = text_of([theirs, ours])
     assert "**Size s, 64k env steps**, levels 1,000,000 to 1,000,009:" in text
     mean_steps = (2_000 + 5_000 + 16_000 + 16_001 + 40_000 + 4 * 64_000) / 9
-    of_ours = ["`ours`", "9 of 10", share(6, 9), share(3, 9), f"{mean_steps:,.0f}", "2.5", "0.500", "35"]
+    of_ours = ["`alone`", "9 of 10", share(6, 9), "100.0%", share(3, 9), f"{mean_steps + 60:,.0f}", "2.5", "0.500", "35"]
     solved, paired = text.split("Level by level:")
-    assert cells(solved, "`ours`") == of_ours
-    assert cells(solved, "`reference`")[1:4] == ["9 of 10", share(3, 9), "-"]
-    assert cells(paired, "`ours`")[1:] == ["`reference`", "9", "4", "1", "0.38"]
-    assert cells(paired, "`ours`, a quarter of the budget")[1:] == ["`reference`", "9", "3", "3", "1"]
-    assert f"- `ours`: {VARIANTS['ours'].text}" in tables.variants_of([ours])
-    assert text.index("| `reference` |") < text.index("| `ours` |")
+    assert cells(solved, "`alone`") == of_ours
+    assert cells(solved, "`reference`")[1:4] == ["9 of 10", share(3, 9), "100.0%"]
+    assert cells(paired, "`alone`")[1:] == ["`reference`", "9", "4", "1", "0.38"]
+    assert cells(paired, "`alone`, a quarter of the budget")[1:] == ["`reference`", "9", "3", "3", "1"]
+    assert f"- `alone`: {VARIANTS['alone'].text}" in tables.variants_of([ours])
+    assert text.index("| `reference` |") < text.index("| `alone` |")
 
 
 def test_a_variant_is_compared_with_several(ours: Results, theirs: Results) -> None:
@@ -129,14 +131,14 @@ def test_a_variant_is_compared_with_several(ours: Results, theirs: Results) -> N
     there = Results(header("original"), dict(rows))
     paired = text_of([ours, theirs, there]).split("Level by level:")[1]
     assert cells(paired, "`original` | `reference`")[2:] == ["2", "1", "0", "1"]
-    assert cells(paired, "`ours` | `original`")[2:] == ["2", "0", "0", "1"]
-    assert cells(paired, "`ours` | `reference`")[2:] == ["9", "4", "1", "0.38"]
-    assert cells(paired, "`ours`, a quarter of the budget | `original`")[2:] == ["2", "0", "0", "1"]
+    assert cells(paired, "`alone` | `original`")[2:] == ["2", "0", "0", "1"]
+    assert cells(paired, "`alone` | `reference`")[2:] == ["9", "4", "1", "0.38"]
+    assert cells(paired, "`alone`, a quarter of the budget | `original`")[2:] == ["2", "0", "0", "1"]
 
 
 def test_pairs_are_of_the_levels_that_both_tried(ours: Results) -> None:
     text = text_of([ours, Results(header("width_32"), dict([row(FIRST + 1, "unsolved", 64_000)]))])
-    assert cells(text.split("Level by level:")[1], "`width_32`")[1:] == ["`ours`", "1", "0", "1", "1"]
+    assert cells(text.split("Level by level:")[1], "`width_32`")[1:] == ["`alone`", "1", "0", "1", "1"]
 
 
 class TestFile:
@@ -147,7 +149,7 @@ class TestFile:
         merge(Results(ours.header, dict([*ours.rows.items()][3:])), file)
         first = file.read_bytes()
         merge(Results(ours.header, dict([*ours.rows.items()][:5])), file)
-        assert {each.header.name: each for each in read(file)} == {"s-64k-ours": ours, "s-64k-reference": theirs}
+        assert {each.header.name: each for each in read(file)} == {"s-64k-alone": ours, "s-64k-reference": theirs}
         merge(ours, file)
         again = file.read_bytes()
         merge(ours, file)
@@ -218,7 +220,7 @@ def test_plot(ours: Results, tmp_path: Path) -> None:
 def test_a_mistake_gets_a_sentence(
     arguments: list[str], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["solved", "--variant", "ours", *arguments, "--results", str(tmp_path / "none.parquet")]
+    words = ["solved", "--variant", "alone", *arguments, "--results", str(tmp_path / "none.parquet")]
     assert main(words) == Exit.INPUT
     assert sentence in capsys.readouterr().err
 
@@ -229,7 +231,7 @@ def test_results_that_are_not_there(tmp_path: Path, ours: Results, capsys: pytes
     merge(ours, file)
     assert main(["solved", "s-64k-theirs", "--results", str(file)]) == Exit.INPUT
     assert "no results of s-64k-theirs" in capsys.readouterr().err
-    assert main(["solved", "s-64k-ours", "--results", str(file), "--json"]) == Exit.DONE
+    assert main(["solved", "s-64k-alone", "--results", str(file), "--json"]) == Exit.DONE
     (group,) = json.loads(capsys.readouterr().out)["groups"]
     assert (group["with_expert"], group["solved"], group["core_seconds"]) == (9, 6, 15)
 
@@ -248,14 +250,14 @@ def test_results_under_other_settings_are_left_alone(tmp_path: Path, ours: Resul
     merge(ours, file)
     other = replace(ours.header, config={"expert": {}, "stop": {"rule": "solved"}})
     with pytest.raises(UserError, match="--again"):
-        measure(other, VARIANTS["ours"], range(0), 1, work, file=file)
+        measure(other, VARIANTS["alone"], range(0), 1, work, file=file)
 
 
 @pytest.mark.campaign
 def test_a_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process dies, which leaves the lines of units that were done; the next run trains the others only."""
-    variant, file, scratch = Variant("small", SMALL), tmp_path / "solved.parquet", tmp_path / "scratch.jsonl"
-    of = Header("small", "s", 4_096, {"expert": plain(variant.expert), "stop": plain(variant.stop)})
+    variant, file, scratch = Variant("small", untouched(StopConfig(rule=Rule.SOLVED), SMALL)), tmp_path / "solved.parquet", tmp_path / "scratch.jsonl"
+    of = Header("small", "s", 4_096, plain(variant.procedure))
     monkeypatch.setattr(measuring, "scratch_of", lambda _: scratch)
     level_id, before = row(FIRST, "solved", 7, 7)
     scratch.write_text(json.dumps({"level_id": level_id} | before) + "\n")
@@ -277,7 +279,7 @@ def test_a_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def shown(ends: dict[int, list[tuple[int, bool]]], first_goal: tuple[int, int] | None) -> dict[str, np.ndarray]:
     """What the reference's process writes of a level: the episodes' ends of each attempt, a success of training."""
-    config = VARIANTS["original"].expert
+    config = VARIANTS["original"].procedure.expert
     training = np.zeros((2, 2 * config.horizon, config.environments), bool)
     if first_goal is not None:
         training[:, *first_goal] = True
@@ -294,7 +296,7 @@ def shown(ends: dict[int, list[tuple[int, bool]]], first_goal: tuple[int, int] |
 
 def test_the_reference_is_judged_as_we_are() -> None:
     """An attempt succeeds when an episode ended and all that ended reached the goal; the first one is the witness."""
-    config = VARIANTS["original"].expert
+    config = VARIANTS["original"].procedure.expert
     ends = {0: [(9, True), (19, False)], 3: [(29, True), (49, True)], 5: [(4, True)], 6: [(255, False)]}
     verdict = original.judged(shown(ends, (66, 5)), config, False)
     assert (verdict.label, verdict.witness, verdict.steps_to_goal) == (Label.SOLVED, Source.SAMPLED, 30)
@@ -307,7 +309,7 @@ def test_the_reference_is_judged_as_we_are() -> None:
 
 
 def test_a_level_without_a_good_attempt_is_unsolved() -> None:
-    config = VARIANTS["original"].expert
+    config = VARIANTS["original"].procedure.expert
     verdict = original.judged(shown({0: [(9, True), (19, False)]}, None), config, False)
     assert (verdict.label, verdict.witness, verdict.steps_to_goal) == (Label.UNSOLVED, None, None)
     assert verdict.success_rate == 0, "no sampled attempt had an episode that ended"
@@ -331,7 +333,7 @@ def test_the_original_runs(tmp_path: Path, reference: Path, monkeypatch: pytest.
     """Two updates of a level that gets an expert; its neighbour needs none."""
     variant, file = VARIANTS["original"], tmp_path / "solved.parquet"
     monkeypatch.setattr(measuring, "scratch_of", lambda _: tmp_path / "scratch.jsonl")
-    of = Header("original", "s", 2 * 2_048, {"expert": plain(variant.expert), "stop": plain(variant.stop)})
+    of = Header("original", "s", 2 * 2_048, plain(variant.procedure))
     wanted = range(FIRST + 9, FIRST + 11)
     measure(of, variant, wanted, 1, original.work, file=file)
     (results,) = read(file)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from experts.config import ExpertConfig, Rule, StopConfig
+from experts.config import ExpertConfig, Procedure, Rule, ScoutConfig, StopConfig
 from levelgen.task.rules import DEFAULT_RULES
 
 IDS = np.array([0, 2, 3, 4, 6, 7, 9])  # levels of size s that need an expert
@@ -13,3 +13,8 @@ CONFIG = ExpertConfig(
 )
 SHAPED = replace(DEFAULT_RULES, dense_reward_scale=CONFIG.dense_reward_scale)  # as a pool has them
 WHOLE = StopConfig(rule=Rule.BUDGET)
+
+
+def untouched(stopping: StopConfig, config: ExpertConfig = CONFIG) -> Procedure:
+    """Experts of levels in which nobody looked before."""
+    return Procedure(ScoutConfig(rounds=0), config, stopping)

@@ -26,7 +26,7 @@ def evaluation(*episodes: list[tuple[int, bool]], success: int = 0) -> Evaluatio
 
 def test_a_record_is_the_first_attempt_without_failure() -> None:
     one = evaluation([(9, True), (20, False)], [(99, True), (199, True)], [(30, True)])
-    witness = witness_of([one], CONFIG)
+    witness = witness_of([one], Source.SCOUT, CONFIG)
     assert witness is not None
     assert (witness.source, witness.steps) == (Source.SAMPLED, 100)
     np.testing.assert_array_equal(witness.action[:, 0], np.arange(RECORD_STEPS) + 1000)
@@ -34,7 +34,7 @@ def test_a_record_is_the_first_attempt_without_failure() -> None:
 
 def test_the_shortest_success_is_repeated() -> None:
     one = evaluation([(9, True), (14, True), (20, False)], [(99, True)], [(30, True)])
-    witness = witness_of([one], replace(CONFIG, witness=Choice.SHORTEST))
+    witness = witness_of([one], Source.SCOUT, replace(CONFIG, witness=Choice.SHORTEST))
     assert witness is not None
     assert (witness.source, witness.steps) == (Source.MOST_PROBABLE, 5)
     np.testing.assert_array_equal(witness.action[:12, 0], [10, 11, 12, 13, 14] * 2 + [10, 11])
@@ -44,20 +44,19 @@ def test_the_best_of_several_evaluations_counts() -> None:
     before, polished = evaluation([(99, True)]), evaluation([(49, True)])
     failed = evaluation([(9, False)])
     for several in ([before, polished], [polished, before], [polished, failed]):
-        witness = witness_of(several, CONFIG)
+        witness = witness_of(several, Source.SCOUT, CONFIG)
         assert witness is not None
         assert witness.steps == 50
 
 
-def test_exploration_is_a_witness_only_if_wanted_and_only_where_there_is_no_other() -> None:
-    wants = replace(CONFIG, exploration=True)
+def test_a_rehearsed_success_is_a_witness_only_if_wanted_and_only_where_there_is_no_other() -> None:
     failed, solved = evaluation([(9, False)], success=4), evaluation([(9, True)], success=4)
-    assert witness_of([failed], CONFIG) is None
-    assert witness_of([evaluation([(9, False)])], wants) is None
-    explored, own = witness_of([failed], wants), witness_of([solved], wants)
-    assert explored is not None
+    assert witness_of([failed], Source.SCOUT, replace(CONFIG, exploration=False)) is None
+    assert witness_of([evaluation([(9, False)])], Source.SCOUT, CONFIG) is None
+    found, own = witness_of([failed], Source.SCOUT, CONFIG), witness_of([solved], Source.SCOUT, CONFIG)
+    assert found is not None
     assert own is not None
-    assert (explored.source, explored.steps) == (Source.EXPLORATION, 4)
+    assert (found.source, found.steps) == (Source.SCOUT, 4)
     assert own.source is Source.MOST_PROBABLE
 
 

@@ -7,11 +7,12 @@ import pytest
 from experts.judge import Trained
 from experts.pool import Pool, Submission, capacity_of
 from experts.queue import empty_queue, enter, next_indices
+from experts.success import no_success
 from experts.witness import take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
-from tests.experts.small import CONFIG
+from tests.experts.small import CONFIG, untouched
 from tests.experts.test_slots import SOLVED, same
 
 IDS = np.arange(100, 136)
@@ -27,11 +28,11 @@ def levels() -> Level:
 def alone(levels: Level) -> list[Trained]:
     pool = new_pool()
     (submission,) = finished(pool, pool.submit(levels, IDS))
-    return submission.trained()
+    return submission.trained(CONFIG)
 
 
 def new_pool() -> Pool:
-    return Pool(UPDATES, CONFIG, SOLVED, DEFAULT_RULES)
+    return Pool(UPDATES, untouched(SOLVED), DEFAULT_RULES)
 
 
 def part(levels: Level, at: range) -> tuple[Level, np.ndarray]:
@@ -54,12 +55,12 @@ def test_each_gets_what_it_would_get_alone(levels: Level, alone: list[Trained]) 
     order = finished(pool, *submissions)
     assert order[0] is submissions[3]  # without levels
     assert len(order) == len(parts)
-    trained = [of for submission in submissions for of in submission.trained()]
+    trained = [of for submission in submissions for of in submission.trained(CONFIG)]
     assert len(trained) == len(IDS)
     same(trained, alone)
     for submission in submissions:
-        curves = sum(len(of.curve) for of in submission.trained())
-        assert submission.spent(CONFIG).trained == curves * CONFIG.steps_per_update
+        curves = sum(len(of.curve) for of in submission.trained(CONFIG))
+        assert submission.trained_rollouts == curves
 
 
 def test_levels_that_come_later_take_the_slots_that_are_empty(levels: Level) -> None:
@@ -69,7 +70,7 @@ def test_levels_that_come_later_take_the_slots_that_are_empty(levels: Level) -> 
     assert pool.step() == []
     second = pool.submit(*part(levels, range(1, 4)))
     finished(pool, first, second)
-    assert first.spent(CONFIG).idle == CONFIG.steps_per_update  # of the first rollout alone
+    assert first.idle_rollouts == 1  # of the first rollout alone
 
 
 def test_totals_grow_to_the_whole(levels: Level) -> None:
@@ -80,7 +81,7 @@ def test_totals_grow_to_the_whole(levels: Level) -> None:
     seen.append(pool.totals(submission))
     for numbers in zip(*seen, strict=True):
         assert list(numbers) == sorted(numbers)
-    assert seen[-1][:2] == (submission.spent(CONFIG).trained, 5)
+    assert seen[-1][:2] == (submission.trained_rollouts * CONFIG.steps_per_update, 5)
 
 
 def test_a_pool_wants_levels_while_fewer_wait_than_there_are_slots(levels: Level) -> None:
@@ -101,7 +102,7 @@ def test_entries_of_a_queue_go_round(levels: Level) -> None:
     for at in (range(12), range(12, 24)):
         some, ids = part(levels, at)
         assert next_indices(queue, len(ids)) == [i % 20 for i in at]
-        queue = enter(queue, some, ids, CONFIG)
+        queue = enter(queue, some, ids, no_success(len(ids)), CONFIG)
     assert int(queue.come) == 24
     expected = [*IDS[20:24], *IDS[4:20]]
     np.testing.assert_array_equal(queue.level_ids, expected)

@@ -34,11 +34,11 @@ def test_samples_keep_every_number_at_its_place() -> None:
     rng, time, lanes = np.random.default_rng(1), 4, 3
     moving = rng.normal(size=(time, DYNAMIC, lanes)).astype(np.float32)
     action = rng.integers(0, 2, (time, len(CHOICES), lanes))
-    log_probs, value, advantage = rng.normal(size=(3, time, lanes)).astype(np.float32)
-    back = ppo.from_rows(ppo.as_rows(Samples(moving, action, log_probs, value, advantage)))
+    log_probs, value, advantage, rehearsed = rng.normal(size=(4, time, lanes)).astype(np.float32)
+    back = ppo.from_rows(ppo.as_rows(Samples(moving, action, log_probs, value, advantage, rehearsed)))
     np.testing.assert_array_equal(back.moving, np.moveaxis(moving, 1, 0).reshape(DYNAMIC, -1))
     np.testing.assert_array_equal(back.action, np.moveaxis(action, 1, 0).reshape(len(CHOICES), -1))
-    for mine, theirs in zip(back[2:], (log_probs, value, advantage), strict=True):
+    for mine, theirs in zip(back[2:], (log_probs, value, advantage, rehearsed), strict=True):
         np.testing.assert_array_equal(mine, theirs.reshape(-1))
 
 
@@ -59,7 +59,8 @@ def test_learns_a_bandit(kind: Network, seed: int) -> None:
         action = sample(logits, jax.random.uniform(key, (len(CHOICES), count)))
         reward = (action[1] == 2).astype(jnp.float32)
         log_probs = log_probability(logits, action, constants.live[:, None])
-        samples = Samples(moving[None], action[None], log_probs[None], value[None], (reward - value)[None])
+        seen = moving, action, log_probs, value, reward - value, jnp.zeros(count)
+        samples = Samples(*(x[None] for x in seen))
         rows = ppo.as_rows(samples)
         return ppo.update(now, jax.random.fold_in(key, 1), network, constants, rows, config), reward.mean()
 

@@ -9,19 +9,22 @@ import pytest
 
 from experts import advance as advance_module
 from experts.advance import advance
-from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from experts.found import found_by_scouts
 from experts.judge import Trained
 from experts.labels import Label, Source
-from experts.pool import Pool, Spent, capacity_of
+from experts.pool import Pool, Submission, capacity_of
 from experts.queue import empty_queue, enter
+from experts.scout import scout
 from experts.slots import LevelQueue, Mode, empty_slots
 from experts.stop import rules_of
+from experts.success import no_success
 from experts.train import train_levels
 from experts.witness import take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
-from tests.experts.small import CONFIG, IDS, SHAPED, WHOLE
+from tests.experts.small import CONFIG, IDS, SHAPED, WHOLE, untouched
 
 SOLVED = StopConfig(successes=2, share=0.6, wait=2048)
 HALVED = StopConfig(rule=Rule.HALVING, successes=4, first_rung=4 * 512, gain=10.0)
@@ -30,17 +33,17 @@ UPDATES = 24  # 12,288 env steps
 
 def train(
     levels: Level, level_ids: np.ndarray, updates: int, config: ExpertConfig, stopping: StopConfig, **how: Any
-) -> tuple[list[Trained], Spent]:
-    pool = Pool(updates, config, stopping, DEFAULT_RULES)
+) -> tuple[list[Trained], Submission]:
+    pool = Pool(updates, untouched(stopping, config), DEFAULT_RULES)
     submission = pool.submit(levels, level_ids, **how)
     while not pool.step():
         pass
-    return submission.trained(), submission.spent(config)
+    return submission.trained(config), submission
 
 
 def queue_of(levels: Level, updates: int) -> LevelQueue:
     """As in a pool, so that it uses the same program."""
-    return enter(empty_queue(levels, capacity_of(CONFIG), updates, CONFIG), levels, IDS, CONFIG)
+    return enter(empty_queue(levels, capacity_of(CONFIG), updates, CONFIG), levels, IDS, no_success(len(IDS)), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -117,27 +120,25 @@ def test_nothing_is_compiled_again(levels: Level) -> None:
 
 
 def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) -> None:
-    halved, spent = train(levels, IDS, UPDATES, CONFIG, HALVED)
+    halved, submission = train(levels, IDS, UPDATES, CONFIG, HALVED)
     never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
     assert never
     for i in never:
         assert len(halved[i].curve) in (4, 8)  # at the first rung there is nothing to compare with
-    assert spent.trained == sum(len(of.curve) for of in halved) * CONFIG.steps_per_update
-    verdicts = train_levels(levels, IDS, UPDATES * 512, CONFIG, HALVED).verdicts
+    assert submission.trained_rollouts == sum(len(of.curve) for of in halved)
+    verdicts = train_levels(levels, IDS, UPDATES * 512, untouched(HALVED)).verdicts
     reasons = {i: verdict.label_reason for i, verdict in enumerate(verdicts) if verdict.label is Label.UNSOLVED}
     assert all("at a rung the best return had not grown" in reasons[i] for i in never)
 
 
-@pytest.mark.campaign
-def test_a_success_of_training_is_a_witness_if_wanted(levels: Level) -> None:
-    config = replace(CONFIG, exploration=True)
-    result = train_levels(levels, IDS, UPDATES * 512, config, StopConfig(successes=4))
-    for verdict in result.verdicts:
-        explored = verdict.steps_to_first_success is not None
-        assert (verdict.label is Label.SOLVED) == explored
-        if explored:
-            assert verdict.env_steps - verdict.steps_to_first_success < config.steps_per_update
-    assert Source.EXPLORATION in {verdict.witness for verdict in result.verdicts}
+def test_a_success_of_training_is_a_witness_where_evaluation_has_none(levels: Level) -> None:
+    verdicts = train_levels(levels, IDS, UPDATES * 512, untouched(replace(WHOLE, successes=4))).verdicts
+    for verdict in verdicts:
+        if verdict.steps_to_first_success is not None:
+            assert verdict.label is Label.SOLVED
+        if verdict.witness is Source.EXPLORATION:
+            assert verdict.success_rate == 0
+    assert Source.EXPLORATION in {verdict.witness for verdict in verdicts}
 
 
 @pytest.mark.campaign
@@ -159,39 +160,24 @@ def test_going_on_equals_having_trained_through(levels: Level, stopping: StopCon
     left = [i for i, of in enumerate(first) if stopping == WHOLE or of.witness is None]
     assert (stopping == HALVED) == any(len(first[i].curve) < UPDATES // 2 for i in left)
     begun = {number: first[i].expert for number, i in enumerate(left)}
-    later, spent = train(take(levels, np.array(left)), IDS[left], UPDATES, CONFIG, stopping, begun=begun, keep=True)  # type: ignore[arg-type]
-    trained = sum(len(through[i].curve) - len(first[i].curve) for i in left)
-    assert spent.trained == trained * CONFIG.steps_per_update
+    later, submission = train(
+        take(levels, np.array(left)), IDS[left], UPDATES, CONFIG, stopping, begun=begun, keep=True
+    )  # type: ignore[arg-type]
+    assert submission.trained_rollouts == sum(len(through[i].curve) - len(first[i].curve) for i in left)
     for i, of in zip(left, later, strict=True):
         same(of, through[i])
 
 
-def test_only_a_success_that_a_record_can_hold_ends_training(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = replace(CONFIG, exploration=True)
-    queue = queue_of(levels, UPDATES)
-    slots = advance_module.refill(empty_slots(2, queue, config), queue, config)
-    slot = jax.tree.map(lambda x: x[0], slots.slot)
-    monkeypatch.setattr(advance_module.ppo, "update", lambda train_state, *_: train_state)
-    shape = (config.horizon, config.environments)
-    goal = np.zeros(shape, bool)
-    goal[3, 5] = True
-    done = goal.copy()
-    done[3, 6:] = True  # so few successes make no evaluation due
-    for length, mode in ((RECORD_STEPS, Mode.EVALUATE), (RECORD_STEPS + 1, Mode.TRAIN)):
-        now = advance_module._Now(
-            constants=None,  # type: ignore[arg-type]
-            key=jax.random.key(0),
-            rows=None,  # type: ignore[arg-type]
-            action=np.zeros((config.horizon, 6, config.environments), np.int8),  # type: ignore[arg-type]
-            reward=np.zeros(shape, np.float32),  # type: ignore[arg-type]
-            done=done,  # type: ignore[arg-type]
-            goal=goal,  # type: ignore[arg-type]
-            timestep=np.full(shape, length - 1),  # type: ignore[arg-type]
-            rehearsing=np.zeros(config.environments, bool),  # type: ignore[arg-type]
-        )
-        after, _ = advance_module._learn(slot, now, None, config, rules_of(SOLVED, config))  # type: ignore[arg-type]
-        assert int(after.training.progress.first_success) == 4 * config.environments
-        assert after.mode == mode
+def test_a_success_before_training_is_rehearsed_from_the_first_update(levels: Level, whole: list[Trained]) -> None:
+    """It ends at its goal, so the first of its episodes does; and those lanes do not count as the expert's own."""
+    success = scout(levels, IDS, ScoutConfig(rounds=1), DEFAULT_RULES)
+    found = found_by_scouts(*success)
+    trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=found)
+    assert 0 < (found.success.length > 0).sum() < len(IDS)
+    for i, of in enumerate(trained):
+        assert np.array_equal(of.evaluations[-1].success.action, found.success.action[i]) or not found.success.length[i]
+        if not found.success.length[i]:
+            same(of.curve, whole[i].curve[:2])
 
 
 def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level, whole: list[Trained]) -> None:
@@ -201,10 +187,12 @@ def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level
         assert kept
         training = kept.begun.training
         params = jax.tree.map(lambda x, weight=weight: np.full_like(x, weight), training.train_state.params)
-        training = training._replace(train_state=training.train_state._replace(params=params))
+        # without a success: that would be a witness
+        success = jax.tree.map(np.zeros_like, training.success)
+        training = training._replace(train_state=training.train_state._replace(params=params), success=success)
         begun[int(IDS[i])] = kept._replace(begun=kept.begun._replace(training=training))
     some, budget = take(levels, np.arange(2)), 2 * UPDATES * 512
-    for verdict in train_levels(some, IDS[:2], budget, CONFIG, WHOLE, begun=begun).verdicts:
+    for verdict in train_levels(some, IDS[:2], budget, untouched(WHOLE), begun=begun).verdicts:
         assert verdict.label is Label.UNSOLVED
         assert verdict.env_steps == (UPDATES + 1) * 512
         assert f"its network's numbers stopped being finite after {verdict.env_steps} env steps" in verdict.label_reason

@@ -10,7 +10,9 @@ from experts import progress, stop
 from experts.config import ExpertConfig, Rule, StopConfig
 from experts.stop import rules_of
 
-CONFIG = ExpertConfig(environments=16, horizon=64, sticky_attempts=4, moved_attempts=4)  # 1024 env steps an update
+CONFIG = ExpertConfig(
+    environments=16, horizon=64, attempts=8, sticky_attempts=4, moved_attempts=4
+)  # 1024 env steps an update
 SOLVED, HALVING = StopConfig(wait=2048, share=0.9), StopConfig(rule=Rule.HALVING, first_rung=4096, gain=0.1)
 
 
@@ -18,7 +20,7 @@ def after(updates: int, share: float, stopping: StopConfig, best: float = 0.0, f
     now = stop.begin()._replace(updates=jnp.int32(updates - 1), **course)
     totals = progress.start(16)._replace(best_return=jnp.float32(best), first_success=jnp.int32(first))
     usable, share_, deadline = jnp.bool_(first != progress.NEVER), jnp.float32(share), jnp.int32(100)
-    now, due, final = stop.after_update(now, totals, usable, share_, deadline, CONFIG, rules_of(stopping, CONFIG))
+    now, due, final = stop.after_update(now, totals, usable, share_, deadline, rules_of(stopping, CONFIG))
     assert int(now.updates) == updates
     assert bool(now.over) == (bool(final) and updates < 100)
     return now, bool(due), bool(final)
@@ -37,23 +39,6 @@ def test_success_is_worth_an_evaluation() -> None:
     assert after(7, 1.0, StopConfig(rule=Rule.BUDGET))[1:] == (False, False)
 
 
-def test_a_success_of_training_ends_it_where_it_is_a_witness() -> None:
-    config = replace(CONFIG, exploration=True)
-    totals = progress.start(16)._replace(first_success=jnp.int32(5))
-    whole = StopConfig(rule=Rule.BUDGET)
-    for usable, stopping, ends in ((True, SOLVED, True), (False, SOLVED, False), (True, whole, False)):
-        course, due, final = stop.after_update(
-            stop.begin(),
-            totals,
-            jnp.bool_(usable),
-            jnp.float32(0.1),
-            jnp.int32(100),
-            config,
-            rules_of(stopping, config),
-        )
-        assert (bool(due), bool(final), bool(course.over)) == (False, ends, ends)
-
-
 @pytest.mark.parametrize("stopping", [StopConfig(rule=Rule.BUDGET), SOLVED, HALVING])
 def test_an_expert_that_diverged_leaves(stopping: StopConfig) -> None:
     totals = progress.start(16)._replace(diverged=jnp.int32(1024))
@@ -63,7 +48,6 @@ def test_an_expert_that_diverged_leaves(stopping: StopConfig) -> None:
         jnp.bool_(False),
         jnp.float32(0.0),
         jnp.int32(100),
-        CONFIG,
         rules_of(stopping, CONFIG),
     )
     assert (bool(final), bool(course.over)) == (True, True)
@@ -72,7 +56,7 @@ def test_an_expert_that_diverged_leaves(stopping: StopConfig) -> None:
 def test_a_level_that_its_last_update_brings_to_a_rung_is_over_with_any_budget() -> None:
     totals, course = progress.start(16), stop.begin()._replace(updates=jnp.int32(7), rung_return=jnp.float32(0.5))
     course, _, final = stop.after_update(
-        course, totals, jnp.bool_(False), jnp.float32(0.0), jnp.int32(8), CONFIG, rules_of(HALVING, CONFIG)
+        course, totals, jnp.bool_(False), jnp.float32(0.0), jnp.int32(8), rules_of(HALVING, CONFIG)
     )
     assert (bool(final), bool(course.over)) == (True, True)
 

@@ -16,7 +16,8 @@ from configs.compose import compose_job
 from configs.schema import JobConfig
 from experts.config import RECORD_STEPS
 from experts.labels import Label, Source, Verdict
-from experts.train import Spent, UnitResult
+from experts.steps import EnvSteps
+from experts.train import UnitResult
 from experts.witness import Record, replay, succeeds
 from levelgen.level import ACTIONS, SIZES, Level
 from levelgen.sampling.sampler import sample_levels
@@ -30,7 +31,7 @@ from pipeline.store.layout import split_path
 
 T = TypeVar("T")
 PLAYED = 64  # levels of `played_split`
-SPENT = Spent(0, 0, 0)
+SPENT = EnvSteps()
 
 
 def made(kind: type, size: Size, count: int, rng: np.random.Generator, *, time: bool = False) -> Any:

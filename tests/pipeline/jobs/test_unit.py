@@ -36,7 +36,7 @@ def result(job: JobConfig) -> UnitResult:
     """Real levels, experts and witnesses."""
     ids = np.array(UNIT.level_ids, np.int32)
     levels = sample_levels(ids, SIZES[job.size], job.distribution)
-    result = train_levels(levels, ids, job.env_steps, job.expert, job.stop, job.task)
+    result = train_levels(levels, ids, job.env_steps, job.procedure, job.task)
     assert Label.SOLVED in [verdict.label for verdict in result.verdicts], "the tests need a solved level"
     return result
 
