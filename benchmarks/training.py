@@ -66,9 +66,7 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
 
     _, seen, last_value = act(experts.params, acting)
     advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
-    samples = Samples(
-        seen.moving, seen.action, seen.log_probability, seen.value, advantage, jnp.zeros_like(advantage)
-    )
+    samples = Samples(seen.moving, seen.action, seen.log_probability, seen.value, advantage, jnp.zeros_like(advantage))
     rows = jax.vmap(ppo.as_rows, in_axes=-2)(samples)
     constants = LevelConstants(network.constant(levels), action_mask(levels))
     constants = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), constants)

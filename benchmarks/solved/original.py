@@ -170,7 +170,7 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
         first_success=jnp.int32(first_success(goal)),
         diverged=jnp.int32(progress.NEVER),
     )
-    nothing = Success(np.zeros(0), np.int32(0))
+    nothing = Success(np.zeros((0, 6)), np.zeros((), np.int32))
     evaluation = judge.Evaluation(np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, nothing)
     witness = judge.witness_of([evaluation], Source.EXPLORATION, config)
     of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))

@@ -116,7 +116,17 @@ def test_table(ours: Results, theirs: Results) -> None:
     text = text_of([theirs, ours])
     assert "**Size s, 64k env steps**, levels 1,000,000 to 1,000,009:" in text
     mean_steps = (2_000 + 5_000 + 16_000 + 16_001 + 40_000 + 4 * 64_000) / 9
-    of_ours = ["`alone`", "9 of 10", share(6, 9), "100.0%", share(3, 9), f"{mean_steps + 60:,.0f}", "2.5", "0.500", "35"]
+    of_ours = [
+        "`alone`",
+        "9 of 10",
+        share(6, 9),
+        "100.0%",
+        share(3, 9),
+        f"{mean_steps + 60:,.0f}",
+        "2.5",
+        "0.500",
+        "35",
+    ]
     solved, paired = text.split("Level by level:")
     assert cells(solved, "`alone`") == of_ours
     assert cells(solved, "`reference`")[1:4] == ["9 of 10", share(3, 9), "100.0%"]
@@ -256,7 +266,11 @@ def test_results_under_other_settings_are_left_alone(tmp_path: Path, ours: Resul
 @pytest.mark.campaign
 def test_a_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process dies, which leaves the lines of units that were done; the next run trains the others only."""
-    variant, file, scratch = Variant("small", untouched(StopConfig(rule=Rule.SOLVED), SMALL)), tmp_path / "solved.parquet", tmp_path / "scratch.jsonl"
+    variant, file, scratch = (
+        Variant("small", untouched(StopConfig(rule=Rule.SOLVED), SMALL)),
+        tmp_path / "solved.parquet",
+        tmp_path / "scratch.jsonl",
+    )
     of = Header("small", "s", 4_096, plain(variant.procedure))
     monkeypatch.setattr(measuring, "scratch_of", lambda _: scratch)
     level_id, before = row(FIRST, "solved", 7, 7)
