@@ -56,10 +56,10 @@ class Verdict:
     steps_to_goal: int | None  # env steps of the witness's first episode
     steps_to_first_success: int | None  # env steps of training
     env_steps: int  # of training
-    evaluation_steps: int  # env steps of its evaluations
     learning_curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
     best_return: float  # of training's episodes, shaping included; -inf: none ended
     episodes: int  # of training
+    evaluation_steps: int = 0  # env steps
     scout_steps: int = 0  # env steps
     search_steps: int = 0  # env steps
 
@@ -110,7 +110,6 @@ def untrained(
         steps_to_goal=steps_to_goal,
         steps_to_first_success=None,
         env_steps=0,
-        evaluation_steps=0,
         learning_curve=[],
         best_return=float("-inf"),
         episodes=0,

@@ -10,7 +10,7 @@ EXAMPLE = """\
 levelproof generate                                 64 small levels into data
 levelproof generate size=m levels=1k budget=1M      more, larger, for longer
 levelproof generate distribution=vehicles out=cars  other levels
-levelproof generate stop=budget expert.width=128    other experts"""
+levelproof generate stop.rule=budget expert.width=128    other experts"""
 INDENT = 24  # where meanings start
 # What people change; `levelproof settings` has the others
 OFTEN = (
@@ -19,7 +19,7 @@ OFTEN = (
     "levels",
     "first_level",
     "budget",
-    "stop",
+    "procedure",
     "out",
     "keep_experts",
     "workers",

@@ -20,7 +20,7 @@ EXAMPLE = "levelproof settings thruster"
 INDENT = 34  # where meanings start
 INTRODUCTION = """# Settings
 
-Every setting of `levelproof generate`, with its default, as one types it: `levelproof generate size=m stop=budget`. \
+Every setting of `levelproof generate`, with its default, as one types it: `levelproof generate size=m budget=64k`. \
 `levelproof settings WORD` finds them on the command line. Names in brackets and parentheses are where the reference, \
 Kinetix 3.0.2, has the number. This page is written by `levelproof settings --markdown`, from the comments beside the \
 fields of the dataclasses.

@@ -54,7 +54,7 @@ def test_out_may_be_any_path(text: str) -> None:
         ("levels=0", "levels is '0'"),
         ("levels=1.5", "not a whole number"),
         ("budget=0", "budget is '0'"),
-        ("budget=1000", "one update of an expert takes 1024 env steps"),
+        ("budget=1000", "one update of an expert takes 2048 env steps"),
         ("budget=3B", "budget is 3000000000: an expert can count no more than 2147483647 env steps"),
         ("budget=", "budget is ''"),
         ("budgt=1k", r"no setting budgt \(did you mean budget\?\)"),
@@ -102,7 +102,7 @@ def test_the_hash_follows_results_and_nothing_else() -> None:
         "size=m",
         "distribution=free",
         "budget=129k",
-        "expert.width=32",
+        "expert.width=64",
         "task.frame_skip=1",
         "distribution.swap_chance=0",
     ):
@@ -121,7 +121,7 @@ def test_every_setting_that_decides_results_is_hashed() -> None:
     [
         [],
         ["size=l", "budget=64k"],
-        ["expert.width=32", "task.physics.faithful_padding=false"],
+        ["expert.width=64", "task.physics.faithful_padding=false"],
         ["size=8-8-8-4", "distribution=vehicles"],
         ["distribution=clutter", "distribution.max_size=0.5"],
     ],

@@ -69,5 +69,5 @@ def test_all_can_be_typed_back() -> None:
 def test_choices_are_explained_where_the_meaning_does_not() -> None:
     text = {setting.name: setting.text for setting in SETTINGS}
     assert "flat: all features side by side; entity: " in text["expert.network"]
-    assert text["stop"].endswith("(budget, halving, solved)")
+    assert text["procedure"].endswith("(default, label, masters, published)")
     assert "(ray, inline)" not in text["executor"]

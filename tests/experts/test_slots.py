@@ -18,7 +18,7 @@ from experts.queue import empty_queue, enter
 from experts.scout import scout
 from experts.slots import LevelQueue, Mode, empty_slots
 from experts.stop import rules_of
-from experts.success import no_success
+from experts.success import Success, no_success
 from experts.train import train_levels
 from experts.witness import take
 from levelgen.level import SIZES, Level
@@ -187,8 +187,8 @@ def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level
         assert kept
         training = kept.begun.training
         params = jax.tree.map(lambda x, weight=weight: np.full_like(x, weight), training.train_state.params)
-        # without a success: that would be a witness
-        success = jax.tree.map(np.zeros_like, training.success)
+        # what it finds by chance would be a witness: it takes doing nothing for its success
+        success = Success(np.zeros_like(training.success.action), np.ones_like(training.success.length))
         training = training._replace(train_state=training.train_state._replace(params=params), success=success)
         begun[int(IDS[i])] = kept._replace(begun=kept.begun._replace(training=training))
     some, budget = take(levels, np.arange(2)), 2 * UPDATES * 512

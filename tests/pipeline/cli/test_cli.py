@@ -68,8 +68,9 @@ def test_version(tmp_path: Path) -> None:
     [
         (["size=xl"], ["size is 'xl'", "choose one of s, m, l"]),
         (["budget=0"], ["budget is '0'", "at least 1"]),
-        (["budget=1000"], ["1024"]),
-        (["stop=never"], ["there is no stop never", "choose one of budget, halving, solved"]),
+        (["budget=1000"], ["2048"]),
+        (["procedure=never"], ["there is no procedure never", "choose one of default, label, masters, published"]),
+        (["stop=budget"], ["stop is 'budget', but it is a group of settings"]),
         (["stop.rule=never"], ["stop.rule", "never"]),
         (["levels=abc"], ["levels is 'abc'", "64k"]),
         (["levls=5"], ["no setting levls", "did you mean levels?"]),
@@ -122,8 +123,8 @@ def test_a_second_run_says_that_all_is_there(made: Path) -> None:
 
 @pytest.mark.slow
 def test_another_configuration_names_what_differs(made: Path) -> None:
-    done = here(["generate", *TINY, "expert.width=32", "expert.clip=0.1"], made)
-    assert_refused(done, 2, "data/5k/s", "expert.clip was 0.2, now 0.1; expert.width was 64, now 32", "out=NAME")
+    done = here(["generate", *TINY, "expert.width=64", "expert.clip=0.1"], made)
+    assert_refused(done, 2, "data/5k/s", "expert.clip was 0.2, now 0.1; expert.width was 32, now 64", "out=NAME")
 
 
 @pytest.mark.slow

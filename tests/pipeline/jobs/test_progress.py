@@ -5,6 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
+from experts.steps import EnvSteps
 from pipeline.jobs.progress import Board, Tally, duration
 from pipeline.jobs.schedule import Summary, WorkUnit
 
@@ -23,7 +24,7 @@ def test_the_share_grows_with_the_levels() -> None:
     assert (now.trained, now.solved_so_far) == (7, 3)
     now.running[UNIT] = (9_000, 16, 3)
     assert now.share == pytest.approx(16 / 64)
-    now.ended(UNIT, Summary(levels=16, solved=5, env_steps=16_000, evaluated=0, idle=0))
+    now.ended(UNIT, Summary(levels=16, solved=5, spent=EnvSteps(trained=16_000)))
     assert (now.share, now.done, now.solved_so_far) == (pytest.approx(16 / 64), 16, 5)
 
 
@@ -82,7 +83,7 @@ def test_lines_where_there_is_no_terminal() -> None:
         board.refresh()
         board.refresh()
         for first in range(0, 64, 4):
-            board.ended(WorkUnit(tuple(range(first, first + 4))), Summary(4, 1, 4_000, 0, 0))
+            board.ended(WorkUnit(tuple(range(first, first + 4))), Summary(4, 1, EnvSteps(trained=4_000)))
     lines = text.getvalue().splitlines()
     assert len(lines) == 2  # not one for every refresh, nor for every commit where they come fast
     assert "0/64 levels" in lines[0]
@@ -94,7 +95,7 @@ def test_commits_are_told_when_the_last_line_is_old(monkeypatch: pytest.MonkeyPa
     board = Board(tally(), Console(file=text))
     monkeypatch.setattr("pipeline.jobs.progress.LINE_AFTER", 0.0)
     board.refresh()
-    board.ended(UNIT, Summary(16, 5, 16_000, 0, 0))
+    board.ended(UNIT, Summary(16, 5, EnvSteps(trained=16_000)))
     assert "16/64 levels · 5 solved" in text.getvalue().splitlines()[1]
 
 
@@ -108,7 +109,7 @@ def test_a_bar_on_a_terminal() -> None:
     text = io.StringIO()
     board = Board(tally(), Console(file=text, force_terminal=True, width=160))
     with board.shown():
-        board.ended(UNIT, Summary(16, 5, 16_000, 0, 0))
+        board.ended(UNIT, Summary(16, 5, EnvSteps(trained=16_000)))
     assert "16/64 levels · 5 solved" in text.getvalue()
 
 

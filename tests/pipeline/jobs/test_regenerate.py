@@ -82,11 +82,11 @@ def test_what_cannot_go_on_is_refused(folder: Path, tmp_path: Path) -> None:
         return str(error.value)
 
     assert "give a larger budget" in refused("budget=8k")
-    assert "expert.width was 64, now 32" in refused("budget=24k", "expert.width=32")
+    assert "expert.width was 32, now 64" in refused("budget=24k", "expert.width=64")
     without = tmp_path / "data"
-    assert here(["generate", *SETTINGS, "levels=2", "budget=2k", f"out={without}"], tmp_path).returncode == 0
+    assert here(["generate", *SETTINGS, "levels=2", "budget=4k", f"out={without}"], tmp_path).returncode == 0
     with pytest.raises(UserError, match="has kept no experts: make it with keep_experts=true"):
-        require_same_experts(made_job("x", "budget=24k", f"continue_from={without / '2k/s'}"))
+        require_same_experts(made_job("x", "budget=24k", f"continue_from={without / '4k/s'}"))
 
 
 @pytest.mark.slow
@@ -99,7 +99,7 @@ def test_a_damaged_checkpoint_is_named(folder: Path, tmp_path: Path) -> None:
         with pytest.raises(Failure, match=r"experts in .*damaged cannot be read .* leave out continue_from"):
             load_experts(copy, made_job("data", *SETTINGS, "budget=8k"))
     with pytest.raises(Failure, match=r"cannot be read \(.* has another shape or type\)"):
-        load_experts(path, made_job("data", *SETTINGS, "budget=8k", "expert.width=32"))
+        load_experts(path, made_job("data", *SETTINGS, "budget=8k", "expert.width=64"))
 
 
 @pytest.mark.slow

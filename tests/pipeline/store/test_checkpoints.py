@@ -10,6 +10,7 @@ import pytest
 from experts.judge import Kept
 from experts.labels import Label
 from experts.slots import begin
+from experts.success import no_success
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 from pipeline.store import manifest
@@ -21,11 +22,11 @@ UNITS = 3
 
 
 def test_each_unit_s_experts_come_back_bit_for_bit(tmp_path: Path) -> None:
-    job = made_job("data", "expert.width=8", "expert.environments=24")
+    job = made_job("data", "expert.width=8", "expert.environments=24", "expert.attempts=8")
     ids = np.arange(UNITS, dtype=np.int32)
     levels = sample_levels(ids, SIZES["s"], job.distribution)
     rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(lambda: begin(levels, ids, job.expert))
+    shapes = jax.eval_shape(lambda: begin(levels, ids, no_success(len(ids)), job.expert))
     random = lambda x: np.frombuffer(rng.bytes(x.size * x.dtype.itemsize), x.dtype).reshape(x.shape)
     begun = jax.tree.map(lambda x: rng.random(x.shape) < 0.5 if x.dtype == bool else random(x), shapes)
     kept = [Kept(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(UNITS)]
@@ -46,7 +47,7 @@ def test_a_worker_reads_the_fragments_of_its_levels_only(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(manifest, "read_fragment", noted)
     assert experts_for(made_job("data", f"continue_from={split}"), [2, 3]) == {}
-    assert read == [("000000000002-000000000003", {"level_id", "label", "experts"})]
+    assert read == [("000000000002-000000000003", {"level_id", "witness", "experts"})]
 
 
 def test_a_source_that_is_not_there_is_not_taken_for_one_without_experts(tmp_path: Path) -> None:

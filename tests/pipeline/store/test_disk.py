@@ -12,6 +12,7 @@ import pytest
 
 from experts.judge import Kept
 from experts.slots import begin as begin_experts
+from experts.success import no_success
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 from pipeline.store.checkpoints import save_experts
@@ -37,10 +38,10 @@ def tiny(tmp_path: Path) -> Iterator[Path]:
 
 
 def kept_experts() -> dict[int, Kept]:
-    job = made_job("data", "expert.width=8", "expert.environments=24")
+    job = made_job("data", "expert.width=8", "expert.environments=24", "expert.attempts=8")
     ids = np.arange(1, dtype=np.int32)
     levels = sample_levels(ids, SIZES["s"], job.distribution)
-    begun = jax.eval_shape(lambda: begin_experts(levels, ids, job.expert))
+    begun = jax.eval_shape(lambda: begin_experts(levels, ids, no_success(len(ids)), job.expert))
     return {0: Kept(jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), begun), [0.0])}
 
 

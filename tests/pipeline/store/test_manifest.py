@@ -136,14 +136,14 @@ def test_another_version_is_refused(tmp_path: Path, job: JobConfig) -> None:
     table = pq.read_table(path)
     metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"9"}
     pq.write_table(table.replace_schema_metadata(metadata), path)
-    with pytest.raises(Failure, match="has manifest version 9, this program reads 4"):
+    with pytest.raises(Failure, match="has manifest version 9, this program reads 5"):
         read_manifest(tmp_path)
 
 
 def test_two_configurations_in_one_split_are_named(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [0])
-    commit(tmp_path, made_job("data", "expert.width=32"), [1])
-    with pytest.raises(Failure, match=r"mixes two configurations.*expert.width was 64, now 32.*with the shards"):
+    commit(tmp_path, made_job("data", "expert.width=64"), [1])
+    with pytest.raises(Failure, match=r"mixes two configurations.*expert.width was 32, now 64.*with the shards"):
         read_manifest(tmp_path)
 
 

@@ -34,9 +34,9 @@ def test_the_folder_is_made_and_its_path_is_budget_and_size(tmp_path: Path, job:
 def test_another_configuration_is_refused_with_every_difference(tmp_path: Path, job: JobConfig) -> None:
     with writing(job, print) as (split, _):
         committed(job, split)
-    other = made_job(str(tmp_path / "data"), "expert.width=32", "task.frame_skip=3")
+    other = made_job(str(tmp_path / "data"), "expert.width=64", "task.frame_skip=3")
     with (
-        pytest.raises(UserError, match=r"expert.width was 64, now 32; task.frame_skip was 2, now 3.*out=NAME"),
+        pytest.raises(UserError, match=r"expert.width was 32, now 64; task.frame_skip was 2, now 3.*out=NAME"),
         writing(other, print),
     ):
         pass
