@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experts.search.config import SearchConfig
-from experts.search.explore import Search, begin, explore
+from experts.search.explore import Search, begin, draw, explore
 from experts.search.play import arena, fresh_walk, play
 from experts.search.search import Searched, search, side_by_side
 from experts.search.shorten import shorten
@@ -87,6 +87,14 @@ def test_a_level_alone_gives_what_it_gives_among_others() -> None:
 def test_another_id_is_another_search() -> None:
     one = search(take(levels(), np.array([0])), np.array([9], np.int32), CONFIG, DEFAULT_RULES)
     assert (one.success.action[0] != found().success.action[0]).any()
+
+
+def test_no_chance_twice() -> None:
+    """Rounds and levels draw their own."""
+    keys = begun().key
+    drawn = [draw(keys[level], jnp.int32(env_steps), CONFIG) for level in (0, 1) for env_steps in (0, ROUND)]
+    for numbers in zip(*drawn, strict=True):
+        assert len({np.asarray(x).tobytes() for x in numbers}) == len(drawn)
 
 
 def test_an_interruption_changes_nothing() -> None:
