@@ -4,22 +4,14 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 
 from experts.config import RECORD_STEPS
 from experts.labels import Label, Source, Verdict, trivial_reason, unsolvable_reason, untrained
 from experts.witness import blocks, replay, steps_to_goal, succeeds, take
 from levelgen.level import ACTIONS, Level
-from levelgen.proofs import Proof, examine
+from levelgen.proofs import Facts, Proof, examine
 from levelgen.task.rules import TaskParams
-
-
-class Known(NamedTuple):
-    """`levelgen.proofs.Facts` on the host."""
-
-    reaches: Bool[np.ndarray, " level"]
-    fails: Bool[np.ndarray, " level"]
-    proof: Int[np.ndarray, " level"]
 
 
 class Before(NamedTuple):
@@ -44,11 +36,11 @@ def decide(levels: Level, rules: TaskParams) -> Before:
     for i in np.flatnonzero(facts.proof != Proof.NONE):
         fails = bool(facts.fails[i])
         verdicts[i] = untrained(Label.UNSOLVABLE, unsolvable_reason(Proof(int(facts.proof[i])), fails), fails)
-    return Before(verdicts, facts.fails)
+    return Before(verdicts, np.asarray(facts.fails))
 
 
-def facts_of(levels: Level, rules: TaskParams) -> Known:
+def facts_of(levels: Level, rules: TaskParams) -> Facts:
     """`levelgen.proofs.examine` for any number of levels, on the host; it watches one record's length."""
     count, watched = levels.role.shape[-1], min(RECORD_STEPS, rules.max_timesteps)
     parts = [jax.device_get(examine(take(levels, lanes), rules, watched)) for lanes in blocks(count)]
-    return Known(*(np.concatenate(x, -1)[:count] for x in zip(*parts, strict=True)))
+    return jax.tree.map(lambda *xs: np.concatenate(xs, -1)[:count], *parts)

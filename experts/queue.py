@@ -64,7 +64,8 @@ def enter(
         if mine := {i - first: begun[i] for i in some if i in begun}:
             experts = jax.tree.map(np.array, experts)
             for i, expert in mine.items():
-                jax.tree.map(partial(_put_row, i), experts, expert)
+                for rows, row in zip(jax.tree.leaves(experts), jax.tree.leaves(expert), strict=True):
+                    rows[i] = row
         nowhere = [queue.capacity] * (GROUP - len(some))
         queue = _put(queue, group, ids, experts, np.array(next_indices(queue, len(some)) + nowhere))
         queue = queue._replace(come=np.int32(int(queue.come) + len(some)))
@@ -81,7 +82,3 @@ def _put(
         level_ids=put(queue.level_ids, level_ids),
         begun=jax.tree.map(put, queue.begun, experts),
     )
-
-
-def _put_row(row: int, rows: np.ndarray, new: np.ndarray) -> None:
-    rows[row] = new

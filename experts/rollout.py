@@ -32,8 +32,8 @@ class Manner(NamedTuple):
 
     greedy: Bool[Array, " lane"]  # the most probable one
     stickiness: Float[Array, " lane"]  # chance of the last one again
-    rehearsing: Bool[Array, " lane"]  # as in `rehearsal`
-    rehearsal: Int[Array, "256 6 level"]  # by env step of the episode
+    rehearsing: Bool[Array, " lane"]  # what `rehearsal` has for the episode's env step
+    rehearsal: Int[Array, "256 6 level"]
 
 
 class Trajectory(NamedTuple):
@@ -87,6 +87,7 @@ def rollout(
     """
     level_count = keys.shape[0]
     environments = len(manner.greedy) // level_count
+    level_of = jnp.arange(len(manner.greedy)) // environments
     lanes = repeat(levels, environments)
     constant, live = network.constant(levels), action_mask(lanes)
     per_level = lambda x: x.reshape(*x.shape[:-1], level_count, environments)
@@ -107,7 +108,8 @@ def rollout(
         uniform = flat(jnp.moveaxis(jax.vmap(draw, in_axes=(0, None))(keys, t), 0, 1))
         action = jnp.where(manner.greedy, most_probable(logits), sample(logits, uniform[:-1]))
         action = jnp.where(uniform[-1] < manner.stickiness, last, action)
-        action = jnp.where(manner.rehearsing, rehearsed(manner.rehearsal, world.timestep), action)
+        rehearsed = manner.rehearsal[world.timestep, :, level_of].T.astype(jnp.int32)
+        action = jnp.where(manner.rehearsing, rehearsed, action)
         action = jnp.where(live, action, 0)
         log_probs = log_probability(logits, action, live)
         after, outcome = task.step(lanes, world, action, rules)
@@ -117,9 +119,3 @@ def rollout(
 
     acting, trajectory = jax.lax.scan(act, acting, jnp.arange(steps))
     return acting, trajectory, look(acting.world)[2]
-
-
-def rehearsed(actions: Int[Array, "time 6 level"], timestep: Int[Array, " lane"]) -> Int[Array, "6 lane"]:
-    """The action of each lane's env step."""
-    environments = len(timestep) // actions.shape[-1]
-    return actions[timestep, :, jnp.arange(len(timestep)) // environments].T.astype(jnp.int32)

@@ -18,8 +18,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from levelgen.level import Level
 from levelgen.task import rules as task
+from levelgen.task.actions import controls
 from levelgen.task.rules import DEFAULT_RULES, TaskParams, TaskState
-from physics.pairs import pairs_of
+from physics.buffers import zeros_of
 from physics.types import Manifold, State
 from physics.vector import select, unvec, vec
 
@@ -88,12 +89,12 @@ def take(tree: T, lanes: np.ndarray) -> T:
 def _replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskParams) -> Record:
     def act(carry: tuple[TaskState, Manifold], action):
         now, manifold = carry
-        after, outcome, contacts = task.advance_seen(level, now, action, rules)
+        after, outcome, _, contacts = task.advance_driven(level, now, controls(level, action), rules, seen=True)
         record = Record(
             now.state,
             manifold,
-            joint_point(level, now.state),
-            thruster_point(level, now.state),
+            _points(now.state, model.joint_a, model.joint_anchor_a),
+            _points(now.state, model.thruster_body, model.thruster_position),
             now.timestep,
             now.last_distance,
             action,
@@ -102,20 +103,8 @@ def _replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskPar
         blank = lambda x: jnp.where(outcome.done, jnp.zeros_like(x), x)
         return (task.restart(level, after, outcome.done), jax.tree.map(blank, contacts)), record
 
-    start = task.reset(level), _no_manifold(level)
-    return jax.lax.scan(act, start, action)[1]
-
-
-def joint_point(level: Level, state: State) -> Float[Array, "joint 2 lane"]:
-    """Where each joint sits on its body a, in the world, m."""
-    model = level.model
-    return _points(state, model.joint_a, model.joint_anchor_a)
-
-
-def thruster_point(level: Level, state: State) -> Float[Array, "thruster 2 lane"]:
-    """Where each thruster sits, in the world, m."""
-    model = level.model
-    return _points(state, model.thruster_body, model.thruster_position)
+    model, start = level.model, task.reset(level)
+    return jax.lax.scan(act, (start, zeros_of(Manifold, level.size, len(start.timestep))), action)[1]
 
 
 def _points(state: State, body: Int[Array, "thing lane"], point: Float[Array, "thing 2 lane"]) -> Array:
@@ -124,9 +113,3 @@ def _points(state: State, body: Int[Array, "thing lane"], point: Float[Array, "t
     rotation = pick(state.rotation)
     centre = vec(state.position).map(pick)
     return unvec(vec(point).rotate(jnp.cos(rotation), jnp.sin(rotation)) + centre)
-
-
-def _no_manifold(level: Level) -> Manifold:
-    contacts, lanes = pairs_of(level.size).contacts, level.state.rotation.shape[-1]
-    scalar, vector = jnp.zeros((contacts, lanes)), jnp.zeros((contacts, 2, lanes))
-    return Manifold(jnp.zeros((contacts, lanes), bool), vector, scalar, vector, scalar)

@@ -41,8 +41,8 @@ class Levers(NamedTuple):
 
 
 def clear(block: Block) -> None:
-    """No contact acts, none is remembered."""
-    constraints, after = block.scratch.constraints, block.after
+    """No contact acts, none is remembered, and none is active, if anybody looks."""
+    constraints, after, seen = block.scratch.constraints, block.after, block.seen
 
     def blank(ref):
         def one(i):
@@ -53,6 +53,13 @@ def clear(block: Block) -> None:
     contacts = after.contact_active, after.contact_normal_impulse, after.contact_tangent_impulse
     for ref in (*contacts, constraints.touching, constraints.counts):
         each(ref.shape[0], blank(ref))
+    if seen is not None:
+
+        def blank_all(c):
+            for ref in (seen.active, seen.normal, seen.penetration, seen.point, seen.restitution_velocity):
+                ref[c] = jnp.zeros_like(ref[c])
+
+        each(seen.active.shape[0], blank_all)
 
 
 def count_touching(block: Block, kind: int, contacts: list[Contact]) -> Float[Array, " lane"]:
@@ -73,19 +80,6 @@ def bounce(block: Block, a: Scalar, b: Scalar, contact: Contact) -> Float[Array,
 
     approach = (point_velocity(b) - point_velocity(a)).dot(contact.normal)
     return approach * jnp.minimum(model.restitution[a], model.restitution[b])
-
-
-def see_nothing(block: Block) -> None:
-    """No contact is active, if anybody looks."""
-    seen = block.seen
-    if seen is None:
-        return
-
-    def blank(c):
-        for ref in (seen.active, seen.normal, seen.penetration, seen.point, seen.restitution_velocity):
-            ref[c] = jnp.zeros_like(ref[c])
-
-    each(seen.active.shape[0], blank)
 
 
 def see(block: Block, c: Scalar, contact: Contact) -> None:

@@ -23,7 +23,6 @@ def fall(block: Block, params: Params) -> None:
 def find_contacts(block: Block, params: Params) -> None:
     """Contacts of the pairs that come near each other, as constraints; they push with what they remember."""
     contact.clear(block)
-    contact.see_nothing(block)
 
     def found(kind: int, numbers: list, contacts: list[contact.Contact]) -> None:
         so_far = contact.count_touching(block, kind, contacts)

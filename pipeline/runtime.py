@@ -40,8 +40,9 @@ def prepare_jax(core: int | None = None) -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = " ".join([flags, *(flag for flag in XLA_FLAGS if flag not in flags)]).strip()
     os.environ.update(dict.fromkeys(THREADS, "1"))
-    if core is not None:
-        _pin(core)
+    if core is not None and sys.platform == "linux":  # no other system can
+        for thread in os.listdir("/proc/self/task"):  # all of this process; those yet to come follow them
+            os.sched_setaffinity(int(thread), {core})
     import jax  # reads the environment above
 
     programs = cache_folder() / "jax"
@@ -83,10 +84,3 @@ def _allowed_cores() -> list[int]:
     if sys.platform == "linux":
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
-
-
-def _pin(core: int) -> None:
-    """Every thread of this process, those yet to come included, on one core; only Linux can."""
-    if sys.platform == "linux":
-        for thread in os.listdir("/proc/self/task"):
-            os.sched_setaffinity(int(thread), {core})

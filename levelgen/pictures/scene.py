@@ -80,17 +80,12 @@ def _paper(footer: float) -> str:
     return above + rectangle((-style.BORDER, -footer), (right, 0), style.PAPER) if footer else above
 
 
-def _body_colours(level: Level, body: int) -> tuple[style.Colour, style.Colour, bool]:
-    """Fill, edge, and whether it is hatched because it cannot move."""
-    role, fixed = Role(int(level.role[body])), level.model.inverse_mass[body] == 0
+def _body(level: Level, state: State, body: int) -> Part:
+    role, fixed = Role(int(level.role[body])), bool(level.model.inverse_mass[body] == 0)
     fill = style.ROLE_COLOUR[role]
     if fixed:
         fill = style.FIXED_PLAIN if role == Role.PLAIN else _shade(fill, 0.72)
-    return fill, _shade(fill, style.SHADE), bool(fixed)
-
-
-def _body(level: Level, state: State, body: int) -> Part:
-    fill, edge, fixed = _body_colours(level, body)
+    edge = _shade(fill, style.SHADE)
     circle = body - level.size.polygons
     if circle >= 0:
         radius = float(level.model.radius[circle])

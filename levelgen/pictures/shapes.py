@@ -12,8 +12,7 @@ import jax
 import numpy as np
 from PIL import ImageFont
 
-from levelgen.level import WORLD_SIDE
-from levelgen.pictures.style import BORDER, EDGE, HATCHING, HEADER, Colour
+from levelgen.pictures.style import EDGE, HATCHING, Colour
 
 Point = tuple[float, float]
 Host = np.ndarray | jax.Array  # levels and states that were read or computed
@@ -37,11 +36,6 @@ class Scene:
     parts: tuple[Part, ...]
     title: str
     footer: float  # m of picture below the world
-
-    @property
-    def top(self) -> float:
-        """Height of the picture's upper edge above the world's lower one, m."""
-        return WORLD_SIDE + BORDER + HEADER
 
 
 def polygon(

@@ -7,30 +7,29 @@ Programs that do not play them show the first scene.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from pathlib import Path
 from xml.sax.saxutils import escape
 
 import numpy as np
 
 from levelgen.level import WORLD_SIDE
 from levelgen.pictures.shapes import Part, Scene, number, rectangle
-from levelgen.pictures.style import BORDER, HATCH, PAPER, PIXELS
+from levelgen.pictures.style import BORDER, HATCH, HEADER, PAPER, PIXELS
 
 FONTS = "Aileron, Helvetica, Arial, sans-serif"
 WIDTH = WORLD_SIDE + 2 * BORDER  # m, of a picture
-
-
-def write_svg(scenes: Sequence[Scene], path: Path, seconds: Sequence[float]) -> None:
-    """A film that repeats, each scene shown for its seconds; of one scene, a picture."""
-    path.write_text(svg_of(scenes, seconds), encoding="utf-8")
+TOP = WORLD_SIDE + BORDER + HEADER  # m, of a picture's upper edge above the world's lower one
 
 
 def svg_of(scenes: Sequence[Scene], seconds: Sequence[float], pixels: int = PIXELS) -> str:
-    """The text of the file, `pixels` wide. The scenes are of one level."""
-    first, clock = scenes[0], Clock.of(seconds)
-    height = first.top + first.footer
+    """The text of a file, `pixels` wide: a film that repeats, each scene shown for its seconds; of one, a picture.
+
+    The scenes are of one level.
+    """
+    first, (*ends, length) = scenes[0], accumulate(seconds)
+    clock = Clock(tuple(end / length for end in (0.0, *ends)), length)
+    height = TOP + first.footer
     size = f'width="{pixels}" height="{round(pixels * height / WIDTH)}" preserveAspectRatio="none"'
-    view = f'viewBox="{-BORDER} {number(-first.top)} {number(WIDTH)} {number(height)}"'
+    view = f'viewBox="{-BORDER} {number(-TOP)} {number(WIDTH)} {number(height)}"'
     parts = [_part(states, clock) for states in zip(*(scene.parts for scene in scenes), strict=True)]
     return "\n".join(
         [
@@ -38,7 +37,7 @@ def svg_of(scenes: Sequence[Scene], seconds: Sequence[float], pixels: int = PIXE
             f"<title>{escape(first.title)}</title>",
             f"<defs>{HATCH}</defs>",
             '<g transform="scale(1,-1)" stroke-linejoin="round">',
-            rectangle((-BORDER, -first.footer), (WIDTH - BORDER, first.top), PAPER),
+            rectangle((-BORDER, -first.footer), (WIDTH - BORDER, TOP), PAPER),
             *filter(None, parts),
             "</g></svg>\n",
         ]
@@ -51,11 +50,6 @@ class Clock:
 
     starts: tuple[float, ...]  # shares of its length
     length: float  # s
-
-    @classmethod
-    def of(cls, seconds: Sequence[float]) -> "Clock":
-        *ends, length = accumulate(seconds)
-        return cls(tuple(end / length for end in (0.0, *ends)), length)
 
     def animate(self, tag: str, values: Sequence[str], smooth: bool) -> str:
         """An element that makes its parent follow one value a scene; of equal ones in a row, the ends alone."""

@@ -24,12 +24,8 @@ class Caption:
 
 def caption_parts(caption: Caption) -> list[Part]:
     """Title, badge and clock, each a part."""
-    middle, left, right, size = (
-        WORLD_SIDE + style.BORDER + style.HEADER / 2,
-        0.04,
-        WORLD_SIDE - 0.04,
-        style.CAPTION_SIZE,
-    )
+    middle, size = WORLD_SIDE + style.BORDER + style.HEADER / 2, style.CAPTION_SIZE
+    left, right = 0.04, WORLD_SIDE - 0.04
     title, clock, outcome = (printable(words) for words in (caption.title, caption.clock, caption.outcome))
     badge = text_width(outcome, size) + 0.3 if outcome else 0.0
     title = _fitted(title, right - left - badge - text_width(clock, size) - 0.1, size)

@@ -114,7 +114,7 @@ def hands(size: Size, dist: Distribution) -> list[tuple[type, tuple[int, ...]]]:
         (FillingDraws, (turns(size),)),
         (BodyDraws, (turns(size), proposals)),
         (ThrusterDraws, (size.thrusters,)),
-        (OrderDraws, (shuffled_rows(size),)),
+        (OrderDraws, (sum(shuffled_rows(size)),)),
     ]
 
 

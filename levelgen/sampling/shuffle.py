@@ -22,9 +22,9 @@ class OrderDraws(NamedTuple):
     order: Float[Array, "row lane"]
 
 
-def shuffled_rows(size: Size) -> int:
-    """How many rows are shuffled."""
-    return sum(_rows_of_kinds(size))
+def shuffled_rows(size: Size) -> tuple[int, int, int, int]:
+    """How many rows of each kind are shuffled."""
+    return size.polygons - FIXED_POLYGONS, size.circles, size.joints, size.thrusters
 
 
 def shuffle(level: Level, draws: OrderDraws) -> Level:
@@ -43,7 +43,7 @@ def shuffle(level: Level, draws: OrderDraws) -> Level:
 
 def draw_order(size: Size, numbers: Float[Array, "row lane"]) -> dict[str, Int[Array, "row lane"]]:
     """For each row of an axis, by its name in annotations, the row its content comes from."""
-    drawn = jnp.split(numbers, np.cumsum(_rows_of_kinds(size))[:-1])
+    drawn = jnp.split(numbers, np.cumsum(shuffled_rows(size))[:-1])
     polygons, circles, joints, thrusters = (jnp.argsort(part, 0).astype(jnp.int32) for part in drawn)
     scenery = jnp.broadcast_to(jnp.arange(FIXED_POLYGONS)[:, None], (FIXED_POLYGONS, numbers.shape[-1]))
     polygons = jnp.concatenate([scenery, polygons + FIXED_POLYGONS])
@@ -61,10 +61,6 @@ def _in_order(things: T, order: dict[str, Int[Array, "row lane"]]) -> T:
         elif (axis := hint.dim_str.split()[0]) in order:
             moved[name] = _take(values, order[axis])
     return replace(things, **moved)  # pyright: ignore[reportArgumentType]
-
-
-def _rows_of_kinds(size: Size) -> tuple[int, int, int, int]:
-    return size.polygons - FIXED_POLYGONS, size.circles, size.joints, size.thrusters
 
 
 def separate(model: Model) -> Bool[Array, "body body lane"]:

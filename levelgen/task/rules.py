@@ -114,14 +114,6 @@ def advance(
     return advance_driven(level, now, controls(level, action), params)[:2]
 
 
-def advance_seen(
-    level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
-) -> tuple[TaskState, StepResult, Manifold]:
-    """The same, and the contacts of the last physics step."""
-    after, result, _, manifold = advance_driven(level, now, controls(level, action), params, seen=True)
-    return after, result, manifold
-
-
 def advance_driven(
     level: Level, now: TaskState, driven: Controls, params: TaskParams, seen: bool = False
 ) -> tuple[TaskState, StepResult, Float[Array, " lane"], Any]:

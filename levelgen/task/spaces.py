@@ -9,20 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Key
 
 
-class Space:
-    """What `sample` draws and `contains` knows."""
-
-    shape: tuple[int, ...]
-    dtype: Any
-
-    def sample(self, key: Key[Array, ""]) -> Any:
-        raise NotImplementedError
-
-    def contains(self, x: Any) -> Bool[Array, ""]:
-        raise NotImplementedError
-
-
-class Box(Space):
+class Box:
     """An array of numbers between two bounds; whole numbers include both, truth values are False and True."""
 
     def __init__(self, low: Any, high: Any, shape: tuple[int, ...], dtype: Any = jnp.float32) -> None:
@@ -55,10 +42,10 @@ class MultiDiscrete(Box):
         self.n = sum(bounds)
 
 
-class Dict(Space):
+class Dict:
     """Spaces by name."""
 
-    def __init__(self, spaces: Mapping[str, Space]) -> None:
+    def __init__(self, spaces: Mapping[str, Box]) -> None:
         self.spaces = dict(spaces)
         self.num_spaces = len(self.spaces)
 
@@ -68,3 +55,6 @@ class Dict(Space):
 
     def contains(self, x: Mapping[str, Any]) -> Bool[Array, ""]:
         return jnp.stack([space.contains(x[name]) for name, space in self.spaces.items()]).all()
+
+
+Space = Box | Dict

@@ -30,7 +30,7 @@ class Memory:
         """Address of a row."""
         row = INDEX(0)
         for number, size in zip(index, self.shape, strict=True):
-            row = b.add(b.mul(row, INDEX(size)), primitives.to_index(b, number))
+            row = b.add(b.mul(row, INDEX(size)), INDEX(number) if isinstance(number, int) else b.sext(number, INDEX))
         return b.gep(self.pointer, [b.mul(row, self.stride)], source_etype=STORED[self.dtype])
 
 
@@ -74,9 +74,11 @@ def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
         return [primitives.elementwise(b, name, operands, str(out.dtype))]
     if name in CONTROL:
         return CONTROL[name](b, equation, operands)
-    if name in ACCESS:
-        return ACCESS[name](b, params, operands)
     match name:
+        case "get":
+            return [_read(b, *_indexed(params, operands))]
+        case "swap":
+            return [_swap(b, params, operands)]
         case "convert_element_type":
             return [primitives.convert(b, operands[0], str(params["new_dtype"]))]
         case "broadcast_in_dim":
@@ -151,10 +153,6 @@ def _rows(axes: list) -> tuple[tuple[int, ...], Callable[[tuple], list]]:
     return shape, address
 
 
-def _get(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
-    return [_read(b, *_indexed(params, operands))]
-
-
 def _read(b: ir.IRBuilder, memory: Memory, axes: list) -> Value:
     shape, address = _rows(axes)
     return Value(array(shape, lambda at: _load(b, memory, address(at))), memory.dtype, memory.lanes)
@@ -174,7 +172,7 @@ def _store(b: ir.IRBuilder, memory: Memory, index: list, x: Operand) -> None:
     b.store(x, memory.at(b, index), align=BYTES[memory.dtype])
 
 
-def _swap(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
+def _swap(b: ir.IRBuilder, params: dict, operands: list) -> Value:
     """Write, and hand on what was there."""
     memory, axes = _indexed(params, operands, 2)
     before = _read(b, memory, axes)
@@ -182,7 +180,7 @@ def _swap(b: ir.IRBuilder, params: dict, operands: list) -> list[Value]:
     rows = np.broadcast_to(_written(b, operands[1], memory).rows, shape)
     for at in np.ndindex(*shape):
         _store(b, memory, address(at), rows[at])
-    return [before]
+    return before
 
 
 def _written(b: ir.IRBuilder, x: Value, memory: Memory) -> Value:
@@ -289,4 +287,3 @@ CONTROL: dict[str, Callable[[ir.IRBuilder, core.JaxprEqn, list], list[Value]]] =
     "closed_call": _call("call_jaxpr"),
     "custom_jvp_call": _call("call_jaxpr"),
 }
-ACCESS: dict[str, Callable[[ir.IRBuilder, dict, list], list[Value]]] = {"get": _get, "swap": _swap}

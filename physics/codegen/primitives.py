@@ -8,7 +8,7 @@ import numpy as np
 from llvmlite import ir
 
 from physics.codegen.buffers import LANES
-from physics.codegen.values import INDEX, Operand, Value, array, constant, has_lanes, llvm_type, vector
+from physics.codegen.values import Operand, Value, array, constant, has_lanes, llvm_type, vector
 
 Emit = Callable[..., Operand]
 FLOAT, INT, BOOL = "float32", "int32", "bool"
@@ -192,8 +192,3 @@ def _across(b: ir.IRBuilder, name: str, dtype: str, x: Operand) -> Operand:
 
 def iota(shape: tuple[int, ...], dimension: int, dtype: str) -> Value:
     return Value(array(shape, lambda at: constant(at[dimension], dtype)), dtype, False)
-
-
-def to_index(b: ir.IRBuilder, x: Operand | int) -> Operand:
-    """A number of a row, as 64 bits."""
-    return INDEX(x) if isinstance(x, int) else b.sext(x, INDEX)

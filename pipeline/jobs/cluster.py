@@ -63,53 +63,42 @@ class WorkerHandle:
     core: int | None  # that it stays on; None: the system or the cluster chooses
     gpus: int
     actor: Any = None
-    starting: Any = None  # reference to the new worker's first answer
+    answer: Any = None  # reference to what it will answer next: that it has started, or a Round
+    up: bool = False  # it has started
     failed_starts: int = 0  # in a row
     why: str = ""  # of the last of them
     assignment: Assignment = field(default_factory=Assignment)
-    round: Any = None  # reference to the coming Round
 
     def start(self) -> None:
         """Ask for a worker. It gets no unit before it answers: a cluster may have no room for it now, or ever."""
         options = {"num_cpus": 1, "num_gpus": self.gpus, "max_restarts": 0}
         self.actor = ray.remote(WorkerActor).options(**options).remote(self.job, self.split, self.core)
-        self.starting = self.actor.ready.remote()
+        self.answer = self.actor.ready.remote()
 
-    def started(self) -> None:
-        """The new worker has answered, or died."""
-        try:
-            ray.get(self.starting)
-        except RayError as error:
-            self.actor, self.failed_starts, self.why = None, self.failed_starts + 1, _told(error)
-        else:
-            self.failed_starts = 0
-        self.starting = None
-
-    def stop(self) -> None:
-        """Withdraw the request for a worker that has not started."""
-        if self.actor is not None:
-            ray.kill(self.actor)
-        self.actor = self.starting = None
+    @property
+    def starting(self) -> bool:
+        return self.actor is not None and not self.up
 
     @property
     def free(self) -> bool:
         """Whether it can be told of units now."""
-        return self.actor is not None and self.starting is None and self.round is None
+        return self.up and self.answer is None
 
-    def go_on(self) -> None:
-        """Let the worker train for a while, with what it was assigned meanwhile."""
-        self.round = self.actor.work.remote(self.assignment.hand_over())
-
-    def report(self) -> tuple[list[UnitOutcome], dict[WorkUnit, tuple[int, float, int]]]:
-        """Outcomes and progress of the round that is over; a worker that died leaves its resources to a new one."""
-        over, self.round = self.round, None
+    def report(self) -> Round:
+        """What it has answered; a worker that died leaves its resources to a new one."""
+        over, self.answer = self.answer, None
         try:
-            round: Round = ray.get(over)  # pyright: ignore[reportAssignmentType] - one reference, one value
+            answer: Any = ray.get(over)
         except RayError as error:
-            self.actor = None
-            return self.assignment.lose(f"{error}\n\n{_told(error)}"), {}
-        self.assignment.account(round)
-        return round.outcomes, round.totals
+            if not self.up:
+                self.failed_starts, self.why = self.failed_starts + 1, _told(error)
+            self.actor, self.up = None, False
+            return Round(self.assignment.lose(f"{error}\n\n{_told(error)}"), {}, 0)
+        if self.up:
+            self.assignment.account(answer)
+            return answer
+        self.up, self.failed_starts = True, 0
+        return Round([], {}, 0)
 
 
 def _told(error: RayError) -> str:
@@ -172,14 +161,15 @@ class Crew:
         room = _room(self._gpus, self._most)
         surplus = len(self._handles) + self._given_up - len(room)
         self._handles += map(self._handle, room[: max(0, -surplus)])
-        gone = [handle for handle in self._handles if handle.actor is None or handle.starting is not None]
+        gone = [handle for handle in self._handles if not handle.up]
         for handle in gone[: max(0, min(surplus, len(self._handles) - 1))]:
-            handle.stop()
+            if handle.actor is not None:
+                ray.kill(handle.actor)
             self._handles.remove(handle)
 
     def start_workers(self, waiting: int) -> None:
         """Where there is none, and more units wait than workers are starting."""
-        starting = sum(handle.starting is not None for handle in self._handles)
+        starting = sum(handle.starting for handle in self._handles)
         without = [handle for handle in self._handles if handle.actor is None]
         for handle in without[: max(0, waiting - starting)]:
             handle.start()
@@ -187,7 +177,7 @@ class Crew:
     def assign(self, queue: UnitQueue) -> None:
         """Give units to the workers that have reported, and let them go on. Each gets one before any gets two."""
         free = [handle for handle in self._handles if handle.free]
-        starting = sum(handle.starting is not None for handle in self._handles)
+        starting = sum(handle.starting for handle in self._handles)
         while any(
             handle.assignment.take(queue)
             for handle in free
@@ -196,25 +186,19 @@ class Crew:
             pass
         for handle in free:
             if handle.assignment.units:
-                handle.go_on()
+                handle.answer = handle.actor.work.remote(handle.assignment.hand_over())
 
     def wait(self) -> list[UnitOutcome]:
         """Outcomes of the rounds that are over, if any ends in a moment."""
-        starting = {handle.starting: handle for handle in self._handles if handle.starting is not None}
-        rounds = {handle.round: handle for handle in self._handles if handle.round is not None}
-        both = [*starting, *rounds]
-        ray.wait(both, timeout=POLL)  # for the first
-        ended = ray.wait(both, num_returns=len(both), timeout=0)[0]
-        for reference in starting.keys() & set(ended):
-            starting[reference].started()
-        self._give_up()
-        self._notice_silence(bool(rounds))
+        asked = {handle.answer: handle for handle in self._handles if handle.answer is not None}
+        self._notice_silence(any(handle.up for handle in asked.values()))
+        ray.wait([*asked], timeout=POLL)  # for the first
         outcomes: list[UnitOutcome] = []
-        for reference in ended:
-            if reference in rounds:
-                more, totals = rounds[reference].report()
-                outcomes += more
-                self._board.tally.running.update(totals)
+        for reference in ray.wait([*asked], num_returns=len(asked), timeout=0)[0]:
+            round = asked[reference].report()
+            outcomes += round.outcomes
+            self._board.tally.running.update(round.totals)
+        self._give_up()
         return outcomes
 
     def _give_up(self) -> None:

@@ -30,11 +30,9 @@ class Worker:
         outcomes = [outcome for unit in units if (outcome := self._begin(unit))]
         while self._runs and not outcomes and time.monotonic() < until:
             outcomes = self._step()
-        return Round(outcomes, {unit: self._totals(run) for unit, run in self._runs.items()}, self._pool.wants)
-
-    def _totals(self, run: TrainingRun) -> tuple[int, float, int]:
-        now = totals(self._pool, run)
-        return now.env_steps, now.levels, now.solved  # plain: who reads it may not have JAX imported
+        now = {unit: totals(self._pool, run) for unit, run in self._runs.items()}
+        plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}  # read without JAX
+        return Round(outcomes, plain, self._pool.wants)
 
     def _begin(self, unit: WorkUnit) -> UnitOutcome | None:
         try:

@@ -19,7 +19,7 @@ from levelgen.level import ACTIONS, Level, name_of
 from levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
 from levelgen.pictures.scene import scene_of
 from levelgen.pictures.shapes import Scene
-from levelgen.pictures.svg import write_svg
+from levelgen.pictures.svg import svg_of
 from levelgen.pictures.words import Caption
 from levelgen.task.rules import StepResult, TaskParams, TaskState, advance, has_nan, reset
 from physics.types import State
@@ -205,11 +205,11 @@ def packaged_ffmpeg() -> str | None:
     return imageio_ffmpeg.get_ffmpeg_exe()
 
 
-WRITERS: dict[str, Callable[[Film, Path], None]] = {
+WRITERS: dict[str, Callable[[Film, Path], object]] = {
     ".gif": lambda film, path: write_gif(map(rasterised, film.scenes), path, film.seconds),
     ".png": write_sheet,
     ".mp4": write_mp4,
-    ".svg": lambda film, path: write_svg(film.scenes, path, film.seconds),
+    ".svg": lambda film, path: path.write_text(svg_of(film.scenes, film.seconds), encoding="utf-8"),
 }
 
 

@@ -5,6 +5,7 @@ Worked out for many levels at once, whatever shards they lie in.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ COLUMNS = (
 )  # fmt: skip
 
 Mask = Bool[np.ndarray, " level"]
+Lanes = Int[np.ndarray, " lane"]  # indices of some of the levels
 
 
 @dataclass
@@ -82,18 +84,16 @@ class Evidence:
         levels = jax.tree.map(np.array, made)  # to be replaced by what shards hold
         known = self._identity(levels)
         for first in range(0, len(stored), LANES):
-            known |= self._witnesses(stored[first : first + LANES], levels)
+            known[self._witnesses(stored[first : first + LANES], levels)] = True
         self._labels(levels, known)
         self.findings.levels += len(self.ids)
 
-    def _tell(self, where: Any, what: Callable[[int], str]) -> None:
-        """Note what is wrong with these levels, those that have a sentence left out."""
-        where = np.asarray(where, bool)
-        self.findings.wrong += [f"Level {self.ids[i]} {what(int(i))}." for i in np.flatnonzero(where & ~self.told)]
-        self.told |= where
-
-    def _mask(self, lanes: Int[np.ndarray, " lane"]) -> Mask:
-        return np.isin(np.arange(len(self.ids)), lanes)
+    def _tell(self, where: Any, what: Callable[[int], str], lanes: Any = slice(None)) -> None:
+        """Note what is wrong with these of the lanes' levels, those that have a sentence left out."""
+        where, ids = np.asarray(where, bool), self.ids[lanes]
+        new = np.flatnonzero(where & ~self.told[lanes])
+        self.findings.wrong += [f"Level {ids[i]} {what(int(i))}." for i in new]
+        self.told[lanes] |= where
 
     def _claims(self) -> Mask:
         """Which levels have a row of a shard: one whose id stands there."""
@@ -127,7 +127,7 @@ class Evidence:
         )
         return same
 
-    def _witnesses(self, lanes: Int[np.ndarray, " lane"], levels: Level) -> Mask:
+    def _witnesses(self, lanes: Lanes, levels: Level) -> Lanes:
         """Look at what shards hold of these levels, and put their worlds in place of those in `levels`.
 
         Returns:
@@ -135,37 +135,26 @@ class Evidence:
         """
         lanes, arrays = self._read(lanes)
         if not len(lanes):
-            return np.zeros(len(self.ids), bool)
+            return lanes
         level, record = tree_of(Level, arrays, "level/"), tree_of(Record, arrays, "record/")
         self._worlds(lanes, level, levels)
         again = replay(level, record.action, self.making.rules)
         done = np.asarray(again.done)
-        differs, steps, claimed = unlike_fields(record, again), steps_to_goal(done), self.of["steps_to_goal"]
+        differs, steps = unlike_fields(record, again), steps_to_goal(done)
+        labels, claimed = (np.array(self.of[name], object)[lanes] for name in ("label", "steps_to_goal"))
         self.findings.witnesses += len(lanes)
         self.findings.same_bits += len(lanes) - len(differs)
-        lane_of = {int(i): lane for lane, i in enumerate(lanes)}
-        unlike = self._mask(lanes[list(differs)])
-        self._tell(
-            unlike & self.same_stack,
-            lambda i: f"has a witness that does not replay: its {differs[lane_of[i]]} differs",
-        )
-        self._tell(
-            self._mask(lanes[~succeeds(done, again.goal)]),
-            lambda _: "has a witness that does not reach the goal when replayed",
-        )
-        trivial = np.array([self.of["label"][i] == Label.TRIVIAL for i in lanes])
-        self._tell(
-            self._mask(lanes[record.action.any((0, 1)) & trivial]),
-            lambda _: "is trivial, and its witness does something",
-        )
-        late = self._mask(lanes[[claimed[i] != count for i, count in zip(lanes, steps, strict=True)]])
-        self._tell(
-            late & ~unlike,
-            lambda i: f"reaches the goal in {steps[lane_of[i]]} steps, the manifest says {claimed[i]}",
-        )
-        return self._mask(lanes)
+        unlike = np.isin(np.arange(len(lanes)), list(differs))
+        tell = partial(self._tell, lanes=lanes)
+        tell(unlike & self.same_stack[lanes], lambda i: f"has a witness that does not replay: its {differs[i]} differs")
+        tell(~succeeds(done, again.goal), lambda _: "has a witness that does not reach the goal when replayed")
+        busy = record.action.any((0, 1))
+        tell(busy & (labels == Label.TRIVIAL), lambda _: "is trivial, and its witness does something")
+        late = (claimed != steps) & ~unlike
+        tell(late, lambda i: f"reaches the goal in {steps[i]} steps, the manifest says {claimed[i]}")
+        return lanes
 
-    def _read(self, lanes: Int[np.ndarray, " lane"]) -> tuple[Int[np.ndarray, " lane"], dict[str, np.ndarray]]:
+    def _read(self, lanes: Lanes) -> tuple[Lanes, dict[str, np.ndarray]]:
         """The levels that could be read, and what their shards hold of them, side by side."""
         by_shard: dict[str, list[int]] = {}
         for i in lanes:
@@ -184,17 +173,16 @@ class Evidence:
         names = parts[0] if parts else {}
         return np.array(found, int), {name: np.concatenate([part[name] for part in parts], -1) for name in names}
 
-    def _worlds(self, lanes: Int[np.ndarray, " lane"], stored: Level, levels: Level) -> None:
+    def _worlds(self, lanes: Lanes, stored: Level, levels: Level) -> None:
         """Compare the worlds in shards with those that ids make, and put them in their place."""
         ours = arrays_of(levels)
         same = np.array([same_bits(x, ours[name][..., lanes]) for name, x in arrays_of(stored).items()]).all(0)
-        self._tell(
-            self._mask(lanes[~same]) & self.same_stack, lambda _: "has another world in its shard than its id makes"
-        )
+        wrong = ~same & self.same_stack[lanes]
+        self._tell(wrong, lambda _: "has another world in its shard than its id makes", lanes)
         if not same.all():
             hashes = content_hashes(stored)
             other = [self.of["content_hash"][i] != of for i, of in zip(lanes, hashes, strict=True)]
-            self._tell(self._mask(lanes[other]), lambda _: "has another world in its shard than its content hash says")
+            self._tell(other, lambda _: "has another world in its shard than its content hash says", lanes)
         for name, values in arrays_of(stored).items():
             ours[name][..., lanes] = values
 

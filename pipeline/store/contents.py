@@ -5,6 +5,7 @@ engines and pictures look things up by these numbers and check no bounds.
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from typing import Any
 
@@ -49,15 +50,13 @@ def size_in(fields: Any) -> Size:
     Raises:
         ContentsError: they are those of none.
     """
-    try:
+    with suppress(KeyError, IndexError, TypeError):
         shapes = {field["name"]: field["shape"] for field in fields}
         size = Size(*(shapes[name][0] for name in COUNTED))
         fits = all(type(n) is int and low <= n <= MOST_THINGS for low, n in zip(FEWEST, size, strict=True))
-    except (KeyError, IndexError, TypeError):
-        raise ContentsError("its fields are those of no size") from None
-    if not fits or fields != [field.as_json() for field in table_for(size)]:
-        raise ContentsError("its fields are those of no size")
-    return size
+        if fits and fields == [field.as_json() for field in table_for(size)]:
+            return size
+    raise ContentsError("its fields are those of no size")
 
 
 def check_level_ids(level_ids: Any) -> None:
@@ -74,10 +73,9 @@ def check_numbers(arrays: Mapping[str, np.ndarray], size: Size) -> None:
             raise ContentsError(f"its field {name} has numbers that size {name_of(size)} cannot have")
 
 
-@cache
-def highest(size: Size) -> dict[str, np.ndarray]:
+def highest(size: Size) -> dict[str, np.ndarray | int]:
     """The largest number that may stand in each field of integers; the smallest is 0."""
-    numbers = {
+    return {
         "record/timestep": np.iinfo(np.int32).max,
         "record/action": np.array(CHOICES)[:, None] - 1,
         "level/role": max(Role),
@@ -89,4 +87,3 @@ def highest(size: Size) -> dict[str, np.ndarray]:
         "level/model/joint_b": size.bodies - 1,
         "level/model/thruster_body": size.bodies - 1,
     }
-    return {name: np.asarray(number) for name, number in numbers.items()}

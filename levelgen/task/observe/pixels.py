@@ -39,8 +39,11 @@ NO_MOTOR: RGB = (255, 255, 255)
 BINDING_COLOUR: tuple[RGB, ...] = ((255, 255, 0), (255, 0, 255), (0, 255, 255), (255, 153, 51))
 # Of the thruster: (from, to) along its axis and across it, as shares of its side from the middle; brightness, and
 # whether it has the binding's colour.
-NOZZLE = (((-0.5, -0.2), (-0.12, 0.12), 0.6, True), ((-0.2, 0.06), (-0.34, 0.34), 0.8, True))
-BASE = (((0.06, 0.5), (-0.4, 0.4), 0.3, False),)
+THRUSTER = (
+    ((-0.5, -0.2), (-0.12, 0.12), 0.6, True),
+    ((-0.2, 0.06), (-0.34, 0.34), 0.8, True),
+    ((0.06, 0.5), (-0.4, 0.4), 0.3, False),
+)
 
 
 @jax.tree_util.register_dataclass
@@ -81,15 +84,15 @@ def _shapes(level: Level, state: State) -> list[Coverage]:
     colours = _role_colour(level.role, model.inverse_mass == 0)
     floor = centre[0] + model.vertices[0] * PIXELS_PER_METRE  # its rotation is not drawn
     floor_colour = _role_colour(level.role[0], jnp.array(True))
-    shapes = [_shape(_polygon_planes(floor), floor_colour)]
+    shapes = [Coverage(*_polygon(floor), floor_colour)]
     for body in range(FIXED_POLYGONS, size.polygons):
         corners = centre[body] + _turn(model.vertices[body] * PIXELS_PER_METRE, state.rotation[body])
-        interval = _meet(_columns(_polygon_planes(corners)), _patch(centre[body]))
+        interval = _meet(_polygon(corners), _patch(centre[body]))
         shapes.append(_if(model.active[body], Coverage(*interval, colours[body])))
     for circle in range(size.circles):
         body = size.polygons + circle
         disc = _meet(_disc(centre[body], model.radius[circle] * PIXELS_PER_METRE), _patch(centre[body]))
-        spoke = _meet(disc, _columns(_spoke_planes(centre[body], state.rotation[body])))
+        spoke = _meet(disc, _spoke(centre[body], state.rotation[body]))
         shapes.append(_if(model.active[body], Coverage(*disc, colours[body])))
         shapes.append(_if(model.active[body], Coverage(*spoke, _packed(np.array(SPOKE)))))
     binding_colours = jnp.array(BINDING_COLOUR)
@@ -120,50 +123,42 @@ def _thruster(level: Level, state: State, thruster: int, colours: Float[Array, "
     angle = model.thruster_rotation[thruster] + state.rotation[body]
     tint = colours[level.thruster_binding[thruster]]
     shapes = []
-    for along, across, brightness, tinted in (*NOZZLE, *BASE):
+    for along, across, brightness, tinted in THRUSTER:
         # Clockwise, as polygons are
         corners = np.array([(along[0], across[0]), (along[0], across[1]), (along[1], across[1]), (along[1], across[0])])
-        planes = _polygon_planes(centre + _turn(jnp.asarray(corners * THRUSTER_SIDE, jnp.float32), angle))
+        interval = _polygon(centre + _turn(jnp.asarray(corners * THRUSTER_SIDE, jnp.float32), angle))
         colour = brightness * (tint if tinted else jnp.array(BACKGROUND))
-        shapes.append(_if(model.thruster_active[thruster], _shape(planes, _packed(colour))))
+        shapes.append(_if(model.thruster_active[thruster], Coverage(*interval, _packed(colour))))
     return shapes
-
-
-class Planes(NamedTuple):
-    """Half-planes x * dx + y * dy <= bound, in pixels."""
-
-    dx: Float[Array, " plane"]
-    dy: Float[Array, " plane"]
-    bound: Float[Array, " plane"]
-
-
-def _polygon_planes(corners: Float[Array, "corner 2"]) -> Planes:
-    """Right of each side; a side without length has nothing on its right."""
-    ends = jnp.roll(corners, -1, axis=0)
-    dx, dy = corners[:, 1] - ends[:, 1], ends[:, 0] - corners[:, 0]
-    bound = corners[:, 0] * dx + corners[:, 1] * dy
-    return Planes(dx, dy, jnp.where((dx == 0) & (dy == 0), -jnp.inf, bound))
-
-
-def _spoke_planes(centre: Float[Array, "2"], angle: Float[Array, ""]) -> Planes:
-    """Two pixels wide, from the centre on."""
-    back = jnp.array([jnp.sin(angle), -jnp.cos(angle)])
-    side = jnp.array([-back[1], back[0]])
-    normals = jnp.stack([back, side, -side])
-    return Planes(normals[:, 0], normals[:, 1], normals @ centre + jnp.array([0.0, 1.0, 1.0]))
 
 
 Interval = tuple[Float[Array, " x"], Float[Array, " x"]]
 
 
-def _columns(planes: Planes) -> Interval:
-    """What lies in all half-planes, of each column."""
+def _polygon(corners: Float[Array, "corner 2"]) -> Interval:
+    """What lies right of each side; a side without length has nothing on its right."""
+    ends = jnp.roll(corners, -1, axis=0)
+    dx, dy = corners[:, 1] - ends[:, 1], ends[:, 0] - corners[:, 0]
+    bound = corners[:, 0] * dx + corners[:, 1] * dy
+    return _columns(dx, dy, jnp.where((dx == 0) & (dy == 0), -jnp.inf, bound))
+
+
+def _spoke(centre: Float[Array, "2"], angle: Float[Array, ""]) -> Interval:
+    """Two pixels wide, from the centre on."""
+    back = jnp.array([jnp.sin(angle), -jnp.cos(angle)])
+    side = jnp.array([-back[1], back[0]])
+    normals = jnp.stack([back, side, -side])
+    return _columns(normals[:, 0], normals[:, 1], normals @ centre + jnp.array([0.0, 1.0, 1.0]))
+
+
+def _columns(dx: Float[Array, " plane"], dy: Float[Array, " plane"], bound: Float[Array, " plane"]) -> Interval:
+    """What lies in all half-planes x * dx + y * dy <= bound, of each column; in pixels."""
     x = jnp.arange(SIDE, dtype=jnp.float32)[:, None]
-    room = planes.bound - x * planes.dx  # y * dy <= room
-    edge = room / jnp.where(planes.dy == 0, 1.0, planes.dy)
-    low = jnp.where(planes.dy < 0, edge, -jnp.inf).max(1)
-    high = jnp.where(planes.dy > 0, edge, jnp.inf)
-    high = jnp.where((planes.dy == 0) & (room < 0), -jnp.inf, high).min(1)
+    room = bound - x * dx  # y * dy <= room
+    edge = room / jnp.where(dy == 0, 1.0, dy)
+    low = jnp.where(dy < 0, edge, -jnp.inf).max(1)
+    high = jnp.where(dy > 0, edge, jnp.inf)
+    high = jnp.where((dy == 0) & (room < 0), -jnp.inf, high).min(1)
     return low, high
 
 
@@ -184,10 +179,6 @@ def _patch(centre: Float[Array, "2"]) -> Interval:
 
 def _meet(one: Interval, other: Interval) -> Interval:
     return jnp.maximum(one[0], other[0]), jnp.minimum(one[1], other[1])
-
-
-def _shape(planes: Planes, colour: Int[Array, ""]) -> Coverage:
-    return Coverage(*_columns(planes), colour)
 
 
 def _if(shown: Array, shape: Coverage) -> Coverage:

@@ -102,7 +102,7 @@ def test_is_the_plain_formula_on_entities(name: str) -> None:
 def test_the_order_of_things_does_not_matter(name: str, seed: int) -> None:
     network, params = network_of(name)
     level = sample_levels(jnp.arange(LEVELS), network.size)
-    draws = jax.random.uniform(jax.random.key(seed), (shuffled_rows(network.size), LEVELS))
+    draws = jax.random.uniform(jax.random.key(seed), (sum(shuffled_rows(network.size)), LEVELS))
     other = jax.jit(shuffle)(level, OrderDraws(draws))
     ours, others = (outputs(network, params, x, x.state) for x in (level, other))
     np.testing.assert_allclose(ours, others, atol=FROM_TANH)

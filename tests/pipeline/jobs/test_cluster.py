@@ -79,7 +79,7 @@ def test_there_are_as_many_workers_as_a_cluster_has_room_for_now(monkeypatch: py
             each.follow_cluster()
         assert len(crew._handles) == min(max(cores, 1), 6)  # of six units, each
         assert len(capped._handles) == min(max(cores, 1), 2)
-    crew._handles[0].actor = "one that has answered"
+    crew._handles[0].actor, crew._handles[0].up = "one that has answered", True
     now["CPU"] = 2
     crew.follow_cluster()
     now["CPU"] = 1
