@@ -8,38 +8,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from experts.witness import Record, replay
-    from levelgen.files.level_file import LevelFile, read_level_file, write_level_file
-    from levelgen.level import SIZES, Level
-    from levelgen.pictures.raster import draw
-    from levelgen.sampling.distribution import Distribution
-    from levelgen.sampling.sampler import sample_levels
-    from levelgen.task.environment import make, starts
-    from levelgen.task.rules import TaskParams
-    from physics.types import Size
-    from pipeline.store.manifest import read_manifest
-    from pipeline.store.shard import Shard
-    from pipeline.version import __version__
-
-__all__ = [
-    "SIZES",
-    "Distribution",
-    "Level",
-    "LevelFile",
-    "Record",
-    "Shard",
-    "Size",
-    "TaskParams",
-    "__version__",
-    "draw",
-    "make",
-    "read_level_file",
-    "read_manifest",
-    "replay",
-    "sample_levels",
-    "starts",
-    "write_level_file",
-]
+    from experts.witness import Record as Record
+    from experts.witness import replay as replay
+    from levelgen.files.level_file import LevelFile as LevelFile
+    from levelgen.files.level_file import read_level_file as read_level_file
+    from levelgen.files.level_file import write_level_file as write_level_file
+    from levelgen.level import SIZES as SIZES
+    from levelgen.level import Level as Level
+    from levelgen.pictures.raster import draw as draw
+    from levelgen.sampling.distribution import Distribution as Distribution
+    from levelgen.sampling.sampler import sample_levels as sample_levels
+    from levelgen.task.environment import make as make
+    from levelgen.task.environment import starts as starts
+    from levelgen.task.rules import TaskParams as TaskParams
+    from physics.types import Size as Size
+    from pipeline.store.manifest import read_manifest as read_manifest
+    from pipeline.store.shard import Shard as Shard
+    from pipeline.version import __version__ as __version__
 
 HOME = {
     "SIZES": "levelgen.level",
@@ -60,6 +45,7 @@ HOME = {
     "starts": "levelgen.task.environment",
     "write_level_file": "levelgen.files.level_file",
 }
+__all__ = list(HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

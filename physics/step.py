@@ -42,19 +42,15 @@ def step(
     Returns:
         The worlds after the step, and the contacts found at its start: a Manifold, or None if they are not `seen`.
     """
-    given = _same_lanes(Given(model, state, motor, thrust))
+    given = Given(model, state, motor, thrust)
+    lanes = max(x.shape[-1] for x in jax.tree.leaves(given))
+    given = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], lanes)), given)
     if state.position.dtype != jnp.float32:
         return on_all_lanes(given, params, seen)
     if jax.default_backend() == "cpu":
         return as_machine_code(given, params, seen)
     ways = {"cpu": as_machine_code, "default": on_all_lanes}
     return jax.lax.platform_dependent(given, **{k: lambda given, f=f: f(given, params, seen) for k, f in ways.items()})
-
-
-def _same_lanes(given: Given) -> Given:
-    """Every array with as many lanes as the one that has most."""
-    lanes = max(x.shape[-1] for x in jax.tree.leaves(given))
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], lanes)), given)
 
 
 def on_all_lanes(given: Given, params: Params, seen: bool) -> tuple[State, Any]:

@@ -7,7 +7,7 @@ numbered. No sampled and no handmade level has such copies. Numpy on the host.
 """
 
 import hashlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -30,73 +30,51 @@ def level_first(level: Level) -> Any:
     return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), -1, 0), level)
 
 
-class _Rows(NamedTuple):
-    """Things of many levels as rows of words, (level, thing, word), and who has what to do with whom."""
-
-    levels: Any  # level axis first
-    bodies: np.ndarray
-    rings: np.ndarray
-    radii: np.ndarray
-    joints: dict[int, tuple[np.ndarray, np.ndarray]]
-    joint_acts: np.ndarray
-    entries: np.ndarray
-    pushes: np.ndarray
-    push_acts: np.ndarray
-
-
 def worlds(level: Level) -> list[World]:
-    """The content of each level."""
+    """The content of each level. Its active bodies are numbered one after another."""
     levels = level_first(level)
     model = levels.model
     count, polygons = model.n_vertices.shape
-    rows = _Rows(
-        levels,
-        _body_rows(levels),
-        _words(model.vertices.reshape(count, polygons, 2 * MAX_VERTICES)),
-        _words(model.radius[..., None]),
-        _joint_rows(levels),
-        acting_joints(levels),
-        np.where(_runs(levels) & ~levels.motor_auto, levels.motor_binding, NO_ENTRY),
-        _columns(model.thruster_position, model.thruster_rotation, model.thruster_power),
-        acting_thrusters(levels),
-    )
-    return [_world(rows, i) for i in range(count)]
+    # (level, thing, word)
+    matter, sides, gravity = _body_rows(levels), _joint_rows(levels), _words(model.gravity)
+    rings, radii = _words(model.vertices.reshape(count, polygons, 2 * MAX_VERTICES)), _words(model.radius[..., None])
+    pushes = _columns(model.thruster_position, model.thruster_rotation, model.thruster_power)
+    # (level, thing)
+    entries = np.where(_runs(levels) & ~levels.motor_auto, levels.motor_binding, NO_ENTRY)
+    joints, thrusters = acting_joints(levels), acting_thrusters(levels)
 
+    def world(i: int) -> World:
+        bodies = np.flatnonzero(model.active[i]).tolist()
+        number = {body: k for k, body in enumerate(bodies)}
 
-def _world(rows: _Rows, i: int) -> World:
-    """Of level i. Its active bodies are numbered one after another."""
-    model = rows.levels.model
-    bodies = np.flatnonzero(model.active[i]).tolist()
-    number = {body: k for k, body in enumerate(bodies)}
-    ends = np.stack([model.joint_a[i], model.joint_b[i]], 1).tolist()
+        def shape(body: int) -> bytes:
+            if body >= polygons:
+                return radii[i, body - polygons].tobytes()
+            return _ring(rings[i, body, : 2 * model.n_vertices[i, body]].tobytes())
 
-    def side(j: int, way: int) -> Side:
-        first, second = (number[end] for end in ends[j][::way])
-        row, direction = rows.joints[way]
-        return Side(first, second, row[i, j].tobytes(), int(direction[i, j]), int(rows.entries[i, j]))
+        def side(j: int, way: int) -> Side:
+            first, second = (number[int(end[i, j])] for end in (model.joint_a, model.joint_b)[::way])
+            row, direction = sides[way]
+            return Side(first, second, row[i, j].tobytes(), int(direction[i, j]), int(entries[i, j]))
 
-    pushes = [
-        Push(
-            number[int(model.thruster_body[i, t])], rows.pushes[i, t].tobytes(), int(rows.levels.thruster_binding[i, t])
+        def push(t: int) -> Push:
+            body, entry = int(model.thruster_body[i, t]), int(levels.thruster_binding[i, t])
+            return Push(number[body], pushes[i, t].tobytes(), entry)
+
+        return World(
+            gravity[i].tobytes(),
+            [matter[i, body].tobytes() + shape(body) for body in bodies],
+            [(side(j, 1), side(j, -1)) for j in np.flatnonzero(joints[i]).tolist()],
+            [push(t) for t in np.flatnonzero(thrusters[i]).tolist()],
+            _apart(model.collides[i], model.inverse_mass[i] != 0, bodies),
         )
-        for t in np.flatnonzero(rows.push_acts[i])
-    ]
-    return World(
-        _words(model.gravity[i]).tobytes(),
-        [rows.bodies[i, body].tobytes() + _shape(rows, i, body) for body in bodies],
-        [(side(j, 1), side(j, -1)) for j in np.flatnonzero(rows.joint_acts[i]).tolist()],
-        pushes,
-        _apart(model.collides[i], model.inverse_mass[i] != 0, bodies),
-    )
+
+    return list(map(world, range(count)))
 
 
-def _shape(rows: _Rows, i: int, body: int) -> bytes:
-    """A circle's radius, or a polygon's vertices; which of them is the first is a number only."""
-    polygons, one = rows.rings.shape[1], 8
-    if body >= polygons:
-        return rows.radii[i, body - polygons].tobytes()
-    ring = rows.rings[i, body].tobytes()[: one * int(rows.levels.model.n_vertices[i, body])]
-    return min((ring[start:] + ring[:start] for start in range(0, len(ring), one)), default=ring)
+def _ring(vertices: bytes) -> bytes:
+    """Vertices of 8 bytes in a circle: which of them is the first is a number only."""
+    return min((vertices[k:] + vertices[:k] for k in range(0, len(vertices), 8)), default=vertices)
 
 
 def kinds(levels: Any) -> np.ndarray:

@@ -41,7 +41,8 @@ def compile_kernel(
     text = str(module)
     name = "levelproof_" + hashlib.sha256(text.encode()).hexdigest()[:16]
     if name not in _libraries:
-        library = _link(name, _object_code(text))
+        builder = binding.JITLibraryBuilder().add_object_img(_object_code(text))
+        library = builder.export_symbol("handler").link(_jit(), name)
         handler = jax.ffi.pycapsule(ctypes.c_void_p(library["handler"]))
         jax.ffi.register_ffi_target(name, handler, platform="cpu")
         _libraries[name] = library
@@ -81,8 +82,3 @@ def _object_code(text: str) -> bytes:
 def _jit() -> binding.LLJIT:
     """LLVM's just-in-time linker (ORC), one for the process."""
     return binding.create_lljit_compiler()
-
-
-def _link(name: str, code: bytes) -> binding.ResourceTracker:
-    """Load object code; `["handler"]` of the result is the handler's address."""
-    return binding.JITLibraryBuilder().add_object_img(code).export_symbol("handler").link(_jit(), name)

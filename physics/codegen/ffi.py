@@ -75,7 +75,10 @@ def add_handler(
     buffer = lambda array, i: _load(b, array, ctypes.sizeof(c_void_p) * i)
     data = [_load(b, buffer(handed, i), _offset(FrameBuffer, "data")) for i in range(len(arguments))]
     data += [_load(b, buffer(filled, i), _offset(FrameBuffer, "data")) for i in range(len(results) + 1)]
-    lanes = _last_dimension(b, buffer(handed, 0))
+    first = buffer(handed, 0)
+    last = b.sub(_load(b, first, _offset(FrameBuffer, "rank"), INDEX), INDEX(1))
+    dimension = b.gep(_load(b, first, _offset(FrameBuffer, "dims")), [last], source_etype=INDEX)
+    lanes = b.load(dimension, typ=INDEX)
     *outside, memory = data
     workspace, offset = [], 0
     for part in scratch:
@@ -96,12 +99,6 @@ def _answer_query(b: ir.IRBuilder, frame: Operand) -> None:
                 offset = _offset(Metadata, "api_version", field)
                 b.store(INT(number), b.gep(metadata, [INDEX(offset)], source_etype=BYTE))
             b.ret(NULL)
-
-
-def _last_dimension(b: ir.IRBuilder, buffer: Operand) -> Operand:
-    last = b.sub(_load(b, buffer, _offset(FrameBuffer, "rank"), INDEX), INDEX(1))
-    dimension = b.gep(_load(b, buffer, _offset(FrameBuffer, "dims")), [last], source_etype=INDEX)
-    return b.load(dimension, typ=INDEX)
 
 
 def _each_block(

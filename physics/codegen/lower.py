@@ -177,18 +177,13 @@ def _swap(b: ir.IRBuilder, params: dict, operands: list) -> Value:
     memory, axes = _indexed(params, operands, 2)
     before = _read(b, memory, axes)
     shape, address = _rows(axes)
-    rows = np.broadcast_to(_written(b, operands[1], memory).rows, shape)
+    x = primitives.with_lanes(b, operands[1]) if memory.lanes else operands[1]
+    if x.lanes != memory.lanes:
+        raise NotImplementedError(f"a kernel writes arrays without lanes number by number, not {LANES} at once")
+    rows = np.broadcast_to(x.rows, shape)
     for at in np.ndindex(*shape):
         _store(b, memory, address(at), rows[at])
     return before
-
-
-def _written(b: ir.IRBuilder, x: Value, memory: Memory) -> Value:
-    if memory.lanes:
-        return primitives.with_lanes(b, x)
-    if x.lanes:
-        raise NotImplementedError(f"a kernel writes arrays without lanes number by number, not {LANES} at once")
-    return x
 
 
 def _flat(values: Sequence[Value]) -> list[Operand]:

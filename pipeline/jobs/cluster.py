@@ -47,9 +47,6 @@ class WorkerActor:
 
         self._worker = Worker(job, split)
 
-    def ready(self) -> None:
-        """Answers once the process is there."""
-
     def work(self, units: list[WorkUnit]) -> Round:
         return self._worker.work(units, ROUND)
 
@@ -63,7 +60,7 @@ class WorkerHandle:
     core: int | None  # that it stays on; None: the system or the cluster chooses
     gpus: int
     actor: Any = None
-    answer: Any = None  # reference to what it will answer next: that it has started, or a Round
+    answer: Any = None  # reference to the coming Round; its first says that it has started
     up: bool = False  # it has started
     failed_starts: int = 0  # in a row
     why: str = ""  # of the last of them
@@ -73,7 +70,7 @@ class WorkerHandle:
         """Ask for a worker. It gets no unit before it answers: a cluster may have no room for it now, or ever."""
         options = {"num_cpus": 1, "num_gpus": self.gpus, "max_restarts": 0}
         self.actor = ray.remote(WorkerActor).options(**options).remote(self.job, self.split, self.core)
-        self.answer = self.actor.ready.remote()
+        self.answer = self.actor.work.remote([])  # nothing yet: that it is there
 
     @property
     def starting(self) -> bool:
@@ -88,17 +85,16 @@ class WorkerHandle:
         """What it has answered; a worker that died leaves its resources to a new one."""
         over, self.answer = self.answer, None
         try:
-            answer: Any = ray.get(over)
+            round: Round = ray.get(over)  # pyright: ignore[reportAssignmentType] - one reference, one value
         except RayError as error:
             if not self.up:
                 self.failed_starts, self.why = self.failed_starts + 1, _told(error)
             self.actor, self.up = None, False
             return Round(self.assignment.lose(f"{error}\n\n{_told(error)}"), {}, 0)
         if self.up:
-            self.assignment.account(answer)
-            return answer
+            self.assignment.account(round)
         self.up, self.failed_starts = True, 0
-        return Round([], {}, 0)
+        return round
 
 
 def _told(error: RayError) -> str:
@@ -186,7 +182,7 @@ class Crew:
             pass
         for handle in free:
             if handle.assignment.units:
-                handle.answer = handle.actor.work.remote(handle.assignment.hand_over())
+                handle.answer = handle.actor.work.remote(handle.assignment.units)
 
     def wait(self) -> list[UnitOutcome]:
         """Outcomes of the rounds that are over, if any ends in a moment."""

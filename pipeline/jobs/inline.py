@@ -21,7 +21,7 @@ def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Bo
             if not assignment.units:
                 return
             board.refresh()
-            round = worker.work(assignment.hand_over(), ROUND)
+            round = worker.work(assignment.units, ROUND)
             assignment.account(round)
             board.tally.running.update(round.totals)
             settle(round.outcomes)

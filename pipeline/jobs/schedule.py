@@ -104,7 +104,6 @@ class Assignment:
     """The units that one worker has."""
 
     units: list[WorkUnit] = field(default_factory=list)
-    new: list[WorkUnit] = field(default_factory=list)  # those of them that it has not been told of
     wants: int = 1  # levels more for which it has room
 
     def take(self, queue: UnitQueue) -> bool:
@@ -115,14 +114,8 @@ class Assignment:
         if unit is None:
             return False
         self.units.append(unit)
-        self.new.append(unit)
         self.wants -= len(unit.level_ids)
         return True
-
-    def hand_over(self) -> list[WorkUnit]:
-        """The units that the worker is now told of."""
-        new, self.new = self.new, []
-        return new
 
     def account(self, round: Round) -> None:
         """Follow the worker's report."""
@@ -132,7 +125,7 @@ class Assignment:
 
     def lose(self, reason: str) -> list[UnitOutcome]:
         """The worker died, and its units failed."""
-        units, self.units, self.new, self.wants = self.units, [], [], 1
+        units, self.units, self.wants = self.units, [], 1
         return [UnitOutcome(unit, reason=reason) for unit in units]
 
 

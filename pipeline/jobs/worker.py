@@ -22,12 +22,12 @@ class Worker:
         self._runs: dict[WorkUnit, TrainingRun] = {}
 
     def work(self, units: Sequence[WorkUnit], seconds: float) -> Round:
-        """Begin these units, then train for so many seconds, or until one ends.
+        """Begin those of these units that are not under way, then train for so many seconds, or until one ends.
 
         A failure of one unit is that unit's outcome. One of the step that all share is the outcome of each.
         """
         until = time.monotonic() + seconds
-        outcomes = [outcome for unit in units if (outcome := self._begin(unit))]
+        outcomes = [outcome for unit in units if unit not in self._runs and (outcome := self._begin(unit))]
         while self._runs and not outcomes and time.monotonic() < until:
             outcomes = self._step()
         now = {unit: totals(self._pool, run) for unit, run in self._runs.items()}

@@ -59,11 +59,11 @@ def write_shard(path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.nd
 class Shard:
     """One shard on disk, opened lazily for reading. What it says is checked before anything of it is given out."""
 
-    def __init__(self, path: Path) -> None:
-        """Open the group at `path`.
+    def __init__(self, path: Path, size: str | None = None) -> None:
+        """Open the group at `path`, whose levels are to be of `size`, if that is known.
 
         Raises:
-            Failure: it is missing, damaged, no shard of any size, or of another version.
+            Failure: it is missing, damaged, no shard of that or any size, or of another version.
         """
         self.path = path
         try:
@@ -77,6 +77,8 @@ class Shard:
                     "use the levelproof that wrote it."
                 )
             self.size = size_in(attributes["fields"])
+            if size not in (None, name_of(self.size)):
+                raise ContentsError(f"it has levels of size {name_of(self.size)}, and its row says {size}")
             self.table = table_for(self.size)
             check_level_ids(attributes["level_ids"])
             self.level_ids: list[int] = list(attributes["level_ids"])  # type: ignore[arg-type]
@@ -145,13 +147,7 @@ def open_shard(split: Path, name: str, size: str) -> Shard:
     Raises:
         Failure: it is missing, damaged, of another size, or not in the split.
     """
-    shard = Shard(data_path(split, name))
-    if name_of(shard.size) != size:
-        raise Failure(
-            f"The shard {shard.path} has levels of size {name_of(shard.size)}, and its row says {size}: "
-            f"delete {fragment_of(shard.path)} and run the same `levelproof generate` again to remake its levels."
-        )
-    return shard
+    return Shard(data_path(split, name), size)
 
 
 def stored_bytes(path: Path) -> int:

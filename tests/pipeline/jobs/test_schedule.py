@@ -58,7 +58,7 @@ def drain(queue: UnitQueue, workers: int, kills: Collection[int]) -> tuple[list[
         if not any(assignment.units for assignment in assignments):
             return sorted(done), deaths
         for assignment in assignments:
-            running = assignment.hand_over()
+            running = assignment.units
             if any(level_id in kills for unit in running for level_id in unit.level_ids):
                 deaths += 1
                 for outcome in assignment.lose("died"):
@@ -99,12 +99,11 @@ def test_a_worker_gets_units_while_it_has_room() -> None:
     queue, assignment = UnitQueue(deque(plan_units(range(12), set(), 4))), Assignment()
     assert assignment.take(queue)  # however little room there is
     assert not assignment.take(queue)
-    (first,) = assignment.hand_over()
-    assert assignment.hand_over() == []
+    (first,) = assignment.units
     assignment.account(Round([], {first: (0, 0.0, 0)}, wants=2))
     assert assignment.take(queue)
     assert not assignment.take(queue)
-    (second,) = assignment.hand_over()
+    first, second = assignment.units
     assignment.account(Round([UnitOutcome(first)], {}, wants=0))
     assert assignment.units == [second]
     assert [outcome.unit for outcome in assignment.lose("died")] == [second]
