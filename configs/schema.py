@@ -8,7 +8,9 @@ from typing import Any, Literal
 from configs.convert import plain
 from configs.errors import ConfigError
 from configs.numbers import parse_count
-from experts.config import ExpertConfig, Procedure, ScoutConfig, StopConfig, check_budget
+from experts.config import ExpertConfig, ScoutConfig, StopConfig, check_budget
+from experts.procedure import Procedure
+from experts.search.config import SearchConfig
 from levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION
 from levelgen.level import SIZES, size_of
 from levelgen.sampling.distribution import CONTROL_WEIGHTS, Distribution
@@ -43,6 +45,7 @@ class JobConfig:
     distribution: Distribution = field(default_factory=Distribution)  # what random levels are like
     task: TaskParams = field(default_factory=TaskParams)  # what a level asks for
     scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first
+    search: SearchConfig = field(default_factory=SearchConfig)  # who looks where scouts find nothing
     expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
     stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot
 
@@ -84,7 +87,7 @@ class JobConfig:
     @property
     def procedure(self) -> Procedure:
         """How its levels get their labels."""
-        return Procedure(self.scout, self.expert, self.stop)
+        return Procedure(self.scout, self.search, self.expert, self.stop)
 
     @property
     def env_steps(self) -> int:

@@ -1,6 +1,6 @@
 """What an expert is, how it learns, when it stops and what counts as a witness."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 
 RECORD_STEPS = 256  # env steps of a record, with automatic reset inside
@@ -146,15 +146,6 @@ class StopConfig:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
         if not 0 <= self.share <= 1:
             raise ValueError(f"share is {self.share}: it must be between 0 and 1")
-
-
-@dataclass(frozen=True)
-class Procedure:
-    """How a level gets its label (hashable)."""
-
-    scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first
-    expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
-    stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot
 
 
 def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> None:

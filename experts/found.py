@@ -1,12 +1,21 @@
-"""What is known of levels before their experts train: successes, and the env steps that they took to find."""
+"""What is known of levels before their experts train: successes, and what it took to look for them."""
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from experts.labels import Source
+from experts.procedure import Procedure
+from experts.scout import scout
+from experts.search.search import Searched, Searching
 from experts.success import Success, no_success
+from experts.witness import take
+from levelgen.level import Level
+from levelgen.task.rules import TaskParams
+
+STILL = 0.75  # of a search: a cell that is new after so much of it says that more of it would find more
 
 
 class Found(NamedTuple):
@@ -15,16 +24,57 @@ class Found(NamedTuple):
     success: Success
     source: list[Source]  # of the success; where there is none, of the one that training may find
     scout_steps: Int[np.ndarray, " level"]
-    search_steps: Int[np.ndarray, " level"]
+    search_steps: Int[np.ndarray, " level"]  # 0: it was not searched
+    cells: Int[np.ndarray, " level"]  # that its search reached
+    still_grew: Bool[np.ndarray, " level"]  # its archive, at the end of its search
 
 
 def nothing_found(count: int) -> Found:
-    """Of levels in which nobody looked."""
+    """Of levels in which nobody has looked."""
     zeros = np.zeros(count, np.int64)
-    return Found(no_success(count), [Source.EXPLORATION] * count, zeros, zeros)
+    return Found(no_success(count), [Source.EXPLORATION] * count, zeros, zeros.copy(), zeros.copy(), zeros.astype(bool))
 
 
-def found_by_scouts(success: Success, env_steps: Int[np.ndarray, " level"]) -> Found:
-    """What scouts found."""
-    source = [Source.SCOUT if length else Source.EXPLORATION for length in success.length]
-    return Found(success, source, env_steps, np.zeros_like(env_steps))
+class Looking:
+    """Levels in which scouts have looked, and in which a search goes on where they found nothing."""
+
+    def __init__(
+        self, levels: Level, level_ids: Int[np.ndarray, " level"], procedure: Procedure, rules: TaskParams
+    ) -> None:
+        """
+        Args:
+            levels: on the host.
+            level_ids: their ids, the seeds of all randomness.
+            procedure: how long to look.
+            rules: of the task.
+        """
+        scouted = scout(levels, level_ids, procedure.scout, rules)
+        source = [Source.SCOUT if length else Source.EXPLORATION for length in scouted.success.length]
+        self.found = nothing_found(len(level_ids))._replace(
+            success=scouted.success, source=source, scout_steps=scouted.env_steps
+        )
+        self._left = np.flatnonzero(scouted.success.length == 0)
+        some = take(levels, self._left), level_ids[self._left]
+        searches = procedure.search.env_steps and len(self._left)
+        self._searching = Searching(*some, procedure.search, rules) if searches else None
+
+    def step(self) -> bool:
+        """Search a little further; whether there is anything left to search."""
+        if self._searching is None:
+            return False
+        if self._searching.step():
+            return True
+        self._take(self._searching.result())
+        self._searching = None
+        return False
+
+    def _take(self, searched: Searched) -> None:
+        """Put in what the search found."""
+        found, left = self.found, self._left
+        put = lambda whole, part: whole.__setitem__(left, part)
+        jax.tree.map(put, found.success, searched.success)
+        put(found.search_steps, searched.env_steps)
+        put(found.cells, searched.cells)
+        put(found.still_grew, searched.grew > STILL * np.asarray(searched.env_steps))
+        for i in left[np.asarray(searched.success.length) > 0]:
+            found.source[i] = Source.SEARCH

@@ -62,6 +62,8 @@ class Verdict:
     evaluation_steps: int = 0  # env steps
     scout_steps: int = 0  # env steps
     search_steps: int = 0  # env steps
+    cells: int | None = None  # that the search reached; None: there was none
+    still_grew: bool | None = None  # whether its archive did, at its end
 
 
 def solved_reason(source: Source, episodes: int) -> str:

@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Int
 
 from experts.advance import advance
-from experts.config import RECORD_STEPS, ExpertConfig, Procedure
+from experts.config import RECORD_STEPS, ExpertConfig
 from experts.found import Found, nothing_found
 from experts.judge import Evaluation, Kept, Trained, Witness, witness_of
+from experts.procedure import Procedure
 from experts.queue import GROUP, empty_queue, enter, next_indices
 from experts.slots import Begun, LevelQueue, Mode, Report, Slots, empty_slots
 from experts.stop import rules_of

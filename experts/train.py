@@ -2,19 +2,18 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Int
 
-from experts.before import Before, decide
-from experts.config import RECORD_STEPS, Procedure, Rule, check_budget
-from experts.found import Found, found_by_scouts
+from experts.before import decide
+from experts.config import RECORD_STEPS, Rule, check_budget
+from experts.found import Found, Looking
 from experts.judge import Kept, Trained, judge, repeating
 from experts.labels import WITNESSED, Label, Verdict
 from experts.pool import NOTHING_BEGUN, Pool, Submission, Totals
-from experts.scout import scout
+from experts.procedure import Procedure
 from experts.steps import EnvSteps
 from experts.success import Success
 from experts.witness import Record, replay, take
@@ -41,15 +40,40 @@ class UnitResult:
     experts: dict[int, Kept] = field(default_factory=dict)  # by level id, where they are kept
 
 
-class TrainingRun(NamedTuple):
-    """Levels of which each has its verdict or is in a pool."""
+class TrainingRun:
+    """Levels on their way to their verdicts: decided at once, looked into, then in a pool."""
 
-    level_ids: np.ndarray
-    levels: Level
-    before: Before
-    left: np.ndarray  # indices of the levels that `before` has not decided
-    found: Found  # in those
-    submission: Submission  # those, or none where no expert is asked for
+    def __init__(self, pool: Pool, levels: Level, level_ids: np.ndarray, begun: Mapping[int, Kept], keep: bool) -> None:
+        """The arguments are those of `begin`."""
+        self.pool, self.level_ids, self._begun, self._keep = pool, level_id_array(level_ids), begun, keep
+        self.levels: Level = jax.tree.map(np.asarray, levels)
+        self.before = decide(self.levels, pool.rules)
+        self.left = np.array([i for i, verdict in enumerate(self.before.verdicts) if verdict is None], int)
+        self._looking = Looking(*self._some(self.left), pool.procedure, pool.rules)
+        self.submission: Submission | None = None  # of those that an expert is asked for
+        self.look()
+
+    @property
+    def found(self) -> Found:
+        return self._looking.found
+
+    def look(self) -> None:
+        """Search a little further; submit to the pool once there is nothing left to search."""
+        if self.submission is None and not self._looking.step():
+            some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
+            levels, level_ids = self._some(some)
+            mine = {
+                i: self._begun[level_id] for i, level_id in enumerate(level_ids.tolist()) if level_id in self._begun
+            }
+            self.submission = self.pool.submit(levels, level_ids, self.found, mine, self._keep)
+
+    @property
+    def searching(self) -> int:
+        """Levels that will come to the pool."""
+        return 0 if self.submission else len(self.left)
+
+    def _some(self, indices: Int[np.ndarray, " index"]) -> tuple[Level, Int[np.ndarray, " index"]]:
+        return take(self.levels, indices), self.level_ids[indices]
 
 
 def train_levels(
@@ -79,7 +103,8 @@ def train_levels(
     """
     pool = new_pool(budget, procedure, rules)
     run = begin(pool, levels, level_ids, begun, keep)
-    while not pool.step():
+    while run.submission is None or not pool.step():
+        run.look()
         tell(*totals(pool, run))
     result = finish(pool, run)
     solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
@@ -94,7 +119,7 @@ def begin(
     begun: Mapping[int, Kept] = NOTHING_BEGUN,
     keep: bool = False,
 ) -> TrainingRun:
-    """Scout the levels that doing nothing does not decide, and submit them to the pool.
+    """Look into the levels that doing nothing does not decide; `TrainingRun.look` goes on with it.
 
     Args:
         pool: where experts train, perhaps beside those of other runs.
@@ -103,30 +128,23 @@ def begin(
         begun: by level id, experts that go on with what they have left of the budget; the others begin.
         keep: whether the result has the experts.
     """
-    level_ids, procedure = level_id_array(level_ids), pool.procedure
-    levels = jax.tree.map(np.asarray, levels)
-    before = decide(levels, pool.rules)
-    left = np.array([i for i, verdict in enumerate(before.verdicts) if verdict is None], int)
-    found = found_by_scouts(*scout(take(levels, left), level_ids[left], procedure.scout, pool.rules))
-    some = left if procedure.stop.rule != Rule.NONE else left[:0]
-    mine = {index: begun[level_id] for index, level_id in enumerate(level_ids[some].tolist()) if level_id in begun}
-    submission = pool.submit(take(levels, some), level_ids[some], found, mine, keep)
-    return TrainingRun(level_ids, levels, before, left, found, submission)
+    return TrainingRun(pool, levels, level_ids, begun, keep)
 
 
 def totals(pool: Pool, run: TrainingRun) -> Totals:
     """How far all levels of a run are, those that need no expert included."""
-    now = pool.totals(run.submission)
-    waiting = len(run.submission.level_ids)
-    return now._replace(
-        env_steps=now.env_steps + int(run.found.scout_steps.sum() + run.found.search_steps.sum()),
-        levels=len(run.level_ids) - waiting + now.levels,
-    )
+    looked = int(run.found.scout_steps.sum() + run.found.search_steps.sum())
+    if run.submission is None:
+        return Totals(looked, len(run.level_ids) - len(run.left), 0)
+    now, waiting = pool.totals(run.submission), len(run.submission.level_ids)
+    return now._replace(env_steps=now.env_steps + looked, levels=len(run.level_ids) - waiting + now.levels)
 
 
 def finish(pool: Pool, run: TrainingRun) -> UnitResult:
     """Choose witnesses and give verdicts, once the run's submission has finished."""
-    level_ids, levels, (before, failed), left, found, submission = run
+    level_ids, levels, (before, failed), left, found = run.level_ids, run.levels, run.before, run.left, run.found
+    submission = run.submission
+    assert submission is not None
     trained = submission.trained(pool.config) if len(submission.level_ids) else as_found(found)
     actions = np.zeros((RECORD_STEPS, ACTIONS, len(level_ids)), np.int32)  # doing nothing, where none are found
     for i, of in zip(left, trained, strict=True):
@@ -135,10 +153,7 @@ def finish(pool: Pool, run: TrainingRun) -> UnitResult:
     record = replay(levels, actions, pool.rules)
     judged = judge(trained, take(record, left), pool.updates, pool.config, failed[left])
     verdicts = {
-        i: replace(verdict, scout_steps=scouted, search_steps=searched)
-        for i, verdict, scouted, searched in zip(
-            left.tolist(), judged, found.scout_steps.tolist(), found.search_steps.tolist(), strict=True
-        )
+        int(i): with_looks(verdict, found, at) for at, (i, verdict) in enumerate(zip(left, judged, strict=True))
     }
     known = [verdict or verdicts[i] for i, verdict in enumerate(before)]
     witnessed = np.array([verdict.label in WITNESSED for verdict in known])
@@ -146,6 +161,18 @@ def finish(pool: Pool, run: TrainingRun) -> UnitResult:
     ended = zip(level_ids[left].tolist(), trained, strict=True)
     experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
     return UnitResult(level_ids, levels, record, known, spent_on(known, submission, pool), experts)
+
+
+def with_looks(verdict: Verdict, found: Found, index: int) -> Verdict:
+    """The verdict with what was done before training."""
+    searched = int(found.search_steps[index])
+    return replace(
+        verdict,
+        scout_steps=int(found.scout_steps[index]),
+        search_steps=searched,
+        cells=int(found.cells[index]) if searched else None,
+        still_grew=bool(found.still_grew[index]) if searched else None,
+    )
 
 
 def as_found(found: Found) -> list[Trained]:

@@ -6,7 +6,8 @@ from typing import Any
 
 from benchmarks.reference.hyperparameters import PPO
 from configs.compose import compose_job
-from experts.config import Choice, ExpertConfig, Network, Procedure, Rule, StopConfig
+from experts.config import Choice, ExpertConfig, Network, Rule, StopConfig
+from experts.procedure import Procedure
 
 PUBLISHED = compose_job(["procedure=published"]).procedure
 ALONE = replace(PUBLISHED, stop=StopConfig(rule=Rule.SOLVED))

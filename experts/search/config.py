@@ -11,7 +11,7 @@ MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are co
 class SearchConfig:
     """Settings of a search (hashable: pass as a static argument)."""
 
-    env_steps: int = 1_048_576  # of one level, all lanes together; rounded up to whole rounds
+    env_steps: int = 1_048_576  # of one level, all lanes together; rounded up to whole rounds; 0: none
     # play
     lanes: int = 64  # of one level
     redrawn: tuple[float, ...] = (0.02, 0.05, 0.1, 0.3)  # chance of drawing an entry of the action anew, per env step
@@ -33,7 +33,9 @@ class SearchConfig:
     rounds: int = 8  # between looks of the host
 
     def __post_init__(self) -> None:
-        for name in ("env_steps", "lanes", "segment", "stretch", "entries", "trials", "rounds"):
+        if self.env_steps < 0:
+            raise ValueError(f"env_steps is {self.env_steps}: it must not be negative")
+        for name in ("lanes", "segment", "stretch", "entries", "trials", "rounds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
         if self.entries > MOST_ENTRIES:

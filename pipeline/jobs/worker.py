@@ -32,7 +32,8 @@ class Worker:
             outcomes = self._step()
         now = {unit: totals(self._pool, run) for unit, run in self._runs.items()}
         plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}  # read without JAX
-        return Round(outcomes, plain, self._pool.wants)
+        wants = max(0, self._pool.wants - sum(run.searching for run in self._runs.values()))
+        return Round(outcomes, plain, wants)
 
     def _begin(self, unit: WorkUnit) -> UnitOutcome | None:
         try:
@@ -42,8 +43,10 @@ class Worker:
         return None
 
     def _step(self) -> list[UnitOutcome]:
-        """A rollout of every expert; the outcomes of the units that it finished."""
+        """A step of every search and a rollout of every expert; the outcomes of the units that it finished."""
         try:
+            for run in self._runs.values():
+                run.look()
             finished = self._pool.step()
         except Exception as error:
             units = list(self._runs)

@@ -40,6 +40,8 @@ COLUMNS = pa.schema(
         pa.field("evaluation_steps", pa.int64(), nullable=False),  # env steps, as the next two
         pa.field("scout_steps", pa.int64(), nullable=False),
         pa.field("search_steps", pa.int64(), nullable=False),
+        pa.field("cells", pa.int32()),  # that the search reached; null: there was none
+        pa.field("still_grew", pa.bool_()),  # its archive, at its end
         pa.field(
             "learning_curve", pa.list_(pa.float32()), nullable=False
         ),  # success rate per update, null: no episode ended

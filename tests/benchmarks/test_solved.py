@@ -19,8 +19,9 @@ from benchmarks.solved.results import Header, Results, count, made, merge, read,
 from benchmarks.solved.variants import VARIANTS, Variant
 from benchmarks.statistics import mcnemar
 from configs.convert import flat, plain
-from experts.config import RECORD_STEPS, ExpertConfig, Procedure, Rule, StopConfig
+from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.labels import Label, Source
+from experts.procedure import Procedure
 from levelgen.task.actions import CHOICES
 from pipeline.errors import Exit, UserError
 from tests.experts.small import untouched

@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from experts.config import ExpertConfig, Procedure, Rule, ScoutConfig, StopConfig
+from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from experts.procedure import Procedure
+from experts.search.config import SearchConfig
 from levelgen.task.rules import DEFAULT_RULES
 
 IDS = np.array([0, 2, 3, 4, 6, 7, 9])  # levels of size s that need an expert
@@ -17,4 +19,4 @@ WHOLE = StopConfig(rule=Rule.BUDGET)
 
 def untouched(stopping: StopConfig, config: ExpertConfig = CONFIG) -> Procedure:
     """Experts of levels in which nobody looked before."""
-    return Procedure(ScoutConfig(rounds=0), config, stopping)
+    return Procedure(ScoutConfig(rounds=0), SearchConfig(env_steps=0), config, stopping)

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from experts.before import decide, facts_of
-from experts.config import RECORD_STEPS, ExpertConfig, Procedure
+from experts.config import RECORD_STEPS, ExpertConfig
 from experts.labels import Label, Verdict
+from experts.procedure import Procedure
 from experts.train import train_levels
 from experts.witness import replay, succeeds, take
 from levelgen.level import SIZES, Level

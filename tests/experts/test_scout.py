@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.config import RECORD_STEPS, Procedure, Rule, ScoutConfig, StopConfig
+from experts.config import RECORD_STEPS, Rule, ScoutConfig, StopConfig
 from experts.labels import Label, Source
 from experts.scout import REDRAWN, STEPS_PER_ROUND, Scouted, persistent, scout, shortest
+from experts.search.config import SearchConfig
 from experts.train import train_levels
 from experts.witness import replay, take
 from levelgen.level import SIZES, Level
@@ -89,7 +90,9 @@ def test_the_shortest_success_counts() -> None:
 
 
 def test_without_experts_labels_rest_on_what_was_found(levels: Level, found: Scouted) -> None:
-    result = train_levels(levels, IDS, 1024, Procedure(TWICE, CONFIG, StopConfig(rule=Rule.NONE)))
+    result = train_levels(
+        levels, IDS, 1024, Procedure(TWICE, SearchConfig(env_steps=0), CONFIG, StopConfig(rule=Rule.NONE))
+    )
     for verdict, length, steps in zip(result.verdicts, found.success.length, found.env_steps, strict=True):
         assert verdict.label is (Label.SOLVED if length else Label.UNSOLVED)
         assert verdict.witness is (Source.SCOUT if length else None)

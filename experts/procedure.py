@@ -1,0 +1,16 @@
+"""How a level gets its label: everything that decides it but the rules of the task and the budget."""
+
+from dataclasses import dataclass, field
+
+from experts.config import ExpertConfig, ScoutConfig, StopConfig
+from experts.search.config import SearchConfig
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """Who looks, who trains and when that ends (hashable)."""
+
+    scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first
+    search: SearchConfig = field(default_factory=SearchConfig)  # who looks where scouts find nothing
+    expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
+    stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot
