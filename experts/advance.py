@@ -174,9 +174,7 @@ def _learn(
     shuffling = jax.random.fold_in(now.key, config.horizon)  # the rollout used 0 .. horizon - 1
     train_state = ppo.update(training.train_state, shuffling, network, now.constants, now.rows, config)
     totals = progress.watch(totals, train_state.params)
-    course, due, final = stop.after_update(
-        training.course, totals, jnp.asarray(success.length > 0), share, slot.deadline, stopping
-    )
+    course, due, final = stop.after_update(training.course, totals, success.length > 0, share, slot.deadline, stopping)
     training = Training(train_state, totals, course, success, recent[config.horizon :])
     trial = slot.trial._replace(part=jnp.int32(0), due=due, final=final)
     return slot._replace(mode=jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share

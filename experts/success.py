@@ -14,13 +14,14 @@ from levelgen.task.actions import CHOICES
 class Success(NamedTuple):
     """A successful episode; episodes start in the level's own state, so its actions reach the goal again."""
 
-    action: Int[Array, "256 6"] | Int[np.ndarray, "... 256 6"]  # zeros after its end
-    length: Int[Array, ""] | Int[np.ndarray, "..."]  # env steps; 0: there is none
+    action: Int[Array, "256 6"]  # zeros after its end
+    length: Int[Array, ""]  # env steps; 0: there is none
 
 
 def no_success(count: int) -> Success:
     """None for each of so many levels, on the host, level first."""
-    return Success(np.zeros((count, RECORD_STEPS, len(CHOICES)), np.int8), np.zeros(count, np.int32))
+    action, length = np.zeros((count, RECORD_STEPS, len(CHOICES)), np.int8), np.zeros(count, np.int32)
+    return Success(action, length)  # pyright: ignore[reportArgumentType]
 
 
 def remember(known: Success, new: Success) -> Success:

@@ -155,10 +155,11 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
         config: of its expert.
         failed_by_noop: whether doing nothing lets green touch red.
     """
+    import jax
     import jax.numpy as jnp
 
     from experts import judge, progress
-    from experts.success import Success
+    from experts.success import no_success
     from experts.witness import succeeds
 
     done, goal = seen["trained_done"], seen["trained_goal"]
@@ -170,7 +171,7 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
         first_success=jnp.int32(first_success(goal)),
         diverged=jnp.int32(progress.NEVER),
     )
-    nothing = Success(np.zeros((0, 6)), np.zeros((), np.int32))
+    nothing = jax.tree.map(lambda x: x[0], no_success(1))
     evaluation = judge.Evaluation(np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, nothing)
     witness = judge.witness_of([evaluation], Source.EXPLORATION, config)
     of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))

@@ -11,7 +11,7 @@ MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are co
 class SearchConfig:
     """Settings of a search (hashable: pass as a static argument)."""
 
-    env_steps: int = 1_048_576  # of one level, all lanes together; rounded up to whole rounds; 0: none
+    env_steps: int = 262_144  # of one level, all lanes together; rounded up to whole rounds; 0: none
     # play
     lanes: int = 64  # of one level
     redrawn: tuple[float, ...] = (0.02, 0.05, 0.1, 0.3)  # chance of drawing an entry of the action anew, per env step

@@ -1,5 +1,7 @@
 """Persistent random play: what it finds is true, depends on the level alone, and is played as said."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,14 +10,13 @@ import pytest
 from experts.config import RECORD_STEPS, Rule, ScoutConfig, StopConfig
 from experts.labels import Label, Source
 from experts.scout import REDRAWN, STEPS_PER_ROUND, Scouted, persistent, scout, shortest
-from experts.search.config import SearchConfig
 from experts.train import train_levels
 from experts.witness import replay, take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.actions import CHOICES, action_mask
 from levelgen.task.rules import DEFAULT_RULES
-from tests.experts.small import CONFIG, IDS
+from tests.experts.small import IDS, untouched
 
 TWICE = ScoutConfig(rounds=2)
 
@@ -90,9 +91,8 @@ def test_the_shortest_success_counts() -> None:
 
 
 def test_without_experts_labels_rest_on_what_was_found(levels: Level, found: Scouted) -> None:
-    result = train_levels(
-        levels, IDS, 1024, Procedure(TWICE, SearchConfig(env_steps=0), CONFIG, StopConfig(rule=Rule.NONE))
-    )
+    procedure = replace(untouched(StopConfig(rule=Rule.NONE)), scout=TWICE)
+    result = train_levels(levels, IDS, 1024, procedure)
     for verdict, length, steps in zip(result.verdicts, found.success.length, found.env_steps, strict=True):
         assert verdict.label is (Label.SOLVED if length else Label.UNSOLVED)
         assert verdict.witness is (Source.SCOUT if length else None)

@@ -32,7 +32,7 @@ def test_the_first_success_is_found_with_its_actions(seed: int, p_end: float) ->
             done[t, e] |= timestep[t, e] == RECORD_STEPS - 1
     goal = done & (rng.random(done.shape) < 0.5)
 
-    recent, known = np.zeros((RECORD_STEPS, 6, ENVIRONMENTS), np.int8), no_success()
+    recent, known = np.zeros((RECORD_STEPS, 6, ENVIRONMENTS), np.int8), jax.tree.map(lambda x: x[0], no_success(1))
     for r in range(ROLLOUTS):
         part = slice(r * HORIZON, (r + 1) * HORIZON)
         recent, known = look(recent, action[part], goal[part], timestep[part], known)
