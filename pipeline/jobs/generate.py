@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from configs.schema import JobConfig
+from experts.labels import Label
 from experts.steps import EnvSteps
 from pipeline.errors import Exit, Failure
 from pipeline.jobs.progress import Board, Tally, say
@@ -48,7 +49,7 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
                     f"Stopped: {board.tally.done} of {len(wanted)} levels are committed; the same command goes on."
                 )
                 raise
-            manifest = read_manifest(split, ["label", "env_steps", "steps_to_first_success"])
+            manifest = read_manifest(split, ["label", "env_steps"])
             spent = _spent(manifest, wanted - done, board.tally.spent) if board.tally.spent.shown else ""
         else:
             print(f"Nothing to do: all {len(wanted)} levels are there.")
@@ -93,19 +94,17 @@ def _labels(manifest: Manifest, wanted: Collection[int]) -> Counter[str]:
 def _spent(manifest: Manifest, made: Collection[int], spent: EnvSteps) -> str:
     """What this run's env steps were for."""
     rows = manifest.table.filter(np.isin(manifest.level_ids, list(made)))
-    steps, first, label = (rows.column(name).to_numpy() for name in ("env_steps", "steps_to_first_success", "label"))
-    total = sum(spent)
-    after = np.nansum(np.where(label == "solved", steps - first.astype(float), 0.0))
+    steps, label = (rows.column(name).to_numpy() for name in ("env_steps", "label"))
     shares = {
-        "of scouts": spent.scouted / total,
-        "of searches": spent.searched / total,
-        "of training after a level's first success": after / total,
-        "of training of levels that stayed unsolved": steps[label == "unsolved"].sum() / total,
-        "of evaluations": spent.evaluated / total,
-        "in empty slots": spent.idle / total,
+        "of scouts": spent.scouted,
+        "of searches": spent.searched,
+        "of training that solved its level": steps[label == Label.SOLVED].sum(),
+        "of training that did not": steps[label == Label.UNSOLVED].sum(),
+        "of evaluations": spent.evaluated,
+        "in empty slots": spent.idle,
     }
-    told = ", ".join(f"{share:.0%} {name}" for name, share in shares.items() if share)
-    return f"{total:,} env steps: {told}."
+    told = ", ".join(f"{share / sum(spent):.0%} {name}" for name, share in shares.items() if share)
+    return f"{sum(spent):,} env steps: {told}."
 
 
 def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: UnitQueue, spent: str) -> None:
