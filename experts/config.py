@@ -25,10 +25,10 @@ class Rule(StrEnum):
 
 
 class Choice(StrEnum):
-    """Which of a level's successes becomes its witness."""
+    """Which successes of its evaluations can be a level's witness."""
 
-    RECORD = "record"  # the first attempt whose every finished episode reached the goal, automatic reset and all
-    SHORTEST = "shortest"  # the shortest successful episode of any attempt, repeated to fill the record
+    RECORD = "record"  # attempts whose every finished episode reached the goal, automatic reset and all
+    SHORTEST = "shortest"  # the shortest successful episodes of any attempt, repeated to fill the record
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,9 @@ class ExpertConfig:
     sticky_attempts: int = 8  # lanes where an action is sometimes repeated against the expert's will
     moved_attempts: int = 8  # lanes that start with other velocities
     # witness
-    witness: Choice = Choice.RECORD  # which of a level's successes becomes its witness
+    witness: Choice = Choice.RECORD  # which successes of its evaluations can be a level's witness
     exploration: bool = True  # a success of scout, search or training is a witness, too, where evaluation has none
+    replays: int = 32  # of each candidate, from starts moved by a rounding error; 0: the first candidate is the witness
     # machine
     slots: int = 0  # experts that train side by side in one program; 0: as many as suit the device
 
@@ -80,7 +81,7 @@ class ExpertConfig:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be between 0 and 1")
         not_negative = ("dense_reward_scale", "value_weight", "entropy_weight", "imitation_weight", "slots")
-        for name in (*not_negative, "rehearsals", "sticky_attempts", "moved_attempts"):
+        for name in (*not_negative, "rehearsals", "sticky_attempts", "moved_attempts", "replays"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
         if self.steps_per_update % self.minibatches:

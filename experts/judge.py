@@ -14,6 +14,9 @@ from experts.slots import Begun
 from experts.success import Success
 from experts.witness import Record, steps_to_goal, succeeds
 
+MOST_OF_AN_EVALUATION = 8  # candidates
+MOST_CANDIDATES = 16  # of a level
+
 
 class Evaluation(NamedTuple):
     """One evaluation, on the host; environments in the order of `experts.advance._manner`."""
@@ -38,6 +41,7 @@ class Witness(NamedTuple):
     action: Int[np.ndarray, "256 6"]
     source: Source
     steps: int  # of the first episode
+    portability: float | None = None  # as in `Verdict`; None: not known
 
 
 class Trained(NamedTuple):
@@ -46,12 +50,13 @@ class Trained(NamedTuple):
     curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
     evaluations: list[Evaluation]  # those that solved it, and the last
     expert: Kept | None = None  # if it is kept
-    witness: Witness | None = None  # the best, not yet replayed
+    candidates: Sequence[Witness] = ()  # for its witness, the shortest first; not yet replayed
     evaluation_steps: int = 0  # env steps
 
 
 def judge(
     trained: Sequence[Trained],
+    chosen: Sequence[Witness | None],
     record: Record,
     updates: int,
     config: ExpertConfig,
@@ -59,50 +64,52 @@ def judge(
 ) -> list[Verdict]:
     """Verdicts. A witness counts only if its record, by replay, shows what the evaluation showed.
 
-    `updates` are those that the budget paid for.
+    `chosen` are the witnesses, not yet replayed; `updates` are those that the budget paid for.
     """
     replays, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
     verdicts = []
-    for i, of in enumerate(trained):
-        counts = of.witness is not None and replays[i] and steps[i] == of.witness.steps
-        witness = of.witness if counts else None
+    for i, (of, choice) in enumerate(zip(trained, chosen, strict=True)):
+        counts = choice is not None and replays[i] and steps[i] == choice.steps
+        witness = choice if counts else None
         episodes, halted = int(record.done[:, i].sum()), len(of.curve) < updates
         verdicts.append(verdict_of(of, witness, episodes, halted, config, bool(failed_by_noop[i])))
     return verdicts
 
 
-def witness_of(evaluations: Sequence[Evaluation], source: Source, config: ExpertConfig) -> Witness | None:
-    """The best witness there is: of any evaluation, the one with the shortest way to the goal.
+def candidates_of(evaluations: Sequence[Evaluation], source: Source, config: ExpertConfig) -> list[Witness]:
+    """What could be a level's witness: successes of its evaluations, the shortest first.
 
     Without one, the success that was rehearsed, which is of this source.
     """
     found = [witness for e in evaluations for witness in witnesses_in(e, config)]
     if not found and config.exploration:
         return repeating(evaluations[-1].success, source)
-    return min(found, key=lambda witness: witness.steps, default=None)
+    return sorted(found, key=lambda witness: witness.steps)[:MOST_CANDIDATES]
 
 
-def repeating(success: Success, source: Source) -> Witness | None:
+def repeating(success: Success, source: Source) -> list[Witness]:
     """A success again and again, if there is one."""
     steps = int(success.length)
-    return Witness(repeated(np.asarray(success.action), steps), source, steps) if steps else None
+    return [Witness(repeated(np.asarray(success.action), steps), source, steps)] if steps else []
 
 
 def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
-    """One witness of an evaluation, or none."""
+    """The shortest witnesses of an evaluation; where none is replayed from moved starts, one."""
     attempts = evaluation.action.shape[-1]
     done, goal = evaluation.done[:, :attempts], evaluation.goal[:, :attempts]
     source = lambda attempt: Source.SAMPLED if attempt else Source.MOST_PROBABLE
+    most = MOST_OF_AN_EVALUATION if config.replays else 1
     if config.witness == Choice.RECORD:
-        usable = np.flatnonzero(succeeds(done, goal))[:1]
-        return [Witness(evaluation.action[..., i], source(i), int(steps_to_goal(done)[i])) for i in usable]
+        steps, usable = steps_to_goal(done), np.flatnonzero(succeeds(done, goal))
+        if config.replays:
+            usable = usable[np.argsort(steps[usable], stable=True)]
+        return [Witness(evaluation.action[..., i], source(i), int(steps[i])) for i in usable[:most]]
     episodes = [(end - start, attempt, start) for attempt in range(attempts)
                 for start, end in successful_episodes(done[:, attempt], goal[:, attempt])]  # fmt: skip
-    if not episodes:
-        return []
-    steps, attempt, start = min(episodes)
-    action = evaluation.action[start : start + steps, :, attempt]
-    return [Witness(repeated(action, steps), source(attempt), steps)]
+    played = lambda steps, attempt, start: evaluation.action[start : start + steps, :, attempt]
+    distinct = {played(*episode).tobytes(): episode for episode in sorted(episodes, reverse=True)}  # the first stays
+    shortest = sorted(distinct.values())[:most]
+    return [Witness(repeated(played(*episode), episode[0]), source(episode[1]), episode[0]) for episode in shortest]
 
 
 def successful_episodes(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:
@@ -126,9 +133,11 @@ def verdict_of(
 ) -> Verdict:
     """A level's verdict: `episodes` are those of its record, `halted` tells that it left before its budget ended."""
     if not trained.evaluations:
-        source, steps = (witness.source, witness.steps) if witness else (None, None)
-        reason = solved_reason(witness.source, episodes) if witness else UNTRAINED
-        return untrained(Label.SOLVED if witness else Label.UNSOLVED, reason, failed_by_noop, source, steps)
+        if witness is None:
+            return untrained(Label.UNSOLVED, UNTRAINED, failed_by_noop)
+        _, source, steps, portability = witness
+        reason = solved_reason(source, episodes)
+        return untrained(Label.SOLVED, reason, failed_by_noop, source, steps, portability)
     last = trained.evaluations[-1]
     attempts, sticky, moved = shares(last, config)
     first, diverged = (int(x) for x in (last.progress.first_success, last.progress.diverged))
@@ -148,6 +157,7 @@ def verdict_of(
         steps_to_goal=None if witness is None else witness.steps,
         steps_to_first_success=None if first == NEVER else first,
         env_steps=int(last.progress.env_steps),
+        portability=None if witness is None else witness.portability,
         evaluation_steps=trained.evaluation_steps,
         learning_curve=trained.curve,
         best_return=float(last.progress.best_return),

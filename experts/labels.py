@@ -59,6 +59,7 @@ class Verdict:
     learning_curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
     best_return: float  # of training's episodes, shaping included; -inf: none ended
     episodes: int  # of training
+    portability: float | None = None  # share of the witness's replays from moved starts that reach the goal
     evaluation_steps: int = 0  # env steps
     scout_steps: int = 0  # env steps
     search_steps: int = 0  # env steps
@@ -96,7 +97,12 @@ def unsolvable_reason(proof: Proof, fails: bool) -> str:
 
 
 def untrained(
-    label: Label, reason: str, failed_by_noop: bool, witness: Source | None = None, steps_to_goal: int | None = None
+    label: Label,
+    reason: str,
+    failed_by_noop: bool,
+    witness: Source | None = None,
+    steps_to_goal: int | None = None,
+    portability: float | None = None,
 ) -> Verdict:
     """The verdict on a level without an expert. Where none is needed, doing nothing counts as the evaluation."""
     decided = label not in TRAINED
@@ -115,4 +121,5 @@ def untrained(
         learning_curve=[],
         best_return=float("-inf"),
         episodes=0,
+        portability=portability,
     )

@@ -17,7 +17,7 @@ from jaxtyping import Int
 from experts.advance import advance
 from experts.config import RECORD_STEPS, ExpertConfig
 from experts.found import Found, nothing_found
-from experts.judge import Evaluation, Kept, Trained, Witness, witness_of
+from experts.judge import Evaluation, Kept, Trained, Witness, candidates_of
 from experts.procedure import Procedure
 from experts.queue import GROUP, empty_queue, enter, next_indices
 from experts.slots import Begun, LevelQueue, Mode, Report, Slots, empty_slots
@@ -57,7 +57,7 @@ class Submission:
         self.curves = [list(begun[i].curve) if i in begun else [] for i in range(count)]
         self.evaluations: list[list[Evaluation]] = [[] for _ in range(count)]
         self.experts: list[Kept | None] = [None] * count
-        self.witnesses: list[Witness | None] = [None] * count
+        self.candidates: list[list[Witness]] = [[] for _ in range(count)]
         self.under_way = set(range(count))
         self.solved = 0
         self.trained_rollouts = self.idle_rollouts = 0
@@ -65,7 +65,7 @@ class Submission:
 
     def trained(self, config: ExpertConfig) -> list[Trained]:
         evaluated = (self.evaluated_rollouts * config.steps_per_update).tolist()
-        of = self.curves, self.evaluations, self.experts, self.witnesses, evaluated
+        of = self.curves, self.evaluations, self.experts, self.candidates, evaluated
         return [Trained(*level) for level in zip(*of, strict=True)]
 
 
@@ -177,8 +177,9 @@ class Pool:
         if seen.left[slot]:
             if submission.keep:
                 submission.experts[i] = Kept(expert_of(self._slots, slot, self.config), submission.curves[i])
-            submission.witnesses[i] = witness_of(submission.evaluations[i], submission.found.source[i], self.config)
-            submission.solved += submission.witnesses[i] is not None
+            candidates = candidates_of(submission.evaluations[i], submission.found.source[i], self.config)
+            submission.candidates[i] = candidates
+            submission.solved += bool(candidates)
             del self._at[index]
             submission.under_way.remove(i)
 

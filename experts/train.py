@@ -1,6 +1,6 @@
 """From levels to verdicts: they are decided without an expert, or scouted, trained and judged."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -10,9 +10,10 @@ from jaxtyping import Int
 from experts.before import decide
 from experts.config import RECORD_STEPS, Rule, check_budget
 from experts.found import Found, Looking
-from experts.judge import Kept, Trained, judge, repeating
-from experts.labels import WITNESSED, Label, Verdict
+from experts.judge import Kept, Trained, Witness, judge, repeating
+from experts.labels import WITNESSED, Label, Source, Verdict
 from experts.pool import NOTHING_BEGUN, Pool, Submission, Totals
+from experts.portability import choose
 from experts.procedure import Procedure
 from experts.steps import EnvSteps
 from experts.success import Success
@@ -147,15 +148,24 @@ def finish(pool: Pool, run: TrainingRun) -> UnitResult:
     assert submission is not None
     trained = submission.trained(pool.config) if len(submission.level_ids) else as_found(found)
     actions = np.zeros((RECORD_STEPS, ACTIONS, len(level_ids)), np.int32)  # doing nothing, where none are found
+    candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
     for i, of in zip(left, trained, strict=True):
-        if of.witness is not None:
-            actions[..., i] = of.witness.action
+        candidates[i] = of.candidates
+    chosen = choose(levels, level_ids, candidates, pool.config.replays, pool.rules)
+    for i, witness in enumerate(chosen):
+        if witness is not None:
+            actions[..., i] = witness.action
     record = replay(levels, actions, pool.rules)
-    judged = judge(trained, take(record, left), pool.updates, pool.config, failed[left])
+    witnesses = [chosen[i] for i in left]
+    judged = judge(trained, witnesses, take(record, left), pool.updates, pool.config, failed[left])
     verdicts = {
         int(i): with_looks(verdict, found, at) for at, (i, verdict) in enumerate(zip(left, judged, strict=True))
     }
-    known = [verdict or verdicts[i] for i, verdict in enumerate(before)]
+    shares = [None if witness is None else witness.portability for witness in chosen]
+    known = [
+        replace(verdict, portability=share) if verdict else verdicts[i]
+        for i, (verdict, share) in enumerate(zip(before, shares, strict=True))
+    ]
     witnessed = np.array([verdict.label in WITNESSED for verdict in known])
     record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
     ended = zip(level_ids[left].tolist(), trained, strict=True)
@@ -178,7 +188,13 @@ def with_looks(verdict: Verdict, found: Found, index: int) -> Verdict:
 def as_found(found: Found) -> list[Trained]:
     """Levels that no expert trained for: their witness is what was found before."""
     each = zip(found.success.action, found.success.length, found.source, strict=True)
-    return [Trained([], [], witness=repeating(Success(action, length), source)) for action, length, source in each]
+    return [Trained([], [], candidates=repeating(Success(action, length), source)) for action, length, source in each]
+
+
+def idling(verdict: Verdict, nothing: Int[np.ndarray, "256 6"]) -> Sequence[Witness]:
+    """The witness of a level that needs no expert, if it has one: doing nothing."""
+    steps = verdict.steps_to_goal
+    return () if steps is None else (Witness(nothing, Source.NOTHING, steps),)
 
 
 def spent_on(verdicts: list[Verdict], submission: Submission, pool: Pool) -> EnvSteps:

@@ -173,7 +173,7 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
     )
     nothing = jax.tree.map(lambda x: x[0], no_success(1))
     evaluation = judge.Evaluation(np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, nothing)
-    witness = judge.witness_of([evaluation], Source.EXPLORATION, config)
+    witness = next(iter(judge.candidates_of([evaluation], Source.EXPLORATION, config)), None)
     of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))
     episodes = int(seen["done"][:, of_witness].sum())
     return judge.verdict_of(judge.Trained([], [evaluation]), witness, episodes, False, config, failed_by_noop)

@@ -25,6 +25,7 @@ class Stream(IntEnum):
     EVALUATION = 2  # the record that labels the level
     SCOUT = 3  # random play before training
     SEARCH = 4  # exploration of a search
+    PORTABILITY = 5  # the moved starts that witnesses are replayed from
 
 
 def level_id_array(level_ids: ArrayLike) -> Int[np.ndarray, " level"]:

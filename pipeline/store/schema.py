@@ -35,6 +35,7 @@ COLUMNS = pa.schema(
         pa.field("sticky_success_rate", pa.float32()),
         pa.field("moved_success_rate", pa.float32()),
         pa.field("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: none
+        pa.field("portability", pa.float32()),  # share of the witness's replays that reach the goal; null: none
         pa.field("steps_to_first_success", pa.int64()),  # env steps of training; null: never
         pa.field("env_steps", pa.int64(), nullable=False),  # of training: used of the budget
         pa.field("evaluation_steps", pa.int64(), nullable=False),  # env steps, as the next two

@@ -6,7 +6,16 @@ import numpy as np
 
 from experts import progress
 from experts.config import RECORD_STEPS, Choice, ExpertConfig
-from experts.judge import Evaluation, repeated, shares, successful_episodes, witness_of
+from experts.judge import (
+    MOST_CANDIDATES,
+    MOST_OF_AN_EVALUATION,
+    Evaluation,
+    Witness,
+    candidates_of,
+    repeated,
+    shares,
+    successful_episodes,
+)
 from experts.labels import Source
 from experts.success import Success
 
@@ -24,9 +33,13 @@ def evaluation(*episodes: list[tuple[int, bool]], success: int = 0) -> Evaluatio
     return Evaluation(action, done, goal, progress.start(CONFIG.environments), played)
 
 
+def best_of(evaluations: list[Evaluation], source: Source, config: ExpertConfig) -> Witness | None:
+    return next(iter(candidates_of(evaluations, source, config)), None)
+
+
 def test_a_record_is_the_first_attempt_without_failure() -> None:
     one = evaluation([(9, True), (20, False)], [(99, True), (199, True)], [(30, True)])
-    witness = witness_of([one], Source.SCOUT, CONFIG)
+    witness = best_of([one], Source.SCOUT, replace(CONFIG, replays=0))
     assert witness is not None
     assert (witness.source, witness.steps) == (Source.SAMPLED, 100)
     np.testing.assert_array_equal(witness.action[:, 0], np.arange(RECORD_STEPS) + 1000)
@@ -34,7 +47,7 @@ def test_a_record_is_the_first_attempt_without_failure() -> None:
 
 def test_the_shortest_success_is_repeated() -> None:
     one = evaluation([(9, True), (14, True), (20, False)], [(99, True)], [(30, True)])
-    witness = witness_of([one], Source.SCOUT, replace(CONFIG, witness=Choice.SHORTEST))
+    witness = best_of([one], Source.SCOUT, replace(CONFIG, witness=Choice.SHORTEST))
     assert witness is not None
     assert (witness.source, witness.steps) == (Source.MOST_PROBABLE, 5)
     np.testing.assert_array_equal(witness.action[:12, 0], [10, 11, 12, 13, 14] * 2 + [10, 11])
@@ -44,20 +57,48 @@ def test_the_best_of_several_evaluations_counts() -> None:
     before, polished = evaluation([(99, True)]), evaluation([(49, True)])
     failed = evaluation([(9, False)])
     for several in ([before, polished], [polished, before], [polished, failed]):
-        witness = witness_of(several, Source.SCOUT, CONFIG)
+        witness = best_of(several, Source.SCOUT, CONFIG)
         assert witness is not None
         assert witness.steps == 50
 
 
+def test_all_that_succeed_are_candidates_the_shortest_first() -> None:
+    one, two = evaluation([(99, True)], [(9, True), (29, False)], [(30, True)]), evaluation([(30, True)], [(20, True)])
+    steps = lambda found: [(witness.steps, witness.source) for witness in found]
+    sampled, probable = Source.SAMPLED, Source.MOST_PROBABLE
+    found = candidates_of([one, two], Source.SCOUT, CONFIG)
+    assert steps(found) == [(21, sampled), (31, sampled), (31, probable), (100, probable)]
+    assert steps(candidates_of([one, two], Source.SCOUT, replace(CONFIG, replays=0))) == [
+        (31, probable),
+        (100, probable),
+    ]
+    for witness in found:
+        assert witness.action.shape == (RECORD_STEPS, 6)
+
+
+def test_of_many_candidates_the_shortest_are_kept_and_of_copies_one() -> None:
+    config = replace(CONFIG, witness=Choice.SHORTEST)
+    ends = [(end, True) for end in np.cumsum(np.arange(20, 8, -1)).tolist()]
+    one = evaluation(ends)
+    found = candidates_of([one, one, one], Source.SCOUT, config)
+    assert [witness.steps for witness in found] == [n for n in range(9, 9 + MOST_OF_AN_EVALUATION) for _ in "123"][
+        :MOST_CANDIDATES
+    ]
+    copies = evaluation(*[[(9, True), (19, True), (29, True)]] * 3)
+    copies.action[:] = 1
+    assert [witness.steps for witness in candidates_of([copies], Source.SCOUT, config)] == [10]
+
+
 def test_a_rehearsed_success_is_a_witness_only_if_wanted_and_only_where_there_is_no_other() -> None:
     failed, solved = evaluation([(9, False)], success=4), evaluation([(9, True)], success=4)
-    assert witness_of([failed], Source.SCOUT, replace(CONFIG, exploration=False)) is None
-    assert witness_of([evaluation([(9, False)])], Source.SCOUT, CONFIG) is None
-    found, own = witness_of([failed], Source.SCOUT, CONFIG), witness_of([solved], Source.SCOUT, CONFIG)
+    assert best_of([failed], Source.SCOUT, replace(CONFIG, exploration=False)) is None
+    assert best_of([evaluation([(9, False)])], Source.SCOUT, CONFIG) is None
+    found, own = best_of([failed], Source.SCOUT, CONFIG), best_of([solved], Source.SCOUT, CONFIG)
     assert found is not None
     assert own is not None
     assert (found.source, found.steps) == (Source.SCOUT, 4)
     assert own.source is Source.MOST_PROBABLE
+    assert [of.source for of in candidates_of([solved], Source.SCOUT, CONFIG)] == [own.source]
 
 
 def test_shares() -> None:

@@ -156,7 +156,7 @@ def test_going_on_equals_having_trained_through(levels: Level, stopping: StopCon
     """A level that left at a rung, too: it is over, and uses none of the larger budget."""
     through, _ = train(levels, IDS, UPDATES, CONFIG, stopping, keep=True)
     first, _ = train(levels, IDS, UPDATES // 2, CONFIG, stopping, keep=True)
-    left = [i for i, of in enumerate(first) if stopping == WHOLE or of.witness is None]
+    left = [i for i, of in enumerate(first) if stopping == WHOLE or not of.candidates]
     assert (stopping == HALVED) == any(len(first[i].curve) < UPDATES // 2 for i in left)
     begun = {number: first[i].expert for number, i in enumerate(left)}
     later, submission = train(

@@ -95,6 +95,7 @@ def made_verdict(label: Label = Label.SOLVED, **changes: Any) -> Verdict:
         sticky_success_rate=0.5 if solved else float("nan"),
         moved_success_rate=0.75 if solved else float("nan"),
         steps_to_goal=17 if solved else None,
+        portability=0.875 if solved else None,
         steps_to_first_success=640 if solved else None,
         env_steps=4096,
         learning_curve=[float("nan"), 0.5],

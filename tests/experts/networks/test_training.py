@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experts.config import Network
-from experts.judge import Trained, witness_of
+from experts.judge import Trained
 from experts.witness import take
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
@@ -27,7 +27,7 @@ def trained(network: Network, at: list[int]) -> list[Trained]:
 @pytest.mark.parametrize("network", Network)
 def test_learns_real_levels_in_any_slot(network: Network) -> None:
     every = trained(network, [0, 1, 2, 3])
-    solved = [witness_of(of.evaluations, CONFIG) is not None for of in every]
+    solved = [bool(of.candidates) for of in every]
     assert sum(solved) >= 3
     assert min(len(of.curve) for of in every) < UPDATES
     for i, of in zip([2, 0, 1], trained(network, [2, 0, 1]), strict=True):

@@ -51,12 +51,14 @@ def test_rows_come_back_sorted_with_every_column(tmp_path: Path, job: JobConfig)
     assert manifest.table.schema.equals(COLUMNS)
     assert (manifest.config_hash, manifest.config) == (job.hash, job.results)
     row = manifest.table.to_pylist()[1]
-    assert (row["budget"], row["steps_to_goal"], row["env_steps"]) == ("128k", 17, 4096)
+    assert (row["budget"], row["steps_to_goal"], row["portability"], row["env_steps"]) == ("128k", 17, 0.875, 4096)
     assert row["learning_curve"] == [None, 0.5]
     assert row["command"] == "levelproof generate size=s budget=128k first_level=3 levels=1"
     nothing = manifest.table.to_pylist()[2]
     rates = ("success_rate", "sticky_success_rate", "moved_success_rate")
-    assert {nothing[name] for name in (*rates, "best_return", "steps_to_goal", "steps_to_first_success")} == {None}
+    assert {
+        nothing[name] for name in (*rates, "best_return", "steps_to_goal", "portability", "steps_to_first_success")
+    } == {None}
 
 
 def test_the_issue_s_columns_are_there() -> None:

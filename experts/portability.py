@@ -1,0 +1,135 @@
+"""How portable a witness is: the share of its replays that reach the goal from starts moved by one rounding error.
+
+A witness is bits of one machine. Another one, or the reference's physics, rounds otherwise, and where a world is
+chaotic the same actions then miss the goal. Of a level's candidates the one that survives most is its witness.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from experts.config import RECORD_STEPS
+from experts.judge import Witness
+from experts.rollout import repeat
+from experts.witness import take
+from levelgen.identity.keys import Stream, key_for
+from levelgen.level import Level
+from levelgen.task import rules as task
+from levelgen.task.rules import TaskParams
+from physics.types import State
+
+LATE = 16  # env steps by which a replay may reach the goal later than the candidate
+CANDIDATES_IN_CACHE = 4  # side by side, each in as many lanes as it has replays
+CANDIDATES_ON_ACCELERATOR = 512
+
+
+def choose(
+    levels: Level,
+    level_ids: Int[np.ndarray, " level"],
+    candidates: Sequence[Sequence[Witness]],
+    replays: int,
+    rules: TaskParams,
+) -> list[Witness | None]:
+    """Of each level's candidates the first of those that survive most replays, with its portability.
+
+    None survives more than one that survives all, so those after it are not replayed.
+
+    Args:
+        levels: on the host.
+        level_ids: their ids, the seeds of all randomness.
+        candidates: of each level, perhaps none.
+        replays: of each candidate; 0: the first is chosen, its portability is not known.
+        rules: of the task.
+    """
+    best = [next(iter(of), None) for of in candidates]
+    shares = np.full(len(best), -1.0)
+    left = [i for i, witness in enumerate(best) if witness is not None and replays]
+    rank = 0
+    while left:
+        at, now = np.array(left), [candidates[i][rank] for i in left]
+        found = survival(take(levels, at), level_ids[at], now, replays, rules)
+        for i, witness, share in zip(left, now, found.tolist(), strict=True):
+            if share > shares[i]:
+                best[i], shares[i] = witness._replace(portability=share), share
+        rank += 1
+        left = [i for i in left if rank < len(candidates[i]) and shares[i] < 1]
+    return best
+
+
+def survival(
+    levels: Level, level_ids: Int[np.ndarray, " level"], witnesses: Sequence[Witness], replays: int, rules: TaskParams
+) -> Float[np.ndarray, " level"]:
+    """The share of replays that reach the goal, of one witness a level; every level on its own.
+
+    Args:
+        levels: on the host, several times where it has several witnesses.
+        level_ids: their ids, the seeds of all randomness.
+        witnesses: of each level.
+        replays: of each witness: their starts are the same for all witnesses of a level.
+        rules: of the task.
+    """
+    side_by_side = CANDIDATES_IN_CACHE if jax.default_backend() == "cpu" else CANDIDATES_ON_ACCELERATOR
+    shares = []
+    for first in range(0, len(witnesses), side_by_side):
+        some = np.minimum(np.arange(first, first + side_by_side), len(witnesses) - 1)
+        action = np.stack([witnesses[i].action for i in some], -1).astype(np.int8)
+        steps = np.array([witnesses[i].steps for i in some], np.int32)
+        shares.append(jax.device_get(_survival(take(levels, some), level_ids[some], action, steps, replays, rules)))
+    return np.concatenate([np.zeros(0, np.float32), *shares])[: len(witnesses)]
+
+
+@partial(jax.jit, static_argnames=("replays", "rules"))
+def _survival(
+    levels: Level,
+    level_ids: Int[Array, " level"],
+    action: Int[Array, "256 6 level"],
+    steps: Int[Array, " level"],
+    replays: int,
+    rules: TaskParams,
+) -> Float[Array, " level"]:
+    lanes = repeat(levels, replays)
+    action = jnp.repeat(action, replays, -1)
+    last = jnp.repeat(jnp.minimum(steps + LATE, RECORD_STEPS), replays) - 1
+
+    def act(carry):
+        t, now, over, reached = carry
+        now, outcome = task.advance(lanes, now, action[t].astype(jnp.int32), rules)
+        return t + 1, now, over | outcome.done | (t == last), reached | (outcome.goal & ~over)
+
+    no = jnp.zeros(len(last), bool)
+    start = replace(task.reset(lanes), state=moved(lanes, level_ids, replays))
+    reached = jax.lax.while_loop(lambda carry: ~carry[2].all(), act, (jnp.int32(0), start, no, no))[3]
+    return reached.reshape(-1, replays).mean(-1)
+
+
+def moved(lanes: Level, level_ids: Int[Array, " level"], replays: int) -> State:
+    """First states: every number of a body that can move is one unit in the last place less or more, or as it was.
+
+    Args:
+        lanes: `replays` of each level, level by level.
+        level_ids: of the levels.
+        replays: of each level.
+    """
+    state, model = lanes.state, lanes.model
+    movable = model.active & ((model.inverse_mass > 0) | (model.inverse_inertia > 0))
+
+    def move(number: int, x: Array, these: Bool[Array, "..."]) -> Array:
+        def draw(level_id):
+            key = jax.random.fold_in(key_for(level_id, Stream.PORTABILITY), number)
+            return jax.random.randint(key, (*x.shape[:-1], replays), -1, 2)
+
+        by = jnp.moveaxis(jax.vmap(draw)(level_ids), 0, -2).reshape(x.shape)
+        return jnp.where(these & (by != 0), jnp.nextafter(x, jnp.where(by > 0, jnp.inf, -jnp.inf)), x)
+
+    return replace(
+        state,
+        position=move(0, state.position, movable[:, None]),
+        rotation=move(1, state.rotation, movable),
+        velocity=move(2, state.velocity, movable[:, None]),
+        angular_velocity=move(3, state.angular_velocity, movable),
+    )
