@@ -26,6 +26,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "scaling": ("benchmarks.scaling", "env steps/s against active contacts, and against bodies"),
     "observation": ("benchmarks.observation", "what the symbolic-flat observation costs beside the step"),
     "families": ("benchmarks.families", "how many levels of each distribution need no expert, and a sheet of each"),
+    "portability": ("benchmarks.portability", "how many witnesses reach the goal in the reference"),
     "readme": ("benchmarks.readme", "the README's commands in a fresh clone and environment"),
 }
 

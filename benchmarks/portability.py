@@ -1,0 +1,161 @@
+"""How many witnesses reach the goal in the reference: exported levels, its own loader and environment.
+
+Levels are labelled by the default procedure. Of each solved one the chosen witness is played, and the one that it
+would have if none were replayed from moved starts.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from benchmarks import oracle
+from benchmarks.report import Report, Table
+from benchmarks.statistics import wilson
+from experts.config import ExpertConfig
+from experts.judge import Witness, candidates_of
+from experts.labels import Label
+from experts.pool import Pool
+from experts.portability import survival
+from experts.procedure import Procedure
+from experts.train import begin, finish, new_pool
+from experts.witness import take
+from levelgen.files.level_file import LevelFile, write_level_file
+from levelgen.level import SIZES, Level
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import DEFAULT_RULES
+from pipeline.runtime import prepare_jax
+
+BUDGET = 64_000  # env steps of an expert
+FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
+UNIT = 64  # levels at a time
+KINDS = ("chosen", "first")  # the most portable candidate, and the first that there is
+
+
+class Played(NamedTuple):
+    """A size's solved levels; what there is of both kinds has them in this order."""
+
+    portability: Float[np.ndarray, "2 level"]
+    reached: Bool[np.ndarray, "2 level"]  # the goal, in the reference
+
+
+class Solved(NamedTuple):
+    """A level and its witnesses."""
+
+    level: Level  # one lane
+    level_id: int
+    witnesses: tuple[Witness, Witness]  # KINDS
+
+
+def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Iterator[Solved]:
+    """Of these levels those that are solved."""
+    levels = jax.tree.map(np.asarray, sample_levels(level_ids, SIZES[size]))
+    run = begin(pool, levels, level_ids)
+    while run.submission is None or not pool.step():
+        run.look()
+    result, submission = finish(pool, run), run.submission
+    once = replace(pool.config, replays=0)
+    for at, i in enumerate(run.left.tolist()):
+        verdict = result.verdicts[i]
+        if verdict.label is Label.SOLVED:
+            assert verdict.witness is not None
+            assert verdict.steps_to_goal is not None
+            chosen = Witness(
+                np.asarray(result.record.action)[..., i], verdict.witness, verdict.steps_to_goal, verdict.portability
+            )
+            first = candidates_of(submission.evaluations[at], submission.found.source[at], once)[0]
+            yield Solved(take(levels, np.array([i])), int(level_ids[i]), (chosen, first))
+
+
+def measured(python: Path, size: str, count: int, first: int) -> Played:
+    """How portable the witnesses of so many levels of a size are."""
+    pool = new_pool(BUDGET, Procedure())
+    ids = np.arange(first, first + count, dtype=np.int32)
+    found = [of for start in range(0, count, UNIT) for of in solved(pool, ids[start : start + UNIT], size)]
+    oracle.tell(f"{size}: {len(found)} of {count} levels are solved.")
+    levels = jax.tree.map(lambda *x: np.concatenate(x, -1), *(of.level for of in found))
+    level_ids = np.array([of.level_id for of in found], np.int32)
+    kinds = list(zip(*(of.witnesses for of in found), strict=True))
+    shares = [survival(levels, level_ids, kind, ExpertConfig().replays, DEFAULT_RULES) for kind in kinds]
+    return Played(np.array(shares), in_reference(python, [of.level for of in found], kinds))
+
+
+def in_reference(python: Path, levels: list[Level], kinds: list[tuple[Witness, ...]]) -> Bool[np.ndarray, "kind level"]:
+    """Whether witnesses of several kinds reach the goal there."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, actions, out = Path(name) / "levels", Path(name) / "actions.npz", Path(name) / "out.npz"
+        folder.mkdir()
+        for i, level in enumerate(levels):
+            write_level_file(LevelFile(level, DEFAULT_RULES), folder / f"{i:06}.json")
+        np.savez(actions, action=np.stack([np.stack([of.action for of in kind], 1) for kind in kinds]))
+        oracle.run_script(python, "witnesses", [out, actions, folder], "play witnesses in the reference")
+        with np.load(out) as file:
+            return file["reached"]
+
+
+def result(size: str, levels: int, played: Played) -> dict:
+    """Of one size, as JSON has it."""
+    kinds = {}
+    for kind, portability, reached in zip(KINDS, *played, strict=True):
+        survived_all = reached[portability == 1]
+        kinds[kind] = {
+            "reach_the_goal": share(reached),
+            "interval": wilson(int(reached.sum()), len(reached)),
+            "portability": float(portability.mean()),
+            "survive_all": len(survived_all) / len(reached),
+            "reach_the_goal_of_those": share(survived_all),
+        }
+    return {"size": size, "levels": levels, "witnesses": played.reached.shape[1], **kinds}
+
+
+def share(of: Bool[np.ndarray, " level"]) -> float:
+    return float(of.mean()) if len(of) else float("nan")
+
+
+def rows(of: Mapping) -> list[list[str]]:
+    return [
+        [
+            of["size"],
+            f"{of['witnesses']:,}",
+            kind,
+            f"{of[kind]['reach_the_goal']:.1%}",
+            " to ".join(f"{x:.1%}" for x in of[kind]["interval"]),
+            f"{of[kind]['portability']:.3f}",
+            f"{of[kind]['survive_all']:.1%}",
+            f"{of[kind]['reach_the_goal_of_those']:.1%}",
+        ]
+        for kind in KINDS
+    ]
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
+    parser.add_argument("--levels", type=int, default=1024, help="of each size (default: 1,024)")
+    parser.add_argument("--first", type=int, default=FIRST, help=f"level id (default: {FIRST:,})")
+
+
+def run(given: argparse.Namespace) -> Report:
+    prepare_jax()
+    python = oracle.oracle_python()
+    results = [result(size, given.levels, measured(python, size, given.levels, given.first)) for size in given.size]
+    head = ("size", "witnesses", "which", "reach the goal", "95% interval", "portability", "survive all", "of those")
+    return Report(
+        title="Witnesses in the reference",
+        results=results,
+        tables=[Table(head, [row for of in results for row in rows(of)])],
+        notes=[
+            f"{given.levels:,} levels a size from id {given.first:,} on, experts of {BUDGET:,} env steps, the default "
+            "procedure. Solved levels, exported as level files and played in the reference by its own loader and "
+            "environment: how many witnesses end their first episode in the goal. *chosen*: the candidate that "
+            "survives most replays from starts moved by a rounding error; *first*: with `expert.replays=0`. "
+            "*portability*: the mean share of these replays that reach the goal; *survive all*: the witnesses that do "
+            "in every one, and how many *of those* reach the goal in the reference."
+        ],
+        reference=oracle.versions(python),
+    )
