@@ -32,18 +32,18 @@ T = TypeVar("T")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Record:
-    """What happened in 256 env steps with automatic reset: numpy arrays, time first, level last; SI units."""
+    """What happened in 256 env steps with automatic reset: numpy arrays, time first, levels (`lane`) last; SI units."""
 
     state: State  # [256, ..., level]: before each action
     manifold: Manifold  # [256, contact, ..., level]: of the physics step that led there; zero at an episode's start
-    joint_point: Float[Array, "256 joint 2 level"]  # m, where the joint sits on its body a
-    thruster_point: Float[Array, "256 thruster 2 level"]  # m
-    timestep: Int[Array, "256 level"]  # env steps since the episode's start
-    last_distance: Float[Array, "256 level"]  # m; -1 at an episode's start
-    action: Int[Array, "256 6 level"]
-    reward: Float[Array, "256 level"]
-    done: Bool[Array, "256 level"]
-    goal: Bool[Array, "256 level"]
+    joint_point: Float[Array, "256 joint 2 lane"]  # m, where the joint sits on its body a
+    thruster_point: Float[Array, "256 thruster 2 lane"]  # m
+    timestep: Int[Array, "256 lane"]  # env steps since the episode's start
+    last_distance: Float[Array, "256 lane"]  # m; -1 at an episode's start
+    action: Int[Array, "256 6 lane"]
+    reward: Float[Array, "256 lane"]
+    done: Bool[Array, "256 lane"]
+    goal: Bool[Array, "256 lane"]
 
 
 def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -> Record:

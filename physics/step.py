@@ -5,7 +5,7 @@ lanes; the tests hold them to each other.
 """
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -76,31 +76,24 @@ def as_machine_code(given: Given, params: Params, seen: bool, stages: tuple[Stag
     With fewer `stages`, it takes less time and fills in less: to measure what each costs.
     """
     lanes = given.before.rotation.shape[-1]
-    kernel = _compiled(given.model.size, params, seen, buffers_like(given), stages)
+    name, filled, scratch_bytes = _compiled(given.model.size, params, seen, buffers_like(given), stages)
     missing = -lanes % LANES
     fill = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge")
     given = jax.tree.map(fill, given) if missing else given
-    results = [buffer.array(lanes + missing) for buffer in jax.tree.leaves(kernel.results)]
-    call = jax.ffi.ffi_call(kernel.name, [*results, jax.ShapeDtypeStruct((kernel.scratch_bytes,), np.uint8)])
-    *filled, _ = call(*jax.tree.leaves(given), *table_of(given.model.size, params.faithful_padding))
-    filled = [x[..., :lanes] for x in filled] if missing else filled
-    return jax.tree.unflatten(jax.tree.structure(kernel.results), filled)
-
-
-class CompiledStep(NamedTuple):
-    """A compiled step."""
-
-    name: str  # for `jax.ffi.ffi_call`
-    results: tuple[State, Manifold | None]  # buffers
-    scratch_bytes: int
+    results = [buffer.array(lanes + missing) for buffer in jax.tree.leaves(filled)]
+    call = jax.ffi.ffi_call(name, [*results, jax.ShapeDtypeStruct((scratch_bytes,), np.uint8)])
+    *results, _ = call(*jax.tree.leaves(given), *table_of(given.model.size, params.faithful_padding))
+    results = [x[..., :lanes] for x in results] if missing else results
+    return jax.tree.unflatten(jax.tree.structure(filled), results)
 
 
 @cache
-def _compiled(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...]) -> CompiledStep:
+def _compiled(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...]) -> tuple[str, Any, int]:
+    """The name of the compiled step for `jax.ffi.ffi_call`, buffers of its results, and bytes of its scratch memory."""
     buffers, jaxpr = trace(size, params, seen, given, stages)
     reads, table, results, scratch = map(jax.tree.leaves, buffers)
     name = compile_kernel(jaxpr, [*reads, *table], results, scratch)
-    return CompiledStep(name, buffers[2], sum(buffer.bytes for buffer in scratch))
+    return name, buffers[2], sum(buffer.bytes for buffer in scratch)
 
 
 def trace(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...] = STAGES) -> tuple[Any, Any]:

@@ -46,14 +46,10 @@ class Entry:
             numbers = int if self.kind is int else int | float
             good = isinstance(value, numbers) and not isinstance(value, bool) and self.low <= value <= self.high
         if not good:
-            raise LevelFileError(f"{where} is {told(value)}, it has to be {self._wanted}")
+            number = f"a {'whole ' if self.kind is int else ''}number from {self.low:,g} to {self.high:,g}"
+            wanted = "true or false" if self.kind is bool else number
+            raise LevelFileError(f"{where} is {told(value)}, it has to be {wanted}")
         return self.kind(value)  # pyright: ignore[reportArgumentType]
-
-    @property
-    def _wanted(self) -> str:
-        if self.kind is bool:
-            return "true or false"
-        return f"a {'whole ' if self.kind is int else ''}number from {self.low:,g} to {self.high:,g}"
 
 
 def item(parent: object, name: str, where: str) -> object:
@@ -140,13 +136,8 @@ def entries_of(size: Size) -> dict[str, dict[str, Entry]]:
     return {"polygon": BODY, "circle": BODY, "joint": joint, "thruster": thruster}
 
 
-_COUNT = Entry(int, 0, MOST_THINGS)
-COUNTS = {
-    "num_polygons": Entry(int, FIXED_POLYGONS, MOST_THINGS),
-    "num_circles": _COUNT,
-    "num_joints": _COUNT,
-    "num_thrusters": _COUNT,
-}
+_OTHERS = dict.fromkeys(("num_circles", "num_joints", "num_thrusters"), Entry(int, 0, MOST_THINGS))
+COUNTS = {"num_polygons": Entry(int, FIXED_POLYGONS, MOST_THINGS), **_OTHERS}
 STATIC_CONSTANTS = {  # of which this engine has one value
     "max_polygon_vertices": MAX_VERTICES,
     "num_solver_iterations": SOLVER_ITERATIONS,

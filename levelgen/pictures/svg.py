@@ -5,7 +5,6 @@ Programs that do not play them show the first scene.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from xml.sax.saxutils import escape
 
@@ -26,7 +25,7 @@ def svg_of(scenes: Sequence[Scene], seconds: Sequence[float], pixels: int = PIXE
     The scenes are of one level.
     """
     first, (*ends, length) = scenes[0], accumulate(seconds)
-    clock = Clock(tuple(end / length for end in (0.0, *ends)), length)
+    clock = tuple(end / length for end in (0.0, *ends)), length
     height = TOP + first.footer
     size = f'width="{pixels}" height="{round(pixels * height / WIDTH)}" preserveAspectRatio="none"'
     view = f'viewBox="{-BORDER} {number(-TOP)} {number(WIDTH)} {number(height)}"'
@@ -44,29 +43,25 @@ def svg_of(scenes: Sequence[Scene], seconds: Sequence[float], pixels: int = PIXE
     )
 
 
-@dataclass(frozen=True)
-class Clock:
-    """When the scenes of a film begin."""
+Clock = tuple[tuple[float, ...], float]  # when the scenes of a film begin, as shares of its length; its length, s
 
-    starts: tuple[float, ...]  # shares of its length
-    length: float  # s
 
-    def animate(self, tag: str, values: Sequence[str], smooth: bool) -> str:
-        """An element that makes its parent follow one value a scene; of equal ones in a row, the ends alone."""
-        last = len(values) - 1
-        keep = [
-            i
-            for i, value in enumerate(values)
-            if i in (0, last) or values[i - 1] != value or (smooth and values[i + 1] != value)
-        ]
-        times, chosen = [f"{self.starts[i]:.5f}" for i in keep], [values[i] for i in keep]
-        if smooth:  # the last scene stands still until the end
-            times, chosen = [*times, "1"], [*chosen, chosen[-1]]
-        mode = "" if smooth else ' calcMode="discrete"'
-        return (
-            f'<{tag} dur="{number(self.length)}s" repeatCount="indefinite"{mode} '
-            f'keyTimes="{";".join(times)}" values="{";".join(chosen)}"/>'
-        )
+def _animate(clock: Clock, tag: str, values: Sequence[str], smooth: bool) -> str:
+    """An element that makes its parent follow one value a scene; of equal ones in a row, the ends alone."""
+    (starts, length), last = clock, len(values) - 1
+    keep = [
+        i
+        for i, value in enumerate(values)
+        if i in (0, last) or values[i - 1] != value or (smooth and values[i + 1] != value)
+    ]
+    times, chosen = [f"{starts[i]:.5f}" for i in keep], [values[i] for i in keep]
+    if smooth:  # the last scene stands still until the end
+        times, chosen = [*times, "1"], [*chosen, chosen[-1]]
+    mode = "" if smooth else ' calcMode="discrete"'
+    return (
+        f'<{tag} dur="{number(length)}s" repeatCount="indefinite"{mode} '
+        f'keyTimes="{";".join(times)}" values="{";".join(chosen)}"/>'
+    )
 
 
 def _part(states: Sequence[Part], clock: Clock) -> str:
@@ -75,7 +70,7 @@ def _part(states: Sequence[Part], clock: Clock) -> str:
     for look in dict.fromkeys(state.shapes for state in states if state.shapes):
         shown = ["visible" if state.shapes == look else "hidden" for state in states]
         if "hidden" in shown:
-            timing = clock.animate('animate attributeName="visibility"', shown, smooth=False)
+            timing = _animate(clock, 'animate attributeName="visibility"', shown, smooth=False)
             look = f'<g visibility="{shown[0]}">{timing}{look}</g>'
         drawn.append(look)
     spots = [",".join(map(number, state.position)) for state in states]
@@ -85,6 +80,6 @@ def _part(states: Sequence[Part], clock: Clock) -> str:
     motion = ""
     if len({*zip(spots, turns, strict=True)}) > 1:
         way = 'animateTransform attributeName="transform" type='
-        motion = clock.animate(f'{way}"translate"', spots, smooth=True)
-        motion += clock.animate(f'{way}"rotate" additive="sum"', turns, smooth=True)
+        motion = _animate(clock, f'{way}"translate"', spots, smooth=True)
+        motion += _animate(clock, f'{way}"rotate" additive="sum"', turns, smooth=True)
     return f'<g transform="translate({spots[0]}) rotate({turns[0]})">{motion}{"".join(drawn)}</g>'

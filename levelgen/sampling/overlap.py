@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.manifold import FLIP_BIAS, faces
+from physics.manifold import FLIP_BIAS, Faces, faces
 from physics.types import Model, State
 from physics.vector import Vec, nonzero, vec
 
@@ -20,7 +20,7 @@ class WorldPolygons(NamedTuple):
     """In the world, clockwise, all with four vertices."""
 
     vertex: Vec  # components [vertex, polygon, lane]
-    normal: Vec  # outward unit normal of the face from a vertex to the next
+    face: Faces  # from a vertex to the next
 
 
 class WorldCircles(NamedTuple):
@@ -37,28 +37,22 @@ def count_contacts(
 ) -> Int[Array, " lane"]:
     """Contacts of a new body with the active bodies: a polygon with these corners in the world, or a circle `body`."""
     n = model.size.polygons
-    polygons = polygons_in_world(model, state)
-    new = with_normals(vec(corners).map(lambda x: x[:, None]))
-    position = vec(state.position)
+    cos, sin, position = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n]), vec(state.position)
+    local = vec(model.vertices).map(lambda x: x.swapaxes(0, 1))
+    polygons = in_world(local.rotate(cos, sin) + position.map(lambda x: x[:n]))
+    new = in_world(vec(corners).map(lambda x: x[:, None]))
     circles = WorldCircles(position.map(lambda x: x[n:]), model.radius)
+    between = (circles.centre - body.centre).norm()
     touching = jnp.where(
         is_polygon,
         jnp.concatenate([polygon_contacts(polygons, new), touch(new, circles).astype(jnp.int32)]),
-        jnp.concatenate([touch(polygons, body), circles_touch(circles, body)]).astype(jnp.int32),
+        jnp.concatenate([touch(polygons, body), between < circles.radius + body.radius]).astype(jnp.int32),
     )
     return jnp.where(model.active, touching, 0).sum(0)
 
 
-def polygons_in_world(model: Model, state: State) -> WorldPolygons:
-    """All polygons in the world."""
-    n = model.size.polygons
-    cos, sin = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n])
-    local = vec(model.vertices).map(lambda x: x.swapaxes(0, 1))
-    return with_normals(local.rotate(cos, sin) + vec(state.position).map(lambda x: x[:n]))
-
-
-def with_normals(vertex: Vec) -> WorldPolygons:
-    return WorldPolygons(vertex, faces(vertex).outward)
+def in_world(vertex: Vec) -> WorldPolygons:
+    return WorldPolygons(vertex, faces(vertex))
 
 
 def polygon_contacts(a: WorldPolygons, b: WorldPolygons) -> Int[Array, "polygon lane"]:
@@ -72,7 +66,7 @@ def polygon_contacts(a: WorldPolygons, b: WorldPolygons) -> Int[Array, "polygon 
 def deepest(a: WorldPolygons, b: WorldPolygons) -> tuple[Float[Array, "polygon lane"], Float[Array, "polygon lane"]]:
     """Distances of b's two deepest vertices from the face of a that separates most (negative: inside)."""
     reach = [
-        a.normal.dot(Vec(b.vertex.x[k] - a.vertex.x, b.vertex.y[k] - a.vertex.y)) for k in range(4)
+        a.face.outward.dot(Vec(b.vertex.x[k] - a.vertex.x, b.vertex.y[k] - a.vertex.y)) for k in range(4)
     ]  # of b's vertex k from each face
     low, high = jnp.minimum(reach[0], reach[1]), jnp.maximum(reach[0], reach[1])
     low2, high2 = jnp.minimum(reach[2], reach[3]), jnp.maximum(reach[2], reach[3])
@@ -87,14 +81,9 @@ def deepest(a: WorldPolygons, b: WorldPolygons) -> tuple[Float[Array, "polygon l
 
 def touch(polygons: WorldPolygons, circles: WorldCircles) -> Bool[Array, "pair lane"]:
     """Whether the circle's centre is inside the polygon or within its radius of an edge."""
-    vertex, normal = polygons
-    edge, length, _ = faces(vertex)
+    vertex, (edge, length, normal) = polygons
     along = edge.scale(1 / nonzero(length))
     offset = circles.centre - vertex
     clipped = along.scale(jnp.clip(along.dot(offset), 0.0, length))
     inside = (normal.dot(offset) < 0).all(0)
     return inside | ((offset - clipped).norm().min(0) <= circles.radius)
-
-
-def circles_touch(a: WorldCircles, b: WorldCircles) -> Bool[Array, "circle lane"]:
-    return (a.centre - b.centre).norm() < a.radius + b.radius

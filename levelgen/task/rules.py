@@ -14,7 +14,7 @@ from levelgen.level import Level, Role
 from levelgen.task.actions import Controls, controls
 from physics.pairs import pairs_of
 from physics.step import step as physics_step
-from physics.types import Manifold, Params, State
+from physics.types import Params, State
 from physics.vector import rows, select, vec
 
 NO_DISTANCE = -1.0  # last_distance before the first step of an episode
@@ -98,15 +98,6 @@ def goal_distance(level: Level, state: State) -> Float[Array, " lane"]:
     return total
 
 
-class Frame(NamedTuple):
-    """What the task reads off one physics step."""
-
-    goal: Bool[Array, " lane"]
-    fail: Bool[Array, " lane"]
-    distance: Float[Array, " lane"]
-    manifold: Manifold | None
-
-
 def advance(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
 ) -> tuple[TaskState, StepResult]:
@@ -127,22 +118,22 @@ def advance_driven(
         state, manifold = physics_step(level.model, state, motor, thrust, params.physics, seen)
         fail = touches(level, state.contact_active, Role.GREEN, Role.RED)
         goal = touches(level, state.contact_active, Role.GREEN, Role.BLUE) & ~fail
-        return state, Frame(goal, fail, goal_distance(level, state), manifold)
+        return state, (goal, fail, goal_distance(level, state), manifold)
 
-    state, frames = jax.lax.scan(frame, now.state, None, length=params.frame_skip)
-    ended = frames.goal | frames.fail
+    state, (goals, fails, distances, manifolds) = jax.lax.scan(frame, now.state, None, length=params.frame_skip)
+    ended = goals | fails
     first = jnp.argmax(ended, axis=0)  # the first physics step that ended the episode counts
     at_end = lambda x: select(x, jnp.where(ended.any(0), first, params.frame_skip - 1))
-    goal = select(frames.goal, first)
-    distance = at_end(frames.distance)
+    goal = select(goals, first)
+    distance = at_end(distances)
     timestep = now.timestep + 1
     done = ended.any(0) | (timestep >= params.max_timesteps) | has_nan(state)
 
     closer = jnp.nan_to_num(now.last_distance - distance, nan=0.0, posinf=0.0, neginf=0.0)
     shaping = jnp.where(now.last_distance == NO_DISTANCE, 0.0, params.dense_reward_scale * closer)
-    reward = goal.astype(jnp.float32) - select(frames.fail, first).astype(jnp.float32) + shaping
+    reward = goal.astype(jnp.float32) - select(fails, first).astype(jnp.float32) + shaping
     after = TaskState(state, timestep, jnp.where(done, NO_DISTANCE, distance))
-    return after, StepResult(reward, done, goal), distance, jax.tree.map(lambda x: x[-1], frames.manifold)
+    return after, StepResult(reward, done, goal), distance, jax.tree.map(lambda x: x[-1], manifolds)
 
 
 def has_nan(state: State) -> Bool[Array, " lane"]:

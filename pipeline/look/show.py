@@ -108,9 +108,11 @@ def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
     shown = [*range(0, steps, STEPS_A_PICTURE), steps]
     scenes = []
     for step in shown:
-        state = _at(states, step) if step < steps else _touch(_at(states, steps - 1), rules)
+        last = min(step, steps - 1)
+        state = jax.tree.map(lambda x, last=last: x[last], states)
+        state = state if step < steps else _touch(state, rules)
         caption = Caption(_title(row), f"{step * second:.1f} s", "goal reached" if step == steps else "")
-        scenes.append(scene_of(level, state, action=action[min(step, steps - 1)], caption=caption))
+        scenes.append(scene_of(level, state, action=action[last], caption=caption))
     seconds = [second * (after - step) for step, after in pairwise(shown)] + [LAST_SECONDS]
     told = f"solved in {steps} step{'s' if steps > 1 else ''} ({steps * second:.1f} s)"
     return Film(scenes, seconds, f"level {row['level_id']} of size {row['size']}, {told}")
@@ -211,10 +213,6 @@ WRITERS: dict[str, Callable[[Film, Path], object]] = {
     ".mp4": write_mp4,
     ".svg": lambda film, path: path.write_text(svg_of(film.scenes, film.seconds), encoding="utf-8"),
 }
-
-
-def _at(states: State, step: int) -> State:
-    return jax.tree.map(lambda x: x[step], states)
 
 
 def _touch(state: State, rules: TaskParams) -> State:

@@ -97,23 +97,17 @@ class Evidence:
 
     def _claims(self) -> Mask:
         """Which levels have a row of a shard: one whose id stands there."""
+        names, rows = self.of["shard"], self.of["row"]
         holds: list[int | None] = []
-        for name, row in zip(self.of["shard"], self.of["row"], strict=True):
+        for name, row in zip(names, rows, strict=True):
             shard = self.shards.get(name)
             ids = shard.level_ids if shard else []
             holds.append(ids[row] if row is not None and 0 <= row < len(ids) else None)
-        unusable = np.array([name is not None and self.shards[name] is None for name in self.of["shard"]])
-        wrong = [
-            name is not None and there != of for name, there, of in zip(self.of["shard"], holds, self.ids, strict=True)
-        ]
-        self._tell(
-            wrong & ~unusable,
-            lambda i: (
-                f"is said to be row {self.of['row'][i]} of {self.of['shard'][i]}, which has level {holds[i]} there"
-            ),
-        )
-        self.told |= unusable
-        return np.array([there == of for there, of in zip(holds, self.ids, strict=True)])
+        self.told |= [name is not None and self.shards[name] is None for name in names]  # with their shards
+        right = np.array(holds, object) == self.ids
+        wrong = ~right & [name is not None for name in names]
+        self._tell(wrong, lambda i: f"is said to be row {rows[i]} of {names[i]}, which has level {holds[i]} there")
+        return right
 
     def _identity(self, made: Level) -> Mask:
         """Whether rows are of the very levels that their ids make; on another stack, levels have to look like those."""

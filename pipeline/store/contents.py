@@ -9,6 +9,7 @@ from contextlib import suppress
 from functools import cache
 from typing import Any
 
+import jax
 import numpy as np
 
 from experts.config import RECORD_STEPS
@@ -16,9 +17,9 @@ from experts.witness import Record
 from levelgen.identity.keys import MAX_LEVEL_ID
 from levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
 from levelgen.task.actions import CHOICES
-from physics.buffers import axes_of
+from physics.buffers import buffers_of
 from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
-from pipeline.store.fields import annotated
+from pipeline.store.fields import arrays_of
 from pipeline.store.schema import FieldSpec, field_table
 
 COUNTED = (  # fields with one entry for each thing of a kind, in the order of Size
@@ -37,8 +38,9 @@ class ContentsError(ValueError):
 @cache
 def table_for(size: Size) -> tuple[FieldSpec, ...]:
     """The field table of a shard of this size."""
-    counts = axes_of(size) | {"lane": 0, "level": 0}
-    level, record = annotated(Level, counts, "level/"), annotated(Record, counts, "record/")
+    empty = lambda buffer: np.zeros((*buffer.shape, 0), buffer.dtype)  # of no level
+    level, record = (jax.tree.map(empty, buffers_of(of, size)) for of in (Level, Record))
+    level, record = arrays_of(level, "level/"), arrays_of(record, "record/")
     for name in ("record/state/", "record/manifold/"):  # of the engine, which knows one moment only
         record |= {of: np.stack([x] * RECORD_STEPS) for of, x in record.items() if of.startswith(name)}
     return tuple(field_table(level | record))

@@ -10,8 +10,6 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
-from physics.buffers import DTYPES
-
 T = TypeVar("T")
 
 
@@ -30,21 +28,6 @@ def tree_of(cls: type[T], arrays: Mapping[str, np.ndarray], path: str = "") -> T
         nested = isinstance(hint, type) and dataclasses.is_dataclass(hint)
         values[field.name] = tree_of(hint, arrays, f"{name}/") if nested else arrays[name]
     return cls(**values)  # type: ignore[return-value]
-
-
-def annotated(cls: type, counts: Mapping[str, int], path: str = "") -> dict[str, np.ndarray]:
-    """An array of zeros for every leaf of a dataclass, by its path, with the type and shape of its annotation.
-
-    `counts` has the lengths of axes that have names.
-    """
-    arrays: dict[str, np.ndarray] = {}
-    for name, hint in get_type_hints(cls).items():
-        if dataclasses.is_dataclass(hint):
-            arrays |= annotated(hint, counts, f"{path}{name}/")  # type: ignore[arg-type]
-        else:
-            shape = [counts[word] if word in counts else int(word) for word in hint.dim_str.split()]
-            arrays[f"{path}{name}"] = np.zeros(shape, DTYPES[hint.dtype])
-    return arrays
 
 
 def same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.before import Known, facts_of
+from experts.before import facts_of
 from experts.witness import take
 from levelgen.level import SIZES, Level, Role
-from levelgen.proofs import Proof
+from levelgen.proofs import Facts, Proof
 from levelgen.sampling.distribution import Distribution
 from levelgen.sampling.sampler import sample_levels
 from levelgen.sampling.scenery import empty_level
@@ -77,7 +77,7 @@ def sampled(name: str) -> Level:
 
 
 @functools.cache
-def facts(name: str) -> Known:
+def facts(name: str) -> Facts:
     return facts_of(sampled(name), SAMPLES[name].rules)
 
 

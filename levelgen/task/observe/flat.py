@@ -150,12 +150,8 @@ def joint_rows(level: Level, seen_from_a: bool = False) -> list[Array]:
         model.motor_on,
         model.joint_limited,
         *_one_hot(level.motor_binding, MOTOR_BINDINGS),
-        limit(jnp.sin(model.joint_min)),
-        limit(jnp.cos(model.joint_min)),
-        limit(jnp.sin(model.joint_max)),
-        limit(jnp.cos(model.joint_max)),
-        limit(model.joint_min - model.joint_rotation),
-        limit(model.joint_max - model.joint_rotation),
+        *(limit(part(angle)) for angle in (model.joint_min, model.joint_max) for part in (jnp.sin, jnp.cos)),
+        *(limit(angle - model.joint_rotation) for angle in (model.joint_min, model.joint_max)),
     ]
     return [
         model.joint_active,

@@ -127,7 +127,7 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
         (note,) = (tmp_path / "data/8k/s/quarantine").iterdir()
         assert f"The experts in {tmp_path / SPLIT / trained['experts']} cannot be read" in note.read_text()
 
-        own = run(["generate", "levels=1", "budget=2k", "out=own"], tmp_path)
+        own = run(["generate", "levels=1", "budget=5k", "out=own"], tmp_path)
         assert own.returncode == 0, own.stderr  # a cluster that RAY_ADDRESS does not name is let be
     finally:
         machines.shutdown()
