@@ -166,10 +166,10 @@ def draw_joint(
     top = jnp.where(polygons, dist.max_motor_power, dist.max_wheel_power)
     return Joint(
         *ends,
-        fixed=fixed,
-        limited=limited,
-        limit_min=jnp.where(limited, between(d.limit_min, -dist.max_limit, 0.0), 0.0),
-        limit_max=jnp.where(limited, between(d.limit_max, 0.0, dist.max_limit), 0.0),
+        joint_fixed=fixed,
+        joint_limited=limited,
+        joint_min=jnp.where(limited, between(d.limit_min, -dist.max_limit, 0.0), 0.0),
+        joint_max=jnp.where(limited, between(d.limit_max, 0.0, dist.max_limit), 0.0),
         motor_on=turns & (d.motor < dist.motor_chance),
         motor_speed=jnp.where(turns, between(d.motor_speed, dist.min_motor_speed, dist.max_motor_speed), 0.0),
         motor_power=jnp.where(turns, between(d.motor_power, dist.min_motor_power, top), 0.0),

@@ -67,15 +67,15 @@ class BodyShape(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """From the proposed body to its target."""
+    """From the proposed body to its target. What has the name of a field of Model is what stands there."""
 
     target: Bool[Array, "body lane"]
     anchor: Vec  # in the frame of the proposed body
     target_anchor: Vec
-    fixed: Flag
-    limited: Flag
-    limit_min: Lane
-    limit_max: Lane
+    joint_fixed: Flag
+    joint_limited: Flag
+    joint_min: Lane
+    joint_max: Lane
     motor_on: Flag
     motor_speed: Lane
     motor_power: Lane
@@ -171,22 +171,17 @@ def _insert_joint(level: Level, p: Proposal, body: Bool[Array, "body lane"]) -> 
         where(target_first, joint.anchor, joint.target_anchor),
     )
     rotation = p.rotation - at(level.state.rotation, joint.target)
-    rotation = jnp.where(joint.fixed, jnp.where(target_first, rotation, -rotation), 0.0)
+    rotation = jnp.where(joint.joint_fixed, jnp.where(target_first, rotation, -rotation), 0.0)
+    same = {name: put(vars(model)[name], row, x) for name, x in joint._asdict().items() if name in vars(model)}
     model = replace(
         model,
+        **same,
         joint_active=model.joint_active | row,
         joint_a=put(model.joint_a, row, jnp.minimum(own, target)),
         joint_b=put(model.joint_b, row, jnp.maximum(own, target)),
         joint_anchor_a=put(model.joint_anchor_a, row, unvec(first)),
         joint_anchor_b=put(model.joint_anchor_b, row, unvec(second)),
-        joint_fixed=put(model.joint_fixed, row, joint.fixed),
         joint_rotation=put(model.joint_rotation, row, rotation),
-        joint_limited=put(model.joint_limited, row, joint.limited),
-        joint_min=put(model.joint_min, row, joint.limit_min),
-        joint_max=put(model.joint_max, row, joint.limit_max),
-        motor_on=put(model.motor_on, row, joint.motor_on),
-        motor_speed=put(model.motor_speed, row, joint.motor_speed),
-        motor_power=put(model.motor_power, row, joint.motor_power),
     )
     return replace(level, model=model, motor_binding=put(level.motor_binding, row, joint.motor_binding))
 

@@ -108,9 +108,7 @@ class Assignment:
 
     def take(self, queue: UnitQueue) -> bool:
         """Another unit from the queue, if there is room for one and one may join these."""
-        if self.units and self.wants <= 0:
-            return False
-        unit = queue.take(self.units)
+        unit = queue.take(self.units) if self.wants > 0 or not self.units else None
         if unit is None:
             return False
         self.units.append(unit)

@@ -67,10 +67,8 @@ def is_written(split: Path) -> bool:
     try:
         with (split / WRITER_LOCK).open() as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:  # never written to, or not ours to ask
-        return False
+    except OSError as error:  # of other kinds: never written to, or not ours to ask
+        return isinstance(error, BlockingIOError)
     return False
 
 

@@ -198,15 +198,10 @@ def require_manifest(
         UserError: there is no split here, or nothing is committed in it.
         Failure: as `read_manifest`.
     """
-    if not split.is_dir():
-        raise UserError(
-            f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
-        )
     manifest = read_manifest(split, columns, level_ids)
     if not manifest.fragments and (level_ids is None or not fragment_paths(split)):
-        raise UserError(
-            f"Nothing is committed in {split} yet: give a folder such as data/128k/s that `levelproof generate` made."
-        )
+        what = f"Nothing is committed in {split} yet" if split.is_dir() else f"There is no split at {split}"
+        raise UserError(f"{what}: give a folder such as data/128k/s that `levelproof generate` made.")
     return manifest
 
 
