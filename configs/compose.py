@@ -19,13 +19,15 @@ from omegaconf.errors import OmegaConfBaseException
 
 from configs.convert import flat, plain, typed
 from configs.errors import ConfigError, suggestion
-from configs.schema import JobConfig, hash_of
+from configs.schema import JobConfig, from_files, hash_of
 from levelgen.sampling.distribution import Distribution
 
 JOB = "generate"
 ConfigStore.instance().store(name="code", node=plain(JobConfig()))  # where configs/generate.yaml has defaults from
-BY_HAND = frozenset({"size", "budget", "sampler_version"})  # results that are not settings, or have their own word
-WORDS = frozenset({"size", "levels", "budget", "out", "continue_from"})  # kept as typed: 007 stays 007
+# Results that are not settings, or have their own word
+BY_HAND = frozenset({"size", "distribution", "budget", "sampler_version"})
+WORDS = frozenset({"size", "levels", "level_files", "budget", "out", "continue_from"})  # kept as typed: 007 stays 007
+OF_RANDOM_LEVELS = ("size", "levels", "first_level", "distribution")
 
 
 def compose_job(overrides: Sequence[str]) -> JobConfig:
@@ -34,7 +36,12 @@ def compose_job(overrides: Sequence[str]) -> JobConfig:
     Raises:
         ConfigError: an unknown setting or a wrong value, in one sentence.
     """
-    return typed(JobConfig, settings(overrides))
+    job = typed(JobConfig, settings(overrides))
+    given = {_parsed(text).key_or_group.partition(".")[0] for text in overrides} if job.level_files else ()
+    for name in OF_RANDOM_LEVELS:
+        if name in given:
+            raise ConfigError(f"{name} is for random levels, level_files for others: leave out one of the two.")
+    return job
 
 
 def settings(overrides: Sequence[str]) -> dict[str, Any]:
@@ -67,13 +74,15 @@ def presets() -> dict[str, list[str]]:
 
 
 def again(job: JobConfig) -> str:
-    """The shortest command, but for `first_level`, `levels` and `out`, with the same results as `job`."""
-    fixed, wanted = [f"size={job.size}", f"budget={job.budget}"], flat(job.results)
+    """The shortest command, but for `out` and which levels, with the same results as `job`."""
+    fixed, wanted = [f"budget={job.budget}"], flat(job.results)
+    if not job.level_files:
+        fixed.insert(0, f"size={job.size}")
     commands = []
     for words in product(*(_words(folder) for folder in ("procedure", "distribution"))):
         named = [word for word in words if word]
         # with its own budget: the job's may be too small for its experts
-        start = flat(replace(_started(words), size=job.size).results)
+        start = flat(replace(_started(words), size=job.size, level_files=job.level_files).results)
         changed = [typed_as(key, value) for key, value in wanted.items() if key not in BY_HAND and start[key] != value]
         commands.append(shlex.join(["levelproof", "generate", *fixed, *named, *changed]))
     return min(commands, key=len)
@@ -81,9 +90,10 @@ def again(job: JobConfig) -> str:
 
 def words_for(results: Mapping[str, Any]) -> list[str]:
     """The settings, but for the budget, that a job with these `JobConfig.results` has and the default has not."""
-    default, known = flat(replace(_started(()), size=results["size"]).results), flat(results)
+    default, known = flat(_started(()).results), flat(results)
     changed = [name for name in known if name not in BY_HAND and known[name] != default.get(name, ...)]
-    return [f"size={results['size']}", *(typed_as(name, known[name]) for name in changed)]
+    size = [] if from_files(results) else [f"size={results['size']}"]
+    return [*size, *(typed_as(name, known[name]) for name in changed)]
 
 
 def typed_as(name: str, value: Any) -> str:

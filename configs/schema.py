@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
@@ -24,8 +25,9 @@ UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8
 
 # Where, how many and by whom: these change neither a level nor its expert, so one split may mix them.
 WITHOUT_EFFECT = frozenset(
-    {"levels", "first_level", "out", "unit", "executor", "workers", "keep_experts", "continue_from"}
+    {"levels", "first_level", "level_files", "out", "unit", "executor", "workers", "keep_experts", "continue_from"}
 )
+FROM_FILES = "files"  # in the results of level files, where those of random levels have their distribution
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class JobConfig:
     size: str = "s"  # s, m, l, or how many polygons (4 are scenery), circles, joints, thrusters, as in 8-8-8-4
     levels: str = "64"  # how many, with consecutive ids
     first_level: int = 0  # id of the first of them
+    level_files: str = ""  # a level file, or a folder of them, to label instead of random levels; empty: random levels
     budget: str = "128k"  # environment steps an expert may use; names the folder
     out: str = "data"  # folder; the split is written to {out}/{budget}/{size}
     unit: int | None = None  # levels per work unit, lost when its worker dies; null: 32 to 4, the larger the fewer
@@ -67,7 +70,7 @@ class JobConfig:
         check_size(size)
         if size.bodies > MOST_BODIES:
             raise ConfigError(f"size is {self.size}: experts train among at most {MOST_BODIES} polygons and circles.")
-        if not control_weights(size, self.distribution):
+        if not self.level_files and not control_weights(size, self.distribution):
             raise ConfigError(
                 f"size is {self.size}: it has no room for what must act, of which {', '.join(CONTROL_WEIGHTS)} in "
                 "distribution are the weights (a motor needs a joint and a third body beside the scenery)."
@@ -98,12 +101,19 @@ class JobConfig:
     def results(self) -> dict[str, Any]:
         """Everything that decides a level's results, as JSON's types."""
         kept = {f.name: plain(getattr(self, f.name)) for f in fields(self) if f.name not in WITHOUT_EFFECT}
+        if self.level_files:
+            kept["distribution"] = FROM_FILES
         return kept | {"budget": self.env_steps, "sampler_version": SAMPLER_VERSION}
 
     @property
     def hash(self) -> str:
         """Short hash of `results`: other hash, other split."""
         return hash_of(self.results)
+
+
+def from_files(results: Mapping[str, Any]) -> bool:
+    """Whether a job with these `JobConfig.results` labels level files: no id makes such a level."""
+    return results.get("distribution") == FROM_FILES
 
 
 def hash_of(results: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from levelgen.identity.form import NO_ENTRY, Push, Side, World, canonical_form
+from levelgen.identity.keys import MAX_LEVEL_ID
 from levelgen.level import Level
 from physics.types import FIXED_POLYGONS, MAX_VERTICES
 
@@ -23,6 +24,11 @@ DIGITS = 32  # of a hash, hexadecimal: 128 bits
 def content_hashes(level: Level) -> list[str]:
     """A hash for each level, such as `c1:` and 32 digits. Levels start without contacts; none are looked at."""
     return [f"c{VERSION}:{hashlib.sha256(canonical_form(world)).hexdigest()[:DIGITS]}" for world in worlds(level)]
+
+
+def level_id_for(content_hash: str) -> int:
+    """The id of a level that no id makes: its random streams follow from its content alone."""
+    return int(content_hash.partition(":")[2][:8], 16) & MAX_LEVEL_ID
 
 
 def level_first(level: Level) -> Any:

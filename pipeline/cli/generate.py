@@ -10,6 +10,7 @@ EXAMPLE = """\
 levelproof generate                                 64 small levels into data
 levelproof generate size=m levels=1k budget=1M      more, larger, for longer
 levelproof generate distribution=vehicles out=cars  other levels
+levelproof generate level_files=mine out=labelled  levels of your own, below the folder mine
 levelproof generate stop.rule=budget expert.width=128    other experts"""
 INDENT = 24  # where meanings start
 # What people change; `levelproof settings` has the others
@@ -37,9 +38,11 @@ def run(arguments: argparse.Namespace) -> Exit:
 
     from configs.compose import compose_job
     from pipeline.jobs.generate import generate
+    from pipeline.jobs.level_files import generate_from_files
 
     job = compose_job(arguments.settings)
-    return generate(job, ["levelproof", "generate", *arguments.settings], Console(stderr=True))
+    make = generate_from_files if job.level_files else generate
+    return make(job, ["levelproof", "generate", *arguments.settings], Console(stderr=True))
 
 
 def _help(parser: argparse.ArgumentParser) -> str:

@@ -2,7 +2,7 @@
 
 import shlex
 from collections import Counter, deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -18,13 +18,21 @@ from pipeline.jobs.schedule import UnitOutcome, UnitQueue, WorkUnit, levels_text
 from pipeline.store.checkpoints import require_same_experts
 from pipeline.store.layout import quarantine_path
 from pipeline.store.manifest import Manifest, read_manifest
+from pipeline.store.origins import Origin, require_same_levels
 from pipeline.store.split import note_job, writing
 
 
-def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids: Sequence[int] | None = None) -> Exit:
+def generate(
+    job: JobConfig,
+    command: Sequence[str],
+    console: Console,
+    level_ids: Sequence[int] | None = None,
+    origins: Mapping[int, Origin] | None = None,
+) -> Exit:
     """Make what is missing of the job's levels, and commit it unit by unit.
 
-    `command` is as typed, for the hint of how to go on; `level_ids` are which levels, if not those of the job.
+    `command` is as typed, for the hint of how to go on; `level_ids` are which levels, if not those of the job;
+    `origins` say where they are, if their ids do not make them.
 
     Raises:
         UserError, Failure: see `store.split.writing` and `store.checkpoints.require_same_experts`; or the disk refuses.
@@ -32,9 +40,10 @@ def generate(job: JobConfig, command: Sequence[str], console: Console, level_ids
     """
     require_same_experts(job)
     with writing(job, partial(say, console)) as (split, manifest):
-        wanted = set(job.level_ids if level_ids is None else map(int, level_ids))
+        wanted = set(map(int, origins or (job.level_ids if level_ids is None else level_ids)))
         done = wanted.intersection(manifest.level_ids.tolist())
-        queue = UnitQueue(deque(plan_units(sorted(wanted), done, job.levels_per_unit)))
+        require_same_levels(split, origins or {}, done)
+        queue = UnitQueue(deque(plan_units(sorted(wanted), done, job.levels_per_unit, origins)))
         note_job(split, job, command, runs(sorted(wanted)))
         if queue.waiting:
             solved = _labels(manifest, wanted)["solved"]

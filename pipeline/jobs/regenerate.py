@@ -1,19 +1,22 @@
 """A split's levels again, at another budget: `levelproof regenerate manifest=data/256k/s budget=1M`."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
 from configs.compose import compose_job, words_for
+from configs.schema import from_files
 from levelgen.identity.keys import SAMPLER_VERSION
 from pipeline.errors import Exit, UserError
 from pipeline.jobs.generate import generate
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import require_manifest
+from pipeline.store.origins import origins_of
 
 OWN = ("manifest", "where", "continue")  # words that are not settings of a job
-NOT_OURS = ("size", "levels", "first_level")  # settings that the manifest decides
+NOT_OURS = ("size", "levels", "first_level", "level_files")  # settings that the manifest decides
 HINT = "as in levelproof regenerate manifest=data/256k/s budget=1M where=\"label = 'unsolved'\""
 
 
@@ -39,8 +42,10 @@ def regenerate(words: Sequence[str], console: Console) -> Exit:
     if not len(level_ids):
         raise UserError(f"The condition {own.get('where')!r} holds for none of the {len(manifest.level_ids)} levels.")
     goes_on = [f"continue_from={source}"] if own.get("continue") == "true" else []
-    job = compose_job([*words_for(config), *settings, *goes_on])
-    return generate(job, ["levelproof", "regenerate", *words], console, level_ids)
+    of_files = [f"level_files={source}"] if from_files(config) else []
+    job = replace(compose_job([*words_for(config), *settings, *goes_on, *of_files]), size=config["size"])
+    origins = origins_of(source, level_ids) if of_files else None
+    return generate(job, ["levelproof", "regenerate", *words], console, level_ids, origins)
 
 
 def split_words(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:

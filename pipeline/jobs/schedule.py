@@ -1,13 +1,14 @@
 """What is left to do: work units, who has them, their attempts and their quarantine. Knows nothing of files."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from experts.steps import EnvSteps
 from pipeline.store.layout import unit_name
+from pipeline.store.origins import Origin
 
 # How many units a worker may have at once, those included that failed as often: a unit that kills its worker takes
 # fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.
@@ -18,25 +19,29 @@ TOLD = 4  # runs of levels in a message
 
 @dataclass(frozen=True)
 class WorkUnit:
-    """Level ids of one multiple of the job's `unit`, done together and committed together."""
+    """Levels done together and committed together: ids of one multiple of the job's `unit`, or as many from files."""
 
     level_ids: tuple[int, ...]  # ascending
+    origins: tuple[Origin, ...] = field(default=(), compare=False, repr=False)  # of each; empty: ids make them
 
     @property
     def name(self) -> str:
         return unit_name(self.level_ids[0], self.level_ids[-1])
 
 
-def plan_units(wanted: Iterable[int], done: Collection[int], unit: int) -> list[WorkUnit]:
-    """Units that cover what is wanted and not done.
+def plan_units(
+    wanted: Iterable[int], done: Collection[int], unit: int, origins: Mapping[int, Origin] | None = None
+) -> list[WorkUnit]:
+    """Units that cover what is wanted, ascending, and not done.
 
-    A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same ids.
+    A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same ids. Ids of levels
+    with origins lie far apart: of those a unit has as many as it may.
     """
     left: dict[int, list[int]] = {}
-    for level_id in wanted:
-        if level_id not in done:
-            left.setdefault(level_id // unit, []).append(level_id)
-    return [WorkUnit(tuple(level_ids)) for level_ids in left.values()]
+    for index, level_id in enumerate(level_id for level_id in wanted if level_id not in done):
+        left.setdefault((index if origins else level_id) // unit, []).append(level_id)
+    of = origins or {}
+    return [WorkUnit(tuple(ids), tuple(of[i] for i in ids if i in of)) for ids in left.values()]
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ Idempotent: an attempt that dies anywhere leaves at most a shard that no fragmen
 """
 
 import math
+import shlex
 import traceback
 from dataclasses import asdict
 from pathlib import Path
@@ -25,6 +26,7 @@ from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import TaskParams
 from pipeline.errors import Failure
 from pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
+from pipeline.read.level_files import LevelUnseen, levels_at
 from pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
 from pipeline.store.disk import REFUSALS
 from pipeline.store.fields import arrays_of, unlike_fields
@@ -41,13 +43,13 @@ def pool_for(job: JobConfig) -> Pool:
 
 
 def begin_unit(job: JobConfig, unit: WorkUnit, pool: Pool) -> TrainingRun:
-    """Sample a unit's levels and submit to the pool those that need an expert.
+    """Sample or read a unit's levels and submit to the pool those that need an expert.
 
     Raises:
-        Failure: the experts that should go on cannot be read.
+        Failure: levels cannot be read, or the experts that should go on.
     """
     ids = level_id_array(unit.level_ids)
-    levels = sample_levels(ids, size_of(job.size), job.distribution)
+    levels = levels_at(unit.origins) if unit.origins else sample_levels(ids, size_of(job.size), job.distribution)
     return begin(pool, levels, ids, experts_for(job, unit.level_ids), job.keep_experts)
 
 
@@ -68,7 +70,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool, run: Tr
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     """A failed attempt as a value: exceptions do not travel between processes."""
     reason, fatal = "".join(traceback.format_exception(error)), ""
-    if isinstance(error, (LockRefused, SourceUnseen)):
+    if isinstance(error, (LockRefused, SourceUnseen, LevelUnseen)):
         fatal = str(error)
     elif isinstance(error, OSError) and (what := REFUSALS.get(error.errno or 0)):
         fatal = f"Cannot write to {split}, {what}, then run the same command again."
@@ -107,6 +109,8 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
         row |= {"content_hash": content, "signature": signature}
     for row_of_shard, i in enumerate(kept):
         rows[i] |= {"shard": str(paths.shard.relative_to(split)), "row": row_of_shard}
+    for row, origin in zip(rows, unit.origins, strict=bool(unit.origins)):
+        row |= {"file": origin.file, "command": f"{again(job)} {shlex.quote(f'level_files={origin.file}')}"}
     for row in rows if result.experts else ():
         if row["level_id"] in result.experts:
             row["experts"] = str(paths.experts.relative_to(split))
@@ -132,6 +136,7 @@ def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, A
     known = {name: _finite_or_null(value) for name, value in asdict(verdict).items()}
     return known | {
         "level_id": level_id,
+        "file": None,
         "size": job.size,
         "budget": job.budget,
         "shard": None,

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from configs.compose import identified
 from configs.convert import typed
+from configs.schema import from_files
 from experts.config import RECORD_STEPS
 from experts.labels import DIVERGED
 from levelgen.sampling.distribution import Distribution
@@ -58,12 +59,13 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
     levels, shown = duplicates.compared(chosen), max(rows, 0)
     stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards)
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
-    distribution = typed(Distribution, (manifest.config or {})["distribution"], "distribution")
+    config = manifest.config or {}
+    distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
     first = chosen.column("level_id").slice(0, shown).to_pylist()
     return {
         "split": str(split),
         "config_hash": manifest.config_hash,
-        "distribution": dict(zip(("name", "hash"), identified(distribution), strict=True)),
+        "distribution": dict(zip(("name", "hash"), identified(distribution), strict=True)) if distribution else None,
         "levels": chosen.num_rows,
         "labels": _counts(chosen, "label"),
         "unsolvable": _counts(select(chosen, "label = 'unsolvable'"), "label_reason"),
@@ -104,10 +106,10 @@ def _quantiles(table: pa.Table, column: str) -> dict[str, float] | None:
 
 def _print(facts: dict[str, Any], console: Console) -> None:
     labels = ", ".join(f"{count} {label}" for label, count in facts["labels"].items()) or "none"
-    distribution = facts["distribution"]
+    of = facts["distribution"]
     lines = {
         "split": facts["split"],
-        "distribution": f"{distribution['name'] or 'of its own'} ({distribution['hash']})",
+        "distribution": f"{of['name'] or 'of its own'} ({of['hash']})" if of else "none, levels are of level files",
         "levels": f"{facts['levels']} ({labels})",
         "unsolvable": "; ".join(f"{count} {reason}" for reason, count in facts["unsolvable"].items()) or None,
         "experts that diverged": str(facts["diverged"]) if facts["diverged"] else None,

@@ -1,9 +1,9 @@
-"""What speaks for some rows of a manifest: their ids, their shards, the replay of their witnesses, and proofs.
+"""What speaks for some rows of a manifest: their ids or files, their shards, the replay of their witnesses, and proofs.
 
 Worked out for many levels at once, whatever shards they lie in.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,18 +18,22 @@ from jaxtyping import Bool, Int
 from experts.before import decide
 from experts.labels import TRAINED, WITNESSED, Label
 from experts.witness import LANES, Record, replay, steps_to_goal, succeeds
-from levelgen.identity.content import content_hashes
+from levelgen.identity.content import content_hashes, level_id_for
 from levelgen.identity.signature import signatures
 from levelgen.level import Level, size_of
 from levelgen.sampling.sampler import Distribution, sample_levels
+from levelgen.sampling.scenery import empty_level
 from levelgen.task.rules import TaskParams
 from pipeline.errors import Failure
+from pipeline.read.level_files import level_at
 from pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
+from pipeline.store.origins import origin_of
 from pipeline.store.provenance import device, versions
 from pipeline.store.shard import Shard
 
 COLUMNS = (
-    "label", "label_reason", "failed_by_noop", "content_hash", "signature", "size", "steps_to_goal", "shard", "row",
+    "label", "label_reason", "failed_by_noop", "content_hash", "signature", "file", "size", "steps_to_goal", "shard",
+    "row",
     "versions", "device",
 )  # fmt: skip
 
@@ -54,7 +58,7 @@ class Making:
 
     split: Path
     size: str
-    distribution: Distribution
+    distribution: Distribution | None  # None: no id makes a level, their shards or files have them
     rules: TaskParams
 
 
@@ -80,8 +84,11 @@ class Evidence:
             lambda i: f"is {labels[i]}, and its shard is {shard[i]}",
         )
         stored = np.flatnonzero(self._claims())
-        made = sample_levels(jnp.asarray(self.ids), size_of(self.making.size), self.making.distribution)
-        levels = jax.tree.map(np.array, made)  # to be replaced by what shards hold
+        if self.making.distribution is None:
+            levels = self._kept(stored)
+        else:
+            made = sample_levels(jnp.asarray(self.ids), size_of(self.making.size), self.making.distribution)
+            levels = jax.tree.map(np.array, made)  # to be replaced by what shards hold
         known = self._identity(levels)
         for first in range(0, len(stored), LANES):
             known[self._witnesses(stored[first : first + LANES], levels)] = True
@@ -109,15 +116,41 @@ class Evidence:
         self._tell(wrong, lambda i: f"is said to be row {rows[i]} of {names[i]}, which has level {holds[i]} there")
         return right
 
+    def _kept(self, stored: Lanes) -> Level:
+        """Levels that no id makes, from their shards and, without one, from their files."""
+        levels = jax.tree.map(np.array, empty_level(size_of(self.making.size), len(self.ids)))
+        ours = arrays_of(levels, "level/")
+
+        def put(lanes: Lanes, arrays: dict[str, np.ndarray]) -> None:
+            for name in ours if len(lanes) else ():
+                ours[name][..., lanes] = arrays[name]
+
+        for first in range(0, len(stored), LANES):
+            put(*self._read(stored[first : first + LANES], ours))
+        for i in np.flatnonzero([shard is None for shard in self.of["shard"]]):
+            row, lane = {name: values[i] for name, values in self.of.items()}, np.array([i])
+            try:
+                put(lane, arrays_of(level_at(origin_of(self.making.split, row)), "level/"))
+            except Failure as failure:
+                reason = str(failure)[:-1]
+                self._tell([True], lambda _, reason=reason: f"cannot be made again: {reason}", lane)
+        return levels
+
     def _identity(self, made: Level) -> Mask:
         """Whether rows are of the very levels that their ids make; on another stack, levels have to look like those."""
         rows = list(zip(self.of["content_hash"], self.of["signature"], strict=True))
         ours = list(zip(content_hashes(made), signatures(made), strict=True))
         same = np.array([a == b for a, b in zip(rows, ours, strict=True)])
+        if self.making.distribution is None:
+            same &= [level_id_for(of) == level_id for (of, _), level_id in zip(ours, self.ids, strict=True)]
         near = np.array([bool(set(a[1]) & set(b[1])) for a, b in zip(rows, ours, strict=True)])
         self._tell(
             ~np.where(self.same_stack, same, near),
-            lambda _: "has not the content hash and the signature of the level that its id makes",
+            lambda _: (
+                "has not the content hash and the signature of the level that its id makes"
+                if self.making.distribution
+                else "has not the id, the content hash and the signature of the level in its shard or file"
+            ),
         )
         return same
 
@@ -148,7 +181,7 @@ class Evidence:
         tell(late, lambda i: f"reaches the goal in {steps[i]} steps, the manifest says {claimed[i]}")
         return lanes
 
-    def _read(self, lanes: Lanes) -> tuple[Lanes, dict[str, np.ndarray]]:
+    def _read(self, lanes: Lanes, fields: Iterable[str] | None = None) -> tuple[Lanes, dict[str, np.ndarray]]:
         """The levels that could be read, and what their shards hold of them, side by side."""
         by_shard: dict[str, list[int]] = {}
         for i in lanes:
@@ -158,7 +191,7 @@ class Evidence:
             if (shard := self.shards[name]) is None:  # seen to be damaged before
                 continue
             try:
-                parts.append(shard.read([self.of["row"][i] for i in mine]))
+                parts.append(shard.read([self.of["row"][i] for i in mine], fields))
                 found += mine
             except Failure as failure:
                 self.findings.wrong.append(str(failure))

@@ -6,17 +6,20 @@ from pathlib import Path
 from typing import Any
 
 from configs.convert import typed
+from configs.schema import from_files
 from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelgen.level import Level, size_of
 from levelgen.sampling.sampler import Distribution, sample_levels
 from levelgen.task.rules import TaskParams
 from pipeline.errors import UserError
+from pipeline.read.level_files import level_at
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
+from pipeline.store.origins import ASKED, origin_of
 from pipeline.store.shard import open_shard
 
-COLUMNS = ("size", "label", "label_reason", "shard", "row")  # of a level that is drawn or exported
+COLUMNS = ("label", "label_reason", *ASKED)  # of a level that is drawn or exported
 
 
 def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
@@ -36,14 +39,16 @@ def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
 
 
 def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
-    """The level of a row, one lane: as its shard has it, or made again from its id where it has no shard.
+    """The level of a row, one lane: as its shard has it, or made again from its id or its file where it has no shard.
 
     Raises:
-        Failure: the shard is damaged.
+        Failure: the shard is damaged, or the file is gone or another one.
     """
     if row["shard"]:
         return tree_of(Level, open_shard(manifest.split, row["shard"], row["size"]).read([row["row"]]), "level/")
     prepare_jax()
+    if from_files(manifest.config or {}):
+        return level_at(origin_of(manifest.split, row))
     distribution = typed(Distribution, (manifest.config or {})["distribution"])
     return sample_levels([row["level_id"]], size_of(row["size"]), distribution)
 

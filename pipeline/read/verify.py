@@ -1,5 +1,5 @@
-"""Is a split what it claims to be? Every level made again from its id, every label that needs no expert worked out
-again, every shard read, every witness replayed.
+"""Is a split what it claims to be? Every level made again from its id or its file, every label that needs no expert
+worked out again, every shard read, every witness replayed.
 
 Bits are promised on the stack that made a row. On another one a level has to look as its id makes it, its world has to
 be the one that its row's content hash says, and its witness has to reach the goal.
@@ -13,6 +13,7 @@ from rich.progress import track
 
 from configs.convert import typed
 from configs.errors import ConfigError
+from configs.schema import from_files
 from levelgen.identity.keys import SAMPLER_VERSION
 from levelgen.level import size_of
 from levelgen.sampling.sampler import CHUNK, Distribution
@@ -67,7 +68,7 @@ def _making(manifest: Manifest) -> Making:
             raise ConfigError(f"sampler version {config['sampler_version']}, here it is {SAMPLER_VERSION}")
         size_of(config["size"])
         rules = typed(TaskParams, config["task"], "task")
-        distribution = typed(Distribution, config["distribution"], "distribution")
+        distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
     except (ValueError, KeyError, TypeError) as error:
         raise Failure(
             f"The split {manifest.split} was made by a levelproof with other settings ({error}): use that one."

@@ -14,7 +14,7 @@ from experts.labels import BY_EXPERT
 from experts.slots import begin
 from experts.success import no_success
 from levelgen.level import size_of
-from levelgen.sampling.sampler import sample_levels
+from levelgen.sampling.scenery import empty_level
 from pipeline.errors import Failure, UserError
 from pipeline.store.disk import flush
 from pipeline.store.fields import arrays_of
@@ -48,7 +48,7 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
     Raises:
         Failure: it is damaged or gone, or of another version of this program.
     """
-    level = sample_levels([0], size_of(job.size), job.distribution)
+    level = empty_level(size_of(job.size), 1)
     like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), no_success(1), job.expert), level)
     like = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
     try:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-MANIFEST_VERSION = 5
+MANIFEST_VERSION = 6
 SHARD_VERSION = 1
 
 # Keys of a fragment's metadata
@@ -23,6 +23,7 @@ COLUMNS = pa.schema(
         pa.field("level_id", pa.int64(), nullable=False),
         pa.field("content_hash", pa.string(), nullable=False),  # levelgen.identity.content
         pa.field("signature", pa.list_(pa.string()), nullable=False),  # levelgen.identity.signature
+        pa.field("file", pa.string()),  # absolute path of the level file; null: its id makes the level
         pa.field("size", pa.string(), nullable=False),
         pa.field("budget", pa.string(), nullable=False),  # as typed
         pa.field("label", pa.string(), nullable=False),  # solved, unsolved, unsolvable, trivial

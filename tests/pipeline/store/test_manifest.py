@@ -138,7 +138,7 @@ def test_another_version_is_refused(tmp_path: Path, job: JobConfig) -> None:
     table = pq.read_table(path)
     metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"9"}
     pq.write_table(table.replace_schema_metadata(metadata), path)
-    with pytest.raises(Failure, match="has manifest version 9, this program reads 5"):
+    with pytest.raises(Failure, match="has manifest version 9, this program reads 6"):
         read_manifest(tmp_path)
 
 

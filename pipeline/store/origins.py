@@ -1,0 +1,70 @@
+"""Where levels are that no id makes: in a level file, and once they have a witness in a shard.
+
+Such a level's id is made of its content hash: it has the same random streams wherever its file lies.
+"""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipeline.errors import UserError
+from pipeline.store.manifest import read_manifest
+
+ASKED = ("content_hash", "file", "size", "shard", "row")  # columns that tell a level's origin
+
+
+class Origin(NamedTuple):
+    """Where one level is, and what it has to be."""
+
+    content_hash: str
+    file: str  # absolute path
+    size: str
+    split: str = ""  # absolute path, where a shard has the level
+    shard: str = ""  # path below the split
+    row: int = 0
+
+
+def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:
+    """Of a row of a split's manifest, with the columns ASKED."""
+    found = Origin(row["content_hash"], row["file"] or "", row["size"])
+    if not row["shard"]:
+        return found
+    return found._replace(split=str(split.expanduser().absolute()), shard=row["shard"], row=row["row"])
+
+
+def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
+    """Of these levels of a split, by their ids.
+
+    Raises:
+        UserError: the file of one without a shard is gone.
+        Failure: a fragment is damaged.
+    """
+    rows = read_manifest(split, ASKED, list(level_ids)).table.to_pylist()
+    found = {row["level_id"]: origin_of(split, row) for row in rows}
+    gone = [of.file for of in found.values() if not of.shard and not Path(of.file).is_file()]
+    if gone:
+        more = f" and {len(gone) - 1} more" if gone[1:] else ""
+        raise UserError(
+            f"No shard of {split} has the level of {gone[0]}{more}, and its file is gone: put it back, "
+            "or label the files where they are now with levelproof generate level_files=FOLDER."
+        )
+    return found
+
+
+def require_same_levels(split: Path, origins: Mapping[int, Origin], done: Collection[int]) -> None:
+    """Refuse levels whose ids other ones have in the split: two contents in some ten thousand share one.
+
+    Raises:
+        UserError: there is such a level.
+        Failure: a fragment is damaged.
+    """
+    if not origins or not done:
+        return
+    table = read_manifest(split, ["content_hash", "file"], list(done)).table
+    for row in table.to_pylist():
+        here = origins[row["level_id"]]
+        if row["content_hash"] != here.content_hash:
+            raise UserError(
+                f"The levels of {here.file} and {row['file']} have by chance one id, {row['level_id']}: "
+                "label one of them elsewhere, with out=NAME."
+            )

@@ -1,0 +1,196 @@
+"""Level files instead of random levels: a split for each size, and every command works on it without the sampler."""
+
+import json
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from configs.compose import compose_job
+from configs.errors import ConfigError
+from levelgen.files.level_file import LevelFile, read_level_file, write_level_file
+from levelgen.identity.content import content_hashes, level_id_for
+from levelgen.level import SIZES
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import TaskParams
+from pipeline.jobs.schedule import WorkUnit, plan_units
+from pipeline.jobs.unit import failure
+from pipeline.look.inspect import survey
+from pipeline.look.status import look
+from pipeline.read.level_files import LevelUnseen, level_at, levels_below
+from pipeline.read.verify import examine
+from pipeline.store.manifest import read_manifest
+from pipeline.store.origins import Origin
+from tests.pipeline.command import assert_refused, here
+
+WORDS = ["procedure=label", "budget=5k", "executor=inline"]
+IDS = TRIVIAL, UNSOLVABLE = 1, 16  # of size s: the first gets a shard, the second does not
+
+
+def write(folder: Path, level_id: int, name: str, size: str = "s", rules: TaskParams | None = None) -> Path:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    level = jax.tree.map(np.asarray, sample_levels([level_id], SIZES[size]))
+    write_level_file(LevelFile(level, rules or TaskParams()), path)
+    return path
+
+
+def rows_of(split: Path) -> dict[str, dict]:
+    """By the names of their files."""
+    return {Path(row["file"]).name: row for row in read_manifest(split).table.to_pylist()}
+
+
+@pytest.fixture(scope="module")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with level files below `mine`, of two sizes, and the splits that the command made of them."""
+    folder = tmp_path_factory.mktemp("files")
+    write(folder / "mine", TRIVIAL, "a.json")
+    write(folder / "mine", TRIVIAL, "deeper/copy.json")
+    write(folder / "mine", UNSOLVABLE, "deeper/b c.json")
+    write(folder / "mine", 0, "m.json", "m")
+    write(folder / "mine", 1, "rules.json", rules=replace(TaskParams(), frame_skip=4))
+    (folder / "mine/bad.json").write_text("{")
+    done = here(["generate", "level_files=mine", *WORDS], folder)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    said = done.stderr.splitlines()
+    assert any("copy.json has the same level as" in line and "a.json" in line for line in said)
+    assert any(line.startswith("Cannot use the level file") and "bad.json: it is not JSON" in line for line in said)
+    assert any("rules.json: it is played by other rules, so say task.frame_skip=4" in line for line in said)
+    assert said[-1] == "2 of the level files in mine were left out, for the reasons above."
+    return folder
+
+
+@pytest.fixture
+def folder(once: Path, tmp_path: Path) -> Path:
+    """A copy; the files that rows name are those of the first."""
+    return Path(shutil.copytree(once, tmp_path / "files"))
+
+
+def test_rows_are_named_by_file_and_content(once: Path) -> None:
+    rows = rows_of(once / "data/5k/s")
+    assert {name: row["label"] for name, row in rows.items()} == {"a.json": "trivial", "b c.json": "unsolvable"}
+    assert rows_of(once / "data/5k/m").keys() == {"m.json"}
+    for row in rows.values():
+        assert row["content_hash"] == content_hashes(read_level_file(Path(row["file"])).level)[0]
+        assert row["level_id"] == level_id_for(row["content_hash"])
+        assert Path(row["file"]).is_absolute()
+    ids = [row["level_id"] for row in rows.values()]
+    assert ids != list(IDS), "the id that the sampler knows is not in the file"
+    assert len(read_manifest(once / "data/5k/s").fragments) == 1, "ids far apart share a unit"
+
+
+def test_a_second_run_does_nothing_wherever_the_files_are(folder: Path) -> None:
+    (folder / "mine").rename(folder / "elsewhere")
+    before = rows_of(folder / "data/5k/s")
+    done = here(["generate", "level_files=elsewhere", *WORDS], folder)
+    assert done.stdout.count("Nothing to do") == 2
+    write(folder / "elsewhere", 2, "more.json")
+    done = here(["generate", "level_files=elsewhere", *WORDS], folder)
+    assert done.stdout.count("Nothing to do") == 1
+    after = rows_of(folder / "data/5k/s")
+    assert after.keys() - before.keys() == {"more.json"}
+    assert repr([after[name] for name in before]) == repr(list(before.values()))
+    assert not examine(folder / "data/5k/s").wrong
+
+
+def test_a_rows_command_makes_it_again(once: Path, tmp_path: Path) -> None:
+    row = rows_of(once / "data/5k/s")["b c.json"]
+    done = here([*shlex.split(row["command"])[1:], "executor=inline"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert repr(rows_of(tmp_path / "data/5k/s")) == repr({"b c.json": row})
+
+
+def test_every_level_is_made_again_and_looked_at(once: Path, folder: Path) -> None:
+    split = folder / "data/5k/s"
+    findings = examine(split)
+    assert (findings.levels, findings.witnesses, findings.wrong) == (2, 1, [])
+    (shard,) = (split / "shards").iterdir()
+    chunk = next(path for path in shard.rglob("lvl32/c/*/*") if path.is_file())
+    raw = bytearray(chunk.read_bytes())
+    raw[len(raw) // 2] ^= 1
+    chunk.write_bytes(raw)
+    assert any("is missing or damaged" in sentence for sentence in examine(split).wrong)
+
+
+def test_without_shard_and_file_a_level_is_gone(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine", UNSOLVABLE, "b.json")
+    assert here(["generate", f"level_files={file}", *WORDS], tmp_path).returncode == 0
+    split = tmp_path / "data/5k/s"
+    row = rows_of(split)["b.json"]
+    assert here(["export", str(split), str(row["level_id"]), "-o", "out.json"], tmp_path).returncode == 0
+    assert content_hashes(read_level_file(tmp_path / "out.json").level) == [row["content_hash"]]
+    write(tmp_path / "mine", TRIVIAL, "b.json")
+    assert any("cannot be made again" in text and "has another level" in text for text in examine(split).wrong)
+    file.unlink()
+    assert any("cannot be made again" in text and "No such file" in text for text in examine(split).wrong)
+    assert_refused(
+        here(["show", str(split), str(row["level_id"]), "-o", "x.png"], tmp_path), 1, "b.json", "put it back"
+    )
+    again = ["regenerate", f"manifest={split}", "budget=8k", "executor=inline"]
+    assert_refused(here(again, tmp_path), 2, "b.json", "its file is gone")
+
+
+def test_a_worker_that_does_not_see_a_file_stops_the_job(tmp_path: Path) -> None:
+    with pytest.raises(LevelUnseen) as error:
+        level_at(Origin("c1:0", str(tmp_path / "gone.json"), "s"))
+    assert "all machines share" in failure(tmp_path, WorkUnit((0,)), error.value).fatal
+
+
+def test_levels_are_regenerated_from_shard_and_file(once: Path, tmp_path: Path) -> None:
+    split = once / "data/5k/s"
+    done = here(["regenerate", f"manifest={split}", "budget=8k", "executor=inline"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert not examine(tmp_path / "data/8k/s").wrong
+    before, after = rows_of(split), rows_of(tmp_path / "data/8k/s")
+    for name, row in before.items():
+        same = ("level_id", "file", "content_hash", "label", "label_reason", "steps_to_goal")
+        assert [after[name][column] for column in same] == [row[column] for column in same]
+
+
+def test_questions_are_answered(once: Path, tmp_path: Path) -> None:
+    split = once / "data/5k/s"
+    facts = survey(split, "file LIKE '%a.json'")
+    assert (facts["levels"], facts["distribution"]) == (1, None)
+    assert here(["inspect", str(split)], tmp_path).stdout.count("level files") == 1
+    assert json.loads(here(["inspect", str(split), "--json"], tmp_path).stdout)["levels"] == 2
+    assert look(split)["done"] == look(split)["wanted"] == 2
+    for row in rows_of(split).values():
+        done = here(["show", str(split), str(row["level_id"]), "-o", "level.png"], tmp_path)
+        assert done.returncode == 0, done.stderr
+
+
+def test_what_cannot_be_is_refused(folder: Path) -> None:
+    for word in ("size=s", "levels=3", "first_level=1", "distribution=free", "distribution.motor_chance=1"):
+        with pytest.raises(ConfigError, match="is for random levels"):
+            compose_job(["level_files=mine", word])
+    generate = ["generate", *WORDS]
+    assert_refused(here([*generate, "levels=1"], folder), 2, "distribution was files, now absent", "out=NAME")
+    assert_refused(here([*generate, "level_files=nowhere"], folder), 2, "There is no folder of level files at nowhere")
+    (folder / "empty").mkdir()
+    assert_refused(here([*generate, "level_files=empty"], folder), 2, "There is no level file in empty")
+    assert_refused(here([*generate, "level_files=mine/bad.json"], folder), 2, "None of the level files")
+
+
+def test_two_levels_with_one_id_are_told_apart(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.read.level_files.level_id_for", lambda _: 7)
+    write(tmp_path / "two", TRIVIAL, "a.json")
+    write(tmp_path / "two", UNSOLVABLE, "b.json")
+    listing = levels_below(tmp_path / "two", compose_job([f"level_files={tmp_path}"]))
+    assert list(listing.levels["s"]) == [7]
+    assert "b.json: its level has by chance the id of the one in" in listing.refused[0]
+    row = rows_of(folder / "data/5k/s")["a.json"]
+    monkeypatch.setattr("pipeline.read.level_files.level_id_for", lambda _: row["level_id"])
+    done = here(["generate", f"level_files={tmp_path / 'two/b.json'}", *WORDS], folder)
+    assert_refused(done, 2, "have by chance one id", "out=NAME")
+
+
+def test_units_take_levels_with_origins_as_they_come() -> None:
+    origins = {i: Origin(f"c1:{i}", f"{i}.json", "s") for i in range(0, 1000, 100)}
+    units = plan_units(sorted(origins), {300}, 4, origins)
+    assert [len(unit.level_ids) for unit in units] == [4, 4, 1]
+    assert all([of.file for of in unit.origins] == [f"{i}.json" for i in unit.level_ids] for unit in units)
