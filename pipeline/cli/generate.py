@@ -10,7 +10,7 @@ EXAMPLE = """\
 levelproof generate                                 64 small levels into data
 levelproof generate size=m levels=1k budget=1M      more, larger, for longer
 levelproof generate distribution=vehicles out=cars  other levels
-levelproof generate level_files=mine out=labelled  levels of your own, below the folder mine
+levelproof generate level_files=mine                levels of your own
 levelproof generate stop.rule=budget expert.width=128    other experts"""
 INDENT = 24  # where meanings start
 # What people change; `levelproof settings` has the others
