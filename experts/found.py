@@ -58,6 +58,12 @@ class Looking:
         searches = procedure.search.env_steps and len(self._left)
         self._searching = Searching(*some, procedure.search, rules) if searches else None
 
+    @property
+    def env_steps(self) -> int:
+        """So far, of scouts and search."""
+        searched = self._searching.env_steps if self._searching else int(self.found.search_steps.sum())
+        return int(self.found.scout_steps.sum()) + searched
+
     def step(self) -> bool:
         """Search a little further; whether there is anything left to search."""
         if self._searching is None:

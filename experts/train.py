@@ -50,17 +50,17 @@ class TrainingRun:
         self.levels: Level = jax.tree.map(np.asarray, levels)
         self.before = decide(self.levels, pool.rules)
         self.left = np.array([i for i, verdict in enumerate(self.before.verdicts) if verdict is None], int)
-        self._looking = Looking(*self._some(self.left), pool.procedure, pool.rules)
+        self.looking = Looking(*self._some(self.left), pool.procedure, pool.rules)
         self.submission: Submission | None = None  # of those that an expert is asked for
         self.look()
 
     @property
     def found(self) -> Found:
-        return self._looking.found
+        return self.looking.found
 
     def look(self) -> None:
         """Search a little further; submit to the pool once there is nothing left to search."""
-        if self.submission is None and not self._looking.step():
+        if self.submission is None and not self.looking.step():
             some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
             levels, level_ids = self._some(some)
             mine = {
@@ -134,7 +134,7 @@ def begin(
 
 def totals(pool: Pool, run: TrainingRun) -> Totals:
     """How far all levels of a run are, those that need no expert included."""
-    looked = int(run.found.scout_steps.sum() + run.found.search_steps.sum())
+    looked = run.looking.env_steps
     if run.submission is None:
         return Totals(looked, len(run.level_ids) - len(run.left), 0)
     now, waiting = pool.totals(run.submission), len(run.submission.level_ids)

@@ -54,6 +54,7 @@ class Searching:
         self._waiting = deque(range(count))
         self._index = np.full(side_by_side(config), -1)  # of the level under search; -1: none
         self._search: Search | None = None
+        self.env_steps = 0  # of all levels, so far
         of_one = jax.eval_shape(partial(begin, config=config, rules=rules), take(levels, ONE), jnp.array(ONE))
         empty = lambda x: np.zeros((count, *x.shape[1:]), x.dtype)
         self._result = jax.tree.map(empty, jax.eval_shape(partial(searched, config=config), of_one)[1])
@@ -98,6 +99,8 @@ class Searching:
         for whole, part in zip(jax.tree.leaves(self._result), jax.tree.leaves(seen), strict=True):
             whole[self._index[rows]] = part[rows]
         self._index[rows] = -1
+        going = self._index >= 0
+        self.env_steps = int(self._result.env_steps.sum()) + int(np.asarray(seen.env_steps)[going].sum())
 
 
 def search(levels: Level, level_ids: Int[np.ndarray, " level"], config: SearchConfig, rules: TaskParams) -> Searched:
