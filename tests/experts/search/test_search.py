@@ -8,12 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from experts.labels import Label, Source
+from experts.procedure import Procedure
+from experts.scout import STEPS_PER_ROUND
 from experts.search.config import SearchConfig
 from experts.search.explore import Search, begin, draw, explore
 from experts.search.play import arena, fresh_walk, play
 from experts.search.search import Searched, search, side_by_side
 from experts.search.shorten import shorten
+from experts.steps import EnvSteps
 from experts.success import Success
+from experts.train import train_levels
 from experts.witness import replay, take
 from levelgen.identity.keys import GENERATOR
 from levelgen.level import Level
@@ -195,3 +201,18 @@ def test_shortening() -> None:
 def test_settings_that_cannot_be(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
         SearchConfig(**wrong)
+
+
+def test_a_label_rests_on_what_was_found() -> None:
+    """Scouts first, a search where they find nothing; and every env step is counted."""
+    some = np.array([0, 1, 2])
+    procedure = Procedure(ScoutConfig(rounds=1), CONFIG, ExpertConfig(), StopConfig(rule=Rule.NONE))
+    result = train_levels(take(levels(), some), IDS[some], 2048, procedure)
+    for i, verdict in zip(some, result.verdicts, strict=True):
+        length = int(found().success.length[i])
+        assert verdict.label is (Label.SOLVED if length else Label.UNSOLVED)
+        assert verdict.witness is (Source.SEARCH if length else None)
+        assert verdict.steps_to_goal == (length or None)
+        assert (verdict.scout_steps, verdict.search_steps) == (STEPS_PER_ROUND, found().env_steps[i])
+        assert verdict.cells == found().cells[i]
+    assert result.spent == EnvSteps(scouted=3 * STEPS_PER_ROUND, searched=int(found().env_steps[some].sum()))
