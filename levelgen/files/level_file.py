@@ -115,7 +115,11 @@ def from_document(document: object) -> LevelFile:
     level = level_from_kinetix(_fields(world, size))
     _check(level)
     collides: Any = np.asarray(separate(level.model))
-    return LevelFile(replace(level, model=replace(level.model, collides=collides)), _rules(params, static))
+    physics = {ours: layout.RULES[ours].read(params, theirs, "env_params") for ours, theirs in layout.PHYSICS.items()}
+    task = {name: entry.read(params, name, "env_params") for name, entry in layout.TASK.items()}
+    frame_skip = layout.STEPS.read(static, "frame_skip", "static_env_params")
+    rules = TaskParams(frame_skip=frame_skip, physics=Params(**physics), **task)
+    return LevelFile(replace(level, model=replace(level.model, collides=collides)), rules)
 
 
 def to_document(file: LevelFile) -> dict[str, Any]:
@@ -190,13 +194,6 @@ def _refuse(bad: Any, kind: str, why: str) -> None:
     """`bad` things of a kind, (thing, 1)."""
     if len(found := np.flatnonzero(bad)):
         raise LevelFileError(f"env_state.{kind}[{found[0]}] {why}")
-
-
-def _rules(params: object, static: object) -> TaskParams:
-    physics = {ours: layout.RULES[ours].read(params, theirs, "env_params") for ours, theirs in layout.PHYSICS.items()}
-    task = {name: entry.read(params, name, "env_params") for name, entry in layout.TASK.items()}
-    frame_skip = layout.STEPS.read(static, "frame_skip", "static_env_params")
-    return TaskParams(frame_skip=frame_skip, physics=Params(**physics), **task)
 
 
 def _things(fields: Fields, kind: str, entries: Mapping[str, Entry]) -> list[dict[str, Any]]:
