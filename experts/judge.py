@@ -14,7 +14,6 @@ from experts.slots import Begun
 from experts.success import Success
 from experts.witness import Record, steps_to_goal, succeeds
 
-MOST_OF_AN_EVALUATION = 8  # candidates
 MOST_CANDIDATES = 16  # of a level
 
 
@@ -94,21 +93,19 @@ def repeating(success: Success, source: Source) -> list[Witness]:
 
 
 def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
-    """The shortest witnesses of an evaluation; where none is replayed from moved starts, one."""
+    """Witnesses of an evaluation; where none is replayed from moved starts, one."""
     attempts = evaluation.action.shape[-1]
     done, goal = evaluation.done[:, :attempts], evaluation.goal[:, :attempts]
     source = lambda attempt: Source.SAMPLED if attempt else Source.MOST_PROBABLE
-    most = MOST_OF_AN_EVALUATION if config.replays else 1
     if config.witness == Choice.RECORD:
         steps, usable = steps_to_goal(done), np.flatnonzero(succeeds(done, goal))
-        if config.replays:
-            usable = usable[np.argsort(steps[usable], stable=True)]
-        return [Witness(evaluation.action[..., i], source(i), int(steps[i])) for i in usable[:most]]
+        usable = usable if config.replays else usable[:1]
+        return [Witness(evaluation.action[..., i], source(i), int(steps[i])) for i in usable]
     episodes = [(end - start, attempt, start) for attempt in range(attempts)
                 for start, end in successful_episodes(done[:, attempt], goal[:, attempt])]  # fmt: skip
     played = lambda steps, attempt, start: evaluation.action[start : start + steps, :, attempt]
     distinct = {played(*episode).tobytes(): episode for episode in sorted(episodes, reverse=True)}  # the first stays
-    shortest = sorted(distinct.values())[:most]
+    shortest = sorted(distinct.values())[: MOST_CANDIDATES if config.replays else 1]
     return [Witness(repeated(played(*episode), episode[0]), source(episode[1]), episode[0]) for episode in shortest]
 
 

@@ -8,7 +8,6 @@ from experts import progress
 from experts.config import RECORD_STEPS, Choice, ExpertConfig
 from experts.judge import (
     MOST_CANDIDATES,
-    MOST_OF_AN_EVALUATION,
     Evaluation,
     Witness,
     candidates_of,
@@ -81,9 +80,8 @@ def test_of_many_candidates_the_shortest_are_kept_and_of_copies_one() -> None:
     ends = [(end, True) for end in np.cumsum(np.arange(20, 8, -1)).tolist()]
     one = evaluation(ends)
     found = candidates_of([one, one, one], Source.SCOUT, config)
-    assert [witness.steps for witness in found] == [n for n in range(9, 9 + MOST_OF_AN_EVALUATION) for _ in "123"][
-        :MOST_CANDIDATES
-    ]
+    assert [witness.steps for witness in found] == [n for n in range(9, 20) for _ in "123"][:MOST_CANDIDATES]
+    assert len(candidates_of([one], Source.SCOUT, replace(config, replays=0))) == 1
     copies = evaluation(*[[(9, True), (19, True), (29, True)]] * 3)
     copies.action[:] = 1
     assert [witness.steps for witness in candidates_of([copies], Source.SCOUT, config)] == [10]
