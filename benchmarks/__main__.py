@@ -27,6 +27,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "observation": ("benchmarks.observation", "what the symbolic-flat observation costs beside the step"),
     "families": ("benchmarks.families", "how many levels of each distribution need no expert, and a sheet of each"),
     "portability": ("benchmarks.portability", "how many witnesses reach the goal in the reference"),
+    "handmade": ("benchmarks.handmade", "what it takes to label the reference's 74 handmade levels, one by one"),
     "readme": ("benchmarks.readme", "the README's commands in a fresh clone and environment"),
 }
 

@@ -40,6 +40,12 @@ def oracle_python() -> Path:
     return python
 
 
+def handmade_levels(python: Path) -> Path:
+    """The folder of the reference's handmade levels, in its installation."""
+    code = "from importlib.util import find_spec; print(*find_spec('kinetix').submodule_search_locations)"
+    return Path(_run([python, "-c", code], "find the reference's handmade levels", environment()).strip()) / "levels"
+
+
 def sampled_levels(python: Path, size: str, count: int = LEVELS, seed: int = SEED) -> Path:
     """A file of levels that the reference sampled, made on first use (minutes: it compiles slowly)."""
     path = cache_folder() / "bench" / f"levels-{size}-{count}-{seed}.npz"

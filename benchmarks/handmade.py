@@ -1,0 +1,95 @@
+"""The reference's 74 handmade levels, labelled one by one: the levels that everybody in the field knows.
+
+They are read from its installation and have the ids that `generate level_files=` gives them: the same results.
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import oracle
+from benchmarks.report import Report, Table
+from configs.compose import compose_job
+from configs.schema import JobConfig
+from experts.labels import WITNESSED, Verdict
+from experts.train import train_levels
+from pipeline.errors import UserError
+from pipeline.read.level_files import level_at, levels_below
+from pipeline.runtime import own_cores, prepare_jax
+from pipeline.store.origins import Origin
+
+SIZES = ("s", "m", "l")
+KINDS = {"scout": "scout_steps", "search": "search_steps", "training": "env_steps", "evaluation": "evaluation_steps"}
+HEAD = ("level", "size", "label", "seconds", *KINDS, "witness", "steps to goal")
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", nargs="+", choices=SIZES, default=list(SIZES), help="default: all")
+    parser.add_argument("--budget", default="256k", help="env steps an expert may use (default: 256k)")
+
+
+def run(given: argparse.Namespace) -> Report:
+    prepare_jax(min(own_cores()))
+    python = oracle.oracle_python()
+    folder = oracle.handmade_levels(python)
+    job = compose_job([f"level_files={folder}", f"budget={given.budget}"])
+    listing = levels_below(folder, job)
+    if listing.refused:
+        raise UserError(listing.refused[0])
+    results = [row for size in given.size for row in labelled(job, listing.levels[size])]
+    rows = [[of["level"], of["size"], of["label"], *_cells(of)] for of in results]
+    return Report(
+        "The reference's handmade levels",
+        results,
+        [Table(HEAD, rows), Table(("size", "levels", "with a witness", "seconds", *KINDS), totals(results), "By size")],
+        notes=[
+            "Each level is labelled alone, on one core, by the default procedure; seconds are without compiling. The "
+            "slots beside its expert are empty, so a job that labels many levels takes fewer seconds for each.",
+        ],
+        reference=oracle.versions(python),
+    )
+
+
+def labelled(job: JobConfig, origins: dict[int, Origin]) -> list[dict[str, Any]]:
+    """What came of each level, and how long it took. What compiles for one does not count: it is done twice."""
+    results, compiled = [], set()
+    for level_id, origin in origins.items():
+        verdict, seconds = timed(job, level_id, origin)
+        if new := {name for name in KINDS.values() if getattr(verdict, name)} - compiled:
+            compiled |= new
+            verdict, seconds = timed(job, level_id, origin)
+        of_level = {"level": Path(origin.file).stem, "size": origin.size, "label": str(verdict.label)}
+        of_level |= {"seconds": seconds}
+        of_level |= {kind: getattr(verdict, name) for kind, name in KINDS.items()}
+        of_level |= {"witness": verdict.witness and str(verdict.witness), "steps to goal": verdict.steps_to_goal}
+        results.append(of_level)
+        oracle.tell(f"{of_level['level']}: {of_level['label']}, {of_level['seconds']:.1f} s")
+    return results
+
+
+def timed(job: JobConfig, level_id: int, origin: Origin) -> tuple[Verdict, float]:
+    """A level's verdict, and the seconds that it took."""
+    level, ids = level_at(origin), np.array([level_id])
+    start = time.perf_counter()
+    (verdict,) = train_levels(level, ids, job.env_steps, job.procedure, job.task).verdicts
+    return verdict, time.perf_counter() - start
+
+
+def totals(results: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """A row for each size."""
+    rows = []
+    for size in dict.fromkeys(of["size"] for of in results):
+        mine = [of for of in results if of["size"] == size]
+        with_witness = sum(of["label"] in WITNESSED for of in mine)
+        sums = [f"{sum(of[name] for of in mine):,}" for name in KINDS]
+        rows.append([size, str(len(mine)), str(with_witness), f"{sum(of['seconds'] for of in mine):.1f}", *sums])
+    return rows
+
+
+def _cells(of: dict[str, Any]) -> list[str]:
+    last = ["-" if of[name] is None else str(of[name]) for name in ("witness", "steps to goal")]
+    return [f"{of['seconds']:.1f}", *(f"{of[name]:,}" for name in KINDS), *last]

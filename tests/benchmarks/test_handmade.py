@@ -1,0 +1,28 @@
+"""The benchmark of handmade levels, on a level of our own: no reference is needed to see what it tells."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from benchmarks.handmade import KINDS, labelled, totals
+from configs.compose import compose_job
+from levelgen.files.level_file import LevelFile, write_level_file
+from levelgen.level import SIZES
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import TaskParams
+from pipeline.read.level_files import levels_below
+
+TRIVIAL, UNSOLVABLE = 1, 16
+
+
+def test_each_level_has_its_row_and_each_size_its_sum(tmp_path: Path) -> None:
+    for name, level_id in {"falls": TRIVIAL, "hopeless": UNSOLVABLE}.items():
+        level = jax.tree.map(np.asarray, sample_levels([level_id], SIZES["s"]))
+        write_level_file(LevelFile(level, TaskParams()), tmp_path / f"{name}.json")
+    job = compose_job([f"level_files={tmp_path}", "procedure=label", "budget=5k"])
+    results = labelled(job, levels_below(tmp_path, job).levels["s"])
+    assert {of["level"]: of["label"] for of in results} == {"falls": "trivial", "hopeless": "unsolvable"}
+    assert all(of[kind] == 0 for of in results for kind in KINDS)
+    ((size, levels, with_witness, _, *sums),) = totals(results)
+    assert (size, levels, with_witness, sums) == ("s", "2", "1", ["0"] * len(KINDS))
