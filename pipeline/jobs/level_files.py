@@ -1,17 +1,18 @@
 """The job of `levelproof generate level_files=FOLDER`: a split for each size of the levels that are there."""
 
+import multiprocessing
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 from rich.console import Console
 
 from configs.schema import JobConfig
 from pipeline.errors import Exit, UserError
 from pipeline.jobs.generate import generate
 from pipeline.jobs.progress import say
-from pipeline.read.level_files import levels_below
+from pipeline.read.level_files import Listing, levels_below
 from pipeline.runtime import prepare_jax
 
 
@@ -24,11 +25,12 @@ def generate_from_files(job: JobConfig, command: Sequence[str], console: Console
         UserError: no file can be used, or as `generate`.
         Failure: as `generate`.
     """
-    prepare_jax()
-    if job.executor == "ray":
-        jax.config.update("jax_platforms", "cpu")  # of this process only: GPUs are for workers
     folder = Path(job.level_files).expanduser()
-    listing = levels_below(folder, job)
+    if job.executor == "inline":
+        prepare_jax()
+        listing = levels_below(folder, job)
+    else:
+        listing = _listed_elsewhere(folder, job)
     for sentence in (*listing.copies, *listing.refused):
         say(console, sentence)
     if not listing.levels:
@@ -40,3 +42,17 @@ def generate_from_files(job: JobConfig, command: Sequence[str], console: Console
         say(console, f"{len(listing.refused)} of the level files in {folder} were left out, for the reasons above.")
         return Exit.INPUT
     return max(ends)
+
+
+def _listed_elsewhere(folder: Path, job: JobConfig) -> Listing:
+    """`levels_below`, read by a process of its own: Ray forks this one, which must not have started JAX by then."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _stay_off_gpus) as process:
+        return process.submit(levels_below, folder, job).result()
+
+
+def _stay_off_gpus() -> None:
+    """GPUs are for workers."""
+    import jax
+
+    prepare_jax()
+    jax.config.update("jax_platforms", "cpu")

@@ -25,7 +25,7 @@ from pipeline.read.level_files import LevelUnseen, level_at, levels_below
 from pipeline.read.verify import examine
 from pipeline.store.manifest import read_manifest
 from pipeline.store.origins import Origin
-from tests.pipeline.command import assert_refused, here
+from tests.pipeline.command import assert_refused, here, run
 
 WORDS = ["procedure=label", "budget=5k", "executor=inline"]
 IDS = TRIVIAL, UNSOLVABLE = 1, 16  # of size s: the first gets a shard, the second does not
@@ -194,3 +194,12 @@ def test_units_take_levels_with_origins_as_they_come() -> None:
     units = plan_units(sorted(origins), {300}, 4, origins)
     assert [len(unit.level_ids) for unit in units] == [4, 4, 1]
     assert all([of.file for of in unit.origins] == [f"{i}.json" for i in unit.level_ids] for unit in units)
+
+
+@pytest.mark.campaign
+def test_workers_read_the_files_and_ray_forks_no_process_with_jax(once: Path, tmp_path: Path) -> None:
+    words = ["generate", f"level_files={once / 'mine'}", *WORDS, "executor=ray", "workers=1", "unit=1"]
+    done = run(words, tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert "fork" not in done.stderr
+    assert rows_of(tmp_path / "data/5k/s").keys() == rows_of(once / "data/5k/s").keys()
