@@ -65,7 +65,7 @@ def samples(level: Level) -> Samples:
     """Every statistic's values."""
     lanes = level.role.shape[-1]
     zeros = np.zeros(lanes, np.int32), np.zeros(lanes, np.float32)
-    facts = facts_of(level, DEFAULT_RULES)
+    facts = jax.device_get(facts_of(level, DEFAULT_RULES))
     return statistics(state_to_kinetix(level, level.state, *zeros)) | {
         "noop reaches the goal": facts.reaches,
         "noop touches red": facts.fails,
