@@ -182,8 +182,11 @@ class TestFile:
 
     def test_the_committed_results_are_all_there(self) -> None:
         results = read()
-        assert len(results) == 49
-        assert sum(len(each.rows) for each in results) == 11_984
+        shown = {(each.header.size, each.header.variant) for each in results}
+        assert shown >= {
+            (size, name) for size in ("s", "m", "l") for name in ("default", "label", "alone", "reference")
+        }
+        assert all(each.header.variant in VARIANTS and len(each.rows) >= 15 for each in results)
         assert made(results).startswith("2026-11-21")
         assert "on cpu: AMD EPYC; levelproof" in made(results)
 
