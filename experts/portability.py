@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from experts.config import RECORD_STEPS
 from experts.judge import Witness
 from experts.rollout import repeat
-from experts.witness import take
+from experts.witness import blocks, take
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task import rules as task
@@ -75,8 +75,7 @@ def survival(
     """
     side_by_side = CANDIDATES_IN_CACHE if jax.default_backend() == "cpu" else CANDIDATES_ON_ACCELERATOR
     shares = []
-    for first in range(0, len(witnesses), side_by_side):
-        some = np.minimum(np.arange(first, first + side_by_side), len(witnesses) - 1)
+    for some in blocks(len(witnesses), side_by_side):
         action = np.stack([witnesses[i].action for i in some], -1).astype(np.int8)
         steps = np.array([witnesses[i].steps for i in some], np.int32)
         shares.append(jax.device_get(_survival(take(levels, some), level_ids[some], action, steps, replays, rules)))

@@ -145,6 +145,7 @@ def as_rows(samples: Samples) -> Float[Array, "sample column"]:
 
 def from_rows(rows: Float[Array, "sample column"]) -> Samples:
     columns = rows.T
-    dynamic = columns.shape[0] - len(CHOICES) - 4
+    singles = len(Samples._fields) - 2  # all but the observation and the action
+    dynamic = columns.shape[0] - len(CHOICES) - singles
     action = columns[dynamic : dynamic + len(CHOICES)]
-    return Samples(columns[:dynamic], action, *columns[-4:])
+    return Samples(columns[:dynamic], action, *columns[-singles:])

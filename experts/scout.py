@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int, Key
 from experts.config import RECORD_STEPS, ScoutConfig
 from experts.rollout import repeat
 from experts.success import Success, no_success
-from experts.witness import take
+from experts.witness import blocks, take
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task import rules as task
@@ -51,12 +51,10 @@ def scout(levels: Level, level_ids: Int[np.ndarray, " level"], config: ScoutConf
     for number in range(config.rounds):
         left = np.flatnonzero(length == 0)
         env_steps[left] += STEPS_PER_ROUND
-        for first in range(0, len(left), side_by_side):
-            some = left[first : first + side_by_side]
-            filled = some[np.minimum(np.arange(side_by_side), len(some) - 1)]
-            found = play(take(levels, filled), level_ids[filled], np.int32(number), rules)
-            actions, lengths = jax.device_get(found)
-            action[some], length[some] = actions[: len(some)], lengths[: len(some)]
+        for block in blocks(len(left), side_by_side):
+            some = left[block]
+            found = play(take(levels, some), level_ids[some], np.int32(number), rules)
+            action[some], length[some] = jax.device_get(found)
     return Scouted(Success(action, length), env_steps)
 
 

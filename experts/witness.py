@@ -74,10 +74,10 @@ def steps_to_goal(done: ArrayLike) -> Int[np.ndarray, " level"]:
     return np.argmax(np.asarray(done), axis=0) + 1
 
 
-def blocks(count: int) -> Iterator[np.ndarray]:
-    """Lane numbers of each block; the last one is filled up with its last lane."""
-    for first in range(0, count, LANES):
-        yield np.minimum(np.arange(first, first + LANES), count - 1)
+def blocks(count: int, size: int = LANES) -> Iterator[np.ndarray]:
+    """Numbers of each block of so many; the last one is filled up with its last number: one program serves all."""
+    for first in range(0, count, size):
+        yield np.minimum(np.arange(first, first + size), count - 1)
 
 
 def take(tree: T, lanes: np.ndarray) -> T:

@@ -14,7 +14,7 @@ from experts.search.config import SearchConfig
 from experts.search.explore import Search, begin, explore, successes, under_way
 from experts.search.shorten import shorten
 from experts.success import Success
-from experts.witness import take
+from experts.witness import blocks, take
 from levelgen.level import Level
 from levelgen.task.rules import TaskParams
 
@@ -72,14 +72,13 @@ class Searching:
         """What was found, once nothing is left to search: successes that replay, made shorter."""
         found, width = self._result, len(self._index)
         indices = np.flatnonzero(found.success.length)
-        for first in range(0, len(indices), width):
-            some = indices[first : first + width]
-            filled = some[np.minimum(np.arange(width), len(some) - 1)]
-            given = jax.tree.map(lambda x, filled=filled: x[filled], found.success)
-            levels, level_ids = take(self.levels, filled), self.level_ids[filled]
+        for block in blocks(len(indices), width):
+            some = indices[block]
+            given = jax.tree.map(lambda x, some=some: x[some], found.success)
+            levels, level_ids = take(self.levels, some), self.level_ids[some]
             shorter = jax.device_get(shorten(levels, level_ids, given, self.config, self.rules))
-            found.success.action[some], found.success.length[some] = (x[: len(some)] for x in shorter.success)
-            found.env_steps[some] += shorter.env_steps[: len(some)]
+            found.success.action[some], found.success.length[some] = shorter.success
+            found.env_steps[some] += shorter.env_steps  # once for a level that fills up its block
         return found
 
     def _enter(self) -> None:
