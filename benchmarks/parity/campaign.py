@@ -16,8 +16,9 @@ from benchmarks.parity.episodes import STEPS, Block, Episodes, play_block, summe
 from benchmarks.parity.onestep import OneStep, Pool, distinct, one_step, picked, pool_of
 from benchmarks.parity.progress import Board
 from benchmarks.parity.scenes import SCENES
-from benchmarks.parity.worlds import blocks, joined, lanes_of
+from benchmarks.parity.worlds import BLOCK, joined, lanes_of
 from benchmarks.reference.actions import sticky_actions
+from experts.witness import blocks
 from levelgen.level import SIZES, Level, Role, name_of, size_of
 from levelgen.sampling.sampler import sample_levels
 from pipeline.errors import UserError
@@ -106,7 +107,7 @@ def _episodes(reference: Reference, pairs: Pool, states: int, tick: Tick) -> tup
     """Play the pairs, and pick states along them."""
     rng, pools, parts = np.random.default_rng(0), [], []
     shares = {HANDMADE: HANDMADE_SHARE, SAMPLED: 1 - ADVERSARIAL_SHARE - HANDMADE_SHARE}
-    for lanes in blocks(len(pairs)):
+    for lanes in blocks(len(pairs), BLOCK):
         block = pairs.lanes(lanes)
         count = int(lanes[-1] - lanes[0]) + 1  # the last block is filled up
         parts.append(play_block(block, count, reference, tick))
@@ -138,7 +139,7 @@ def _scenes(reference: Reference, sampled: Level, states: int, with_sampled: boo
     level = replace(level, role=np.full_like(level.role, Role.PLAIN))
     every = Pool(level, sticky_actions(SHORT, len(scene), seed=1), scene, origin)
     pools = []
-    for lanes in blocks(len(every)):
+    for lanes in blocks(len(every), BLOCK):
         block, keep = every.lanes(lanes), np.arange(lanes[-1] - lanes[0] + 1)
         record = reference.play(block.level, block.level.state, block.action, record=True).states
         times = np.repeat(np.array(TIMES)[:, None], len(keep), 1)
@@ -148,4 +149,4 @@ def _scenes(reference: Reference, sampled: Level, states: int, with_sampled: boo
 
 
 def _blocks(count: int) -> int:
-    return len([*blocks(count)])
+    return len([*blocks(count, BLOCK)])

@@ -11,7 +11,8 @@ from jaxtyping import Int
 from benchmarks.parity.causes import Step, find_cause
 from benchmarks.parity.distance import OFF, UNITS, Distances, distances
 from benchmarks.parity.engines import RULES, Stepped, step_ours
-from benchmarks.parity.worlds import blocks, joined, lanes_of, starting_in
+from benchmarks.parity.worlds import BLOCK, joined, lanes_of, starting_in
+from experts.witness import blocks
 from levelgen.level import Level
 from physics.types import State
 
@@ -128,7 +129,7 @@ def picked(played: Pool, record: State, times: Int[np.ndarray, "pick lane"]) -> 
 def one_step(pool: Pool, step_theirs: Step, tick: Callable[[str], None]) -> OneStep:
     """Step the pool in both engines, and find out why states are off."""
     parts, off, defect = [], [], []
-    for lanes in blocks(len(pool)):
+    for lanes in blocks(len(pool), BLOCK):
         block, count = pool.lanes(lanes), int(lanes[-1] - lanes[0]) + 1  # the last block is filled up
         theirs, ours = step_theirs(block.level, block.action), step_ours(block.level, block.action)
         fixed = step_ours(block.level, block.action, replace(RULES.physics, faithful_padding=False))

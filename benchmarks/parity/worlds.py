@@ -1,7 +1,7 @@
 """Batches of worlds on the host: numpy trees of our types, lanes last, in blocks of one size."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import jax
@@ -25,12 +25,6 @@ def lanes_of(tree: T, lanes) -> T:
 def joined(trees: Sequence[T]) -> T:
     """One batch of several."""
     return jax.tree.map(lambda *xs: np.concatenate(xs, -1), *trees)
-
-
-def blocks(count: int, size: int = BLOCK) -> Iterator[np.ndarray]:
-    """Lane numbers of each block; the last one is filled up with its last lane."""
-    for first in range(0, count, size):
-        yield np.minimum(np.arange(first, first + size), count - 1)
 
 
 def starting_in(level: Level, state: State) -> Level:

@@ -20,8 +20,9 @@ from benchmarks.parity.distance import distances, gap
 from benchmarks.parity.engines import Played, Stepped, play_ours, step_ours
 from benchmarks.parity.onestep import Pool, distinct, one_step, picked
 from benchmarks.parity.report import report_of
-from benchmarks.parity.worlds import BLOCK, blocks, contact_bodies, lanes_of, nudged
+from benchmarks.parity.worlds import BLOCK, contact_bodies, lanes_of, nudged
 from benchmarks.report import Report
+from experts.witness import blocks
 from physics.types import FIXED_POLYGONS, Params
 from pipeline.errors import Exit
 from tests.golden.load import HERE, load
