@@ -67,7 +67,7 @@ class Shard:
         """
         self.path = path
         try:
-            self._require_file("zarr.json")
+            ordinary_file(path, "zarr.json")
             self._group = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
             attributes = self._group.attrs.asdict()
             version = attributes.get("version")
@@ -80,12 +80,13 @@ class Shard:
             if size not in (None, name_of(self.size)):
                 raise ContentsError(f"it has levels of size {name_of(self.size)}, and its row says {size}")
             self.table = table_for(self.size)
+            self.arrays = tuple(dict.fromkeys(field.array for field in self.table))
             check_level_ids(attributes["level_ids"])
             self.level_ids: list[int] = list(attributes["level_ids"])  # type: ignore[arg-type]
         except Failure:
             raise
         except Exception as error:  # zarr raises many kinds
-            raise self._damaged(error) from error
+            raise damaged(path, error) from error
 
     def read(self, rows: Iterable[int] | None = None, fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """Named arrays of `rows` (default: all), level axis last and, for `record/` fields, time first.
@@ -107,38 +108,47 @@ class Shard:
             arrays = unpack(packed, table)
             check_numbers(arrays, self.size)
         except Exception as error:  # zarr and its codecs raise many kinds
-            raise self._damaged(error) from error
+            raise damaged(self.path, error) from error
         return arrays
 
     def _array(self, name: str, rows: list[int]) -> np.ndarray:
-        self._require_file(f"{name}/zarr.json")
+        ordinary_file(self.path, f"{name}/zarr.json")
         array, dtype = self._group[name], np.dtype(f"u{PACKED[name] // 8}")
         components = sum(field.count for field in self.table if field.array == name)
         shape = (len(self.level_ids), components, *((RECORD_STEPS,) if name in ALONG_TIME else ()))
         if not isinstance(array, zarr.Array) or (array.shape, array.dtype) != (shape, dtype):
             raise ContentsError(f"its array {name} has not the shape and type that its fields need")
         kinds = [type(codec) for codec in (*array.filters, array.serializer, *array.compressors)]
-        if (array.chunks, array.shards) != ((1, *shape[1:]), shape) or kinds != CODECS:
+        rows_a_file, *others = array.shards or (0,)
+        if (array.chunks, others) != ((1, *shape[1:]), [*shape[1:]]) or kinds != CODECS:
             raise ContentsError(f"its array {name} is not stored as this program stores it")
-        if array.size:
-            self._require_file(f"{name}/c/{'/'.join('0' * array.ndim)}")
+        for file in sorted({row // rows_a_file for row in rows}) if array.size else ():
+            ordinary_file(self.path, "/".join([name, "c", str(file), *"0" * len(others)]))
         index = slice(None) if rows == list(range(shape[0])) else np.asarray(rows, np.intp)
         return np.asarray(array.oindex[index])
 
-    def _require_file(self, name: str) -> None:
-        """An ordinary file, here and nowhere else. Of a missing one zarr makes zeros; a pipe never ends."""
-        path = self.path / name
-        if path.resolve() != self.path.resolve() / name:
-            raise ContentsError("it has links to other places")
-        if not path.is_file():
-            raise FileNotFoundError(path)
 
-    def _damaged(self, error: Exception) -> Failure:
-        reason = str(error) if isinstance(error, ContentsError) else type(error).__name__
-        return Failure(
-            f"The shard {self.path} is missing or damaged ({reason}): "
-            f"delete {fragment_of(self.path)} and run the same `levelproof generate` again to remake its levels."
-        )
+def ordinary_file(shard: Path, name: str) -> Path:
+    """A file of a shard, here and nowhere else. Of a missing one zarr makes zeros; a pipe never ends.
+
+    Raises:
+        ContentsError, FileNotFoundError: it is none.
+    """
+    path = shard / name
+    if path.resolve() != shard.resolve() / name:
+        raise ContentsError("it has links to other places")
+    if not path.is_file():
+        raise FileNotFoundError(path)
+    return path
+
+
+def damaged(shard: Path, error: Exception) -> Failure:
+    """What to say of a shard that raised this when it was read."""
+    reason = str(error) if isinstance(error, ContentsError) else type(error).__name__
+    return Failure(
+        f"The shard {shard} is missing or damaged ({reason}): "
+        f"delete {fragment_of(shard)} and run the same `levelproof generate` again to remake its levels."
+    )
 
 
 def open_shard(split: Path, name: str, size: str) -> Shard:
