@@ -56,9 +56,15 @@ def size_in(fields: Any) -> Size:
         shapes = {field["name"]: field["shape"] for field in fields}
         size = Size(*(shapes[name][0] for name in COUNTED))
         fits = all(type(n) is int and low <= n <= MOST_THINGS for low, n in zip(FEWEST, size, strict=True))
-        if fits and fields == [field.as_json() for field in table_for(size)]:
+        if fits and fields == _told(size):
             return size
     raise ContentsError("its fields are those of no size")
+
+
+@cache
+def _told(size: Size) -> list[dict[str, Any]]:
+    """The field table as a shard's attributes have it."""
+    return [field.as_json() for field in table_for(size)]
 
 
 def check_level_ids(level_ids: Any) -> None:
@@ -69,9 +75,13 @@ def check_level_ids(level_ids: Any) -> None:
 
 
 def check_numbers(arrays: Mapping[str, np.ndarray], size: Size) -> None:
-    """Raises ContentsError where a whole number is one that a level or a record of this size cannot have."""
+    """Raises ContentsError where a whole number is one that a level or a record of this size cannot have.
+
+    `arrays` have the level axis first.
+    """
     for name, most in highest(size).items():
-        if name in arrays and not ((arrays[name] >= 0) & (arrays[name] <= most)).all():
+        values = np.moveaxis(arrays[name], 0, -1) if name in arrays else np.zeros(0)
+        if not ((values >= 0) & (values <= most)).all():
             raise ContentsError(f"its field {name} has numbers that size {name_of(size)} cannot have")
 
 

@@ -15,9 +15,10 @@ import google_crc32c
 import numpy as np
 
 from pipeline.errors import Failure
+from pipeline.store.chunks import ordinary_file
 from pipeline.store.contents import ContentsError
 from pipeline.store.disk import flush
-from pipeline.store.shard import Shard, damaged, ordinary_file, stored_bytes
+from pipeline.store.shard import Shard, damaged, stored_bytes
 
 FILE_BYTES = 64 * 2**20  # that a file has at least, if there is as much; larger: longer indices to read before a chunk
 MISSING = 2**64 - 1  # in an index, of a chunk that is not there

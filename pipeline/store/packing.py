@@ -1,10 +1,12 @@
 """Between named arrays and the packed arrays of a shard; every bit comes back. Knows nothing of files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from experts.config import RECORD_STEPS
+from physics.types import Size
+from pipeline.store.contents import table_for
 from pipeline.store.schema import ALONG_TIME, PACKED, FieldSpec
 
 
@@ -27,8 +29,19 @@ def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[s
     return {name: np.ascontiguousarray(np.concatenate(part, 1)) for name, part in parts.items() if part}
 
 
+def empty(size: Size, names: Iterable[str], levels: int) -> dict[str, np.ndarray]:
+    """Room for these packed arrays of so many levels."""
+    components = {name: sum(field.count for field in table_for(size) if field.array == name) for name in names}
+    return {
+        name: np.empty((levels, count, *((RECORD_STEPS,) if name in ALONG_TIME else ())), f"u{PACKED[name] // 8}")
+        for name, count in components.items()
+    }
+
+
 def unpack(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[str, np.ndarray]:
-    """The inverse of `pack`, with the arrays that `packed` has.
+    """The inverse of `pack`, with the arrays that `packed` has, but for the order of axes: level first, then time.
+
+    These are views where types have as many bits as they are stored with.
 
     Raises:
         ValueError: a flag is neither 0 nor 1.
@@ -39,10 +52,10 @@ def unpack(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict
             continue
         part = packed[field.array][:, field.first : field.first + field.count]
         if field.array in ALONG_TIME:
-            shaped = np.moveaxis(part.reshape(len(part), *field.shape, RECORD_STEPS), (0, -1), (-1, 0))
+            part = np.moveaxis(part.reshape(len(part), *field.shape, RECORD_STEPS), -1, 1)
         else:
-            shaped = np.moveaxis(part.reshape(len(part), *field.shape), 0, -1)
-        arrays[field.name] = _original(np.ascontiguousarray(shaped), field)
+            part = part.reshape(len(part), *field.shape)
+        arrays[field.name] = _original(part, field)
     return arrays
 
 

@@ -1,0 +1,85 @@
+"""What shards hold of some rows of a manifest, side by side, whatever shards they lie in."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from pipeline.errors import Failure
+from pipeline.store.manifest import read_manifest
+from pipeline.store.shard import Shard, open_shard, read_together
+
+COLUMNS = ("level_id", "size", "shard", "row")  # that rows need to be read
+ATTEMPTS = 3  # to find shards that a seal takes away meanwhile
+
+Open = Callable[[Path, str, str], Shard]
+
+
+def read_rows(split: Path, rows: pa.Table, fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+    """Named arrays of these rows, in their order: level axis last and, for `record/` fields, time first.
+
+    Where a shard is gone because a seal has put its levels elsewhere, the manifest is asked again.
+
+    Args:
+        split: that the rows are of.
+        rows: of its manifest, at least one, all with a witness; at least COLUMNS.
+        fields: names to return (default: all).
+
+    Raises:
+        Failure: a shard is missing or damaged, or has other levels than the manifest says.
+    """
+    levels_first = read_levels_first(split, rows, fields)
+    return {name: np.ascontiguousarray(np.moveaxis(x, 0, -1)) for name, x in levels_first.items()}
+
+
+def read_levels_first(
+    split: Path, rows: pa.Table, fields: Iterable[str] | None = None, opened: Open = open_shard
+) -> dict[str, np.ndarray]:
+    """The same with the level axis first, then time; views of what shards hold, where these have time last.
+
+    `opened` opens a shard of a split by its name and its levels' size; a cache may stand in for it.
+    """
+    wanted = None if fields is None else list(fields)
+    for attempt in range(ATTEMPTS):
+        try:
+            return _read(split, rows, wanted, opened)
+        except Failure:
+            moved = moved_rows(split, rows)
+            if attempt == ATTEMPTS - 1 or moved.select(["shard", "row"]).equals(rows.select(["shard", "row"])):
+                raise
+            rows = moved
+    raise AssertionError("unreachable")
+
+
+def moved_rows(split: Path, rows: pa.Table) -> pa.Table:
+    """The same levels as the manifest has them now, in their order.
+
+    Raises:
+        Failure: it has not all of them any more.
+    """
+    ids = rows.column("level_id").to_numpy()
+    table = read_manifest(split, COLUMNS, ids).table
+    known = table.column("level_id").to_numpy()
+    if missing := set(ids.tolist()) - set(known.tolist()):
+        raise Failure(f"The split {split} has no level {min(missing)} any more: open it again.")
+    return table.take(np.searchsorted(known, ids))
+
+
+def _read(split: Path, rows: pa.Table, fields: list[str] | None, opened: Open) -> dict[str, np.ndarray]:
+    """Shard by shard."""
+    ids, sizes, names, row = (rows.column(name).to_pylist() for name in COLUMNS)
+    by_shard: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        by_shard.setdefault(name, []).append(i)
+    parts = [(opened(split, name, sizes[mine[0]]), [row[i] for i in mine]) for name, mine in by_shard.items()]
+    order = [i for mine in by_shard.values() for i in mine]
+    for (shard, held), mine in zip(parts, by_shard.values(), strict=True):
+        known = [shard.level_ids[k] if 0 <= k < len(shard.level_ids) else None for k in held]
+        if known != [ids[i] for i in mine]:
+            raise Failure(f"The shard {shard.path} has not the levels that the manifest says: verify {split}.")
+    arrays = read_together(parts, fields)
+    if order == sorted(order):
+        return arrays
+    back = np.argsort(order)
+    return {name: x[back] for name, x in arrays.items()}

@@ -1,0 +1,122 @@
+"""The chunks of one packed array: found in its files, read by their position, checked, and decoded where they belong.
+
+They lie there as zarr's sharding codec has them: chunks one after another, then an index of their places and its
+CRC-32C. A chunk is a Blosc buffer and its CRC-32C. zarr-python would read the same bits, several times slower: here
+an index is read once, and Blosc decodes into the caller's buffer without Python's global lock, so that threads help.
+"""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+from numcodecs import blosc  # pyright: ignore[reportAttributeAccessIssue]
+
+from pipeline.store.contents import ContentsError
+
+CHECKSUM = 4  # bytes of a CRC-32C
+ENTRY = 16  # bytes of an index for each chunk: where it starts, and how many bytes it has
+BLOSC_HEADER = 16  # bytes; its words of 4 at SIZES are how many bytes a buffer decodes to, and has
+SIZES = 4, 12
+KINDS = ["bytes", "blosc", "crc32c"]  # of a chunk's codecs
+
+
+class Chunks:
+    """Of one array of a shard. Its first axis is levels, a chunk each."""
+
+    def __init__(self, shard: Path, name: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
+        """Look at what the array `name` says of itself.
+
+        Raises:
+            ContentsError: it has another shape or type, or is not stored as this program stores it.
+            OSError, ValueError, KeyError, TypeError: it is missing or damaged.
+        """
+        self.shard, self.name, self.shape = shard, name, shape
+        about = json.loads(ordinary_file(shard, f"{name}/zarr.json").read_bytes())
+        if [about[key] for key in ("node_type", "shape", "data_type")] != ["array", [*shape], str(dtype)]:
+            raise ContentsError(f"its array {name} has not the shape and type that its fields need")
+        self.rows_a_file = _rows_a_file(about, shape)
+        if self.rows_a_file < 1:
+            raise ContentsError(f"its array {name} is not stored as this program stores it")
+        self._indices: dict[int, np.ndarray] = {}  # by file: [chunk, (first byte, bytes)]
+
+    def read(self, rows: Sequence[int], out: np.ndarray) -> None:
+        """Decode the chunk of `rows[i]` into `out[i]`, which is C-contiguous.
+
+        Raises:
+            ContentsError, OSError, ValueError, RuntimeError: a chunk is missing or damaged.
+        """
+        by_file: dict[int, list[int]] = {}
+        for i, row in enumerate(rows if out.size else ()):
+            by_file.setdefault(row // self.rows_a_file, []).append(i)
+        for number, mine in by_file.items():
+            file = self._opened(number)
+            try:
+                if number not in self._indices:
+                    self._indices[number] = self._index(file)
+                for i in mine:
+                    first, length = self._indices[number][rows[i] % self.rows_a_file].tolist()
+                    self._decode(os.pread(file, length, first), out[i])
+            finally:
+                os.close(file)
+
+    def _opened(self, number: int) -> int:
+        name = "/".join([self.name, "c", str(number), *"0" * (len(self.shape) - 1)])
+        path = self.shard / name if number in self._indices else ordinary_file(self.shard, name)
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+
+    def _index(self, file: int) -> np.ndarray:
+        end, length = os.fstat(file).st_size, ENTRY * self.rows_a_file + CHECKSUM
+        if length > end:
+            raise ContentsError(f"a file of its array {self.name} is cut off")
+        index = np.frombuffer(self._checked(os.pread(file, length, end - length)), "<u8").reshape(-1, 2)
+        return np.where(index.max(1, keepdims=True) > end, 0, index)  # what lies outside is as if it had no byte
+
+    def _checked(self, data: bytes) -> bytes:
+        """Without the CRC-32C at their end."""
+        body = data[:-CHECKSUM]
+        if len(data) < CHECKSUM or google_crc32c.value(body) != int.from_bytes(data[-CHECKSUM:], "little"):
+            raise ContentsError(f"bytes of its array {self.name} are missing or not those that were written")
+        return body
+
+    def _decode(self, stored: bytes, out: np.ndarray) -> None:
+        chunk = self._checked(stored)
+        sizes = [int.from_bytes(chunk[at : at + 4], "little") for at in SIZES]
+        if len(chunk) < BLOSC_HEADER or sizes != [out.nbytes, len(chunk)]:
+            raise ContentsError(f"a chunk of its array {self.name} has another size than it should")
+        blosc.decompress(chunk, out)
+
+
+def ordinary_file(shard: Path, name: str) -> Path:
+    """A file of a shard, here and nowhere else: no link, and no pipe, which never ends.
+
+    Raises:
+        ContentsError, FileNotFoundError: it is none.
+    """
+    path = shard / name
+    if path.resolve() != shard.resolve() / name:
+        raise ContentsError("it has links to other places")
+    if not path.is_file():
+        raise FileNotFoundError(path)
+    return path
+
+
+def _rows_a_file(about: dict[str, Any], shape: tuple[int, ...]) -> int:
+    """How many levels the files of an array have, of its metadata; 0 where it is not stored as this program does."""
+    grid, (sharding,) = about["chunk_grid"]["configuration"]["chunk_shape"], about["codecs"]
+    inside = sharding["configuration"]
+    endian = [codec.get("configuration", {}).get("endian", "little") for codec in inside["codecs"]]
+    alike = [
+        (about["chunk_grid"]["name"], about["chunk_key_encoding"]["name"], sharding["name"])
+        == ("regular", "default", "sharding_indexed"),
+        about["chunk_key_encoding"].get("configuration", {}).get("separator", "/") == "/",
+        inside["chunk_shape"] == [1, *shape[1:]],
+        [codec["name"] for codec in inside["codecs"]] == KINDS and set(endian) == {"little"},
+        [codec["name"] for codec in inside["index_codecs"]] == ["bytes", "crc32c"],
+        inside.get("index_location", "end") == "end" and not about.get("storage_transformers"),
+        grid[1:] == [*shape[1:]] and type(grid[0]) is int,
+    ]
+    return grid[0] if all(alike) else 0
