@@ -14,12 +14,14 @@ from experts.labels import Label
 from experts.steps import EnvSteps
 from pipeline.errors import Exit, Failure
 from pipeline.jobs.progress import Board, Tally, say
-from pipeline.jobs.schedule import UnitOutcome, UnitQueue, WorkUnit, levels_text, plan_units, runs
+from pipeline.jobs.schedule import UnitOutcome, UnitQueue, WorkUnit, levels_text, plan_units
 from pipeline.store.checkpoints import require_same_experts
+from pipeline.store.job_note import note_job
 from pipeline.store.layout import quarantine_path
 from pipeline.store.manifest import Manifest, read_manifest
 from pipeline.store.origins import Origin, require_same_levels
-from pipeline.store.split import note_job, writing
+from pipeline.store.runs import runs
+from pipeline.store.split import writing
 
 
 def generate(

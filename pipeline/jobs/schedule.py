@@ -4,17 +4,15 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from experts.steps import EnvSteps
 from pipeline.store.layout import unit_name
 from pipeline.store.origins import Origin
+from pipeline.store.runs import runs, told_levels
 
 # How many units a worker may have at once, those included that failed as often: a unit that kills its worker takes
 # fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.
 COMPANY = (64, 8, 1)
 ROUND = 1.0  # s that a worker trains between reports; a step that is compiled takes longer
-TOLD = 4  # runs of levels in a message
 
 
 @dataclass(frozen=True)
@@ -132,16 +130,6 @@ class Assignment:
         return [UnitOutcome(unit, reason=reason) for unit in units]
 
 
-def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """First and last of each run of consecutive numbers, ascending."""
-    ordered = np.unique(np.asarray(numbers, np.int64))
-    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
-    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
-
-
 def levels_text(units: Iterable[WorkUnit]) -> str:
     """Their levels, for people: `levels 0 to 31, 96 to 127`."""
-    ids = [level_id for unit in units for level_id in unit.level_ids]
-    of = [f"{first} to {last}" if last > first else f"{first}" for first, last in runs(ids)]
-    more = f" and {len(of) - TOLD} more runs of levels" if len(of) > TOLD else ""
-    return f"level{'s' if len(ids) > 1 else ''} {', '.join(of[:TOLD])}{more}"
+    return told_levels(runs([level_id for unit in units for level_id in unit.level_ids]))

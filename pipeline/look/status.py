@@ -5,12 +5,12 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pipeline.errors import UserError
+from pipeline.store.job_note import NoteError, read_note
 from pipeline.store.layout import JOB, QUARANTINE
 from pipeline.store.locks import is_written
 from pipeline.store.manifest import read_manifest
+from pipeline.store.runs import inside
 
 
 def status(split: Path, as_json: bool) -> None:
@@ -37,14 +37,14 @@ def status(split: Path, as_json: bool) -> None:
 def look(split: Path) -> dict[str, Any]:
     """The facts that `status` prints."""
     try:
-        job = json.loads((split / JOB).read_text())
-        wanted = np.array(sorted(job["level_ids"]), np.int64).reshape(-1, 2)  # first and last of each run of ids
+        note = read_note(split)
     except FileNotFoundError:
         raise UserError(
             f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
         ) from None
-    except (ValueError, KeyError, TypeError, OverflowError):
+    except NoteError:
         raise UserError(f"The file {split / JOB} is damaged: run `levelproof generate` for this split again.") from None
+    wanted = note.level_ids
     manifest = read_manifest(split, ["label"])
     labels = manifest.labels[inside(manifest.level_ids, wanted)]
     return {
@@ -54,13 +54,5 @@ def look(split: Path) -> dict[str, Any]:
         "labels": dict(sorted(Counter(labels.tolist()).items())),
         "quarantined": sorted(path.name for path in (split / QUARANTINE).glob("*.txt")),
         "running": is_written(split),
-        "command": job["command"],
+        "command": note.command,
     }
-
-
-def inside(level_ids: np.ndarray, runs: np.ndarray) -> np.ndarray:
-    """Whether each id lies in one of the runs (first and last id of each, ascending and apart)."""
-    if not len(runs):
-        return np.zeros(len(level_ids), bool)
-    before = np.searchsorted(runs[:, 0], level_ids, side="right") - 1  # the last run that begins at or before an id
-    return (before >= 0) & (level_ids <= runs[before, 1])

@@ -4,7 +4,6 @@ A fragment is written last and appears at once or not at all; readers see only w
 """
 
 import json
-import os
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,9 +20,10 @@ import pyarrow.parquet as pq
 from configs.convert import flat
 from configs.schema import hash_of
 from pipeline.errors import Failure, UserError
+from pipeline.store.checksums import digest_of, with_own
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
-from pipeline.store.schema import COLUMNS, CONFIG_KEY, HASH_KEY, MANIFEST_VERSION, VERSION_KEY
+from pipeline.store.schema import COLUMNS, CONFIG_KEY, DIGESTS_KEY, HASH_KEY, MANIFEST_VERSION, VERSION_KEY
 
 SHOWN = 6  # differing settings that an error lists
 THREADS = 8  # fragments read at once: a shared folder takes its time for each
@@ -37,6 +37,7 @@ class Fragment:
     path: Path
     config_hash: str
     config: dict[str, Any]  # the settings that decide results
+    digests: dict[str, str]  # of the shards and checkpoints that its rows name
 
 
 def begin_fragment(attempt: Attempt) -> None:
@@ -58,18 +59,26 @@ def write_fragment(
     Raises:
         OSError: the disk refuses; no fragment is there then, or the one that was there before.
     """
+    table = pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS)
     metadata = {
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
         HASH_KEY: config_hash.encode(),
         CONFIG_KEY: json.dumps(config, sort_keys=True).encode(),
+        DIGESTS_KEY: json.dumps(_digests(attempt.fragment.parent.parent, table)).encode(),
     }
-    table = pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS.with_metadata(metadata))
-    with attempt.begun.open("wb") as file:
-        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
-        file.flush()
-        os.fsync(file.fileno())
+    table = table.replace_schema_metadata(metadata)
+    whole = pa.BufferOutputStream()
+    pq.write_table(table, whole, compression="zstd", write_page_checksum=True)
+    attempt.begun.write_bytes(with_own(whole.getvalue().to_pybytes()))
+    flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
     flush_entry(attempt.fragment.parent)  # the new name itself
+
+
+def _digests(split: Path, table: pa.Table) -> dict[str, str]:
+    """Of the shards and checkpoints that these rows name, as they are on the disk now."""
+    names = sorted(name for column in DATA_COLUMNS for name in table.column(column).unique().to_pylist() if name)
+    return {name: digest_of(split / name) for name in names if (split / name).exists()}
 
 
 def fragment_paths(split: Path) -> list[Path]:
@@ -96,7 +105,8 @@ def read_fragment(path: Path, columns: Sequence[str] | None = None) -> tuple[Fra
                     "use the levelproof that wrote it."
                 )
             config, true_hash = _config_in(metadata[CONFIG_KEY])
-            fragment = Fragment(path, metadata[HASH_KEY].decode(), config)
+            digests = json.loads(metadata.get(DIGESTS_KEY, b"{}"))
+            fragment = Fragment(path, metadata[HASH_KEY].decode(), config, digests)
             if not file.schema_arrow.equals(COLUMNS) or true_hash != fragment.config_hash:
                 raise ValueError("its footer has other columns or another configuration than were written")
             table = file.read(columns=None if columns is None else list(columns), use_threads=False)

@@ -1,9 +1,7 @@
 """A split opened for writing: its folders, its lock and its configuration."""
 
-import json
 import os
-import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -37,18 +35,6 @@ def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, 
                 "use the same settings, or another folder with out=NAME."
             )
         yield split, manifest
-
-
-def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[tuple[int, int]]) -> None:
-    """Write down which runs of level ids this command wants, first and last of each, for `levelproof status`."""
-    note = {
-        "command": shlex.join(command),
-        "level_ids": wanted,
-        "config_hash": job.hash,
-    }
-    temporary = split / f".{JOB}.{os.getpid()}"
-    temporary.write_text(json.dumps(note, indent=2) + "\n")
-    temporary.replace(split / JOB)
 
 
 def _make_writable(split: Path) -> None:

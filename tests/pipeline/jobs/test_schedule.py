@@ -15,7 +15,6 @@ from pipeline.jobs.schedule import (
     WorkUnit,
     levels_text,
     plan_units,
-    runs,
 )
 
 
@@ -122,12 +121,6 @@ def test_a_unit_that_fails_waits_behind_the_others_until_it_is_given_up() -> Non
         assert queue.failed(bad) == (attempt == len(COMPANY))
     assert queue.quarantined == [bad]
     assert queue.take() is None
-
-
-def test_runs_of_numbers() -> None:
-    assert runs([5, 1, 2, 3, 9, 8, 5]) == [(1, 3), (5, 5), (8, 9)]
-    assert runs([]) == []
-    assert runs(range(64)) == [(0, 63)]
 
 
 def test_levels_are_told_in_runs() -> None:

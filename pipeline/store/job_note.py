@@ -1,0 +1,78 @@
+"""`job.json`: what the last command wanted of a split, so that anybody can tell what is not there."""
+
+import hashlib
+import json
+import os
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from configs.schema import JobConfig, hash_of
+from pipeline.store.layout import JOB
+
+MOST_BYTES = 2**25  # of a file; a run of level ids takes about 30
+DIGEST = "sha256"  # its key
+
+
+class NoteError(ValueError):
+    """It is no such note; the message is the end of a sentence."""
+
+
+@dataclass(frozen=True)
+class JobNote:
+    """What the last command wanted."""
+
+    command: str
+    level_ids: np.ndarray  # (run, 2): first and last of each run of ids, ascending
+    config: dict[str, Any] | None  # the settings that decide results, as in every fragment
+    intact: bool  # every byte is as it was written
+
+
+def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[tuple[int, int]]) -> None:
+    """Write down which runs of level ids this command wants, first and last of each."""
+    note = {
+        "command": shlex.join(command),
+        "level_ids": [list(run) for run in wanted],
+        "config_hash": job.hash,
+        "config": job.results,
+    }
+    temporary = split / f".{JOB}.{os.getpid()}"
+    temporary.write_text(_text(note))
+    temporary.replace(split / JOB)
+
+
+def read_note(split: Path) -> JobNote:
+    """The note of a split.
+
+    Raises:
+        FileNotFoundError: there is none.
+        NoteError: it says nothing that can be understood.
+    """
+    path = split / JOB
+    if not path.exists():
+        raise FileNotFoundError(path)
+    if path.is_symlink() or not path.is_file() or path.stat().st_size > MOST_BYTES:
+        raise NoteError("it is no ordinary file of a few megabytes")
+    try:
+        text = path.read_text()
+        note = json.loads(text)
+        runs = np.array(sorted(note["level_ids"]), np.int64).reshape(-1, 2)
+        command, config = note["command"], note.get("config")
+        if not isinstance(command, str) or (runs[:, 0] > runs[:, 1]).any():
+            raise ValueError
+        known = isinstance(config, dict) and hash_of(config) == note["config_hash"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise NoteError(type(error).__name__) from None
+    said = {name: value for name, value in note.items() if name != DIGEST}
+    command = "".join(c if c.isprintable() else "?" for c in command)  # no terminal obeys it
+    return JobNote(command, runs, config if known else None, text == _text(said))
+
+
+def _text(note: dict[str, Any]) -> str:
+    """The whole file: one line, its digest last."""
+    digest = hashlib.sha256(json.dumps(note).encode()).hexdigest()
+    return json.dumps(note | {DIGEST: digest}) + "\n"

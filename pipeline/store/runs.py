@@ -1,0 +1,39 @@
+"""Runs of consecutive level ids: what a job wants in a line, however many levels that are."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+TOLD = 4  # runs of levels in a message
+
+
+def runs(numbers: Sequence[int] | np.ndarray) -> list[tuple[int, int]]:
+    """First and last of each run of consecutive numbers, ascending."""
+    ordered = np.unique(np.asarray(numbers, np.int64))
+    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
+
+
+def inside(level_ids: np.ndarray, runs: np.ndarray) -> np.ndarray:
+    """Whether each id lies in one of the runs (first and last id of each, ascending and apart)."""
+    if not len(runs):
+        return np.zeros(len(level_ids), bool)
+    before = np.searchsorted(runs[:, 0], level_ids, side="right") - 1  # the last run that begins at or before an id
+    return (before >= 0) & (level_ids <= runs[before, 1])
+
+
+def without(runs: Iterable[Sequence[int]], level_ids: np.ndarray) -> list[tuple[int, int]]:
+    """What of the runs is left when these ids (ascending) are taken out."""
+    left = []
+    for first, last in runs:
+        there = level_ids[np.searchsorted(level_ids, first) : np.searchsorted(level_ids, last, "right")].tolist()
+        starts, ends = [first, *(i + 1 for i in there)], [*(i - 1 for i in there), last]
+        left += [(start, end) for start, end in zip(starts, ends, strict=True) if start <= end]
+    return left
+
+
+def told_levels(runs: Sequence[Sequence[int]]) -> str:
+    """For people: `levels 0 to 31, 96 to 127`."""
+    of = [f"{first} to {last}" if last > first else f"{first}" for first, last in runs]
+    more = f" and {len(of) - TOLD} more runs of levels" if len(of) > TOLD else ""
+    return f"level{'s' if len(of) != 1 or runs[0][0] != runs[0][1] else ''} {', '.join(of[:TOLD])}{more}"

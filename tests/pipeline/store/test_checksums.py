@@ -1,0 +1,70 @@
+"""A fragment vouches for itself and for what it commits: no byte of either changes unseen."""
+
+import hashlib
+import json
+import subprocess
+from pathlib import Path
+
+import duckdb
+import pyarrow.parquet as pq
+import pytest
+
+from experts.labels import Label
+from pipeline.store.checksums import digest_of, has_own
+from pipeline.store.layout import data_path
+from pipeline.store.manifest import fragment_paths, read_fragment
+from tests.pipeline.made import made_split
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    return made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]])
+
+
+def test_every_byte_of_a_fragment_counts(split: Path) -> None:
+    (path,) = fragment_paths(split)
+    assert has_own(path)
+    whole = path.read_bytes()
+    for at in (*range(0, len(whole), 101), *range(len(whole) - 60, len(whole))):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1 << at % 8]) + whole[at + 1 :])
+        assert not has_own(path), at
+    for end in (0, 3, 8, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:end])
+        assert not has_own(path)
+    path.write_bytes(whole + b"\0")
+    assert not has_own(path)
+
+
+def test_it_is_parquet_for_everybody(split: Path) -> None:
+    (path,) = fragment_paths(split)
+    with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        assert file.read().column("level_id").to_pylist() == [0, 1]
+    assert duckdb.sql(f"SELECT level_id, label FROM '{path}' ORDER BY 1").fetchall() == [(0, "solved"), (1, "unsolved")]
+
+
+def test_it_has_the_digests_of_the_shards_that_it_commits(split: Path) -> None:
+    """In coreutils' words, too."""
+    fragment, rows = read_fragment(*fragment_paths(split))
+    name = rows.column("shard")[0].as_py()
+    shard = data_path(split, name)
+    assert fragment.digests == {name: digest_of(shard)}
+    assert json.loads(rows.schema.metadata[b"levelproof.sha256"]) == fragment.digests
+    command = "find . -type f | sed 's,^\\./,,' | LC_ALL=C sort | xargs sha256sum"
+    listed = subprocess.run(["sh", "-c", command], cwd=shard, capture_output=True, check=True).stdout
+    assert hashlib.sha256(listed).hexdigest() == digest_of(shard)
+
+
+def test_names_lengths_and_links_count(split: Path) -> None:
+    fragment, _ = read_fragment(*fragment_paths(split))
+    ((name, digest),) = fragment.digests.items()
+    shard = split / name
+    (shard / "act").rename(shard / "cat")
+    assert digest_of(shard) != digest
+    (shard / "cat").rename(shard / "act")
+    assert digest_of(shard) == digest
+    (shard / "more").touch()
+    assert digest_of(shard) != digest
+    (shard / "more").unlink()
+    (shard / "zarr.json").rename(split / "elsewhere")
+    (shard / "zarr.json").symlink_to(split / "elsewhere")
+    assert digest_of(shard) != digest

@@ -1,0 +1,72 @@
+"""What the last command wanted: read again as it was written, and no byte of it changes unseen."""
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from pipeline.store.job_note import NoteError, note_job, read_note
+from pipeline.store.layout import JOB
+from tests.pipeline.made import made_job
+
+COMMAND = ["levelproof", "regenerate", "where=label = 'solved'"]
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    note_job(tmp_path, made_job(), COMMAND, [(0, 7), (9, 9)])
+    return tmp_path
+
+
+def test_what_was_wanted(split: Path) -> None:
+    note = read_note(split)
+    assert note.command == "levelproof regenerate 'where=label = '\"'\"'solved'\"'\"''"
+    assert note.level_ids.tolist() == [[0, 7], [9, 9]]
+    assert note.config == made_job().results
+    assert note.intact
+
+
+def test_every_byte_counts(split: Path) -> None:
+    whole = (split / JOB).read_bytes()
+    for at in range(0, len(whole), 13):
+        (split / JOB).write_bytes(whole[:at] + bytes([whole[at] ^ 1 << at % 7]) + whole[at + 1 :])
+        with suppress(NoteError):
+            assert not read_note(split).intact, at
+    for other in (whole[:-1], whole + b"\n", whole.replace(b": ", b":")):
+        (split / JOB).write_bytes(other)
+        assert not read_note(split).intact
+
+
+def test_one_of_other_settings_than_its_hash_says_is_not_believed(split: Path) -> None:
+    text = (split / JOB).read_text()
+    (split / JOB).write_text(text.replace('"budget": 131072', '"budget": 131073').replace("128000", "128001"))
+    assert read_note(split).config is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "7", "[" * 100_000, '{"command": 1, "level_ids": []}', "\0", '"\ud800"'])
+def test_what_says_nothing(tmp_path: Path, text: str) -> None:
+    (tmp_path / JOB).write_bytes(text.encode(errors="surrogatepass"))
+    with pytest.raises(NoteError):
+        read_note(tmp_path)
+
+
+def test_what_may_never_end(split: Path) -> None:
+    (split / JOB).unlink()
+    os.mkfifo(split / JOB)
+    with pytest.raises(NoteError):
+        read_note(split)
+    (split / JOB).unlink()
+    (split / JOB).symlink_to("/dev/zero")
+    with pytest.raises(NoteError):
+        read_note(split)
+    (split / JOB).unlink()
+    with (split / JOB).open("wb") as file:
+        file.truncate(2**30)
+    with pytest.raises(NoteError):
+        read_note(split)
+
+
+def test_a_terminal_does_not_obey_it(split: Path) -> None:
+    note_job(split, made_job(), ["\x1b[2J"], [])
+    assert read_note(split).command == "'?[2J'"
