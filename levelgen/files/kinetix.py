@@ -13,9 +13,12 @@ from jaxtyping import Float, Int
 
 from levelgen.level import Level
 from physics.pairs import pairs_of
-from physics.types import MAX_VERTICES, Model, Size, State
+from physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, Size, State
 
 Fields = dict[str, np.ndarray]
+
+POLYGON_RADIUS = np.float32(0.1)  # m, as the next
+CIRCLE_VERTICES = np.float32(0.05) * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]], np.float32)
 
 BODIES = ("polygon", "circle")
 MANIFOLDS = ("acc_rr_manifolds", "acc_cr_manifolds", "acc_cc_manifolds")
@@ -62,6 +65,12 @@ STATE = {
     "joint_impulse": "joint/acc_impulse",
     "joint_angular_impulse": "joint/acc_r_impulse",
 }
+MANIFOLD = {  # what is active in it, STATE has
+    "normal": "@/normal",
+    "penetration": "@/penetration",
+    "point": "@/collision_point",
+    "restitution_velocity": "@/restitution_velocity_target",
+}
 TASK = {
     "role": "*_shape_roles",
     "density": "*_densities",
@@ -88,10 +97,8 @@ def state_to_kinetix(
 
     What its next step does not depend on (manifold geometry, cached points, an editor's flags) is zero.
     """
-    size, fields = level.size, {}
-    for of, names in ((level.model, MODEL), (level, TASK), (state, STATE)):
-        for ours, theirs in names.items():
-            fields |= _theirs(size, theirs, np.moveaxis(np.asarray(getattr(of, ours)), -1, 0))
+    size = level.size
+    fields = level_to_kinetix(level) | to_kinetix(size, state, STATE)
     zero = lambda *shape: np.zeros((len(timestep), *shape), np.float32)
     for kind in MANIFOLDS:
         contacts = fields[f"{kind}/active"].shape[1:]
@@ -107,6 +114,33 @@ def state_to_kinetix(
         "circle/n_vertices": zero(size.circles).astype(np.int32),
         "timestep": np.asarray(timestep, np.int32),
         "last_distance": np.asarray(last_distance, np.float32),
+    }
+
+
+def level_to_kinetix(level: Level) -> Fields:
+    """What is constant within a level and not zero in the files of this program, level axis first."""
+    return to_kinetix(level.size, level.model, MODEL) | to_kinetix(level.size, level, TASK)
+
+
+def to_kinetix(size: Size, of: Any, names: Mapping[str, str]) -> Fields:
+    """The fields of a dataclass of ours that `names` has, under the reference's names, level axis first."""
+    fields = {}
+    for ours, theirs in names.items():
+        fields |= _theirs(size, theirs, np.moveaxis(np.asarray(getattr(of, ours)), -1, 0))
+    return fields
+
+
+def fillers(level: Level) -> Fields:
+    """What the reference's sampler leaves in places that nothing reads, level axis first.
+
+    Of a circle it draws the sides of a rectangle that is not there: this is the one that seven in ten of them have.
+    """
+    scenery = np.arange(level.size.polygons)[:, None] < FIXED_POLYGONS
+    polygons, circles = np.split(np.asarray(level.model.active), [level.size.polygons])
+    return {
+        "polygon/radius": np.where(polygons & ~scenery, POLYGON_RADIUS, np.float32(0)).T,
+        "circle/n_vertices": np.where(circles, MAX_VERTICES, 0).astype(np.int32).T,
+        "circle/vertices": np.where(circles.T[..., None, None], CIRCLE_VERTICES, np.float32(0)),
     }
 
 

@@ -1,0 +1,72 @@
+"""A split as the reference has its data: a folder that `kinetix.data.TrajectoryDatasetManager` opens."""
+
+from pathlib import Path
+
+import pyarrow as pa
+from rich.console import Console
+from rich.progress import track
+
+from experts.config import RECORD_STEPS
+from experts.witness import Record
+from levelgen.level import Level, size_of
+from pipeline.errors import UserError
+from pipeline.read.created import new_folder
+from pipeline.read.kinetix.records import dtype_of, trajectories_of
+from pipeline.read.kinetix.zarr2 import ROWS, write_array, write_chunk, write_group
+from pipeline.read.rows import COLUMNS, read_rows
+from pipeline.read.select import columns_in, select
+from pipeline.runtime import prepare_jax
+from pipeline.store.fields import tree_of
+from pipeline.store.manifest import require_manifest
+
+DEFAULT = "label = 'solved'"
+BLOCK = 4 * ROWS  # trajectories in memory at a time
+ARRAY = 64 * ROWS  # trajectories of an array: the reference shuffles arrays, and what they have
+
+
+def export_kinetix(split: Path, where: str | None, out: Path) -> None:
+    """Write the levels of `split` that have a witness and for which a condition holds, and say so.
+
+    Raises:
+        UserError: no split, no such level, a condition that DuckDB cannot use, or `out` is there already.
+        Failure: the split is damaged.
+    """
+    rows = witnessed(split, where or DEFAULT)
+    prepare_jax()
+    console, count = Console(stderr=True), rows.num_rows
+    with new_folder(out) as folder:
+        blocks = range(0, count, BLOCK)
+        for first in track(blocks, "trajectories", console=console, transient=True, disable=not console.is_terminal):
+            fields = read_rows(split, rows.slice(first, BLOCK))
+            made = trajectories_of(tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/"))
+            array, at = divmod(first, ARRAY)
+            for part in range(0, len(made), ROWS):
+                write_chunk(folder / name_of_array(array), (at + part) // ROWS, made[part : part + ROWS])
+        dtype = dtype_of(size_of(rows.column("size")[0].as_py()))
+        for first in range(0, count, ARRAY):
+            write_array(folder / name_of_array(first // ARRAY), (min(ARRAY, count - first), RECORD_STEPS), dtype)
+        write_group(folder)
+    stored = sum(path.stat().st_size for path in out.rglob("*"))
+    print(
+        f"{out}: {count} trajectories of {split}, {stored / (count * RECORD_STEPS):.0f} bytes per transition.\n"
+        f'Next:  kinetix.data.TrajectoryDatasetManager("{out}", batch_size=64)'
+    )
+
+
+def witnessed(split: Path, where: str) -> pa.Table:
+    """Rows of the levels that have a witness and for which a condition holds, by level id.
+
+    Raises:
+        UserError: there is none.
+    """
+    manifest = require_manifest(split, [*columns_in(where), *COLUMNS])
+    rows = select(manifest.table, where)
+    rows = rows.filter(rows.column("shard").is_valid())
+    if not rows.num_rows:
+        raise UserError(f"No level of {split} for which {where} holds has a witness: choose others with --where.")
+    return rows
+
+
+def name_of_array(number: int) -> str:
+    """Names sort as the arrays do."""
+    return f"{number:06d}"

@@ -1,0 +1,79 @@
+"""Levels and their records as the reference has them on disk: one structured array of trajectories by time.
+
+A field has one more axis than it needs, of length 1, before its own: the reference's reader drops it.
+"""
+
+from functools import cache
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experts.config import RECORD_STEPS
+from experts.witness import Record
+from levelgen.files.kinetix import MANIFOLD, STATE, Fields, fillers, level_to_kinetix, to_kinetix
+from levelgen.level import Level
+from levelgen.task.actions import action_mask
+from physics.buffers import buffers_of
+from physics.types import Size
+
+T = TypeVar("T")
+
+WORLD = "env_state/"  # before the names of the reference's state
+OF_RECORD = {
+    "joint_point": f"{WORLD}joint/global_position",
+    "thruster_point": f"{WORLD}thruster/global_position",
+    "timestep": f"{WORLD}timestep",
+    "last_distance": f"{WORLD}last_distance",
+    "action": "action",
+    "done": "done",
+}
+
+
+def fields_of(level: Level, record: Record) -> Fields:
+    """The 85 fields of trajectories: (trajectory, 256, ...), or (trajectory, 1, ...) where a level decides them.
+
+    Args:
+        level: level axis last.
+        record: of each level; time first, level last.
+    """
+    size, count = level.size, record.done.shape[-1]
+    moving = to_kinetix(size, _lanes(record.state), STATE) | to_kinetix(size, _lanes(record.manifold), MANIFOLD)
+    moving = {
+        f"{WORLD}{name}": values.reshape(count, RECORD_STEPS, *values.shape[1:]) for name, values in moving.items()
+    }
+    moving |= {theirs: np.moveaxis(np.asarray(getattr(record, ours)), -1, 0) for ours, theirs in OF_RECORD.items()}
+    still = level_to_kinetix(level) | fillers(level)
+    still |= {
+        "polygon_highlighted": np.zeros((count, size.polygons), bool),  # by the reference's editor
+        "circle_highlighted": np.zeros((count, size.circles), bool),
+    }
+    mask = np.asarray(action_mask(jax.tree.map(jnp.asarray, level))).T
+    fixed = {f"{WORLD}{name}": values for name, values in still.items()} | {"action_mask": mask}
+    return moving | {name: values[:, None] for name, values in fixed.items()}
+
+
+def trajectories_of(level: Level, record: Record) -> np.ndarray:
+    """The same as one array (trajectory, 256) of `dtype_of` the level's size."""
+    fields = fields_of(level, record)
+    made = np.zeros((len(fields["done"]), RECORD_STEPS), dtype_of(level.size))
+    for name, values in fields.items():
+        made[name][:, :, 0] = values
+    return made
+
+
+@cache
+def dtype_of(size: Size) -> np.dtype:
+    """A step of a trajectory."""
+    empty = lambda buffer: np.zeros((*buffer.shape, 0), buffer.dtype)
+    level, record = (jax.tree.map(empty, buffers_of(of, size)) for of in (Level, Record))
+    in_time = lambda tree: jax.tree.map(lambda x: np.stack([x] * RECORD_STEPS), tree)
+    record = Record(**vars(record) | {"state": in_time(record.state), "manifold": in_time(record.manifold)})
+    fields = fields_of(level, record)
+    return np.dtype([(name, fields[name].dtype, (1, *fields[name].shape[2:])) for name in sorted(fields)])
+
+
+def _lanes(tree: T) -> T:
+    """Each step of each level as a lane, level by level."""
+    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1).reshape(*x.shape[1:-1], -1), tree)

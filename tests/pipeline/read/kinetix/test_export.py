@@ -1,0 +1,119 @@
+"""`levelproof export --format kinetix`: what is in the folder, when it appears, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experts.labels import Label
+from levelgen.level import SIZES
+from physics.pairs import pairs_of
+from pipeline.read.kinetix import export as module
+from pipeline.read.kinetix.records import dtype_of
+from pipeline.read.kinetix.zarr2 import write_group
+from pipeline.read.rows import read_rows
+from pipeline.store.manifest import require_manifest
+from tests.pipeline.command import assert_refused, here
+from tests.pipeline.made import made_split
+from tests.pipeline.read.kinetix.folder import trajectories_in
+
+BYTES = {"s": 1487, "m": 2473, "l": 8053}  # of a step, as zarr 2.18 and the reference have it
+UNITS = [[Label.SOLVED, Label.UNSOLVED, Label.TRIVIAL], [Label.SOLVED]]
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of any bits."""
+    return made_split(tmp_path_factory.mktemp("data"), UNITS)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_step_has_the_bytes_that_the_reference_reads(size: str) -> None:
+    assert dtype_of(SIZES[size]).itemsize == BYTES[size]
+    assert len(dtype_of(SIZES[size]).names or ()) == 85
+
+
+def test_every_bit_of_a_record_is_there(split: Path, tmp_path: Path) -> None:
+    done = here(["export", str(split), "--format", "kinetix", "-o", "new/k"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "new/k: 2 trajectories of" in done.stdout
+    told = trajectories_in(tmp_path / "new/k")
+    rows = require_manifest(split).table.to_pylist()
+    assert [row["label"] for row in rows] == [label for unit in UNITS for label in unit]
+    table = require_manifest(split).table.take([0, 3])
+    ours = {name: np.moveaxis(x, -1, 0) for name, x in read_rows(split, table).items()}
+    polygons, pairs = SIZES["s"].polygons, len(pairs_of(SIZES["s"]).polygon)
+
+    def assert_same(theirs: str, values: np.ndarray) -> None:
+        found = told[theirs][:, :, 0]
+        want = np.broadcast_to(values, found.shape).astype(values.dtype)
+        assert found.dtype == want.dtype, theirs
+        assert found.tobytes() == want.tobytes(), theirs
+
+    still = lambda name: ours[f"level/{name}"][:, None]
+    assert_same("action", ours["record/action"])
+    assert_same("done", ours["record/done"])
+    assert_same("env_state/timestep", ours["record/timestep"])
+    assert_same("env_state/polygon/position", ours["record/state/position"][:, :, :polygons])
+    assert_same("env_state/circle/position", ours["record/state/position"][:, :, polygons:])
+    assert_same("env_state/circle_shape_roles", still("role")[:, :, polygons:])
+    assert_same("env_state/joint/global_position", ours["record/joint_point"])
+    points = ours["record/manifold/point"]
+    assert_same(
+        "env_state/acc_rr_manifolds/collision_point",
+        np.stack([points[:, :, :pairs], points[:, :, pairs : 2 * pairs]], 3),
+    )
+    assert_same("env_state/collision_matrix", still("model/collides"))
+
+
+def test_which_levels_go_out_is_said_with_where(split: Path, tmp_path: Path) -> None:
+    for where, count in (("true", 3), ("label = 'trivial'", 1), ("level_id > 0 AND label = 'solved'", 1)):
+        done = here(["export", str(split), "--format", "kinetix", "-o", f"k{where}", "--where", where], tmp_path)
+        assert f"{count} trajectories" in done.stdout, done.stderr
+    none = ["export", str(split), "--format", "kinetix", "-o", "none", "--where"]
+    assert_refused(here([*none, "label = 'unsolved'"], tmp_path), 2, "has a witness", "--where")
+    assert_refused(here([*none, "labell = 1"], tmp_path), 2, "Cannot use the condition")
+    assert not (tmp_path / "none").exists()
+
+
+def test_trajectories_are_cut_into_arrays_and_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    split = made_split(tmp_path / "data", [[Label.SOLVED] * 9, [Label.SOLVED] * 9, [Label.SOLVED] * 9])
+    words = ["export", str(split), "--format", "kinetix", "-o"]
+    assert here([*words, "one"], tmp_path).returncode == 0
+    monkeypatch.setattr(module, "BLOCK", 16)
+    monkeypatch.setattr(module, "ARRAY", 16)
+    assert here([*words, "cut"], tmp_path).returncode == 0
+    assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == [".zgroup", "000000", "000001"]
+    one, cut = (trajectories_in(tmp_path / name) for name in ("one", "cut"))
+    assert len(one) == 27
+    assert one.tobytes() == cut.tobytes()
+
+
+def test_a_folder_appears_whole_or_not_at_all(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["export", str(split), "--format", "kinetix", "-o", "k"]
+    seen: list[list[str]] = []
+
+    def last(folder: Path) -> None:
+        seen.append([path.name[:3] for path in tmp_path.iterdir()])
+        write_group(folder)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "write_group", lambda _: 1 / 0)
+        assert here(words, tmp_path).returncode == 1
+    assert not (tmp_path / "k").exists()
+    monkeypatch.setattr(module, "write_group", last)
+    assert here(words, tmp_path).returncode == 0
+    assert seen == [[".k."]], "killed before its last step, it leaves no k"
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "k").rglob("*")}
+    assert_refused(here(words, tmp_path), 2, "something at k already", "-o")
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "k").rglob("*")}
+    (tmp_path / "file").write_text("")
+    assert_refused(here([*words[:-1], "file/k"], tmp_path), 2, "Cannot write file/k")
+
+
+def test_what_a_format_is_for(split: Path, tmp_path: Path) -> None:
+    assert_refused(here(["export", str(split)], tmp_path), 2, "give its id", "--format")
+    assert_refused(here(["export", str(split), "0", "--where", "true"], tmp_path), 2, "without --where")
+    assert_refused(here(["export", str(split), "0", "--format", "kinetix"], tmp_path), 2, "--where", "level_id = 0")
+    assert_refused(here(["export", str(split), "--format", "kinetix"], tmp_path), 2, "with -o")
+    assert_refused(here(["export", "nothing", "--format", "kinetix", "-o", "k"], tmp_path), 2, "There is no split")
