@@ -25,10 +25,10 @@ from levelgen.task.rules import StepResult, TaskParams, TaskState, advance, has_
 from physics.types import State
 from pipeline.errors import Failure, UserError
 from pipeline.read.levels import find_level, is_level_file, level_file, level_of, rules_of, writing_to
+from pipeline.read.rows import read_row
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
-from pipeline.store.shard import open_shard
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures a second
 LAST_SECONDS = 1.5  # how long a film rests on its last picture
@@ -98,7 +98,7 @@ def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
     Raises:
         Failure: it does not reach the goal.
     """
-    arrays = open_shard(manifest.split, row["shard"], row["size"]).read([row["row"]])
+    arrays = read_row(manifest.split, row)
     level, states = tree_of(Level, arrays, "level/"), tree_of(State, arrays, "record/state/")
     done, goal, action = (arrays[f"record/{name}"][..., 0] for name in ("done", "goal", "action"))
     if not succeeds(done, goal):

@@ -14,9 +14,9 @@ from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelgen.identity.content import content_hashes, level_id_for
 from levelgen.level import Level, name_of
 from pipeline.errors import Failure, UserError
+from pipeline.read.rows import read_row
 from pipeline.store.fields import tree_of
 from pipeline.store.origins import Origin
-from pipeline.store.shard import open_shard
 
 
 class LevelUnseen(Failure):
@@ -98,7 +98,8 @@ def level_at(origin: Origin) -> Level:
         Failure: its shard is damaged.
     """
     if origin.shard:
-        arrays = open_shard(Path(origin.split), origin.shard, origin.size).read([origin.row])
+        row = origin._asdict() | {"level_id": level_id_for(origin.content_hash)}
+        arrays = read_row(Path(origin.split), row)
         return tree_of(Level, {name: x for name, x in arrays.items() if name.startswith("level/")}, "level/")
     try:
         level = read_level_file(Path(origin.file)).level

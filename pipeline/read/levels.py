@@ -13,11 +13,11 @@ from levelgen.sampling.sampler import Distribution, sample_levels
 from levelgen.task.rules import TaskParams
 from pipeline.errors import UserError
 from pipeline.read.level_files import level_at
+from pipeline.read.rows import read_row
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.origins import ASKED, origin_of
-from pipeline.store.shard import open_shard
 
 COLUMNS = ("label", "label_reason", *ASKED)  # of a level that is drawn or exported
 
@@ -45,7 +45,7 @@ def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
         Failure: the shard is damaged, or the file is gone or another one.
     """
     if row["shard"]:
-        return tree_of(Level, open_shard(manifest.split, row["shard"], row["size"]).read([row["row"]]), "level/")
+        return tree_of(Level, read_row(manifest.split, row), "level/")
     prepare_jax()
     if from_files(manifest.config or {}):
         return level_at(origin_of(manifest.split, row))

@@ -1,7 +1,8 @@
 """What shards hold of some rows of a manifest, side by side, whatever shards they lie in."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -31,6 +32,11 @@ def read_rows(split: Path, rows: pa.Table, fields: Iterable[str] | None = None) 
     """
     levels_first = read_levels_first(split, rows, fields)
     return {name: np.ascontiguousarray(np.moveaxis(x, 0, -1)) for name, x in levels_first.items()}
+
+
+def read_row(split: Path, row: Mapping[str, Any], fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+    """The same of one row, a mapping with COLUMNS."""
+    return read_rows(split, pa.Table.from_pylist([{name: row[name] for name in COLUMNS}]), fields)
 
 
 def read_levels_first(

@@ -77,25 +77,31 @@ def data_path(split: Path, name: str) -> Path:
     return path
 
 
+def begun_path(data: Path) -> Path:
+    """The mark of the attempt that made this shard or these experts."""
+    return data.parent.parent / MANIFEST / f".{attempt_of(data)}.begun"
+
+
 def ids_of(fragment: Path) -> tuple[int, int]:
     """The lowest and the highest level id in a fragment, by its name."""
     first, last = fragment.stem.split("-")
     return int(first), int(last)
 
 
-def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[..., bool]) -> list[Path]:
+def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[..., bool]) -> dict[Path, int]:
     """What one folder of a split, if it is there, has of these paths and of one kind (`DirEntry.is_file`, `is_dir`).
 
-    Links are of no kind, whatever they lead to.
+    Links are of no kind, whatever they lead to. With each path goes the number by which the file system knows what
+    has this name now.
     """
     if not (split / folder).is_dir():
-        return []
+        return {}
     with os.scandir(split / folder) as found:
-        return [
-            split / folder / entry.name
+        return {
+            split / folder / entry.name: entry.inode()
             for entry in found
             if paths.fullmatch(os.path.join(folder, entry.name)) and is_kind(entry, follow_symlinks=False)
-        ]
+        }
 
 
 def fragment_of(shard: Path) -> Path:

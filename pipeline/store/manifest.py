@@ -1,14 +1,13 @@
-"""The manifest: one parquet fragment per work unit, each the commit marker of its unit.
+"""The manifest: a parquet fragment for each work unit, or a sealed one for many, each the commit marker of its levels.
 
 A fragment is written last and appears at once or not at all; readers see only what fragments name.
 """
 
 import json
-from bisect import bisect_left, bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from os import DirEntry
 from pathlib import Path
 from typing import Any
@@ -23,10 +22,20 @@ from pipeline.errors import Failure, UserError
 from pipeline.store.checksums import digest_of, with_own
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
-from pipeline.store.schema import COLUMNS, CONFIG_KEY, DIGESTS_KEY, HASH_KEY, MANIFEST_VERSION, VERSION_KEY
+from pipeline.store.schema import (
+    COLUMNS,
+    CONFIG_KEY,
+    DIGESTS_KEY,
+    HASH_KEY,
+    MANIFEST_VERSION,
+    SEALED_KEY,
+    VERSION_KEY,
+)
 
 SHOWN = 6  # differing settings that an error lists
 THREADS = 8  # fragments read at once: a shared folder takes its time for each
+ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
+ROUNDS = 20  # looks at a split that is sealed meanwhile; each takes a moment, and sealing a fragment takes seconds
 DATA_COLUMNS = ("shard", "experts")  # name what lies beside the manifest
 
 
@@ -38,6 +47,8 @@ class Fragment:
     config_hash: str
     config: dict[str, Any]  # the settings that decide results
     digests: dict[str, str]  # of the shards and checkpoints that its rows name
+    rows: int
+    sealed: bool
 
 
 def begin_fragment(attempt: Attempt) -> None:
@@ -52,23 +63,29 @@ def begin_fragment(attempt: Attempt) -> None:
 
 
 def write_fragment(
-    attempt: Attempt, rows: Sequence[Mapping[str, Any]], config_hash: str, config: Mapping[str, Any]
+    attempt: Attempt,
+    rows: Sequence[Mapping[str, Any]] | pa.Table,
+    config_hash: str,
+    config: Mapping[str, Any],
+    sealed: bool = False,
 ) -> None:
-    """Commit a unit: write its manifest rows to the attempt's fragment, durably and in one step.
+    """Commit a unit, or many that are sealed: write their manifest rows to the attempt's fragment, durably and in one
+    step.
 
     Raises:
         OSError: the disk refuses; no fragment is there then, or the one that was there before.
     """
-    table = pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS)
+    table = rows if isinstance(rows, pa.Table) else pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS)
     metadata = {
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
         HASH_KEY: config_hash.encode(),
         CONFIG_KEY: json.dumps(config, sort_keys=True).encode(),
         DIGESTS_KEY: json.dumps(_digests(attempt.fragment.parent.parent, table)).encode(),
     }
+    metadata |= {SEALED_KEY: b"1"} if sealed else {}
     table = table.replace_schema_metadata(metadata)
     whole = pa.BufferOutputStream()
-    pq.write_table(table, whole, compression="zstd", write_page_checksum=True)
+    pq.write_table(table, whole, compression="zstd", write_page_checksum=True, row_group_size=ROW_GROUP)
     attempt.begun.write_bytes(with_own(whole.getvalue().to_pybytes()))
     flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
@@ -89,10 +106,13 @@ def fragment_paths(split: Path) -> list[Path]:
     return sorted(entries(split, MANIFEST, FRAGMENT, DirEntry.is_file))
 
 
-def read_fragment(path: Path, columns: Sequence[str] | None = None) -> tuple[Fragment, pa.Table]:
-    """A fragment and its rows.
+def read_fragment(
+    path: Path, columns: Sequence[str] | None = None, level_ids: np.ndarray | None = None
+) -> tuple[Fragment, pa.Table]:
+    """A fragment and its rows; with `level_ids` (ascending), at least those of these levels.
 
     Raises:
+        FileNotFoundError: it is gone.
         Failure: it is damaged, or of another version.
     """
     try:
@@ -105,11 +125,15 @@ def read_fragment(path: Path, columns: Sequence[str] | None = None) -> tuple[Fra
                     "use the levelproof that wrote it."
                 )
             config, true_hash = _config_in(metadata[CONFIG_KEY])
-            digests = json.loads(metadata.get(DIGESTS_KEY, b"{}"))
-            fragment = Fragment(path, metadata[HASH_KEY].decode(), config, digests)
+            digests, about = json.loads(metadata.get(DIGESTS_KEY, b"{}")), file.metadata
+            is_sealed = SEALED_KEY in metadata
+            fragment = Fragment(path, metadata[HASH_KEY].decode(), config, digests, about.num_rows, is_sealed)
             if not file.schema_arrow.equals(COLUMNS) or true_hash != fragment.config_hash:
                 raise ValueError("its footer has other columns or another configuration than were written")
-            table = file.read(columns=None if columns is None else list(columns), use_threads=False)
+            groups = [i for i in range(about.num_row_groups) if _may_have(about.row_group(i), level_ids)]
+            table = file.read_row_groups(groups, None if columns is None else list(columns), use_threads=False)
+    except FileNotFoundError:
+        raise
     except PermissionError:
         raise Failure(f"The fragment {path} cannot be read: check its permissions.") from None
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:
@@ -118,6 +142,19 @@ def read_fragment(path: Path, columns: Sequence[str] | None = None) -> tuple[Fra
             "delete it and run the same `levelproof generate` again to remake its levels."
         ) from error
     return fragment, table
+
+
+def _may_have(group: pq.RowGroupMetaData, level_ids: np.ndarray | None) -> bool:
+    """Whether any of these levels (ascending ids) may be in a group of rows."""
+    ids = group.column(COLUMNS.names.index("level_id")).statistics
+    if level_ids is None or ids is None or not ids.has_min_max:
+        return True
+    return _any_within(level_ids, ids.min, ids.max)
+
+
+def _any_within(ordered: np.ndarray, first: int, last: int) -> bool:
+    low, high = np.searchsorted(ordered, [first, last + 1])
+    return bool(low < high)
 
 
 @lru_cache(maxsize=8)
@@ -134,7 +171,13 @@ class Manifest:
     split: Path
     fragments: tuple[Fragment, ...]  # that were read
     table: pa.Table
-    named: Mapping[str, frozenset[str]]  # by column (shard, experts), if it was read: what any fragment names
+    named: Mapping[str, frozenset[str]]  # by column (shard, experts), if it was read: what fragments name that count
+    superseded: tuple[Fragment, ...] = ()  # that do not: every level of theirs counts in another one
+
+    @property
+    def counting(self) -> list[Fragment]:
+        """The fragments of which some row counts."""
+        return [fragment for fragment in self.fragments if fragment not in self.superseded]
 
     @property
     def level_ids(self) -> np.ndarray:
@@ -174,13 +217,8 @@ def read_manifest(
         Failure: a fragment is damaged, or fragments of several configurations lie side by side.
     """
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
-    paths = fragment_paths(split)
-    if level_ids is not None:
-        wanted = np.unique(np.asarray(level_ids, np.int64)).tolist()
-        paths = [path for path in paths if bisect_left(wanted, ids_of(path)[0]) < bisect_right(wanted, ids_of(path)[1])]
-    with ThreadPoolExecutor(THREADS) as threads:
-        read = list(threads.map(lambda path: read_fragment(path, names), paths))
-    fragments = tuple(fragment for fragment, _ in read)
+    parts = _parts(split, names, None if level_ids is None else np.unique(np.asarray(level_ids, np.int64)))
+    fragments = tuple(fragment for fragment, _ in parts)
     for fragment in fragments[1:]:
         if fragment.config_hash != fragments[0].config_hash:
             changes = told(differences(fragments[0].config, fragment.config))
@@ -189,14 +227,88 @@ def read_manifest(
                 f"({changes}): move the fragments of one of them elsewhere, with the shards and experts that are "
                 "named after them."
             )
+    tables, superseded = [], []
+    for neighbours in _overlapping(parts):
+        table, without = each_once(neighbours)
+        tables.append(table)
+        superseded += without
     schema = pa.schema([COLUMNS.field(name) for name in names])
-    table = pa.concat_tables([schema.empty_table(), *(part.select(names).cast(schema) for _, part in read)])
-    data = [name for name in DATA_COLUMNS if name in names]
-    named = {name: frozenset(path for path in table.column(name).unique().to_pylist() if path) for name in data}
-    if level_ids is not None:
-        table = table.filter(np.isin(table.column("level_id").to_numpy(), np.asarray(level_ids, np.int64)))
-    _, first = np.unique(table.column("level_id").to_numpy(), return_index=True)  # sorts; a level counts once
-    return Manifest(split, fragments, table.take(first), named)
+    table = pa.concat_tables([schema.empty_table(), *tables])
+    counting = [part for fragment, part in parts if fragment not in superseded]
+    named = {name: named_by(counting, name) for name in DATA_COLUMNS if name in names}
+    return Manifest(split, fragments, table, named, tuple(superseded))
+
+
+def _parts(split: Path, names: Sequence[str], level_ids: np.ndarray | None) -> list[tuple[Fragment, pa.Table]]:
+    """The fragments and their rows, of these levels (ascending ids; None: of all).
+
+    Who seals removes fragments after there is one that has their levels. So this looks until a look finds no other
+    sealed one, and none gone that the look before had: until then a level may have slipped from the one to the other.
+    """
+    found: dict[tuple[Path, int], tuple[Fragment, pa.Table]] = {}
+    with ThreadPoolExecutor(THREADS) as threads:
+        for look in range(ROUNDS):
+            listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
+            new = [one for one in listed if one not in found and _wanted(one[0], level_ids)]
+            read = list(threads.map(partial(_part, names=names, level_ids=level_ids), (path for path, _ in new)))
+            found |= {one: part for one, part in zip(new, read, strict=True) if part}
+            if look and all(part and not part[0].sealed for part in read):
+                latest = {path: part for (path, _), part in found.items()}  # of those that had one name in turn
+                return [latest[path] for path in sorted(latest)]
+    raise Failure(f"The fragments of {split} change faster than they can be read: try again when they are at rest.")
+
+
+def _wanted(path: Path, level_ids: np.ndarray | None) -> bool:
+    return level_ids is None or _any_within(level_ids, *ids_of(path))
+
+
+def _part(path: Path, names: Sequence[str], level_ids: np.ndarray | None) -> tuple[Fragment, pa.Table] | None:
+    """A fragment and its rows; None: it is gone."""
+    try:
+        fragment, table = read_fragment(path, names, level_ids)
+    except FileNotFoundError:
+        return None
+    table = table.select(names).cast(pa.schema([COLUMNS.field(name) for name in names]))
+    return fragment, table if level_ids is None else table.filter(np.isin(_ids(table), level_ids))
+
+
+def _ids(table: pa.Table) -> np.ndarray:
+    return table.column("level_id").to_numpy()
+
+
+def _overlapping(parts: Sequence[tuple[Fragment, pa.Table]]) -> Iterator[list[tuple[Fragment, pa.Table]]]:
+    """Groups of fragments, ascending; only those of one group can have a level in common."""
+    within = [(_ids(table).min(), _ids(table).max(), i) for i, (_, table) in enumerate(parts) if table.num_rows]
+    group, end = [], -1
+    for first, last, i in sorted(within):
+        if group and first > end:
+            yield group
+            group = []
+        group.append(parts[i])
+        end = max(end, last)
+    if group:
+        yield group
+
+
+def each_once(parts: Sequence[tuple[Fragment, pa.Table]]) -> tuple[pa.Table, list[Fragment]]:
+    """The rows of these fragments, ascending, each level once; and the fragments of which none is among them.
+
+    What is sealed counts before what is not, and the larger before the smaller.
+    """
+    ordered = sorted(parts, key=lambda part: (not part[0].sealed, -part[0].rows))
+    table = pa.concat_tables([table.replace_schema_metadata(None) for _, table in ordered])
+    ids = _ids(table)
+    if (np.diff(ids) > 0).all():  # nearly always, and of millions of rows this takes no time
+        return table, []
+    _, first = np.unique(ids, return_index=True)  # sorts
+    ends = np.cumsum([table.num_rows for _, table in ordered])
+    counts = np.bincount(np.searchsorted(ends, first, side="right"), minlength=len(ordered))
+    return table.take(first), [fragment for (fragment, _), count in zip(ordered, counts, strict=True) if not count]
+
+
+def named_by(tables: Sequence[pa.Table], column: str) -> frozenset[str]:
+    """What rows name in a column: shards or experts."""
+    return frozenset(path for table in tables for path in table.column(column).unique().to_pylist() if path)
 
 
 def require_manifest(

@@ -5,7 +5,6 @@ sharding codec is its chunks, one after another, and an index: offset and length
 """
 
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -15,26 +14,26 @@ import google_crc32c
 import numpy as np
 
 from pipeline.errors import Failure
-from pipeline.store.chunks import ordinary_file
+from pipeline.store.chunks import CHECKSUM, Chunks, file_name, ordinary_file
 from pipeline.store.contents import ContentsError
 from pipeline.store.disk import flush
-from pipeline.store.shard import Shard, damaged, stored_bytes
+from pipeline.store.shard import DAMAGE, Shard, damaged, stored_bytes
 
 FILE_BYTES = 64 * 2**20  # that a file has at least, if there is as much; larger: longer indices to read before a chunk
 MISSING = 2**64 - 1  # in an index, of a chunk that is not there
-CHECKSUM_BYTES = 4
 
 
 class Place(NamedTuple):
-    """Where a trajectory lies."""
+    """Where the trajectory of a level lies."""
 
     shard: Path
     row: int
+    level_id: int
 
 
 class _Source(NamedTuple):
     level_ids: list[int]
-    rows_a_file: dict[str, int]  # by array
+    arrays: dict[str, Chunks]
 
 
 def merge_shards(
@@ -54,11 +53,14 @@ def merge_shards(
         OSError: the disk refuses.
     """
     documents, sources = _opened(dict.fromkeys(place.shard for place in places))
+    for shard, row, level_id in places:
+        if sources[shard].level_ids[row : row + 1] != [level_id]:
+            raise damaged(shard, ContentsError(f"its row {row} is not level {level_id}, as the manifest says"))
     if rows_a_file is None:
         rows_a_file = _rows_a_file(sources)
     rows_a_file = min(rows_a_file, len(places))
     group = documents.pop("")
-    group["attributes"]["level_ids"] = [sources[of].level_ids[row] for of, row in places]
+    group["attributes"]["level_ids"] = [place.level_id for place in places]
     path.mkdir(parents=True)
     (path / "zarr.json").write_text(json.dumps(group))
     for name, array in documents.items():
@@ -68,10 +70,9 @@ def merge_shards(
         (path / name / "zarr.json").write_text(json.dumps(array))
         if not np.prod(array["shape"]):
             continue
-        axes = len(array["shape"])
-        chunks = _chunks(name, axes, places, sources)
+        chunks = _chunks(name, places, sources)
         for number, first in enumerate(range(0, len(places), rows_a_file)):
-            file = path / _file(name, number, axes)
+            file = path / file_name(name, number, len(array["shape"]))
             file.parent.mkdir(parents=True)
             rows = min(rows_a_file, len(places) - first)
             _write_file(file, (next(chunks) for _ in range(rows)), rows_a_file, moved)
@@ -85,28 +86,26 @@ def _opened(paths: Iterable[Path]) -> tuple[dict[str, Any], dict[Path, _Source]]
     """
     first, shared, sources = None, {}, {}
     for path in paths:
-        shard = Shard(path)
+        shard, arrays = Shard(path), {}
         try:
             documents = {name: _document(path, name) for name in ("", *shard.arrays)}
-            rows = {}
             for name in shard.arrays:
-                grid = documents[name]["chunk_grid"]["configuration"]["chunk_shape"]
-                rows[name], documents[name]["shape"][0], grid[0] = int(grid[0]), 0, 0
-                if rows[name] < 1 or documents[name]["codecs"][0]["configuration"]["codecs"][-1] != {"name": "crc32c"}:
-                    raise ContentsError(f"its array {name} is not stored as this program stores it")
+                of = documents[name]
+                arrays[name] = Chunks(path, name, tuple(of["shape"]), np.dtype(of["data_type"]))
+                of["shape"][0] = of["chunk_grid"]["configuration"]["chunk_shape"][0] = 0
             documents[""]["attributes"]["level_ids"] = []
-        except Exception as error:  # of JSON that is none, or other than it should be
+        except DAMAGE as error:
             raise damaged(path, error) from error
         if first is None:
             first, shared = path, documents
         elif documents != shared:
             raise Failure(f"The shards {first} and {path} hold other fields, so they cannot be merged.")
-        sources[path] = _Source(shard.level_ids, rows)
+        sources[path] = _Source(shard.level_ids, arrays)
     return shared, sources
 
 
 def _document(shard: Path, name: str) -> dict[str, Any]:
-    return json.loads(ordinary_file(shard, f"{name}/zarr.json" if name else "zarr.json").read_text())
+    return json.loads(ordinary_file(shard, f"{name}/zarr.json" if name else "zarr.json").read_bytes())
 
 
 def _rows_a_file(sources: dict[Path, _Source]) -> int:
@@ -115,59 +114,13 @@ def _rows_a_file(sources: dict[Path, _Source]) -> int:
     return 1 << max(0, int(np.ceil(np.log2(FILE_BYTES * rows / max(stored, 1)))))
 
 
-def _file(name: str, number: int, axes: int) -> str:
-    """Of an array: one that has some of its rows, whole."""
-    return "/".join([name, "c", str(number), *"0" * (axes - 1)])
-
-
-def _chunks(name: str, axes: int, places: Sequence[Place], sources: dict[Path, _Source]) -> Iterator[bytes]:
-    """The encoded chunks of an array, each with a checksum that is right."""
-    file_of = lambda place: (place.shard, place.row // sources[place.shard].rows_a_file[name])
-    for (path, number), of_file in groupby(places, file_of):
-        rows_a_file = sources[path].rows_a_file[name]
+def _chunks(name: str, places: Sequence[Place], sources: dict[Path, _Source]) -> Iterator[bytes]:
+    """The encoded chunks of an array."""
+    for path, of_shard in groupby(places, lambda place: place.shard):
         try:
-            descriptor = os.open(ordinary_file(path, _file(name, number, axes)), os.O_RDONLY)
-            try:
-                index = _read_index(descriptor, rows_a_file)
-                for _, row in of_file:
-                    yield _read_chunk(descriptor, *index[row % rows_a_file].tolist())
-            finally:
-                os.close(descriptor)
-        except (OSError, ValueError) as error:
+            yield from sources[path].arrays[name].encoded(place.row for place in of_shard)
+        except DAMAGE as error:
             raise damaged(path, error) from error
-
-
-def _read_index(descriptor: int, chunks: int) -> np.ndarray:
-    """Offset and length of each chunk: (chunk, 2)."""
-    length = chunks * 16 + CHECKSUM_BYTES
-    end = os.fstat(descriptor).st_size
-    if length > end:
-        raise ContentsError("a file of it is too short")
-    index = np.frombuffer(_checked(os.pread(descriptor, length, end - length)), "<u8").reshape(-1, 2)
-    there = index[index[:, 0] != MISSING]
-    if (there > end).any():
-        raise ContentsError("an index in it leads nowhere")
-    return index
-
-
-def _read_chunk(descriptor: int, offset: int, length: int) -> bytes:
-    if offset == MISSING:
-        raise ContentsError("a chunk of it is missing")
-    chunk = os.pread(descriptor, length, offset)
-    _checked(chunk)
-    return chunk
-
-
-def _checked(data: bytes) -> bytes:
-    """Without the checksum at its end, which is right."""
-    content, end = data[:-CHECKSUM_BYTES], data[-CHECKSUM_BYTES:]
-    if _checksum(content) != end:
-        raise ContentsError("a checksum is wrong")
-    return content
-
-
-def _checksum(data: bytes) -> bytes:
-    return google_crc32c.value(data).to_bytes(CHECKSUM_BYTES, "little")
 
 
 def _write_file(path: Path, chunks: Iterable[bytes], room: int, moved: Callable[[int], None]) -> None:
@@ -179,4 +132,4 @@ def _write_file(path: Path, chunks: Iterable[bytes], room: int, moved: Callable[
             file.write(chunk)
             moved(len(chunk))
         entries = index.tobytes()
-        file.write(entries + _checksum(entries))
+        file.write(entries + google_crc32c.value(entries).to_bytes(CHECKSUM, "little"))

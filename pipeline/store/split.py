@@ -22,12 +22,7 @@ def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, 
         Failure: a fragment is damaged.
     """
     split = split_path(job.out, job.budget, job.size)
-    _make_writable(split)
-    _require_own_folders(split)
-    with only_writer(split):
-        with committing(split):
-            pass  # as workers do: a file system that refuses their lock is named before anything trains
-        manifest = clean(split, say)
+    with taken(split, say) as manifest:
         if manifest.config_hash not in (None, job.hash):
             changes = told(differences(manifest.config or {}, job.results))
             raise UserError(
@@ -35,6 +30,22 @@ def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, 
                 "use the same settings, or another folder with out=NAME."
             )
         yield split, manifest
+
+
+@contextmanager
+def taken(split: Path, say: Callable[[str], None]) -> Iterator[Manifest]:
+    """The split, locked and cleaned; with what is committed.
+
+    Raises:
+        UserError: it cannot be written or locked, or is being written.
+        Failure: a fragment is damaged.
+    """
+    _make_writable(split)
+    _require_own_folders(split)
+    with only_writer(split):
+        with committing(split):
+            pass  # as workers do: a file system that refuses their lock is named before anything trains
+        yield clean(split, say)
 
 
 def _make_writable(split: Path) -> None:

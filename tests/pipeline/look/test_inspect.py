@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -44,8 +45,8 @@ def test_only_the_columns_of_the_question_are_read(split: Path, monkeypatch: pyt
     """And of the few rows that are shown, the fragments that have them."""
     read: list[tuple[int, int]] = []
 
-    def counted(path: Path, columns: Sequence[str]) -> tuple[Fragment, pa.Table]:
-        fragment, table = read_fragment(path, columns)
+    def counted(path: Path, columns: Sequence[str], level_ids: Any) -> tuple[Fragment, pa.Table]:
+        fragment, table = read_fragment(path, columns, level_ids)
         read.append((table.num_rows, table.num_columns))
         assert set(table.column_names) == set(columns)
         return fragment, table

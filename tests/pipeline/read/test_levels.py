@@ -1,6 +1,7 @@
 """One level that a user names: found without reading the others."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,9 +16,9 @@ from tests.pipeline.made import made_split
 def test_one_fragment_and_few_columns_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     split, read = made_split(tmp_path, [[Label.SOLVED] * 2] * 4), []
 
-    def noted(path: Path, columns: list[str]) -> object:
+    def noted(path: Path, columns: list[str], level_ids: Any) -> object:
         read.append((path.stem, set(columns)))
-        return read_fragment(path, columns)
+        return read_fragment(path, columns, level_ids)
 
     monkeypatch.setattr(manifest, "read_fragment", noted)
     found, row = find_level(split, 5)

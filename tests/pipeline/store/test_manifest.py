@@ -2,6 +2,7 @@
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -166,9 +167,9 @@ def test_rows_of_some_levels_take_the_fragments_that_cover_them(
     paths = {tuple(ids): commit(tmp_path, job, list(ids)) for ids in ((0, 1, 2), (2, 5), (6, 7), (9, 20), (30,))}
     opened: list[Path] = []
 
-    def noted(path: Path, columns: list[str]) -> object:
+    def noted(path: Path, columns: list[str], level_ids: Any) -> object:
         opened.append(path)
-        return read_fragment(path, columns)
+        return read_fragment(path, columns, level_ids)
 
     monkeypatch.setattr(manifest_file, "read_fragment", noted)
     for level_ids, rows, units in (

@@ -1,0 +1,22 @@
+"""`levelproof seal`: few large files for many small ones."""
+
+import argparse
+
+from pipeline.cli.command import add_split
+
+DOES = "merge a split's many small files into few large ones"
+EXAMPLE = "levelproof seal data/128k/s"
+ROWS = "rows of a sealed fragment, about (default: 100,000)"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_split(parser)
+    parser.add_argument("--rows", type=int, metavar="N", help=ROWS)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from rich.console import Console
+
+    from pipeline.jobs.seal import seal_split
+
+    seal_split(arguments.split, arguments.rows, Console(stderr=True))

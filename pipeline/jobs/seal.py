@@ -1,0 +1,127 @@
+"""Who seals: `levelproof seal`, and `levelproof generate` beside its workers."""
+
+import shlex
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from pipeline.errors import Failure, LevelproofError, UserError
+from pipeline.jobs.progress import say
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.store import seal as sealing
+from pipeline.store.disk import REFUSALS
+from pipeline.store.layout import fragment_path, unit_name
+from pipeline.store.manifest import require_manifest
+from pipeline.store.seal import Piece, seal
+from pipeline.store.split import taken
+
+
+def seal_split(split: Path, rows: int | None, console: Console) -> None:
+    """Seal all of a split that is not, in fragments of about so many rows (default: `store.seal.ROWS`).
+
+    Raises:
+        UserError: there is no split, it cannot be written, or somebody writes to it.
+        Failure: it is damaged, or the disk refuses. What is sealed by then stays so; nothing is lost.
+    """
+    if rows is not None and rows < 1:
+        raise UserError(f"A sealed fragment cannot have {rows} rows: give --rows a number from 1.")
+    require_manifest(split, [])
+    with taken(split, partial(say, console)) as manifest:
+        pieces = list(map(Piece.of, manifest.counting))
+        groups = sealing.plan(pieces, rows or sealing.ROWS)
+        columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+            task = bar.add_task("levels sealed", total=sum(piece.rows for group in groups for piece in group))
+            try:
+                for group in groups:
+                    seal(split, group)
+                    bar.advance(task, sum(piece.rows for piece in group))
+            except OSError as error:
+                raise _refused(split, error) from error
+    merged = sum(map(len, groups))
+    levels, fragments = sum(piece.rows for piece in pieces), len(pieces) - merged + len(groups)
+    done = f"{merged:,} fragments were merged into {len(groups):,}" if groups else "there was nothing to seal"
+    print(f"{split}: {done}; it has {levels:,} levels in {fragments:,} fragments now.")
+    print(f"Next:  levelproof inspect {shlex.quote(str(split))}")
+
+
+def _refused(split: Path, error: OSError) -> Failure:
+    reason = REFUSALS.get(error.errno or 0) or f"{error.strerror or type(error).__name__}"
+    return Failure(f"Cannot write to {split}, {reason}, then run the same command again; nothing is lost.")
+
+
+class _Stopped(Exception):
+    """The job ends before a fragment is sealed."""
+
+
+class Sealer:
+    """Seals what a job has committed, in a thread, while its workers go on.
+
+    What goes wrong is told once and ends the sealing, never the job.
+    """
+
+    def __init__(self, split: Path, pieces: Iterable[Piece], units: Iterable[WorkUnit], tell: Callable[[str], None]):
+        """Of a split with these fragments, of which these units, ascending, are to come."""
+        self._split, self._tell = split, tell
+        self._pieces = {piece.path: piece for piece in pieces}
+        self._coming, self._ended = deque(units), set[str]()  # names
+        self._thread, self._stop = ThreadPoolExecutor(1), threading.Event()
+        self._at_work: tuple[list[Piece], Future[Piece]] | None = None
+        self._broken = False
+
+    def ended(self, unit: WorkUnit, committed: bool) -> None:
+        """A unit was committed, or an attempt at it failed: then what lies around it is not kept waiting."""
+        self._ended.add(unit.name)
+        if committed:
+            path = fragment_path(self._split, unit.name)
+            self._pieces[path] = Piece(path, len(unit.level_ids), False)
+
+    def look(self) -> None:
+        """Take note of what was sealed, and begin with the next if there is enough of it before the units to come."""
+        if self._at_work and not self._at_work[1].done():
+            return
+        self._take_note()
+        while self._coming and self._coming[0].name in self._ended:
+            self._ended.remove(self._coming.popleft().name)
+        first = self._coming[0].level_ids[0] if self._coming else None
+        end = None if first is None else fragment_path(self._split, unit_name(first, first))
+        group = sealing.due((piece for piece in self._pieces.values() if end is None or piece.path < end), sealing.ROWS)
+        if group and not self._broken:
+            self._at_work = group, self._thread.submit(seal, self._split, group, self._go_on)
+
+    def finish(self) -> None:
+        """Seal all that there is enough of."""
+        self.look()
+        while self._at_work:
+            self._at_work[1].exception()  # waits
+            self.look()
+
+    def stop(self) -> None:
+        """End at once; what is half sealed goes."""
+        self._stop.set()
+        self._thread.shutdown()
+
+    def _go_on(self, _: int) -> None:
+        if self._stop.is_set():
+            raise _Stopped
+
+    def _take_note(self) -> None:
+        if self._at_work is None:
+            return
+        (group, future), self._at_work = self._at_work, None
+        error = future.exception()
+        if error is None:
+            for piece in group:
+                del self._pieces[piece.path]
+            self._pieces[future.result().path] = future.result()
+            return
+        self._broken = True
+        told = _refused(self._split, error) if isinstance(error, OSError) else error
+        reason = str(told) if isinstance(told, LevelproofError) else f"{type(told).__name__}: {told}"
+        self._tell(f"Not sealed ({reason.rstrip('.')}): `levelproof seal {self._split}` seals it when this has ended.")

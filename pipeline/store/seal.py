@@ -1,0 +1,131 @@
+"""Sealing: neighbouring fragments become one, and their shards one, in the order of level ids.
+
+The new data first, then the new fragment, which counts before those that it was made of; only then do these go. A
+process that dies in between leaves what `leftovers.clean` removes. Knows nothing of who seals, and when.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from pipeline.store.layout import begun_path, data_path, fragment_of, new_attempt, unit_name
+from pipeline.store.leftovers import disown, drop
+from pipeline.store.manifest import (
+    THREADS,
+    Fragment,
+    begin_fragment,
+    each_once,
+    named_by,
+    read_fragment,
+    write_fragment,
+)
+from pipeline.store.merge import Place, merge_shards
+from pipeline.store.schema import COLUMNS
+
+ROWS = 100_000  # of a sealed fragment, about; more: fewer files, and more to write again when some are added
+CROWD = 1_000  # unsealed neighbours that are merged, although they have not as many rows: small files are slow to read
+
+
+class Piece(NamedTuple):
+    """A fragment, as a plan knows it."""
+
+    path: Path  # whose names sort as ids do
+    rows: int
+    sealed: bool
+
+    @staticmethod
+    def of(fragment: Fragment) -> "Piece":
+        return Piece(fragment.path, fragment.rows, fragment.sealed)
+
+
+def plan(pieces: Iterable[Piece], rows: int) -> list[list[Piece]]:
+    """What to merge into fragments of about so many rows, ascending: neighbours that are unsealed, or sealed with less
+    than half of that. The last before a larger one, or of all, may have less together.
+    """
+    groups: list[list[Piece]] = [[]]
+    count = 0
+    for piece in sorted(pieces):
+        large = piece.sealed and 2 * piece.rows >= rows
+        if large or count >= rows:
+            groups.append([])
+            count = 0
+        if not large:
+            groups[-1].append(piece)
+            count += piece.rows
+    return [group for group in groups if len(group) > 1 or any(not piece.sealed for piece in group)]
+
+
+def due(pieces: Iterable[Piece], rows: int) -> list[Piece] | None:
+    """What a job that is under way should merge now: neighbours with enough rows, or a crowd. None: nothing yet."""
+    for group in plan(pieces, rows):
+        if sum(piece.rows for piece in group) >= rows:
+            return group
+        for sealed, run in groupby(group, lambda piece: piece.sealed):
+            if not sealed and len(crowd := list(run)) >= CROWD:
+                return crowd
+    return None
+
+
+def seal(
+    split: Path,
+    pieces: Sequence[Piece],
+    moved: Callable[[int], None] = lambda _: None,
+    rows_a_file: int | None = None,
+) -> Piece:
+    """Merge these fragments and their shards; the sealed fragment. Only the writer of a split may.
+
+    Kept experts stay where they are. `moved` and `rows_a_file` are those of `merge_shards`.
+
+    Raises:
+        Failure: a fragment or a shard is damaged; nothing has changed.
+        OSError: the disk refuses; nothing has changed.
+    """
+    paths = {piece.path for piece in pieces}
+    with ThreadPoolExecutor(THREADS) as threads:
+        parts = list(threads.map(read_fragment, sorted(paths)))
+    table, _ = each_once(parts)
+    level_ids, rows = (table.column(name).to_pylist() for name in ("level_id", "row"))
+    shards = {name: data_path(split, name) for name in named_by([of for _, of in parts], "shard")}
+    places = [
+        Place(shards[name], row, level_id)
+        for name, row, level_id in zip(table.column("shard").to_pylist(), rows, level_ids, strict=True)
+        if name
+    ]
+    replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
+    attempt, about = new_attempt(split, unit_name(level_ids[0], level_ids[-1])), parts[0][0]
+    try:
+        begin_fragment(attempt)
+        if places:
+            merge_shards(attempt.shard, places, moved, rows_a_file)
+        disown(replaced)
+        rows_there = _in_one_shard(table, attempt.shard.relative_to(split).as_posix())
+        write_fragment(attempt, rows_there, about.config_hash, about.config, sealed=True)
+    except BaseException:
+        if attempt.begun.exists():  # not committed
+            drop(attempt.shard)
+            attempt.begun.unlink(missing_ok=True)
+            for shard in replaced:
+                begun_path(shard).unlink(missing_ok=True)
+        raise
+    for path in paths - {attempt.fragment}:
+        path.unlink(missing_ok=True)
+    for shard in replaced:
+        drop(shard)
+    return Piece(attempt.fragment, len(level_ids), True)
+
+
+def _in_one_shard(table: pa.Table, shard: str) -> pa.Table:
+    """The same rows, of which those with a witness have it in this shard, one after another."""
+    has = pc.is_valid(table.column("shard"))
+    rows = pa.array(np.cumsum(has.to_numpy()) - 1, pa.int32())
+    for name, values in ("shard", pa.scalar(shard)), ("row", rows):
+        field = COLUMNS.field(name)
+        values = pc.if_else(has, values, pa.scalar(None, field.type))
+        table = table.set_column(COLUMNS.names.index(name), field, values)
+    return table

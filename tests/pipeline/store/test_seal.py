@@ -1,0 +1,266 @@
+"""Sealing: the same rows and bits in fewer files, whoever reads, commits or dies meanwhile."""
+
+import errno
+import itertools
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+import traceback
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from experts.labels import Label
+from pipeline.errors import Failure
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.jobs.unit import commit
+from pipeline.read.rows import read_row
+from pipeline.store import seal as sealing
+from pipeline.store.layout import fragment_path, unit_name
+from pipeline.store.leftovers import clean
+from pipeline.store.manifest import fragment_paths, read_manifest
+from pipeline.store.seal import CROWD, Piece, due, plan, seal
+from pipeline.store.shard import Shard
+from tests.pipeline.made import made_job, made_result, made_split
+
+UNITS = 6  # of two levels each, one of them solved
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_split(tmp_path_factory.mktemp("made"), [[Label.SOLVED, Label.UNSOLVED]] * UNITS)
+
+
+@pytest.fixture
+def split(made: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "data/128k/s"
+    shutil.copytree(made, path)
+    return path
+
+
+def pieces(split: Path) -> list[Piece]:
+    return list(map(Piece.of, read_manifest(split, []).fragments))
+
+
+def whole(split: Path) -> dict[int, tuple]:
+    """The rows, but for where their data are, and every bit of their data."""
+    found = {}
+    for row in read_manifest(split).table.to_pylist():
+        data = Shard(split / row["shard"]).read([row["row"]]) if row["shard"] else {}
+        bits = tuple(values.tobytes() for values in data.values())
+        found[row["level_id"]] = repr(row | {"shard": None, "row": None}), bits
+    return found
+
+
+def assert_tidy(split: Path, fragments: int) -> None:
+    """So many fragments, the shards that they name, and nothing else."""
+    assert len(fragment_paths(split)) == fragments
+    assert len(list((split / "manifest").iterdir())) == fragments
+    assert {f"shards/{path.name}" for path in (split / "shards").iterdir()} == read_manifest(split).shards
+
+
+@pytest.mark.parametrize(("rows", "fragments"), [(4, 3), (6, 2), (100, 1)])
+def test_rows_and_bits_stay_the_same(split: Path, made: Path, rows: int, fragments: int) -> None:
+    for group in plan(pieces(split), rows):
+        seal(split, group, rows_a_file=2)
+    assert whole(split) == whole(made)
+    assert_tidy(split, fragments)
+    assert all(fragment.sealed for fragment in read_manifest(split).fragments)
+    assert plan(pieces(split), rows) == []
+    said: list[str] = []
+    clean(split, said.append)
+    assert not said
+    assert_tidy(split, fragments)
+
+
+def test_a_plan_merges_neighbours_and_leaves_what_is_large() -> None:
+    def piece(first: int, rows: int, sealed: bool) -> Piece:
+        return Piece(fragment_path(Path(), unit_name(first, first + rows - 1)), rows, sealed)
+
+    small = [piece(i, 1, False) for i in range(5)]
+    large, half, few = piece(10, 9, True), piece(20, 5, True), piece(30, 4, True)
+    assert plan(small, 2) == [small[:2], small[2:4], small[4:]]
+    assert plan([*reversed(small), large], 10) == [small]
+    assert plan([large, half, few], 10) == []  # a sealed one alone
+    assert plan([small[0], large, small[1]._replace(path=piece(40, 1, False).path), few], 10)[1][0] == few
+    assert due(small, 6) is None
+    assert due(small, 5) == small
+    crowd = [piece(100 + i, 1, False) for i in range(CROWD)]
+    assert due([few, *crowd[1:]], 2 * CROWD) is None
+    assert due([few, *crowd], 2 * CROWD) == crowd
+
+
+def test_units_commit_meanwhile_and_afterwards_into_the_same_range(
+    split: Path, made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = made_job(str(split.parents[1]), "size=s")
+    expected = whole(made)
+    write = sealing.write_fragment
+
+    def meanwhile(*args: Any, **how: Any) -> None:
+        commit(job, split, WorkUnit((2, 3)), made_result([2, 3], [Label.SOLVED, Label.UNSOLVED]))
+        write(*args, **how)
+
+    fragment_path(split, unit_name(2, 3)).unlink()
+    (shard,) = (split / "shards").glob(f"{unit_name(2, 3)}-*")
+    shutil.rmtree(shard)
+    with monkeypatch.context() as patched:
+        patched.setattr(sealing, "write_fragment", meanwhile)
+        seal(split, pieces(split))
+    assert whole(split) == expected
+    assert len(fragment_paths(split)) == 2
+    seal(split, pieces(split))  # its range is that of the one before, whose place it takes
+    assert whole(split) == expected
+    assert_tidy(split, 1)
+
+
+WRITES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
+
+
+def killed(split: Path, step: int) -> bool:
+    """Whether who cleans and seals is killed before it has changed the files of a split so many times."""
+    if child := os.fork():
+        _, status = os.waitpid(child, 0)
+        assert status in (0, signal.SIGKILL), "it failed"
+        return status == signal.SIGKILL
+    left = iter(range(step))
+
+    def count(event: str, arguments: tuple) -> None:
+        changes = event in WRITES or (event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
+        if changes and str(split) in str(arguments[0]) and next(left, None) is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    try:
+        sys.addaudithook(count)
+        sealed(split, 100)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+    os._exit(0)
+
+
+def sealed(split: Path, rows: int) -> None:
+    clean(split, print)
+    for group in plan(pieces(split), rows):
+        seal(split, group, rows_a_file=2)
+
+
+@pytest.mark.parametrize("stride", [31, pytest.param(1, marks=pytest.mark.campaign)])
+def test_a_kill_at_any_step_loses_nothing_and_doubles_nothing(made: Path, tmp_path: Path, stride: int) -> None:
+    expected, split, deaths = whole(made), tmp_path / "split", 0
+    for step in itertools.count(0, stride):
+        shutil.copytree(made, split)
+        dead = killed(split, step)
+        assert whole(split) == expected
+        said: list[str] = []
+        clean(split, said.append)
+        assert whole(split) == expected
+        sealed(split, 100)
+        assert whole(split) == expected
+        assert_tidy(split, 1)
+        assert not said
+        shutil.rmtree(split)
+        if not dead:
+            break
+        deaths += 1
+    assert deaths > 100 / stride, "every change of a file is a step"
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    steps=st.lists(
+        st.one_of(
+            st.tuples(st.just("commit"), st.integers(0, UNITS - 1)),
+            st.tuples(st.just("seal"), st.sampled_from([2, 4, 100])),
+            st.tuples(st.just("kill"), st.integers(0, 150)),
+        ),
+        min_size=3,
+        max_size=8,
+    )
+)
+def test_any_sequence_of_commits_seals_and_kills(made: Path, tmp_path: Path, steps: list[tuple[str, int]]) -> None:
+    split, there = tmp_path / "split", set()
+    shutil.rmtree(split, ignore_errors=True)
+    for folder in ("manifest", "shards"):
+        (split / folder).mkdir(parents=True)
+    expected = whole(made)
+    for step, number in steps:
+        if step == "kill":
+            killed(split, number)
+        elif step == "seal":
+            sealed(split, number)
+        elif 2 * number not in there:
+            fragment = fragment_paths(made)[number]
+            (shard,) = (made / "shards").glob(f"{fragment.stem}-*")
+            shutil.copytree(shard, split / "shards" / shard.name)
+            shutil.copy(fragment, split / "manifest")
+            there |= {2 * number, 2 * number + 1}
+        assert whole(split) == {level_id: expected[level_id] for level_id in there}
+    sealed(split, 100)
+    assert whole(split) == {level_id: expected[level_id] for level_id in there}
+    assert_tidy(split, bool(there))
+
+
+def test_readers_at_work_go_on(split: Path, made: Path) -> None:
+    """They see every level all the time, each once, and read its data wherever it lies by then."""
+    expected, ended = whole(made), threading.Event()
+
+    def read() -> int:
+        times = 0
+        while not ended.is_set():
+            rows = read_manifest(split).table.to_pylist()
+            assert [row["level_id"] for row in rows] == list(expected)
+            time.sleep(0.01)  # the data may go elsewhere meanwhile
+            for row in rows:
+                if row["shard"]:
+                    data = read_row(split, row)
+                    assert tuple(values.tobytes() for values in data.values()) == expected[row["level_id"]][1]
+            times += 1
+        return times
+
+    with ThreadPoolExecutor() as threads:
+        readers = [threads.submit(read) for _ in range(2)]
+        try:
+            for rows in (2, 3, 5, 9, 100):
+                sealed(split, rows)
+        finally:
+            ended.set()
+        assert all(reader.result() > 1 for reader in readers)
+    assert_tidy(split, 1)
+
+
+def test_a_row_of_a_damaged_shard_is_not_looked_for_elsewhere(split: Path) -> None:
+    row = next(row for row in read_manifest(split).table.to_pylist() if row["shard"])
+    shutil.rmtree(split / row["shard"])
+    with pytest.raises(Failure, match="missing or damaged"):
+        read_row(split, row)
+
+
+def test_what_is_damaged_is_not_sealed(split: Path, made: Path) -> None:
+    shard = sorted((split / "shards").iterdir())[1]
+    file = shard / "act/c/0/0/0"
+    file.write_bytes(b"x" + file.read_bytes()[1:])
+    before = sorted(split.rglob("*"))
+    with pytest.raises(Failure, match="bytes of its array act are missing or not those"):
+        seal(split, pieces(split))
+    assert sorted(split.rglob("*")) == before
+
+
+def test_a_full_disk_changes_nothing(split: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = sorted(split.rglob("*"))
+    for step in ("merge_shards", "disown", "write_fragment"):
+        with monkeypatch.context() as patched:
+            patched.setattr(sealing, step, full)
+            with pytest.raises(OSError, match="No space left"):
+                seal(split, pieces(split))
+        assert sorted(split.rglob("*")) == before
