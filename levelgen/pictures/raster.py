@@ -47,7 +47,11 @@ def draw(
 
 def rasterised(scene: Scene, pixels: int = PIXELS) -> Image.Image:
     """A scene as a picture that is `pixels` wide."""
-    drawing = svg_of([scene], [1.0], pixels)
+    return picture_of(svg_of([scene], [1.0], pixels))
+
+
+def picture_of(drawing: str) -> Image.Image:
+    """An SVG drawing as a picture of its size, in the letters of all pictures."""
     png = resvg_py.svg_to_bytes(svg_string=drawing, skip_system_fonts=True, font_files=[_letters().name])
     return Image.open(io.BytesIO(png)).convert("RGB")
 

@@ -37,4 +37,5 @@ BINDING_COLOUR: tuple[Colour, ...] = (  # of the action's entries: four motors, 
     (240, 96, 140),
 )
 FLAMES: tuple[tuple[float, Colour], ...] = ((1.0, (245, 124, 40)), (0.6, (255, 214, 92)))  # length, colour
+FONTS = "Aileron, Helvetica, Arial, sans-serif"
 CAPTION_SIZE, KEY_SIZE = 0.155, 0.14  # m, of letters

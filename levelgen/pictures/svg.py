@@ -12,9 +12,8 @@ import numpy as np
 
 from levelgen.level import WORLD_SIDE
 from levelgen.pictures.shapes import Part, Scene, number, rectangle
-from levelgen.pictures.style import BORDER, HATCH, HEADER, PAPER, PIXELS
+from levelgen.pictures.style import BORDER, FONTS, HATCH, HEADER, PAPER, PIXELS
 
-FONTS = "Aileron, Helvetica, Arial, sans-serif"
 WIDTH = WORLD_SIDE + 2 * BORDER  # m, of a picture
 TOP = WORLD_SIDE + BORDER + HEADER  # m, of a picture's upper edge above the world's lower one
 

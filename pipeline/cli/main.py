@@ -9,12 +9,12 @@ import sys
 from collections.abc import Sequence
 
 from configs.errors import ConfigError
-from pipeline.cli import export, generate, inspect, regenerate, sample, seal, settings, show, status, verify
+from pipeline.cli import card, export, generate, inspect, regenerate, sample, seal, settings, show, status, verify
 from pipeline.cli.command import EXITS
 from pipeline.errors import Exit, LevelproofError
 from pipeline.version import __version__
 
-COMMANDS = (generate, regenerate, settings, sample, inspect, show, export, status, verify, seal)
+COMMANDS = (generate, regenerate, settings, sample, inspect, show, export, card, status, verify, seal)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -99,13 +99,24 @@ def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
         Failure: it does not reach the goal.
     """
     arrays = read_row(manifest.split, row)
+    return recorded_film(row, arrays, rules_of(manifest))
+
+
+def recorded_film(
+    row: dict[str, Any], arrays: dict[str, np.ndarray], rules: TaskParams, every: int = STEPS_A_PICTURE
+) -> Film:
+    """The same of what a shard has of a row: a scene every so many env steps, and one when the goal is reached.
+
+    Raises:
+        Failure: it does not reach the goal.
+    """
     level, states = tree_of(Level, arrays, "level/"), tree_of(State, arrays, "record/state/")
     done, goal, action = (arrays[f"record/{name}"][..., 0] for name in ("done", "goal", "action"))
     if not succeeds(done, goal):
         raise Failure("The record of this level does not reach the goal: run `levelproof verify` on its split.")
-    steps, rules = int(steps_to_goal(done)), rules_of(manifest)
+    steps = int(steps_to_goal(done))
     second = rules.frame_skip * rules.physics.dt  # of an env step
-    shown = [*range(0, steps, STEPS_A_PICTURE), steps]
+    shown = [*range(0, steps, every), steps]
     scenes = []
     for step in shown:
         last = min(step, steps - 1)

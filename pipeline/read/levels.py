@@ -5,6 +5,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+import pyarrow as pa
+
 from configs.convert import typed
 from configs.schema import from_files
 from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
@@ -12,9 +16,10 @@ from levelgen.level import Level, size_of
 from levelgen.sampling.sampler import Distribution, sample_levels
 from levelgen.task.rules import TaskParams
 from pipeline.errors import UserError
-from pipeline.read.level_files import level_at
-from pipeline.read.rows import read_row
+from pipeline.read.level_files import level_at, levels_at
+from pipeline.read.rows import read_row, read_rows
 from pipeline.runtime import prepare_jax
+from pipeline.store.contents import table_for
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.origins import ASKED, origin_of
@@ -51,6 +56,26 @@ def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
         return level_at(origin_of(manifest.split, row))
     distribution = typed(Distribution, (manifest.config or {})["distribution"])
     return sample_levels([row["level_id"]], size_of(row["size"]), distribution)
+
+
+def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
+    """The levels of many rows, with COLUMNS, in their order: numpy arrays, level axis last; raises as `level_of`."""
+    stored = rows.column("shard").is_valid().to_numpy()
+    size = size_of(rows.column("size")[0].as_py())
+    parts = []
+    if stored.any():
+        names = [of.name for of in table_for(size) if of.name.startswith("level/")]
+        parts.append(tree_of(Level, read_rows(manifest.split, rows.filter(stored), names), "level/"))
+    if not stored.all():
+        prepare_jax()
+        others, config = rows.filter(~stored), manifest.config or {}
+        if from_files(config):
+            parts.append(levels_at([origin_of(manifest.split, row) for row in others.to_pylist()]))
+        else:
+            ids, distribution = others.column("level_id").to_numpy(), typed(Distribution, config["distribution"])
+            parts.append(sample_levels(ids, size, distribution))
+    back = np.argsort(np.concatenate([np.flatnonzero(stored), np.flatnonzero(~stored)]))
+    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1)[..., back], *parts)
 
 
 def rules_of(manifest: Manifest) -> TaskParams:

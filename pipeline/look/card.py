@@ -1,0 +1,139 @@
+"""The README of a dataset for the Hugging Face hub, with figures and a preview beside it.
+
+The hub's viewer shows the manifests, a subset for each split, and first of all the preview. What is said of a split is
+from its manifest; a person is asked only for what no program can decide, the licence.
+"""
+
+import io
+from collections.abc import Sequence
+from itertools import chain
+from pathlib import Path
+
+import duckdb
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
+
+from configs.compose import identified
+from configs.convert import typed
+from configs.schema import from_files
+from experts.config import RECORD_STEPS
+from experts.labels import Label
+from levelgen.pictures.raster import sheet, write_png
+from levelgen.sampling.distribution import Distribution
+from pipeline.errors import UserError
+from pipeline.look.figures import draw_histograms, draw_shares
+from pipeline.look.preview import preview
+from pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, SplitFacts, Wishes, readme
+from pipeline.read.levels import writing_to
+from pipeline.store.layout import SHARDS
+from pipeline.store.manifest import Manifest, require_manifest
+from pipeline.store.shard import stored_bytes
+from pipeline.version import __version__
+
+README = "README.md"
+ASKED = ("label", "steps_to_goal", "content_hash", "shard", "budget", "versions", "device")
+SAMPLE = 200  # levels of a split in the preview
+SHEET_LEVELS, COLUMNS = 12, 4
+BINS = 32
+
+
+def card(splits: Sequence[Path], out: Path | None, wishes: Wishes) -> None:
+    """Write the card of a dataset of these splits, and tell so and what comes next.
+
+    Raises:
+        UserError: a split is not there or not below the file's folder, or the file is there and somebody else's.
+        Failure: a split is damaged.
+    """
+    out = out or splits[0].absolute().parent.parent / README
+    folder = out.absolute().parent.resolve()
+    _require_ours(out)
+    paths = [_below(folder, split) for split in splits]
+    manifests = [require_manifest(split, ASKED) for split in splits]
+    facts = [_facts(path, manifest) for path, manifest in zip(paths, manifests, strict=True)]
+    with writing_to(out):
+        for name in (PREVIEW, FIGURES):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        tables = [preview(manifest, SAMPLE) for manifest in manifests]
+        for of, table in zip(facts, tables, strict=True):
+            pq.write_table(table, folder / PREVIEW / f"{of.subset}.parquet", row_group_size=100)
+        figures = _draw(folder, facts, tables)
+        name = wishes.name or (wishes.repo or folder.name).rpartition("/")[2]
+        out.write_text(readme(name, facts, wishes, figures, __version__), encoding="utf-8")
+    print(f"{out}: the card of {', '.join(paths)}, with {PREVIEW}/ and {FIGURES}/ beside it.")
+    if not wishes.license:
+        print("It names no licence: choose one with --license, such as cc-by-4.0 or mit.")
+    excluded = '--exclude "*.lock" --exclude "*/job.json" --exclude "*/.*"'
+    print(f"Next:  hf upload {wishes.repo or 'USER/NAME'} {folder} . --repo-type dataset {excluded}")
+
+
+def _require_ours(out: Path) -> None:
+    if out.exists() and MARK not in out.read_text(encoding="utf-8", errors="replace"):
+        raise UserError(f"{out} is there already, and `levelproof card` did not write it: name another file with -o.")
+
+
+def _below(folder: Path, split: Path) -> str:
+    """A split's path below the folder of the card, which has to have all that it describes."""
+    path = split.absolute().resolve()
+    if folder not in path.parents:
+        raise UserError(f"The split {split} is not below {folder}: put all splits of a dataset into one folder.")
+    return path.relative_to(folder).as_posix()
+
+
+def _facts(path: str, manifest: Manifest) -> SplitFacts:
+    table, config = manifest.table, manifest.config or {}
+    labels = {entry["values"]: entry["counts"] for entry in table.column("label").value_counts().to_pylist()}
+    solved = table.filter(manifest.labels == Label.SOLVED)
+    shards = manifest.split / SHARDS
+    return SplitFacts(
+        path=path,
+        labels=labels,
+        distinct=len(table.column("content_hash").unique()),
+        witnesses=table.num_rows - table.column("shard").null_count,
+        steps_to_goal=solved.column("steps_to_goal").to_numpy(),
+        split_bytes=stored_bytes(manifest.split),
+        shard_bytes=stored_bytes(shards) if shards.is_dir() else 0,
+        budget=table.column("budget")[0].as_py(),
+        distribution=_distribution(config),
+        config_hash=manifest.config_hash or "",
+        made_with=_made_with(table),
+    )
+
+
+def _distribution(config: dict) -> str:
+    if from_files(config):
+        return "level files"
+    name, short = identified(typed(Distribution, config["distribution"], "distribution"))
+    return f"random, `{name}`" if name else f"random, of a distribution of its own (`{short}`)"
+
+
+def _made_with(table: pa.Table) -> list[str]:
+    """Each stack, the commonest first."""
+    query = "SELECT versions, device FROM stacks GROUP BY ALL ORDER BY count(*) DESC, device"
+    with duckdb.connect() as connection:
+        connection.register("stacks", table.select(["versions", "device"]))
+        stacks = connection.sql(query).fetchall()
+    return [
+        f"levelproof {v['levelproof']}, Python {v['python']}, JAX {v['jax']}, sampler {v['sampler']}, {device}"
+        for v, device in stacks
+    ]
+
+
+def _draw(folder: Path, facts: Sequence[SplitFacts], tables: Sequence[pa.Table]) -> list[str]:
+    """Those figures that there is something for."""
+    drawn = []
+    rows = (table.select(["label", "goal"]).to_pylist() for table in tables)
+    goals = [[row["goal"] for row in of if row["label"] == Label.SOLVED] for of in rows]
+    each = -(-SHEET_LEVELS // len(goals))
+    if chosen := list(chain(*(of[:each] for of in goals)))[:SHEET_LEVELS]:
+        pictures = [Image.open(io.BytesIO(goal["bytes"])) for goal in chosen]
+        write_png(sheet(pictures, COLUMNS), folder / SHEET)
+        drawn.append(SHEET)
+    if shares := {of.path: of.solved for of in facts if of.solved}:
+        draw_shares(shares, "Solved, of the levels that were trained or searched for", folder / RATES)
+        drawn.append(RATES)
+    if steps := {of.path: of.steps_to_goal for of in facts if len(of.steps_to_goal)}:
+        title = f"Steps to the goal of solved levels (bins of {RECORD_STEPS // BINS})"
+        draw_histograms(steps, RECORD_STEPS, BINS, title, folder / STEPS)
+        drawn.append(STEPS)
+    return drawn

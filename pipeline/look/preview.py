@@ -1,0 +1,77 @@
+"""A sample of a split for the viewer of the Hugging Face hub: rows of the manifest with pictures beside them."""
+
+import io
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from rich.console import Console
+from rich.progress import track
+
+from experts.config import RECORD_STEPS
+from levelgen.level import size_of
+from levelgen.pictures.raster import rasterised
+from levelgen.pictures.scene import scene_of
+from levelgen.pictures.shapes import Scene
+from levelgen.pictures.words import Caption
+from pipeline.look.show import recorded_film
+from pipeline.read.levels import levels_of, rules_of
+from pipeline.read.rows import read_rows
+from pipeline.store.contents import table_for
+from pipeline.store.manifest import Manifest, require_manifest
+from pipeline.store.schema import COLUMNS
+
+PICTURES = ("start", "goal")  # the initial world; the moment that the witness reaches the goal, where there is one
+SHOWN = (  # columns beside them
+    "level_id", "label", "label_reason", "witness", "steps_to_goal", "success_rate", "portability", "env_steps",
+    "command",
+)  # fmt: skip
+PIXELS = 220  # width of a picture
+BLOCK = 16  # rows whose records are in memory at once
+ACTED = ("done", "goal", "action")
+# What the library `datasets` writes where a column has pictures, and the hub's viewer looks for
+IMAGE = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])
+FEATURES = json.dumps({"info": {"features": {name: {"_type": "Image"} for name in PICTURES}}})
+SCHEMA = pa.schema(
+    [*(pa.field(name, IMAGE) for name in PICTURES), *(COLUMNS.field(name) for name in SHOWN)],
+    metadata={"huggingface": FEATURES},
+)
+
+
+def preview(manifest: Manifest, count: int) -> pa.Table:
+    """At most so many rows, spread evenly over the manifest's level ids.
+
+    Raises:
+        Failure: a shard is damaged, or a level's file is gone.
+    """
+    ids = manifest.level_ids
+    chosen = ids[np.unique(np.linspace(0, len(ids) - 1, count).round().astype(int))]
+    full, console = require_manifest(manifest.split, level_ids=chosen.tolist()), Console(stderr=True)
+    blocks, words = range(0, full.table.num_rows, BLOCK), f"pictures of {manifest.split}"
+    shown = track(blocks, words, console=console, transient=True, disable=not console.is_terminal)
+    rows = [row for first in shown for row in _pictured(full, full.table.slice(first, BLOCK))]
+    return pa.Table.from_pylist(rows, SCHEMA)
+
+
+def _pictured(manifest: Manifest, rows: pa.Table) -> Iterator[dict[str, Any]]:
+    solved, arrays = rows.column("shard").is_valid().to_numpy(), {}
+    if solved.any():
+        size = size_of(rows.column("size")[0].as_py())
+        names = [of.name for of in table_for(size) if of.name.startswith(("level/", "record/state/"))]
+        arrays = read_rows(manifest.split, rows.filter(solved), [*names, *(f"record/{name}" for name in ACTED)])
+    level, rules, recorded = levels_of(manifest, rows), rules_of(manifest), 0
+    for lane, row in enumerate(rows.to_pylist()):
+        scenes = [scene_of(level, level.state, lane, caption=Caption(f"level {row['level_id']}"))]
+        if solved[lane]:
+            one = {name: values[..., recorded : recorded + 1] for name, values in arrays.items()}
+            scenes.append(recorded_film(row, one, rules, every=RECORD_STEPS).scenes[-1])
+            recorded += 1
+        yield dict.fromkeys(PICTURES) | dict(zip(PICTURES, map(_picture, scenes), strict=False)) | row
+
+
+def _picture(scene: Scene) -> dict[str, Any]:
+    file = io.BytesIO()
+    rasterised(scene, PIXELS).save(file, "PNG", optimize=True)
+    return {"bytes": file.getvalue(), "path": None}

@@ -1,0 +1,122 @@
+"""A dataset's card: its header, its numbers, its figures and its preview."""
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from PIL import Image
+
+from experts.labels import Label
+from pipeline.cli.main import main
+from pipeline.look import card as cards
+from pipeline.look.figures import Share
+from pipeline.look.preview import PICTURES, PIXELS, SHOWN
+from pipeline.look.readme import SplitFacts, Wishes, readme
+from pipeline.store.manifest import read_manifest
+from tests.pipeline.made import made_split, played_split
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a split that was played, one of which nothing was solved, and their card."""
+    folder = tmp_path_factory.mktemp("rigid-levels")
+    splits = [played_split(folder), made_split(folder, [[Label.UNSOLVED] * 2, [Label.UNSOLVED]], "budget=64k")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cards, "SAMPLE", 12)
+        assert main(["card", *map(str, splits), "--license", "cc-by-4.0", "--repo", "me/levels"]) == 0
+    return folder
+
+
+def header_of(readme: Path) -> dict[str, Any]:
+    return yaml.safe_load(readme.read_text().split("---\n")[1])
+
+
+def test_the_header_leads_the_viewer_to_preview_and_manifests(dataset: Path) -> None:
+    header = header_of(dataset / "README.md")
+    assert (header["license"], header["pretty_name"]) == ("cc-by-4.0", "levels")
+    assert (header["task_categories"], header["size_categories"]) == (["reinforcement-learning"], ["1K<n<10K"])
+    first, *others = header["configs"]
+    assert (first["config_name"], first["default"]) == ("preview", True)
+    assert [of["config_name"] for of in others] == ["128k-s", "64k-s"]
+    for config in header["configs"]:
+        assert re.fullmatch(r"[\w-]+", config["config_name"])
+        for of in config["data_files"]:
+            assert re.fullmatch(r"\w+", of["split"])
+            files = sorted(dataset.glob(of["path"]))
+            assert files
+            assert all(pq.read_metadata(file).num_rows for file in files)
+    assert len(list(dataset.glob(others[1]["data_files"][0]["path"]))) == 2
+
+
+def test_the_preview_has_pictures_where_the_viewer_looks_for_them(dataset: Path) -> None:
+    table = pq.read_table(dataset / "preview/128k-s.parquet")
+    assert table.column_names == [*PICTURES, *SHOWN]
+    assert b'"_type": "Image"' in table.schema.metadata[b"huggingface"]
+    rows, manifest = table.to_pylist(), read_manifest(dataset / "128k/s").table
+    assert [row["level_id"] for row in rows] == np.linspace(0, len(manifest) - 1, 12).round().astype(int).tolist()
+    assert {row["label"] for row in rows} == {"solved", "unsolved"}
+    for row in rows:
+        assert Image.open(io.BytesIO(row["start"]["bytes"])).width == PIXELS
+        assert (row["goal"] is not None) == (row["label"] == "solved")
+    assert [row["goal"] for row in pq.read_table(dataset / "preview/64k-s.parquet").to_pylist()] == [None] * 3
+
+
+def test_the_page_tells_of_each_split_what_its_manifest_says(dataset: Path) -> None:
+    text, manifest = (dataset / "README.md").read_text(), read_manifest(dataset / "128k/s")
+    solved = int((manifest.labels == "solved").sum())
+    assert f"| `128k/s` | 64 | 64 | {solved} | {256 * solved:,} |" in text
+    assert f"| `128k/s` | {solved} | {64 - solved} | 0 | 0 | {Share(solved, 64)} |" in text
+    assert "| `64k/s` | 3 | 3 | 0 | 0 |" in text
+    assert f"| 128k | random, `kinetix` | `{manifest.config_hash}` | levelproof " in text
+    assert "levelproof regenerate manifest=data/128k/s budget=128k out=again" in text
+    assert "hf download me/levels" in text
+    assert "cc-by-4.0, chosen by those who publish" in text
+    figures = re.findall(r"!\[.*\]\((.*)\)", text)
+    assert figures == ["figures/solved.png", "figures/solve-rate.png", "figures/steps-to-goal.png"]
+    for figure in figures:
+        colours = Image.open(dataset / figure).convert("RGB").getcolors(1 << 24)
+        assert colours
+        assert len(colours) > 10, "it shows something"
+
+
+def test_again_overwrites_its_own_card_and_nobody_elses(dataset: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(cards, "SAMPLE", 2)
+    split = dataset / "64k/s"
+    out = dataset / "OTHER.md"
+    assert main(["card", str(split), "-o", str(out)]) == 0
+    assert main(["card", str(split), "-o", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "It names no licence: choose one with --license" in told
+    assert "license" not in header_of(out)
+    assert "None has been chosen yet" in out.read_text()
+    assert re.findall(r"!\[.*\]\((.*)\)", out.read_text()) == ["figures/solve-rate.png"]
+    out.write_text("mine")
+    assert main(["card", str(split), "-o", str(out)]) == 2
+    assert out.read_text() == "mine"
+    assert main(["card", str(split), "-o", str(tmp_path / "README.md")]) == 2
+    assert main(["card", str(tmp_path / "128k/s")]) == 2
+    *_, mine, below, nothing = capsys.readouterr().err.splitlines()
+    assert mine.endswith("`levelproof card` did not write it: name another file with -o.")
+    assert "is not below" in below
+    assert "There is no split at" in nothing
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("witnesses", "words"), [(0, "n<1K"), (3, "n<1K"), (4, "1K<n<10K"), (6 * 10**6, "1B<n<10B")])
+def test_its_size_is_that_of_its_transitions(witnesses: int, words: str) -> None:
+    facts = SplitFacts("1M/s", {"solved": witnesses}, witnesses, witnesses, np.arange(0), 0, 0, "1M", "", "", [])
+    header = readme("name", [facts], Wishes(), [], "0.1.0").split("---\n")[1]
+    assert yaml.safe_load(header)["size_categories"] == [words]
+
+
+def test_intervals_are_wilsons() -> None:
+    assert np.allclose(Share(81, 263).interval, (0.2552, 0.3662), atol=1e-4)  # Newcombe, 1998
+    assert Share(0, 10).interval == pytest.approx((0.0, 0.2775), abs=1e-4)
+    assert Share(10, 10).interval == pytest.approx((0.7225, 1.0), abs=1e-4)
