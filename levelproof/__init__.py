@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from levelgen.task.environment import starts as starts
     from levelgen.task.rules import TaskParams as TaskParams
     from physics.types import Size as Size
+    from pipeline.read.columns import levels_from as levels_from
     from pipeline.store.manifest import read_manifest as read_manifest
     from pipeline.store.shard import Shard as Shard
     from pipeline.version import __version__ as __version__
@@ -37,6 +38,7 @@ HOME = {
     "TaskParams": "levelgen.task.rules",
     "__version__": "pipeline.version",
     "draw": "levelgen.pictures.raster",
+    "levels_from": "pipeline.read.columns",
     "make": "levelgen.task.environment",
     "read_level_file": "levelgen.files.level_file",
     "read_manifest": "pipeline.store.manifest",

@@ -11,7 +11,8 @@ DOES = "write levels and their witnesses for other programs"
 EXAMPLE = """\
 levelproof export data/128k/s 7 -o level.json          a level that Kinetix opens
 levelproof export data/128k/s --format kinetix -o k    a data set that Kinetix' reader opens
-levelproof export data/128k/s --format kinetix -o k --where "steps_to_goal < 64\""""
+levelproof export data/128k/s --format kinetix -o k --where "steps_to_goal < 64"
+levelproof export data/128k/s --format parquet -o t    levels and manifest as a table"""
 JSON = "json"  # one level; all others take a split
 WHERE = "only levels for which this condition on the manifest's columns holds (default: label = 'solved')"
 
@@ -22,8 +23,14 @@ def _kinetix(split: Path, where: str | None, out: Path) -> None:
     export_kinetix(split, where, out)
 
 
+def _parquet(split: Path, where: str | None, out: Path) -> None:
+    from pipeline.read.parquet import export_parquet
+
+    export_parquet(split, where, out)
+
+
 # What writes the levels of a split for which a condition holds (None: each format's own) to a new file or folder
-FORMATS: dict[str, Callable[[Path, str | None, Path], None]] = {"kinetix": _kinetix}
+FORMATS: dict[str, Callable[[Path, str | None, Path], None]] = {"kinetix": _kinetix, "parquet": _parquet}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -162,6 +162,11 @@ def test_questions_are_answered(once: Path, tmp_path: Path) -> None:
     for row in rows_of(split).values():
         done = here(["show", str(split), str(row["level_id"]), "-o", "level.png"], tmp_path)
         assert done.returncode == 0, done.stderr
+    done = here(["card", str(split), "-o", "../README.md"], split)
+    assert done.returncode == 0, done.stderr
+    assert "| level files |" in (once / "data/README.md").read_text()
+    done = here(["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels")], tmp_path)
+    assert done.stdout.startswith(f"{tmp_path / 'levels'}: 2 levels. "), done.stderr
 
 
 def test_what_cannot_be_is_refused(folder: Path) -> None:
