@@ -14,7 +14,10 @@ levelproof export data/128k/s --format kinetix -o k    a data set that Kinetix' 
 levelproof export data/128k/s --format kinetix -o k --where "steps_to_goal < 64"
 levelproof export data/128k/s --format parquet -o t    levels and manifest as a table"""
 JSON = "json"  # one level; all others take a split
-WHERE = "only levels for which this condition on the manifest's columns holds (default: label = 'solved')"
+WHERE = (
+    "only levels for which this condition on the manifest's columns holds "
+    "(default: label = 'solved'; of parquet, every level)"
+)
 
 
 def _kinetix(split: Path, where: str | None, out: Path) -> None:
