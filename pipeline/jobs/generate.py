@@ -1,12 +1,13 @@
 """The job of `levelproof generate`: what is left to do, done by workers or in this process, and said to the user."""
 
 import shlex
-from collections import Counter, deque
-from collections.abc import Collection, Mapping, Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pyarrow.compute as pc
 from rich.console import Console
 
 from configs.schema import JobConfig
@@ -15,6 +16,7 @@ from experts.steps import EnvSteps
 from pipeline.errors import Exit, Failure
 from pipeline.jobs.progress import Board, Tally, say
 from pipeline.jobs.schedule import UnitOutcome, UnitQueue, WorkUnit, levels_text, plan_units
+from pipeline.jobs.seal import Sealer, sealing
 from pipeline.store.checkpoints import require_same_experts
 from pipeline.store.job_note import note_job
 from pipeline.store.layout import quarantine_path
@@ -42,26 +44,28 @@ def generate(
     """
     require_same_experts(job)
     with writing(job, partial(say, console)) as (split, manifest):
-        wanted = set(map(int, origins or (job.level_ids if level_ids is None else level_ids)))
-        done = wanted.intersection(manifest.level_ids.tolist())
+        asked = origins or (job.level_ids if level_ids is None else level_ids)
+        wanted = np.unique(np.fromiter(asked, np.int64, len(asked)))
+        is_done = np.isin(manifest.level_ids, wanted)
+        done = manifest.level_ids[is_done]
         require_same_levels(split, origins or {}, done)
-        queue = UnitQueue(deque(plan_units(sorted(wanted), done, job.levels_per_unit, origins)))
-        note_job(split, job, command, runs(sorted(wanted)))
+        queue = UnitQueue(deque(plan_units(wanted, done, job.levels_per_unit, origins)))
+        note_job(split, job, command, runs(wanted))
         if queue.waiting:
-            solved = _labels(manifest, wanted)["solved"]
+            solved = manifest.counts(is_done).get(Label.SOLVED, 0)
             board = Board(Tally(len(wanted), len(done), solved), console)
-            there = f", {len(done)} are there already" if done else ""
+            there = f", {len(done)} are there already" if len(done) else ""
             board.say(f"{len(wanted)} levels of size {job.size}, {job.budget} env steps each, into {split}{there}")
             try:
-                with board.shown():
-                    _work(job, split, queue, board)
+                with board.shown(), sealing(split, manifest.counting, queue.waiting, board.say) as sealer:
+                    _work(job, split, queue, board, sealer)
             except KeyboardInterrupt:
                 board.say(
                     f"Stopped: {board.tally.done} of {len(wanted)} levels are committed; the same command goes on."
                 )
                 raise
             manifest = read_manifest(split, ["label", "env_steps"])
-            spent = _spent(manifest, wanted - done, board.tally.spent) if board.tally.spent.shown else ""
+            spent = _spent(manifest, np.setdiff1d(wanted, done), board.tally.spent) if board.tally.spent.shown else ""
         else:
             print(f"Nothing to do: all {len(wanted)} levels are there.")
             spent = ""
@@ -69,7 +73,7 @@ def generate(
     return Exit.QUARANTINED if queue.quarantined else Exit.DONE
 
 
-def _work(job: JobConfig, split: Path, queue: UnitQueue, board: Board) -> None:
+def _work(job: JobConfig, split: Path, queue: UnitQueue, board: Board, sealer: Sealer) -> None:
     def settle(outcomes: Sequence[UnitOutcome]) -> None:
         """Account for attempts that ended together."""
         failed: dict[tuple[str, bool], list[WorkUnit]] = {}  # by cause, and whether they are given up
@@ -78,6 +82,7 @@ def _work(job: JobConfig, split: Path, queue: UnitQueue, board: Board) -> None:
             board.ended(unit, outcome.summary)
             if outcome.fatal:
                 raise Failure(outcome.fatal)
+            sealer.ended(unit, committed=outcome.summary is not None)
             note = quarantine_path(split, unit.name)
             if outcome.summary:
                 note.unlink(missing_ok=True)
@@ -89,6 +94,8 @@ def _work(job: JobConfig, split: Path, queue: UnitQueue, board: Board) -> None:
                 note.write_text(f"Failed {queue.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n")
         for (cause, last), units in failed.items():
             board.say(f"{levels_text(units).capitalize()} failed ({cause}): {'given up' if last else 'trying again'}.")
+        if outcomes:
+            sealer.look()
 
     if job.executor == "inline":
         from pipeline.jobs.inline import run
@@ -97,14 +104,9 @@ def _work(job: JobConfig, split: Path, queue: UnitQueue, board: Board) -> None:
     run(job, split, queue, settle, board)
 
 
-def _labels(manifest: Manifest, wanted: Collection[int]) -> Counter[str]:
-    """How many of these levels have which label."""
-    return Counter(manifest.labels[np.isin(manifest.level_ids, list(wanted))].tolist())
-
-
-def _spent(manifest: Manifest, made: Collection[int], spent: EnvSteps) -> str:
+def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
     """What this run's env steps were for."""
-    rows = manifest.table.filter(np.isin(manifest.level_ids, list(made)))
+    rows = manifest.table.filter(np.isin(manifest.level_ids, made))
     steps, label = (rows.column(name).to_numpy() for name in ("env_steps", "label"))
     shares = {
         "of scouts": spent.scouted,
@@ -118,11 +120,11 @@ def _spent(manifest: Manifest, made: Collection[int], spent: EnvSteps) -> str:
     return f"{sum(spent):,} env steps: {told}."
 
 
-def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: UnitQueue, spent: str) -> None:
+def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, queue: UnitQueue, spent: str) -> None:
     """Where it is, what came of it, and what to type next. On stdout."""
-    labels, folder = _labels(manifest, wanted), shlex.quote(str(split))
+    labels, folder = manifest.counts(np.isin(manifest.level_ids, wanted)), shlex.quote(str(split))
     total = sum(labels.values())
-    counts = ", ".join(f"{count} {label}" for label, count in labels.most_common())
+    counts = ", ".join(f"{count} {label}" for label, count in labels.items())
     print(f"{split}: {total} levels, {counts}." if total else f"{split}: nothing is committed.")
     if spent:
         print(spent)
@@ -130,6 +132,6 @@ def _closing(split: Path, manifest: Manifest, wanted: Collection[int], queue: Un
         print(f"Given up: {levels_text([unit])}, for the reason in {quarantine_path(split, unit.name)}")
     if total:
         print(f"Next:  levelproof inspect {folder}")
-    solved = manifest.level_ids[manifest.labels == "solved"]
-    if len(solved):
-        print(f"       levelproof show {folder} {solved[0]} -o level.gif")
+    solved = pc.index(manifest.table.column("label"), Label.SOLVED.value).as_py()
+    if solved >= 0:
+        print(f"       levelproof show {folder} {manifest.level_ids[solved]} -o level.gif")

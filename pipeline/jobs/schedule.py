@@ -4,6 +4,8 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from experts.steps import EnvSteps
 from pipeline.store.layout import unit_name
 from pipeline.store.origins import Origin
@@ -28,18 +30,23 @@ class WorkUnit:
 
 
 def plan_units(
-    wanted: Iterable[int], done: Collection[int], unit: int, origins: Mapping[int, Origin] | None = None
+    wanted: Collection[int] | np.ndarray,
+    done: Collection[int] | np.ndarray,
+    unit: int,
+    origins: Mapping[int, Origin] | None = None,
 ) -> list[WorkUnit]:
-    """Units that cover what is wanted, ascending, and not done.
+    """Units that cover what is wanted (ascending) and not done, ascending.
 
     A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same ids. Ids of levels
     with origins lie far apart: of those a unit has as many as it may.
     """
-    left: dict[int, list[int]] = {}
-    for index, level_id in enumerate(level_id for level_id in wanted if level_id not in done):
-        left.setdefault((index if origins else level_id) // unit, []).append(level_id)
-    of = origins or {}
-    return [WorkUnit(tuple(ids), tuple(of[i] for i in ids if i in of)) for ids in left.values()]
+    there = np.fromiter(wanted, np.int64, len(wanted))
+    left = there[~np.isin(there, np.fromiter(done, np.int64, len(done)))]
+    numbers = (np.arange(len(left)) if origins else left) // unit
+    firsts = np.flatnonzero(np.diff(numbers, prepend=-1)).tolist()
+    ids, of = left.tolist(), origins or {}
+    parts = [tuple(ids[first:end]) for first, end in zip(firsts, [*firsts[1:], len(ids)], strict=True)]
+    return [WorkUnit(part, tuple(of[i] for i in part if i in of)) for part in parts]
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 import shlex
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -14,10 +15,10 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from pipeline.errors import Failure, LevelproofError, UserError
 from pipeline.jobs.progress import say
 from pipeline.jobs.schedule import WorkUnit
-from pipeline.store import seal as sealing
+from pipeline.store import seal as store
 from pipeline.store.disk import REFUSALS
 from pipeline.store.layout import fragment_path, unit_name
-from pipeline.store.manifest import require_manifest
+from pipeline.store.manifest import Fragment, require_manifest
 from pipeline.store.seal import Piece, seal
 from pipeline.store.split import taken
 
@@ -34,7 +35,7 @@ def seal_split(split: Path, rows: int | None, console: Console) -> None:
     require_manifest(split, [])
     with taken(split, partial(say, console)) as manifest:
         pieces = list(map(Piece.of, manifest.counting))
-        groups = sealing.plan(pieces, rows or sealing.ROWS)
+        groups = store.plan(pieces, rows or store.ROWS)
         columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
             task = bar.add_task("levels sealed", total=sum(piece.rows for group in groups for piece in group))
@@ -60,16 +61,31 @@ class _Stopped(Exception):
     """The job ends before a fragment is sealed."""
 
 
+@contextmanager
+def sealing(
+    split: Path, fragments: Iterable[Fragment], units: Iterable[WorkUnit], tell: Callable[[str], None]
+) -> Iterator["Sealer"]:
+    """A `Sealer` beside a job. In the end it seals all that there is enough of; where the job fails, it stops."""
+    sealer = Sealer(split, fragments, units, tell)
+    try:
+        yield sealer
+        sealer.finish()
+    finally:
+        sealer.stop()
+
+
 class Sealer:
     """Seals what a job has committed, in a thread, while its workers go on.
 
     What goes wrong is told once and ends the sealing, never the job.
     """
 
-    def __init__(self, split: Path, pieces: Iterable[Piece], units: Iterable[WorkUnit], tell: Callable[[str], None]):
-        """Of a split with these fragments, of which these units, ascending, are to come."""
+    def __init__(
+        self, split: Path, fragments: Iterable[Fragment], units: Iterable[WorkUnit], tell: Callable[[str], None]
+    ) -> None:
+        """Of a split with these fragments, to which these units, ascending, are to come."""
         self._split, self._tell = split, tell
-        self._pieces = {piece.path: piece for piece in pieces}
+        self._pieces = {fragment.path: Piece.of(fragment) for fragment in fragments}
         self._coming, self._ended = deque(units), set[str]()  # names
         self._thread, self._stop = ThreadPoolExecutor(1), threading.Event()
         self._at_work: tuple[list[Piece], Future[Piece]] | None = None
@@ -91,7 +107,7 @@ class Sealer:
             self._ended.remove(self._coming.popleft().name)
         first = self._coming[0].level_ids[0] if self._coming else None
         end = None if first is None else fragment_path(self._split, unit_name(first, first))
-        group = sealing.due((piece for piece in self._pieces.values() if end is None or piece.path < end), sealing.ROWS)
+        group = store.due((piece for piece in self._pieces.values() if end is None or piece.path < end), store.ROWS)
         if group and not self._broken:
             self._at_work = group, self._thread.submit(seal, self._split, group, self._go_on)
 

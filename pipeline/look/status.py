@@ -1,7 +1,6 @@
 """How far a split is: what the last command wanted, what is committed, what was given up, whether a run is at work."""
 
 import json
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +45,12 @@ def look(split: Path) -> dict[str, Any]:
         raise UserError(f"The file {split / JOB} is damaged: run `levelproof generate` for this split again.") from None
     wanted = note.level_ids
     manifest = read_manifest(split, ["label"])
-    labels = manifest.labels[inside(manifest.level_ids, wanted)]
+    done = inside(manifest.level_ids, wanted)
     return {
         "split": str(split),
         "wanted": int((wanted[:, 1] - wanted[:, 0] + 1).sum()),
-        "done": len(labels),
-        "labels": dict(sorted(Counter(labels.tolist()).items())),
+        "done": int(done.sum()),
+        "labels": dict(sorted(manifest.counts(done).items())),
         "quarantined": sorted(path.name for path in (split / QUARANTINE).glob("*.txt")),
         "running": is_written(split),
         "command": note.command,

@@ -188,6 +188,11 @@ class Manifest:
         labels = self.table.column("label").combine_chunks().dictionary_encode()
         return np.array(labels.dictionary.to_pylist(), dtype=str)[labels.indices.to_numpy()]
 
+    def counts(self, of: np.ndarray) -> dict[str, int]:
+        """How many of these rows (a mask) have which label, the most frequent first."""
+        found = self.table.column("label").filter(of).value_counts().to_pylist()
+        return {of["values"]: of["counts"] for of in sorted(found, key=lambda of: -of["counts"])}
+
     @property
     def shards(self) -> frozenset[str]:
         """Paths below the split. KeyError where the column was not read."""

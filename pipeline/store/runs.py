@@ -10,8 +10,9 @@ TOLD = 4  # runs of levels in a message
 def runs(numbers: Sequence[int] | np.ndarray) -> list[tuple[int, int]]:
     """First and last of each run of consecutive numbers, ascending."""
     ordered = np.unique(np.asarray(numbers, np.int64))
-    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
-    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
+    ends = np.flatnonzero(np.diff(ordered) != 1)
+    firsts, lasts = (ordered[i] for i in (np.r_[0, ends + 1], np.r_[ends, -1])) if len(ordered) else (ordered, ordered)
+    return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
 
 
 def inside(level_ids: np.ndarray, runs: np.ndarray) -> np.ndarray:

@@ -80,15 +80,21 @@ def seal(
 ) -> Piece:
     """Merge these fragments and their shards; the sealed fragment. Only the writer of a split may.
 
-    Kept experts stay where they are. `moved` and `rows_a_file` are those of `merge_shards`.
+    Kept experts stay where they are. `moved` and `rows_a_file` are those of `merge_shards`; `moved` is called before
+    each fragment is read, too.
 
     Raises:
         Failure: a fragment or a shard is damaged; nothing has changed.
         OSError: the disk refuses; nothing has changed.
     """
+
+    def read(path: Path) -> tuple[Fragment, pa.Table]:
+        moved(0)
+        return read_fragment(path)
+
     paths = {piece.path for piece in pieces}
     with ThreadPoolExecutor(THREADS) as threads:
-        parts = list(threads.map(read_fragment, sorted(paths)))
+        parts = list(threads.map(read, sorted(paths)))
     table, _ = each_once(parts)
     level_ids, rows = (table.column(name).to_pylist() for name in ("level_id", "row"))
     shards = {name: data_path(split, name) for name in named_by([of for _, of in parts], "shard")}

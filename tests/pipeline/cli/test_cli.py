@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli import main
+from pipeline.store import seal
+from pipeline.store.locks import only_writer
 from pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import ROOT, TINY, assert_refused, here, run
 
@@ -246,3 +248,46 @@ def test_a_closed_pipe_is_no_error(made: Path) -> None:
     )
     assert done.stdout == "{"
     assert "Traceback" not in done.stderr
+
+
+def answers(split: Path) -> dict[str, object]:
+    """What commands say of a split, but for the bytes that it takes."""
+    folder, name, level = split.parents[2], "data/5k/s", str(solved_level(split))
+    facts = json.loads(here(["inspect", name, "--where", "level_id < 4", "--json"], folder).stdout)
+    rows = [row | {"shard": bool(row["shard"]), "row": None} for row in facts.pop("rows")]
+    for words in ["show", name, level, "-o", "level.svg"], ["export", name, level, "-o", "level.json"]:
+        assert here(words, folder).returncode == 0
+    files = [(folder / file).read_bytes() for file in ("level.svg", "level.json")]
+    facts = {name: fact for name, fact in facts.items() if "bytes" not in name}
+    return {"facts": facts, "rows": rows, "files": files, "status": here(["status", name], folder).stdout}
+
+
+@pytest.mark.slow
+def test_commands_say_the_same_of_a_split_that_is_sealed_and_it_grows(
+    split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, before = split.parents[2], answers(split)
+    done = here(["seal", "data/5k/s", "--rows", "3"], folder)
+    assert "4 fragments were merged into 2; it has 4 levels in 2 fragments now" in done.stdout, done.stderr
+    assert answers(split) == before
+    assert "there was nothing to seal" in here(["seal", "data/5k/s", "--rows", "3"], folder).stdout
+    assert "Nothing to do: all 4 levels are there" in here(["generate", *TINY, "executor=inline"], folder).stdout
+    monkeypatch.setattr(seal, "ROWS", 3)
+    done = here(["generate", *TINY, "levels=6", "executor=inline"], folder)
+    assert done.returncode == 0, done.stderr
+    assert [fragment.rows for fragment in read_manifest(split).fragments] == [3, 3], "it seals as it goes"
+    assert answers(split) | {"status": ""} == before | {"status": ""}
+    verified = here(["verify", "data/5k/s"], folder)
+    assert verified.returncode == 0, verified.stdout
+
+
+def test_what_cannot_be_sealed_is_refused(tmp_path: Path, split: Path) -> None:
+    assert_refused(here(["seal", "data/1k/s"], tmp_path), 2, "no split at data/1k/s")
+    assert_refused(here(["seal", "data/5k/s", "--rows", "0"], tmp_path), 2, "--rows a number from 1")
+    with only_writer(split):
+        assert_refused(here(["seal", "data/5k/s"], tmp_path), 2, "Another", "is writing to data/5k/s")
+    shard = split / sorted(read_manifest(split).shards)[0]
+    (shard / "act/c/0/0/0").write_bytes(b"x")
+    before = sorted(split.rglob("*"))
+    assert_refused(here(["seal", "data/5k/s"], tmp_path), 1, "missing or damaged", shard.name)
+    assert sorted(split.rglob("*")) == before

@@ -22,10 +22,12 @@ SETTINGS = ["levels=12", "executor=inline"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with data/8k/s, made with `keep_experts=true` by a worker that saves several units at once."""
+    """With data/8k/s, made with `keep_experts=true` by a worker that saves several units at once, and sealed."""
     folder = tmp_path_factory.mktemp("ladder")
     done = run(["generate", *SETTINGS, "budget=8k", "keep_experts=true", "executor=ray", "workers=1", "unit=2"], folder)
     assert done.returncode == 0, done.stderr
+    done = here(["seal", "data/8k/s", "--rows", "5"], folder)
+    assert "6 fragments were merged into 2; it has 12 levels in 2 fragments now" in done.stdout
     return folder
 
 
