@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def plan_units(
     numbers = (np.arange(len(left)) if origins else left) // unit
     firsts = np.flatnonzero(np.diff(numbers, prepend=-1)).tolist()
     ids, of = left.tolist(), origins or {}
-    parts = [tuple(ids[first:end]) for first, end in zip(firsts, [*firsts[1:], len(ids)], strict=True)]
+    parts = [tuple(ids[first:end]) for first, end in pairwise([*firsts, len(ids)])]
     return [WorkUnit(part, tuple(of[i] for i in part if i in of)) for part in parts]
 
 

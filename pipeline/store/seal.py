@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from pipeline.store.layout import begun_path, data_path, fragment_of, new_attempt, unit_name
 from pipeline.store.leftovers import disown, drop
@@ -128,10 +127,9 @@ def seal(
 
 def _in_one_shard(table: pa.Table, shard: str) -> pa.Table:
     """The same rows, of which those with a witness have it in this shard, one after another."""
-    has = pc.is_valid(table.column("shard"))
-    rows = pa.array(np.cumsum(has.to_numpy()) - 1, pa.int32())
-    for name, values in ("shard", pa.scalar(shard)), ("row", rows):
-        field = COLUMNS.field(name)
-        values = pc.if_else(has, values, pa.scalar(None, field.type))
-        table = table.set_column(COLUMNS.names.index(name), field, values)
+    without = table.column("shard").is_null().to_numpy()
+    rows = pa.array(np.cumsum(~without) - 1, pa.int32(), mask=without)
+    names = pa.array(np.full(len(without), shard, object), pa.string(), mask=without)
+    for name, values in ("shard", names), ("row", rows):
+        table = table.set_column(COLUMNS.names.index(name), COLUMNS.field(name), values)
     return table

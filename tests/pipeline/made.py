@@ -4,6 +4,7 @@ And a real split without training.
 """
 
 import dataclasses
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -28,6 +29,7 @@ from pipeline.jobs.unit import commit
 from pipeline.store.contents import highest
 from pipeline.store.fields import arrays_of, tree_of
 from pipeline.store.layout import split_path
+from pipeline.store.manifest import fragment_paths
 
 T = TypeVar("T")
 PLAYED = 64  # levels of `played_split`
@@ -148,3 +150,13 @@ def made_split(folder: Path, units: Sequence[Sequence[Label]], *words: str) -> P
         commit(job, path, WorkUnit(tuple(ids)), made_result(ids, list(labels)))
         first += len(labels)
     return path
+
+
+def commit_copy(source: Path, number: int, split: Path) -> None:
+    """Commit to `split` a unit that another one of the same configuration has, by its number there."""
+    fragment = fragment_paths(source)[number]
+    for folder in ("manifest", "shards"):
+        (split / folder).mkdir(parents=True, exist_ok=True)
+    for shard in (source / "shards").glob(f"{fragment.stem}-*"):
+        shutil.copytree(shard, split / "shards" / shard.name)
+    shutil.copy(fragment, split / "manifest")

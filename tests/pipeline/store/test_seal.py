@@ -28,7 +28,7 @@ from pipeline.store.leftovers import clean
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.seal import CROWD, Piece, due, plan, seal
 from pipeline.store.shard import Shard
-from tests.pipeline.made import made_job, made_result, made_split
+from tests.pipeline.made import commit_copy, made_job, made_result, made_split
 
 UNITS = 6  # of two levels each, one of them solved
 
@@ -197,10 +197,7 @@ def test_any_sequence_of_commits_seals_and_kills(made: Path, tmp_path: Path, ste
         elif step == "seal":
             sealed(split, number)
         elif 2 * number not in there:
-            fragment = fragment_paths(made)[number]
-            (shard,) = (made / "shards").glob(f"{fragment.stem}-*")
-            shutil.copytree(shard, split / "shards" / shard.name)
-            shutil.copy(fragment, split / "manifest")
+            commit_copy(made, number, split)
             there |= {2 * number, 2 * number + 1}
         assert whole(split) == {level_id: expected[level_id] for level_id in there}
     sealed(split, 100)
