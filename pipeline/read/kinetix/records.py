@@ -21,6 +21,9 @@ from physics.types import Size
 T = TypeVar("T")
 
 WORLD = "env_state/"  # before the names of the reference's state
+# m, where the reference has joints and thrusters that are not active, at an episode's start. Later such a joint is at
+# 0, and such a thruster where it would be
+UNUSED = {"joint": np.float32(256), "thruster": np.float32(0)}
 OF_RECORD = {
     "joint_point": f"{WORLD}joint/global_position",
     "thruster_point": f"{WORLD}thruster/global_position",
@@ -44,6 +47,11 @@ def fields_of(level: Level, record: Record) -> Fields:
         f"{WORLD}{name}": values.reshape(count, RECORD_STEPS, *values.shape[1:]) for name, values in moving.items()
     }
     moving |= {theirs: np.moveaxis(np.asarray(getattr(record, ours)), -1, 0) for ours, theirs in OF_RECORD.items()}
+    for kind, at_start in UNUSED.items():
+        unused = ~np.asarray(getattr(level.model, f"{kind}_active")).T[:, None, :, None]
+        points, start = moving[f"{WORLD}{kind}/global_position"], moving[f"{WORLD}timestep"][..., None, None] == 0
+        later = np.float32(0) if kind == "joint" else points
+        moving[f"{WORLD}{kind}/global_position"] = np.where(unused, np.where(start, at_start, later), points)
     still = level_to_kinetix(level) | fillers(level)
     still |= {
         "polygon_highlighted": np.zeros((count, size.polygons), bool),  # by the reference's editor

@@ -57,7 +57,9 @@ def test_every_bit_of_a_record_is_there(split: Path, tmp_path: Path) -> None:
     assert_same("env_state/polygon/position", ours["record/state/position"][:, :, :polygons])
     assert_same("env_state/circle/position", ours["record/state/position"][:, :, polygons:])
     assert_same("env_state/circle_shape_roles", still("role")[:, :, polygons:])
-    assert_same("env_state/joint/global_position", ours["record/joint_point"])
+    at_rest = np.where(ours["record/timestep"] == 0, np.float32(256), np.float32(0))[..., None, None]
+    active = still("model/joint_active")[..., None]
+    assert_same("env_state/joint/global_position", np.where(active, ours["record/joint_point"], at_rest))
     points = ours["record/manifold/point"]
     assert_same(
         "env_state/acc_rr_manifolds/collision_point",
