@@ -23,11 +23,16 @@ if TYPE_CHECKING:
     from levelgen.task.rules import TaskParams as TaskParams
     from physics.types import Size as Size
     from pipeline.read.columns import levels_from as levels_from
+    from pipeline.read.dataset.batch import Batch as Batch
+    from pipeline.read.dataset.dataset import Dataset as Dataset
+    from pipeline.read.dataset.dataset import open as open
     from pipeline.store.manifest import read_manifest as read_manifest
     from pipeline.store.shard import Shard as Shard
     from pipeline.version import __version__ as __version__
 
 HOME = {
+    "Batch": "pipeline.read.dataset.batch",
+    "Dataset": "pipeline.read.dataset.dataset",
     "SIZES": "levelgen.level",
     "Distribution": "levelgen.sampling.distribution",
     "Level": "levelgen.level",
@@ -40,6 +45,7 @@ HOME = {
     "draw": "levelgen.pictures.raster",
     "levels_from": "pipeline.read.columns",
     "make": "levelgen.task.environment",
+    "open": "pipeline.read.dataset.dataset",
     "read_level_file": "levelgen.files.level_file",
     "read_manifest": "pipeline.store.manifest",
     "replay": "experts.witness",

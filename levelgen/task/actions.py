@@ -6,6 +6,7 @@ actuator at a time) and continuous. Facts: `kinetix.environment.utils` 3.0.2.
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from levelgen.level import ACTIONS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
@@ -67,4 +68,4 @@ def action_mask(level: Level) -> Bool[Array, "6 lane"]:
     live = [(free & (level.motor_binding == k)).any(0) for k in range(MOTOR_BINDINGS)]
     live += [(model.thruster_active & (level.thruster_binding == k)).any(0) for k in range(THRUSTER_BINDINGS)]
     assert len(live) == ACTIONS
-    return jnp.stack(live)
+    return (np if isinstance(free, np.ndarray) else jnp).stack(live)  # who reads data need not start JAX

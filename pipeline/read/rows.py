@@ -12,7 +12,6 @@ from pipeline.store.manifest import read_manifest
 from pipeline.store.shard import Shard, open_shard, read_together
 
 COLUMNS = ("level_id", "size", "shard", "row")  # that rows need to be read
-ATTEMPTS = 3  # to find shards that a seal takes away meanwhile
 
 Open = Callable[[Path, str, str], Shard]
 
@@ -30,32 +29,21 @@ def read_rows(split: Path, rows: pa.Table, fields: Iterable[str] | None = None) 
     Raises:
         Failure: a shard is missing or damaged, or has other levels than the manifest says.
     """
-    levels_first = read_levels_first(split, rows, fields)
-    return {name: np.ascontiguousarray(np.moveaxis(x, 0, -1)) for name, x in levels_first.items()}
+    wanted = None if fields is None else list(fields)
+    while True:
+        try:
+            arrays = read_placed(split, rows, wanted)
+            return {name: np.ascontiguousarray(np.moveaxis(x, 0, -1)) for name, x in arrays.items()}
+        except Failure:
+            moved = moved_rows(split, rows)
+            if moved.select(["shard", "row"]).equals(rows.select(["shard", "row"])):
+                raise
+            rows = moved
 
 
 def read_row(split: Path, row: Mapping[str, Any], fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
     """The same of one row, a mapping with COLUMNS."""
     return read_rows(split, pa.Table.from_pylist([{name: row[name] for name in COLUMNS}]), fields)
-
-
-def read_levels_first(
-    split: Path, rows: pa.Table, fields: Iterable[str] | None = None, opened: Open = open_shard
-) -> dict[str, np.ndarray]:
-    """The same with the level axis first, then time; views of what shards hold, where these have time last.
-
-    `opened` opens a shard of a split by its name and its levels' size; a cache may stand in for it.
-    """
-    wanted = None if fields is None else list(fields)
-    for attempt in range(ATTEMPTS):
-        try:
-            return _read(split, rows, wanted, opened)
-        except Failure:
-            moved = moved_rows(split, rows)
-            if attempt == ATTEMPTS - 1 or moved.select(["shard", "row"]).equals(rows.select(["shard", "row"])):
-                raise
-            rows = moved
-    raise AssertionError("unreachable")
 
 
 def moved_rows(split: Path, rows: pa.Table) -> pa.Table:
@@ -67,13 +55,21 @@ def moved_rows(split: Path, rows: pa.Table) -> pa.Table:
     ids = rows.column("level_id").to_numpy()
     table = read_manifest(split, COLUMNS, ids).table
     known = table.column("level_id").to_numpy()
-    if missing := set(ids.tolist()) - set(known.tolist()):
-        raise Failure(f"The split {split} has no level {min(missing)} any more: open it again.")
+    if not (there := np.isin(ids, known)).all():
+        raise Failure(f"The split {split} has no level {ids[~there][0]} any more: open it again.")
     return table.take(np.searchsorted(known, ids))
 
 
-def _read(split: Path, rows: pa.Table, fields: list[str] | None, opened: Open) -> dict[str, np.ndarray]:
-    """Shard by shard."""
+def read_placed(
+    split: Path, rows: pa.Table, fields: Iterable[str] | None = None, opened: Open = open_shard
+) -> dict[str, np.ndarray]:
+    """Named arrays of rows that lie where they say, level axis FIRST, then time: views of what shards hold.
+
+    `opened` opens a shard of a split by its name and its levels' size; a cache may stand in for it.
+
+    Raises:
+        Failure: as `read_rows`.
+    """
     ids, sizes, names, row = (rows.column(name).to_pylist() for name in COLUMNS)
     by_shard: dict[str, list[int]] = {}
     for i, name in enumerate(names):

@@ -1,0 +1,1 @@
+"""A split as training code reads it: trajectories batch first, shuffled, parted, prefetched."""

@@ -1,0 +1,33 @@
+"""Train and validation, told apart by what levels consist of: copies of a level never lie on both sides."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool
+
+from pipeline.errors import UserError
+
+PARTS = TRAIN, VALIDATION = "train", "validation"
+DIGITS = 8  # at the end of a content hash; its first ones make ids of level files
+
+
+def check_share(share: float) -> None:
+    """Raises UserError where it is none."""
+    if not 0 <= share <= 1:
+        raise UserError(f"The share of validation is {share}: give a number from 0 to 1.")
+
+
+def in_part(content_hashes: Sequence[str], part: str | None, share: float) -> Bool[np.ndarray, " level"]:
+    """Which levels are in a part (None: all are); `share` of all hashes is validation.
+
+    It depends on a level's hash and the share alone. With a larger share, what was validation still is.
+
+    Raises:
+        UserError: there is no such part.
+    """
+    if part is None:
+        return np.ones(len(content_hashes), bool)
+    if part not in PARTS:
+        raise UserError(f"There is no part {part!r}: choose {' or '.join(PARTS)}, or None for both.")
+    drawn = np.frombuffer(bytes.fromhex("".join(of[-DIGITS:] for of in content_hashes)), ">u4")
+    return (drawn < share * 16**DIGITS) == (part == VALIDATION)
