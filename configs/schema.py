@@ -19,13 +19,29 @@ from levelgen.sampling.sampler import check_size, control_weights
 from levelgen.task.rules import TaskParams
 
 HASH_DIGITS = 16
+Density = Literal["full", "resume", "witness"]  # how much of a record is stored
+KEY_EVERY = 32  # env steps between key frames, by default
+KEYS_EVERY = tuple(2**i for i in range(1, 9))  # what they may be: they divide a record
+MOST_FRAME_SKIP = 64  # where records are simulated again by those who read them
 MOST_BODIES = 48  # the most that was tried; compiling takes minutes from there
 # Levels per work unit by the number of bodies: about as long to train, and multiples of the experts side by side
 UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MOST_BODIES, 4))
 
 # Where, how many and by whom: these change neither a level nor its expert, so one split may mix them.
 WITHOUT_EFFECT = frozenset(
-    {"levels", "first_level", "level_files", "out", "unit", "executor", "workers", "keep_experts", "continue_from"}
+    {
+        "levels",
+        "first_level",
+        "level_files",
+        "out",
+        "unit",
+        "executor",
+        "workers",
+        "keep_experts",
+        "continue_from",
+        "density",
+        "key_every",
+    }
 )
 FROM_FILES = "files"  # in the results of level files, where those of random levels have their distribution
 
@@ -44,6 +60,8 @@ class JobConfig:
     executor: Literal["ray", "inline"] = "ray"  # ray: a worker per core or GPU; inline: this process, for debugging
     workers: int = 0  # at most so many; 0: one per core, or one per GPU where JAX can use them
     keep_experts: bool = False  # keep experts, too, so that a larger budget can go on with them
+    density: Density = "full"  # what is stored of a record: full (all), resume (states), witness (actions, key frames)
+    key_every: int = KEY_EVERY  # env steps of an episode between key frames of density=witness: a power of 2 up to 256
     continue_from: str = ""  # a split made with keep_experts=true, whose experts go on; empty: none
     distribution: Distribution = field(default_factory=Distribution)  # what random levels are like
     task: TaskParams = field(default_factory=TaskParams)  # what a level asks for
@@ -62,6 +80,10 @@ class JobConfig:
             raise ConfigError(f"unit is {self.unit}: a work unit needs at least 1 level.")
         if self.workers < 0:
             raise ConfigError(f"workers is {self.workers}: use 0 for one per core or GPU, or a number from 1.")
+        if self.key_every not in KEYS_EVERY:
+            raise ConfigError(f"key_every is {self.key_every}: choose one of {', '.join(map(str, KEYS_EVERY))}.")
+        if self.density != "full" and self.task.frame_skip > MOST_FRAME_SKIP:
+            raise ConfigError(f"task.frame_skip is {self.task.frame_skip}: above {MOST_FRAME_SKIP}, use density=full.")
         if not self.out:
             raise ConfigError("out is empty: name a folder, as in out=data.")
 

@@ -8,7 +8,7 @@ many others are replayed with it.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from levelgen.level import Level
 from levelgen.task import rules as task
 from levelgen.task.actions import controls
-from levelgen.task.rules import DEFAULT_RULES, TaskParams, TaskState
+from levelgen.task.rules import DEFAULT_RULES, StepResult, TaskParams, TaskState
 from physics.buffers import zeros_of
 from physics.types import Manifold, State
 from physics.vector import select, unvec, vec
@@ -90,21 +90,30 @@ def _replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskPar
     def act(carry: tuple[TaskState, Manifold], action):
         now, manifold = carry
         after, outcome, _, contacts = task.advance_driven(level, now, controls(level, action), rules, seen=True)
-        record = Record(
-            now.state,
-            manifold,
-            _points(now.state, model.joint_a, model.joint_anchor_a),
-            _points(now.state, model.thruster_body, model.thruster_position),
-            now.timestep,
-            now.last_distance,
-            action,
-            *outcome,
-        )
-        blank = lambda x: jnp.where(outcome.done, jnp.zeros_like(x), x)
-        return (task.restart(level, after, outcome.done), jax.tree.map(blank, contacts)), record
+        return onwards(level, after, contacts, outcome.done), record_of(level, now, manifold, action, outcome)
 
-    model, start = level.model, task.reset(level)
+    start = task.reset(level)
     return jax.lax.scan(act, (start, zeros_of(Manifold, level.size, len(start.timestep))), action)[1]
+
+
+def onwards(level: Level, after: TaskState, contacts: Any, done: Bool[Array, " lane"]) -> tuple[TaskState, Any]:
+    """Where the next env step starts, and the contacts that led there: none where an episode begins."""
+    return task.restart(level, after, done), jax.tree.map(lambda x: jnp.where(done, jnp.zeros_like(x), x), contacts)
+
+
+def record_of(level: Level, now: TaskState, manifold: Any, action: Int[Array, "6 lane"], outcome: StepResult) -> Record:
+    """A row of a record."""
+    model = level.model
+    return Record(
+        now.state,
+        manifold,
+        _points(now.state, model.joint_a, model.joint_anchor_a),
+        _points(now.state, model.thruster_body, model.thruster_position),
+        now.timestep,
+        now.last_distance,
+        action,
+        *outcome,
+    )
 
 
 def _points(state: State, body: Int[Array, "thing lane"], point: Float[Array, "thing 2 lane"]) -> Array:

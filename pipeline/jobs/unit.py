@@ -34,6 +34,7 @@ from pipeline.store.layout import new_attempt
 from pipeline.store.locks import LockRefused, committing
 from pipeline.store.manifest import begin_fragment, write_fragment
 from pipeline.store.provenance import device, versions
+from pipeline.store.schema import Encoding
 from pipeline.store.shard import write_shard
 
 
@@ -120,7 +121,10 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
             save_experts(paths.experts, result.experts)
         if kept:
             write_shard(
-                paths.shard, [int(result.level_ids[i]) for i in kept], shard_arrays(result.levels, result.record, kept)
+                paths.shard,
+                [int(result.level_ids[i]) for i in kept],
+                shard_arrays(result.levels, result.record, kept),
+                Encoding(job.density, job.key_every, job.task),
             )
         write_fragment(paths, rows, job.hash, job.results)
 

@@ -19,8 +19,9 @@ from levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
 from levelgen.task.actions import CHOICES
 from physics.buffers import buffers_of
 from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
+from pipeline.store.density import kept
 from pipeline.store.fields import arrays_of
-from pipeline.store.schema import FieldSpec, field_table
+from pipeline.store.schema import Encoding, FieldSpec, field_table
 
 COUNTED = (  # fields with one entry for each thing of a kind, in the order of Size
     "level/model/n_vertices",
@@ -29,6 +30,7 @@ COUNTED = (  # fields with one entry for each thing of a kind, in the order of S
     "level/model/thruster_active",
 )
 FEWEST = Size(FIXED_POLYGONS, 0, 0, 0)
+FULL = Encoding()
 
 
 class ContentsError(ValueError):
@@ -36,17 +38,29 @@ class ContentsError(ValueError):
 
 
 @cache
-def table_for(size: Size) -> tuple[FieldSpec, ...]:
-    """The field table of a shard of this size."""
+def table_for(size: Size, encoding: Encoding = FULL) -> tuple[FieldSpec, ...]:
+    """The field table of a shard of this size; by default, all the fields that any shard gives back."""
     empty = lambda buffer: np.zeros((*buffer.shape, 0), buffer.dtype)  # of no level
     level, record = (jax.tree.map(empty, buffers_of(of, size)) for of in (Level, Record))
     level, record = arrays_of(level, "level/"), arrays_of(record, "record/")
     for name in ("record/state/", "record/manifold/"):  # of the engine, which knows one moment only
         record |= {of: np.stack([x] * RECORD_STEPS) for of, x in record.items() if of.startswith(name)}
-    return tuple(field_table(level | record))
+    return tuple(field_table(kept(level | record, encoding), encoding.density))
 
 
-def size_in(fields: Any) -> Size:
+def encoding_in(attributes: Mapping[str, Any]) -> Encoding:
+    """How a shard with these attributes stores records.
+
+    Raises:
+        ContentsError: as this program does not.
+    """
+    try:
+        return Encoding.of(attributes)
+    except ValueError as error:
+        raise ContentsError(str(error)) from error
+
+
+def size_in(fields: Any, encoding: Encoding) -> Size:
     """The size whose fields, all of them, are these, as a shard's attributes have them.
 
     Raises:
@@ -56,15 +70,15 @@ def size_in(fields: Any) -> Size:
         shapes = {field["name"]: field["shape"] for field in fields}
         size = Size(*(shapes[name][0] for name in COUNTED))
         fits = all(type(n) is int and low <= n <= MOST_THINGS for low, n in zip(FEWEST, size, strict=True))
-        if fits and fields == _told(size):
+        if fits and fields == _told(size, encoding):
             return size
     raise ContentsError("its fields are those of no size")
 
 
 @cache
-def _told(size: Size) -> list[dict[str, Any]]:
+def _told(size: Size, encoding: Encoding) -> list[dict[str, Any]]:
     """The field table as a shard's attributes have it."""
-    return [field.as_json() for field in table_for(size)]
+    return [field.as_json() for field in table_for(size, encoding)]
 
 
 def check_level_ids(level_ids: Any) -> None:

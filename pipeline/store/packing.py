@@ -5,15 +5,13 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from experts.config import RECORD_STEPS
-from physics.types import Size
-from pipeline.store.contents import table_for
-from pipeline.store.schema import ALONG_TIME, PACKED, FieldSpec
+from pipeline.store.schema import ALONG_TIME, FLAT, PACKED, FieldSpec
 
 
 def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[str, np.ndarray]:
-    """Packed arrays: (level, component, 256) for what changes along time, (level, component) for the rest.
+    """Packed arrays: (level, component, 256) for what changes along time, else (level, component); FLAT (level, byte).
 
-    `arrays` have the level axis last, and time first for `record/` fields.
+    `arrays` have the level axis last, and time first but for `level/` fields.
 
     Raises:
         ValueError: a small integer field holds a value that does not fit 8 bits.
@@ -21,20 +19,22 @@ def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[s
     parts: dict[str, list[np.ndarray]] = {name: [] for name in PACKED}
     levels = next(iter(arrays.values())).shape[-1]
     for field in table:
-        values = _unsigned(arrays[field.name], field)
-        if field.array in ALONG_TIME:
-            parts[field.array].append(np.moveaxis(values, (-1, 0), (0, -1)).reshape(levels, field.count, RECORD_STEPS))
-        else:
-            parts[field.array].append(np.moveaxis(values, -1, 0).reshape(levels, field.count))
+        values = np.moveaxis(_unsigned(arrays[field.name], field), -1, 0)
+        if not field.constant:
+            values = np.moveaxis(values, 1, -1)
+        if field.array == FLAT:
+            values = np.ascontiguousarray(values.reshape(levels, field.count * field.steps)).view(np.uint8)
+        shape = (field.count, RECORD_STEPS) if field.array in ALONG_TIME else (field.extent,)
+        parts[field.array].append(values.reshape(levels, *shape))
     return {name: np.ascontiguousarray(np.concatenate(part, 1)) for name, part in parts.items() if part}
 
 
-def empty(size: Size, names: Iterable[str], levels: int) -> dict[str, np.ndarray]:
+def empty(table: Iterable[FieldSpec], names: Iterable[str], levels: int) -> dict[str, np.ndarray]:
     """Room for these packed arrays of so many levels."""
-    components = {name: sum(field.count for field in table_for(size) if field.array == name) for name in names}
+    extents = {name: sum(field.extent for field in table if field.array == name) for name in names}
     return {
-        name: np.empty((levels, count, *((RECORD_STEPS,) if name in ALONG_TIME else ())), f"u{PACKED[name] // 8}")
-        for name, count in components.items()
+        name: np.empty((levels, extent, *((RECORD_STEPS,) if name in ALONG_TIME else ())), f"u{PACKED[name] // 8}")
+        for name, extent in extents.items()
     }
 
 
@@ -50,23 +50,24 @@ def unpack(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict
     for field in table:
         if field.array not in packed:
             continue
-        part = packed[field.array][:, field.first : field.first + field.count]
-        if field.array in ALONG_TIME:
-            part = np.moveaxis(part.reshape(len(part), *field.shape, RECORD_STEPS), -1, 1)
-        else:
+        part = packed[field.array][:, field.first : field.first + field.extent]
+        if field.array == FLAT:
+            part = np.ascontiguousarray(part).view(f"u{field.bits // 8}")
+        if field.constant:
             part = part.reshape(len(part), *field.shape)
+        else:
+            part = np.moveaxis(part.reshape(len(part), *field.shape, field.steps), -1, 1)
         arrays[field.name] = _original(part, field)
     return arrays
 
 
 def _unsigned(values: np.ndarray, field: FieldSpec) -> np.ndarray:
     """The same bits as unsigned integers; small integers as 8 bits."""
-    bits = PACKED[field.array]
-    if values.dtype.itemsize * 8 == bits:
-        return np.ascontiguousarray(values).view(f"u{bits // 8}")
-    if values.size and not (values.min() >= 0 and values.max() < 2**bits):
-        raise ValueError(f"{field.name} has values from {values.min()} to {values.max()}: they do not fit {bits} bits")
-    return values.astype(f"u{bits // 8}")
+    if values.dtype.itemsize * 8 == field.bits:
+        return np.ascontiguousarray(values).view(f"u{field.bits // 8}")
+    if values.size and not (values.min() >= 0 and values.max() < 2**field.bits):
+        raise ValueError(f"{field.name} has values from {values.min()} to {values.max()}: they do not fit 8 bits")
+    return values.astype(f"u{field.bits // 8}")
 
 
 def _original(values: np.ndarray, field: FieldSpec) -> np.ndarray:

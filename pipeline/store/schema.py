@@ -1,17 +1,22 @@
-"""What is written: the manifest's columns and the shard's field table, with their versions.
+"""What is written: the manifest's columns, and how a shard stores records and where its fields lie, with versions.
 
 A fragment or shard of another version is refused with a sentence, never guessed at.
 """
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pyarrow as pa
 
+from configs.convert import plain, typed
+from configs.errors import ConfigError
+from configs.schema import KEY_EVERY, KEYS_EVERY, MOST_FRAME_SKIP, Density
+from levelgen.task.rules import DEFAULT_RULES, TaskParams
+
 MANIFEST_VERSION = 6
-SHARD_VERSION = 1
+SHARD_VERSION = 2
 
 # Keys of a fragment's metadata
 VERSION_KEY = b"levelproof.manifest_version"
@@ -74,47 +79,103 @@ COLUMNS = pa.schema(
 )
 
 # Packed arrays of a shard; the number is the bits of a component. What changes along time: (level, component, 256).
-PACKED = {"dyn32": 32, "dyn8": 8, "act": 8, "lvl32": 32, "lvl8": 8}
+PACKED = {"dyn32": 32, "dyn8": 8, "act": 8, "lvl32": 32, "lvl8": 8, "witness": 8}
 ALONG_TIME = ("dyn32", "dyn8", "act")
+FLAT = "witness"  # the bytes of everything, field after field: one small chunk a level where little is kept
 WIDE = "record/timestep"  # the integers that do not fit 8 bits; others count, index or enumerate things of one level
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How a shard stores records."""
+
+    density: Density = "full"
+    key_every: int = KEY_EVERY  # env steps of an episode between key frames; of `witness` alone
+    rules: TaskParams = DEFAULT_RULES  # by which what is not stored is computed again
+
+    def as_json(self) -> dict[str, Any]:
+        keys = {"key_every": self.key_every} if self.density == "witness" else {}
+        return {"density": self.density, **keys, "task": plain(self.rules)}
+
+    @staticmethod
+    def of(attributes: Mapping[str, Any]) -> "Encoding":
+        """What a shard's attributes say.
+
+        Raises:
+            ValueError: nothing that this program writes.
+        """
+        try:
+            density, key_every = attributes["density"], attributes.get("key_every", KEY_EVERY)
+            encoding = Encoding(density, key_every, typed(TaskParams, attributes["task"]))
+        except (KeyError, TypeError, ConfigError) as error:
+            raise ValueError("it does not say how records are stored") from error
+        if density not in get_args(Density) or type(key_every) is not int or key_every not in KEYS_EVERY:
+            raise ValueError("it does not say how records are stored")
+        if density != "full" and encoding.rules.frame_skip > MOST_FRAME_SKIP:
+            raise ValueError(f"its env steps have more than {MOST_FRAME_SKIP} physics steps")
+        return encoding
 
 
 @dataclass(frozen=True)
 class FieldSpec:
     """Where one field lies in the packed arrays."""
 
-    name: str  # record/... (changes along time) or level/... (constant)
+    name: str  # record/... and key/... change along time, level/... does not
     dtype: str  # of the original
     shape: tuple[int, ...]  # per level and step
+    steps: int  # rows along time; 1 for what is constant
     array: str  # one of PACKED
-    first: int  # component at which it starts
+    first: int  # component at which it starts; of FLAT, byte
 
     @property
     def count(self) -> int:
         return int(np.prod(self.shape, dtype=int))
 
+    @property
+    def bits(self) -> int:
+        return bits_for(self.name, np.dtype(self.dtype))
+
+    @property
+    def constant(self) -> bool:
+        return self.name.startswith("level/")
+
+    @property
+    def extent(self) -> int:
+        """Components of its array; of FLAT, bytes."""
+        return self.count * self.steps * self.bits // 8 if self.array == FLAT else self.count
+
     def as_json(self) -> dict[str, Any]:
         return asdict(self) | {"shape": list(self.shape)}
 
 
-def array_for(name: str, dtype: np.dtype) -> str:
-    """Which packed array holds a field."""
-    if name == "record/action":
-        return "act"
+def bits_for(name: str, dtype: np.dtype) -> int:
+    """Bits that each number of a field is stored with."""
     bits = 8 if dtype.kind in "bi" and name != WIDE else 32
     if bits == 32 and dtype.itemsize != 4:
-        raise TypeError(f"{name} is {dtype}: fields are bool, int32 or float32")
-    return f"{'dyn' if name.startswith('record/') else 'lvl'}{bits}"
+        raise TypeError(f"{name} is {dtype}: fields are of 32 bits, or bool")
+    return bits
 
 
-def field_table(arrays: Mapping[str, np.ndarray]) -> list[FieldSpec]:
-    """Where all fields lie, in the order of `arrays` (level axis last; time first for `record/` fields)."""
-    used = dict.fromkeys(PACKED, 0)
-    table = []
-    for name, values in arrays.items():
-        target = array_for(name, values.dtype)
-        shape = values.shape[1:-1] if name.startswith("record/") else values.shape[:-1]
-        field = FieldSpec(name, str(values.dtype), shape, target, used[target])
-        used[target] += field.count
+def array_for(name: str, bits: int, density: Density) -> str:
+    """Which packed array holds a field."""
+    if density == "witness":
+        return FLAT
+    if name == "record/action":
+        return "act"
+    return f"{'lvl' if name.startswith('level/') else 'dyn'}{bits}"
+
+
+def field_table(arrays: Mapping[str, np.ndarray], density: Density = "full") -> list[FieldSpec]:
+    """Where all fields lie, in the order of `arrays` (level axis last; time first but for `level/` fields).
+
+    In FLAT, wide numbers come first.
+    """
+    used, table = dict.fromkeys(PACKED, 0), []
+    bits = {name: bits_for(name, values.dtype) for name, values in arrays.items()}
+    for name in sorted(arrays, key=lambda name: -bits[name]) if density == "witness" else arrays:
+        steps, *shape = (1, *arrays[name].shape) if name.startswith("level/") else arrays[name].shape
+        target = array_for(name, bits[name], density)
+        field = FieldSpec(name, str(arrays[name].dtype), tuple(shape[:-1]), steps, target, used[target])
+        used[target] += field.extent
         table.append(field)
     return table

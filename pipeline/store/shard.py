@@ -5,59 +5,102 @@ One trajectory is one chunk: larger chunks save under 1% and cost random reads a
 
 import json
 import stat
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
+from configs.schema import MOST_FRAME_SKIP
 from levelgen.level import name_of
 from physics.types import Size
 from pipeline.errors import Failure
 from pipeline.store.chunks import Chunks, ordinary_file
-from pipeline.store.contents import ContentsError, check_level_ids, check_numbers, size_in, table_for
+from pipeline.store.contents import (
+    FULL,
+    ContentsError,
+    check_level_ids,
+    check_numbers,
+    encoding_in,
+    size_in,
+    table_for,
+)
+from pipeline.store.density import Restored, kept, needed, restored
 from pipeline.store.disk import flush
+from pipeline.store.fields import same_bits
 from pipeline.store.layout import data_path, fragment_of
 from pipeline.store.packing import empty, pack, unpack
-from pipeline.store.schema import SHARD_VERSION, FieldSpec, field_table
+from pipeline.store.schema import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
 
 FORMAT = "levelproof.shard"
 # What reading bytes that nobody vouches for can raise
 DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError)
-LEVEL = 5  # of zstd; 9 saves 2% and encodes at 3 MB/s
+PRESSED: dict[str | None, dict[str, Any]] = {  # how arrays are compressed
+    FLAT: {"clevel": 9, "shuffle": "noshuffle"},  # a few kilobytes a level, bytes of all kinds
+    None: {"clevel": 5, "shuffle": "shuffle"},  # 9 saves 2% and encodes at 3 MB/s
+}
 
 
-def write_shard(path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write `arrays` (level axis last, see `pipeline.store.schema`) to a new group at `path`, durably.
+class EngineDiffers(UserWarning):
+    """The engine does not give the states that were stored, on this machine."""
+
+
+def write_shard(
+    path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.ndarray], encoding: Encoding = FULL
+) -> None:
+    """Write `arrays` (every field, level axis last, see `pipeline.store.schema`) to a new group at `path`, durably.
 
     Raises:
         FileExistsError: `path` is there already.
+        Failure: the engine does not give back what this density would leave out.
         OSError: the disk refuses.
     """
-    table = field_table(arrays)
+    stored = kept(arrays, encoding)
+    if len(stored) < len(arrays):
+        _require_given_back(level_ids, arrays, stored, encoding)
+    table = field_table(stored, encoding.density)
     path.mkdir(parents=True)
     attributes = {
         "format": FORMAT,
         "version": SHARD_VERSION,
         "level_ids": [int(level_id) for level_id in level_ids],
+        **encoding.as_json(),
         "fields": [field.as_json() for field in table],
     }
     with zarr.config.set({"json_indent": None}):  # of a small shard, half would be blanks
         group = zarr.create_group(path, attributes=attributes)
-        for name, values in pack(arrays, table).items():
-            blosc = BloscCodec(cname="zstd", clevel=LEVEL, shuffle="shuffle", typesize=values.dtype.itemsize)
+        for name, values in pack(stored, table).items():
+            blosc = BloscCodec(cname="zstd", typesize=values.dtype.itemsize, **PRESSED.get(name, PRESSED[None]))
             group.create_array(
                 name,
                 data=values,
                 chunks=(1, *values.shape[1:]),
                 shards=values.shape,
                 compressors=[blosc, Crc32cCodec()],
-                dimension_names=("level", "component", "time")[: values.ndim],
+                dimension_names=("level", "byte" if name == FLAT else "component", "time")[: values.ndim],
                 config={"write_empty_chunks": True},
             )
     flush(path)
+
+
+def _require_given_back(
+    level_ids: Sequence[int], arrays: Mapping[str, np.ndarray], stored: Mapping[str, np.ndarray], encoding: Encoding
+) -> None:
+    """Raises Failure where arrays do not come back from what is stored of them."""
+    if encoding.rules.frame_skip > MOST_FRAME_SKIP:
+        raise Failure(f"An env step has {encoding.rules.frame_skip} physics steps: store records with density=full.")
+    found = restored(stored, [field for field in field_table(arrays) if field.name not in stored], encoding)
+    for name, values in found.arrays.items():
+        if len(wrong := np.flatnonzero(~same_bits(values, arrays[name]))):
+            raise Failure(
+                f"The engine on this machine does not give {name} of level {level_ids[wrong[0]]} back, which "
+                f"density={encoding.density} would leave out: use density=full, or a machine and versions such as its "
+                "record was made with."
+            )
 
 
 class Shard:
@@ -81,10 +124,11 @@ class Shard:
                     f"The shard {path} has version {str(version)[:20]}, this program reads {SHARD_VERSION}: "
                     "use the levelproof that wrote it."
                 )
-            self.size = size_in(attributes["fields"])
+            self.encoding = encoding_in(attributes)
+            self.size = size_in(attributes["fields"], self.encoding)
             if size not in (None, name_of(self.size)):
                 raise ContentsError(f"it has levels of size {name_of(self.size)}, and its row says {size}")
-            self.arrays = tuple(dict.fromkeys(field.array for field in table_for(self.size)))
+            self.arrays = tuple(dict.fromkeys(field.array for field in table_for(self.size, self.encoding)))
             check_level_ids(attributes["level_ids"])
             self.level_ids: list[int] = attributes["level_ids"]
             self._chunks: dict[str, Chunks] = {}
@@ -98,12 +142,22 @@ class Shard:
             rows: rows of the shard, in the order wanted.
             fields: names to return (default: all); arrays without any of them are not read.
 
+        What is not stored is computed again; EngineDiffers is warned of where that gives other states than were stored.
+
         Raises:
             Failure: a chunk is missing or damaged, or holds what a level or a record of this size cannot.
         """
         index = range(len(self.level_ids)) if rows is None else [int(row) for row in rows]
         levels_first = read_together([(self, index)], fields)
         return {name: np.ascontiguousarray(np.moveaxis(x, 0, -1)) for name, x in levels_first.items()}
+
+    def unlike(self, rows: Sequence[int]) -> np.ndarray:
+        """Of each row, the first step whose state this machine's engine does not give as it was stored; -1: none.
+
+        Raises:
+            Failure: as `read`.
+        """
+        return _read_alike([(self, rows)], table_for(self.size)).unlike
 
     def put(self, rows: Sequence[int], packed: Mapping[str, np.ndarray]) -> None:
         """Decode the chunks of these rows into packed arrays, row after row.
@@ -130,21 +184,61 @@ def read_together(
     Raises:
         Failure: a chunk is missing or damaged, or holds what a level or a record of this size cannot.
     """
-    size, wanted = parts[0][0].size, None if fields is None else set(fields)
-    table = [field for field in table_for(size) if wanted is None or field.name in wanted]
-    packed = empty(size, dict.fromkeys(field.array for field in table), sum(len(rows) for _, rows in parts))
-    lasts = np.cumsum([len(rows) for _, rows in parts]).tolist()
-    slices = [slice(last - len(rows), last) for last, (_, rows) in zip(lasts, parts, strict=True)]
+    wanted = None if fields is None else set(fields)
+    table = [field for field in table_for(parts[0][0].size) if wanted is None or field.name in wanted]
+    by_encoding: dict[Encoding, list[int]] = {}
+    for i, (shard, _) in enumerate(parts):
+        by_encoding.setdefault(shard.encoding, []).append(i)
+    found = [_read_alike([parts[i] for i in alike], table) for alike in by_encoding.values()]
+    for alike, of in zip(by_encoding.values(), found, strict=True):
+        _warn([parts[i] for i in alike], of.unlike)
+    if len(found) == 1:
+        return found[0].arrays
+    ends = np.cumsum([0] + [len(rows) for _, rows in parts])
+    order = np.concatenate([np.arange(ends[i], ends[i + 1]) for alike in by_encoding.values() for i in alike])
+    back = np.argsort(order)
+    return {name: np.concatenate([of.arrays[name] for of in found])[back] for name in found[0].arrays}
+
+
+def _read_alike(parts: Sequence[tuple[Shard, Sequence[int]]], table: Sequence[FieldSpec]) -> Restored:
+    """The same of shards of one encoding, with the first row of each level that is not as it was stored."""
+    size, encoding = parts[0][0].size, parts[0][0].encoding
+    known = table_for(size, encoding)
+    names = needed((field.name for field in table), (field.name for field in known))
+    chosen = [field for field in known if field.name in names]
+    packed = empty(known, dict.fromkeys(field.array for field in chosen), sum(len(rows) for _, rows in parts))
+    slices = _slices(parts)
     for (shard, rows), mine in zip(parts, slices, strict=True):
         with _reading(shard):
             shard.put(rows, {name: x[mine] for name, x in packed.items()})
     try:
-        return _named(packed, table, size)
+        stored = _named(packed, chosen, size)
     except ValueError:  # one of them holds what it cannot
         for (shard, _), mine in zip(parts, slices, strict=True):
             with _reading(shard):
-                _named({name: x[mine] for name, x in packed.items()}, table, size)
+                _named({name: x[mine] for name, x in packed.items()}, chosen, size)
         raise
+    found = restored({name: np.moveaxis(x, 0, -1) for name, x in stored.items()}, table, encoding)
+    return Restored({name: np.moveaxis(x, -1, 0) for name, x in found.arrays.items()}, found.unlike)
+
+
+def _slices(parts: Sequence[tuple[Shard, Sequence[int]]]) -> list[slice]:
+    ends = np.cumsum([len(rows) for _, rows in parts]).tolist()
+    return [slice(end - len(rows), end) for end, (_, rows) in zip(ends, parts, strict=True)]
+
+
+def _warn(parts: Sequence[tuple[Shard, Sequence[int]]], unlike: np.ndarray) -> None:
+    """Say it where this machine's states are not those that were stored."""
+    for (shard, rows), mine in zip(parts, _slices(parts), strict=True):
+        if len(wrong := np.flatnonzero(unlike[mine] >= 0)):
+            first = int(wrong[0])
+            warnings.warn(
+                f"On this machine the engine computes other states than those that were stored of {len(wrong)} of "
+                f"{len(rows)} levels of the shard {shard.path}, of level {shard.level_ids[rows[first]]} from step "
+                f"{unlike[mine][first]} on: between key frames, states are this machine's own.",
+                EngineDiffers,
+                stacklevel=3,
+            )
 
 
 def _named(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec], size: Size) -> dict[str, np.ndarray]:

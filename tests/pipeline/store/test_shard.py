@@ -137,6 +137,6 @@ def test_a_missing_file_is_seen(shard: Path, file: str) -> None:
 
 def test_another_version_is_refused(shard: Path) -> None:
     attributes = shard / "zarr.json"
-    attributes.write_text(attributes.read_text().replace('"version": 1', '"version": 2'))
-    with pytest.raises(Failure, match="has version 2, this program reads 1"):
+    attributes.write_text(attributes.read_text().replace('"version": 2', '"version": 3'))
+    with pytest.raises(Failure, match="has version 3, this program reads 2"):
         Shard(shard)

@@ -1,0 +1,159 @@
+"""What shards of each density keep of records, and the rest computed again: arrays from arrays.
+
+`full` keeps every field. `resume` keeps states, so that an episode goes on from any of them; what else there is to know
+comes of one env step from each. `witness` keeps the level, the actions, where episodes end, a key frame every so many
+env steps of an episode, and checksums of all states; the engine simulates the rest again. Where this machine's states
+are others than the checksums say, key frames are the truth, and states between them are those of this machine.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Int
+
+from experts.config import RECORD_STEPS
+from experts.resume import KnownStates, Moves, checksum, resume, timesteps
+from experts.witness import take
+from levelgen.level import Level
+from levelgen.task.rules import TaskState
+from physics.types import State
+from pipeline.store.fields import tree_of
+from pipeline.store.schema import WIDE, Encoding, FieldSpec
+
+MOVES = "record/action", "record/done", "record/goal"
+LAST_DISTANCE = "record/last_distance"
+STATE = "record/state/"
+KEY = "key/"  # in place of `record/`: a field of the key frames
+CHECKSUM = "checksum"  # of each run of `Encoding.key_every` rows
+
+
+Found = tuple[dict[str, np.ndarray], Int[np.ndarray, " level"]]
+
+
+class Restored(NamedTuple):
+    """The fields that were asked for, and how far they are those that were stored."""
+
+    arrays: dict[str, np.ndarray]
+    unlike: Int[np.ndarray, " level"]  # the first row whose state may not be the one that was stored; -1: none
+
+
+def kept(arrays: Mapping[str, np.ndarray], encoding: Encoding) -> dict[str, np.ndarray]:
+    """What is stored of every field (level axis last; time first but for `level/` fields)."""
+    if encoding.density == "full":
+        return dict(arrays)
+    found = {name: x for name, x in arrays.items() if name.startswith("level/") or name in MOVES}
+    states = {name: x for name, x in arrays.items() if name.startswith(STATE)}
+    if encoding.density == "resume":
+        return found | states
+    states[LAST_DISTANCE] = arrays[LAST_DISTANCE]
+    at, there = key_rows(arrays["record/done"], encoding.key_every)
+    for name, x in states.items():
+        frames = np.take_along_axis(x, _along(at, x), 0)
+        found[KEY + name.removeprefix("record/")] = np.where(_along(there, x), frames, np.zeros_like(frames))
+    states, rows = task_states(arrays, STATE, arrays[WIDE]), np.arange(RECORD_STEPS)[:, None]
+    found[CHECKSUM] = in_runs(checksum(states, rows), encoding)
+    return found
+
+
+def needed(wanted: Iterable[str], stored: Iterable[str]) -> set[str]:
+    """The stored fields that the wanted ones come from."""
+    wanted, stored = set(wanted), set(stored)
+    missing = wanted - stored
+    if missing - {WIDE}:
+        return stored
+    return (wanted & stored) | ({"record/done"} if missing else set())
+
+
+def restored(stored: Mapping[str, np.ndarray], wanted: Iterable[FieldSpec], encoding: Encoding) -> Restored:
+    """The wanted fields, from what `needed` says of them; what they do not need is not computed."""
+    specs = {field.name: field for field in wanted}
+    arrays = {name: stored[name] for name in specs if name in stored}
+    if WIDE in specs and WIDE not in stored:
+        arrays[WIDE] = timesteps(stored["record/done"])
+    missing = [name for name in specs if name not in arrays]
+    levels = next(iter(stored.values())).shape[-1]
+    unlike = np.full(levels, -1)
+    if missing and levels:
+        paths = frozenset(name.removeprefix("record/") for name in missing)
+        found, unlike = (_from_states if encoding.density == "resume" else _from_actions)(stored, encoding, paths)
+        arrays |= {name: found[name.removeprefix("record/")] for name in missing}
+    elif missing:
+        arrays |= {name: np.empty((specs[name].steps, *specs[name].shape, 0), specs[name].dtype) for name in missing}
+    return Restored({name: arrays[name] for name in specs}, unlike)
+
+
+def _from_states(stored: Mapping[str, np.ndarray], encoding: Encoding, paths: frozenset[str]) -> Found:
+    """`resume`: one env step from every state."""
+    level, moves = _played(stored)
+    states = KnownStates(tree_of(State, stored, STATE), None, np.ones_like(moves.done))
+    made = resume(level, moves, states, encoding.rules, paths)
+    return made.fields, _first(~made.agrees)
+
+
+def _from_actions(stored: Mapping[str, np.ndarray], encoding: Encoding, paths: frozenset[str]) -> Found:
+    """`witness`: all env steps again, and those of levels that come out differently from their key frames, too."""
+    level, moves = _played(stored)
+    at, there = key_rows(moves.done, encoding.key_every)
+    frames = task_states(stored, KEY + "state/", np.take_along_axis(timesteps(moves.done), at, 0))
+    made = resume(level, moves, None, encoding.rules, paths)
+    assert made.checksum is not None
+    runs = in_runs(made.checksum, encoding) != stored[CHECKSUM]
+    wrong = np.repeat(runs, encoding.key_every, 0) | ~made.agrees
+    led_elsewhere = there & (np.take_along_axis(made.checksum, at, 0) != checksum(frames, at))
+    wrong |= _placed(led_elsewhere, at)
+    unlike = _first(wrong)
+    if len(lanes := np.flatnonzero(unlike >= 0)):
+        mine = take((level, moves, frames, at, there), lanes)
+        level, moves, frames, at, there = mine
+        state, distance = jax.tree.map(lambda x: _placed(x, at), (frames.state, frames.last_distance))
+        again = resume(level, moves, KnownStates(state, distance, _placed(there, at)), encoding.rules, paths)
+        for name, values in made.fields.items():
+            values[..., lanes] = again.fields[name]
+    return made.fields, unlike
+
+
+def _played(stored: Mapping[str, np.ndarray]) -> tuple[Level, Moves]:
+    return tree_of(Level, stored, "level/"), Moves(*(stored[name] for name in MOVES))
+
+
+def task_states(arrays: Mapping[str, np.ndarray], path: str, timestep: np.ndarray) -> TaskState:
+    """States and last distances that are called so, [row, ..., level]."""
+    return TaskState(tree_of(State, arrays, path), timestep, arrays[path.removesuffix("state/") + "last_distance"])
+
+
+def key_rows(
+    done: Bool[np.ndarray, "256 level"], every: int
+) -> tuple[Int[np.ndarray, "key level"], Bool[np.ndarray, "key level"]]:
+    """The rows of key frames, and which of them there are: every so many env steps of an episode, its start left out.
+
+    An episode starts in the level's own state.
+    """
+    timestep = timesteps(done)
+    key = (timestep % every == 0) & (timestep > 0)
+    at = np.argsort(~key, axis=0, kind="stable")[: (RECORD_STEPS - 1) // every]
+    return at, np.take_along_axis(key, at, 0)
+
+
+def in_runs(sums: np.ndarray, encoding: Encoding) -> np.ndarray:
+    """The sum of each run of so many rows, as 32 bits, [run, level]."""
+    runs = RECORD_STEPS // encoding.key_every
+    return sums.reshape(runs, encoding.key_every, sums.shape[-1]).sum(1, dtype=np.uint32)
+
+
+def _placed(frames: np.ndarray, at: Int[np.ndarray, "key level"]) -> np.ndarray:
+    """Key frames [key, ..., level] at their rows, with zeros elsewhere."""
+    rows = np.zeros((RECORD_STEPS, *frames.shape[1:]), frames.dtype)
+    np.put_along_axis(rows, _along(at, frames), frames, 0)
+    return rows
+
+
+def _along(at: Int[np.ndarray, "key level"], values: np.ndarray) -> np.ndarray:
+    """The same rows for each component of what has [row, ..., level]."""
+    return at.reshape(len(at), *(1,) * (values.ndim - 2), at.shape[-1])
+
+
+def _first(wrong: Bool[np.ndarray, "256 level"]) -> Int[np.ndarray, " level"]:
+    """The first row that is; -1: none is."""
+    return np.where(wrong.any(0), wrong.argmax(0), -1)

@@ -1,0 +1,366 @@
+"""Densities: the same bits come back from each, and what is computed again is held to checksums and key frames."""
+
+import json
+import shutil
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import zarr
+from zarr.codecs import BloscCodec, Crc32cCodec
+
+from configs.compose import compose_job
+from configs.errors import ConfigError
+from configs.schema import KEYS_EVERY
+from experts import resume
+from experts.resume import checksum, timesteps
+from experts.witness import Record, replay
+from levelgen.level import SIZES, Level
+from levelgen.sampling.distribution import Distribution
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import DEFAULT_RULES, TaskParams
+from pipeline.errors import Failure
+from pipeline.store import density
+from pipeline.store.contents import table_for
+from pipeline.store.density import CHECKSUM, key_rows, task_states
+from pipeline.store.fields import arrays_of, same_bits, tree_of
+from pipeline.store.packing import pack, unpack
+from pipeline.store.schema import Encoding, field_table
+from pipeline.store.shard import EngineDiffers, Shard, read_together, stored_bytes, write_shard
+from tests.pipeline.made import made_fields
+
+IDS = [5, 9, 12, 13]
+NAME = "shards/000000000005-000000000013-0123abcd.zarr"
+WITNESS = Encoding("witness")
+FREE = ("record/action", "record/done", "record/goal", "record/timestep", "level/role", "level/state/position")
+
+
+@cache
+def played(size: str = "s", rules: TaskParams = DEFAULT_RULES) -> dict[str, np.ndarray]:
+    """Every field of records that the engine made, of random play with episodes of many lengths."""
+    count = len(IDS)
+    levels = jax.tree.map(np.asarray, sample_levels(np.arange(count, dtype=np.int32), SIZES[size], Distribution()))
+    action = np.repeat(np.random.default_rng(3).integers(0, 2, (32, 6, count)), 8, axis=0).astype(np.int32)
+    return arrays_of(levels, "level/") | arrays_of(replay(levels, action, rules), "record/")
+
+
+def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        assert found[name].dtype == values.dtype
+        assert same_bits(found[name], values).all(), name
+
+
+def write(folder: Path, encoding: Encoding, fields: dict[str, np.ndarray] | None = None) -> Shard:
+    path = folder / encoding.density / NAME
+    write_shard(path, IDS, fields or played(), encoding)
+    return Shard(path)
+
+
+@pytest.fixture(autouse=True)
+def silence_is_wanted() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", EngineDiffers)
+        yield
+
+
+def changed(shard: Shard, change: Callable[[dict[str, np.ndarray]], None]) -> Shard:
+    """A shard with right checksums whose stored numbers somebody has changed."""
+    table = table_for(shard.size, shard.encoding)
+    group = zarr.open_group(shard.path, mode="r+")
+    packed = {name: np.asarray(group[name][:]) for name in shard.arrays}  # type: ignore[index]
+    stored = {name: np.moveaxis(x, 0, -1).copy() for name, x in unpack(packed, table).items()}
+    change(stored)
+    for name, values in pack(stored, table).items():
+        group[name][:] = values  # type: ignore[index]
+    return Shard(shard.path)
+
+
+def test_played_records_have_what_there_is_to_get_wrong() -> None:
+    done, contacts = played()["record/done"], played()["record/state/contact_active"]
+    assert done.any()
+    assert not done.all(1).any()
+    assert contacts.any()
+    _, there = key_rows(done, 32)
+    assert 0 < there.sum() < there.size
+
+
+@pytest.mark.parametrize("encoding", [Encoding("resume"), WITNESS, Encoding("witness", 8), Encoding("witness", 256)])
+def test_every_density_gives_every_bit_back(tmp_path: Path, encoding: Encoding) -> None:
+    """And full, made of what it gave, is the full that was: files and all."""
+    full, other = write(tmp_path, Encoding()), write(tmp_path, encoding)
+    assert Shard(other.path).encoding == encoding
+    assert_same(other.read(), played())
+    assert stored_bytes(other.path) < stored_bytes(full.path)
+    write_shard(tmp_path / "back.zarr", IDS, other.read())
+    assert files(tmp_path / "back.zarr") == files(full.path)
+
+
+def files(shard: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(shard)): path.read_bytes() for path in shard.rglob("*") if path.is_file()}
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("size", ["m", "l"])
+@pytest.mark.parametrize("encoding", [Encoding("resume"), WITNESS], ids=lambda of: of.density)
+def test_every_density_gives_every_bit_back_of_larger_levels(tmp_path: Path, size: str, encoding: Encoding) -> None:
+    assert_same(write(tmp_path, encoding, played(size)).read(), played(size))
+
+
+@pytest.mark.parametrize("density", ["resume", "witness"])
+def test_rows_and_fields_as_they_are_asked_for(tmp_path: Path, density: Any) -> None:
+    shard = write(tmp_path, Encoding(density))
+    assert_same(
+        shard.read([2, 0, 2], FREE), {name: played()[name][..., [2, 0, 2]] for name in played() if name in FREE}
+    )
+    wanted = ("record/reward", "record/state/position")
+    assert_same(shard.read([3], wanted), {name: played()[name][..., [3]] for name in played() if name in wanted})
+    nothing = shard.read([])
+    assert {name: x.shape for name, x in nothing.items()} == {name: (*x.shape[:-1], 0) for name, x in played().items()}
+
+
+def test_the_engine_is_not_started_for_what_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shards = [write(tmp_path, Encoding("resume")), write(tmp_path, WITNESS)]
+
+    def start(*_: Any) -> None:
+        raise AssertionError("the engine was started")
+
+    monkeypatch.setattr(density, "resume", start)
+    for shard in shards:
+        shard.read(fields=FREE)
+    shards[0].read(fields=[name for name in played() if name.startswith("record/state/")])
+    with pytest.raises(AssertionError, match="was started"):
+        shards[1].read(fields=["record/reward"])
+
+
+def test_contacts_are_not_written_down_where_nobody_asks_for_them(tmp_path: Path, monkeypatch: Any) -> None:
+    shard, asked = write(tmp_path, WITNESS), []
+    monkeypatch.setattr(density, "resume", lambda *words: asked.append(words[-1]) or resume.resume(*words))
+    shard.read(fields=["record/state/position", "record/action"])
+    assert asked == [{"state/position"}]
+
+
+def test_shards_of_all_densities_are_read_together(tmp_path: Path) -> None:
+    full, resumed, witness = (write(tmp_path, Encoding(density)) for density in ("full", "resume", "witness"))
+    found = read_together([(witness, [1]), (full, [0, 3]), (resumed, [2]), (witness, [2])])
+    assert_same(
+        {name: np.moveaxis(x, 0, -1) for name, x in found.items()},
+        {name: x[..., [1, 0, 3, 2, 2]] for name, x in played().items()},
+    )
+
+
+def ulp(stored: dict[str, np.ndarray], name: str, key: int, level: int) -> None:
+    """The next number, of the last body."""
+    x = stored[name][key, ..., level]
+    flat = x.reshape(-1).view(np.uint32).copy()
+    flat[np.flatnonzero(flat)[-1]] += 1
+    stored[name][key, ..., level] = flat.view(x.dtype).reshape(x.shape)
+
+
+@pytest.fixture
+def keyed() -> tuple[int, int]:
+    """A level with a key frame, and the frame's row."""
+    at, there = key_rows(played()["record/done"], 32)
+    level = int(np.flatnonzero(there[0])[0])
+    return level, int(at[0, level])
+
+
+def test_another_machine_is_told_and_key_frames_bring_its_states_back(tmp_path: Path, keyed: tuple[int, int]) -> None:
+    """What was stored on it differs from what the engine gives here, by one unit in the last place."""
+    level, row = keyed
+    here, told = played()["record/state/position"], f"of level {IDS[level]} from step {row} on"
+    shard = changed(write(tmp_path, WITNESS), lambda stored: ulp(stored, "key/state/position", 0, level))
+    for fields in (None, ["record/state/position"]):  # whatever is asked for
+        with pytest.warns(EngineDiffers, match=rf"1 of 4 levels of the shard .*, {told}"):
+            found = shard.read(fields=fields)["record/state/position"]
+        differs = found.view(np.uint32) != here.view(np.uint32)
+        assert not np.delete(differs, level, -1).any()
+        assert not differs[:row].any()
+        assert differs[row].sum() == 1  # the key frame is the truth
+        assert differs[row + 1 :].any()  # and the engine goes on from there
+        np.testing.assert_allclose(found[row + 1], here[row + 1], atol=1e-4)
+    assert shard.unlike([0, 1, 2, 3]).tolist() == [row if i == level else -1 for i in range(4)]
+    shard.read([level], ["record/done"])  # nothing is said where nothing is simulated
+
+
+def test_a_checksum_that_differs_is_told(tmp_path: Path) -> None:
+    def change(stored: dict[str, np.ndarray]) -> None:
+        stored[CHECKSUM][3, 2] ^= 1
+
+    shard = changed(write(tmp_path, WITNESS), change)
+    with pytest.warns(EngineDiffers, match=f"of level {IDS[2]} from step 96 on"):
+        assert_same(shard.read(), played())
+
+
+def test_ends_of_episodes_that_differ_are_told(tmp_path: Path) -> None:
+    """They are those that were stored, and what the engine thinks of them is not asked."""
+    for kind, run in (("resume", 1), ("witness", 32)):
+        shard = write(tmp_path, Encoding(kind))
+        done = played()["record/done"]
+        level = int(np.flatnonzero(done.any(0))[0])
+        row = int(done[:, level].argmax())
+
+        def change(stored: dict[str, np.ndarray], row: int = row, level: int = level) -> None:
+            stored["record/done"][row, level] = False
+
+        shard = changed(shard, change)
+        assert shard.unlike([level])[0] == row // run * run
+        with pytest.warns(EngineDiffers):
+            assert not shard.read()["record/done"][row, level]
+
+
+def test_any_bit_of_any_state_changes_its_checksum() -> None:
+    states = task_states(played(), "record/state/", played()["record/timestep"])
+    rows = np.arange(256)[:, None]
+    before = checksum(states, rows)
+    rng = np.random.default_rng(0)
+    for x in jax.tree.leaves(states):
+        for _ in range(20):
+            at = tuple(rng.integers(0, n) for n in x.shape)
+            for bit in range(8 * x.itemsize if x.dtype != bool else 1):
+                raw = x.view(f"u{x.itemsize}")
+                raw[at] ^= 1 << bit
+                changes = np.argwhere(checksum(states, rows) != before) if bit in (0, 31) else None
+                assert changes is None or changes.tolist() == [[at[0], at[-1]]]
+                raw[at] ^= 1 << bit
+
+
+def test_checksums_are_those_that_the_docs_describe() -> None:
+    """Word by word, in whole numbers of any length."""
+    states = task_states(played(), "record/state/", played()["record/timestep"])
+    row, level, total = 7, 1, 0
+    words = np.concatenate([
+        np.atleast_1d(x[row, ..., level]).reshape(-1).view(np.uint32) if x.dtype == np.float32
+        else np.atleast_1d(x[row, ..., level]).reshape(-1).astype(np.uint32)
+        for x in jax.tree.leaves(states)
+    ])  # fmt: skip
+    for i, word in enumerate(words.tolist()):
+        h = word ^ ((row * len(words) + i) * 0x9E3779B9 % 2**32)
+        h = (h ^ h >> 16) * 0x85EBCA6B % 2**32
+        h = (h ^ h >> 13) * 0xC2B2AE35 % 2**32
+        total += h ^ h >> 16
+    assert checksum(states, np.arange(256)[:, None])[row, level] == total % 2**32
+
+
+def test_timesteps_come_from_the_ends_of_episodes() -> None:
+    assert same_bits(timesteps(played()["record/done"]), played()["record/timestep"]).all()
+
+
+@pytest.mark.parametrize("density", ["resume", "witness"])
+def test_what_would_not_come_back_is_not_left_out(tmp_path: Path, density: Any) -> None:
+    """A record of another machine, or one that was changed."""
+    fields = {name: x.copy() for name, x in played().items()}
+    fields["record/reward"][200, 2] += 1
+    with pytest.raises(Failure, match=f"does not give record/reward of level 12 back, .*density={density} would leave"):
+        write(tmp_path, Encoding(density), fields)
+    assert not (tmp_path / density).exists()
+
+
+@pytest.mark.campaign
+def test_other_rules_are_those_of_the_shard(tmp_path: Path) -> None:
+    rules = TaskParams(frame_skip=3, max_timesteps=40, dense_reward_scale=0.5)
+    fields = played("s", rules)
+    with pytest.raises(Failure, match="does not give"):
+        write(tmp_path, WITNESS, fields)
+    assert_same(write(tmp_path, replace(WITNESS, rules=rules), fields).read(), fields)
+
+
+ABOUT: dict[str, dict[str, Any]] = {
+    "another density": {"density": "full"},
+    "the other density": {"density": "resume"},
+    "no density": {"density": "dense"},
+    "no word": {"density": ["witness"]},
+    "another k": {"key_every": 16},
+    "no k": {"key_every": 0},
+    "half a k": {"key_every": 32.0},
+    "no number": {"key_every": "32"},
+    "k beyond the record": {"key_every": 512},
+    "a task that never ends": {"task": {"frame_skip": 10**9}},
+    "a task of another type": {"task": {"frame_skip": "2"}},
+    "a task that is none": {"task": 7},
+    "a task with more": {"task": {"gravity": 1.0}},
+}
+
+
+@pytest.fixture(scope="module")
+def witness(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("good"), WITNESS).path
+
+
+@pytest.mark.parametrize("name", ABOUT)
+def test_a_shard_that_says_otherwise_is_refused(witness: Path, tmp_path: Path, name: str) -> None:
+    path = Path(shutil.copytree(witness, tmp_path / NAME))
+    document = json.loads((path / "zarr.json").read_text())
+    document["attributes"] |= ABOUT[name]
+    (path / "zarr.json").write_text(json.dumps(document))
+    with pytest.raises(Failure) as raised:
+        Shard(path).read()
+    sentence = str(raised.value)
+    assert sentence.startswith("The shard ")
+    assert "\n" not in sentence
+    assert len(sentence) < 600
+
+
+def test_arrays_of_other_shapes_are_refused(witness: Path, tmp_path: Path) -> None:
+    """Whatever the field table says: a key frame less, or checksums of other runs."""
+    for cut in (4, -4):
+        path = Path(shutil.copytree(witness, tmp_path / str(cut) / NAME))
+        group = zarr.open_group(path, mode="r+")
+        data = np.asarray(group["witness"][:])  # type: ignore[index]
+        data = data[:, :cut] if cut < 0 else np.pad(data, [(0, 0), (0, cut)])
+        blosc = BloscCodec(cname="zstd", clevel=9, shuffle="noshuffle", typesize=1)
+        group.create_array("witness", data=data, chunks=(1, data.shape[1]), shards=data.shape,
+                           compressors=[blosc, Crc32cCodec()], overwrite=True)  # fmt: skip
+        with pytest.raises(Failure, match="not the shape and type that its fields need"):
+            Shard(path).read(fields=["record/action"])
+
+
+def test_worlds_without_sense_end(tmp_path: Path) -> None:
+    """Numbers that no engine makes, in key frames too."""
+
+    def change(stored: dict[str, np.ndarray]) -> None:
+        for name, x in stored.items():
+            if x.dtype == np.float32:
+                x.reshape(-1).view(np.uint32)[:] = made[name] if name in made else np.uint32(0x7FC00001)
+
+    made = {name: x.reshape(-1).view(np.uint32) for name, x in made_fields("s", len(IDS)).items() if x.dtype == "f4"}
+    shard = changed(write(tmp_path, WITNESS), change)
+    with pytest.warns(EngineDiffers):
+        shard.read()
+
+
+def test_tables_of_all_densities_and_distances_lie_side_by_side() -> None:
+    for encoding in (Encoding("resume"), *(Encoding("witness", every) for every in KEYS_EVERY)):
+        table = table_for(SIZES["m"], encoding)
+        for array in dict.fromkeys(field.array for field in table):
+            ends = np.cumsum([0] + [field.extent for field in table if field.array == array])
+            assert [field.first for field in table if field.array == array] == ends[:-1].tolist()
+    assert field_table(made_fields("m")) == list(table_for(SIZES["m"]))
+
+
+def test_density_is_a_setting_that_decides_no_result() -> None:
+    jobs = [compose_job(words) for words in ([], ["density=witness", "key_every=8"])]
+    assert jobs[0].density == "full"
+    assert jobs[0].hash == jobs[1].hash
+    with pytest.raises(ConfigError, match="key_every is 33: choose one of 2, 4"):
+        compose_job(["density=witness", "key_every=33"])
+    with pytest.raises(ConfigError, match=r"task.frame_skip is 65: above 64, use density=full"):
+        compose_job(["density=witness", "task.frame_skip=65"])
+
+
+def test_trees_of_states_are_those_of_records() -> None:
+    """What checksums are made of, in the order of the dataclasses."""
+    record = tree_of(Record, played(), "record/")
+    states = task_states(played(), "record/state/", played()["record/timestep"])
+    assert list(arrays_of(states)) == [
+        *(f"state/{name}" for name in arrays_of(record.state)),
+        "timestep",
+        "last_distance",
+    ]
+    assert isinstance(tree_of(Level, played(), "level/"), Level)
