@@ -45,7 +45,7 @@ from pathlib import Path
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import require_manifest
 columns = ["shard", "row", "size", *columns_in({CONDITION!r})]
-print(select(require_manifest(Path(sys.argv[1]), columns).table, {CONDITION!r}).num_rows)
+print(select(require_manifest(Path(sys.argv[1]), columns, compact=True).table, {CONDITION!r}).num_rows)
 """
 
 

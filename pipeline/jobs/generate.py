@@ -22,7 +22,7 @@ from pipeline.store.job_note import note_job
 from pipeline.store.layout import quarantine_path
 from pipeline.store.manifest import Manifest, read_manifest
 from pipeline.store.origins import Origin, require_same_levels
-from pipeline.store.runs import runs
+from pipeline.store.runs import ascending, runs
 from pipeline.store.split import writing
 
 
@@ -45,7 +45,7 @@ def generate(
     require_same_experts(job)
     with writing(job, partial(say, console)) as (split, manifest):
         asked = origins or (job.level_ids if level_ids is None else level_ids)
-        wanted = np.unique(np.fromiter(asked, np.int64, len(asked)))
+        wanted = ascending(np.fromiter(asked, np.int64, len(asked)))
         is_done = np.isin(manifest.level_ids, wanted)
         done = manifest.level_ids[is_done]
         require_same_levels(split, origins or {}, done)
@@ -64,7 +64,7 @@ def generate(
                     f"Stopped: {board.tally.done} of {len(wanted)} levels are committed; the same command goes on."
                 )
                 raise
-            manifest = read_manifest(split, ["label", "env_steps"])
+            manifest = read_manifest(split, ["label", "env_steps"], compact=True)
             spent = _spent(manifest, np.setdiff1d(wanted, done), board.tally.spent) if board.tally.spent.shown else ""
         else:
             print(f"Nothing to do: all {len(wanted)} levels are there.")

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from pipeline.errors import UserError
 from pipeline.store.manifest import require_manifest
@@ -18,6 +20,7 @@ COMPARED = ("content_hash", "signature")
 # The few that share a half of a signature; the same content has the same signature. Grouping hashes of 8 bytes takes a
 # tenth of the time and the memory that grouping strings takes.
 HALVES = ("signature[1]", "signature[2]")
+FACTORS = np.random.default_rng(0).integers(0, 2**63, 64, np.uint64) * 2 + 1  # of the words of a text; odd
 ALIKE_WITHIN = "CREATE TABLE alike AS SELECT * FROM levels WHERE " + " OR ".join(
     f"hash({half}) IN (SELECT hash({half}) AS half FROM levels GROUP BY half HAVING count(*) > 1)" for half in HALVES
 )
@@ -43,6 +46,47 @@ Found = dict[str, dict[str, Any]]  # same, near -> levels (how many), pairs (the
 def compared(manifest_table: pa.Table) -> pa.Table:
     """What is compared of a manifest's rows; a level's name is its id."""
     return manifest_table.select(["level_id", *COMPARED]).rename_columns(["name", *COMPARED])
+
+
+def compared_of(split: Path, level_ids: np.ndarray) -> pa.Table:
+    """The same of these levels of a split."""
+    return compared(require_manifest(split, COMPARED, level_ids).table)
+
+
+def perhaps_alike(split: Path, level_ids: np.ndarray) -> pa.Table:
+    """The same of those of these levels (ascending ids) that share a half of a signature, and of a few by chance.
+
+    Of all that a split has, only numbers are kept to find them.
+    """
+    numbers = require_manifest(split, ["signature"], each=_numbers_of_halves).table
+    ours = np.isin(numbers["level_id"].to_numpy(), level_ids)
+    shared = np.zeros(len(level_ids), bool)
+    for name in HALVES:
+        half = numbers[name].to_numpy()[ours]
+        ordered = np.sort(half)
+        shared |= np.isin(half, ordered[1:][ordered[1:] == ordered[:-1]])
+    return compared_of(split, level_ids[shared])
+
+
+def _numbers_of_halves(rows: pa.Table) -> pa.Table:
+    halves = {name: _numbers(pc.list_element(rows["signature"], i)) for i, name in enumerate(HALVES)}
+    return pa.table({"level_id": rows["level_id"], **halves})
+
+
+def _numbers(texts: pa.ChunkedArray) -> np.ndarray:
+    """A number for each text, the same for the same text and hardly ever for two."""
+    array = pa.concat_arrays(texts.chunks) if texts.num_chunks else pa.array([], pa.string())
+    widths = pc.binary_length(array).to_numpy()
+    if not len(widths) or (widths != widths[0]).any() or widths[0] > 8 * len(FACTORS):
+        return np.fromiter(map(hash, array.to_pylist()), np.int64)
+    width = int(widths[0])
+    padded = np.zeros((len(array), -(-width // 8) * 8), np.uint8)
+    start = array.offset * width  # texts of one width lie there without gaps
+    padded[:, :width] = np.frombuffer(array.buffers()[2], np.uint8)[start : start + padded[:, :width].size].reshape(
+        -1, width
+    )
+    words = padded.view(np.uint64)
+    return (words * FACTORS[: words.shape[1]]).sum(1).view(np.int64)
 
 
 def compared_in(source: Path) -> pa.Table:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from rich.console import Console
 from rich.table import Table
 
@@ -18,7 +19,7 @@ from configs.compose import identified
 from configs.convert import typed
 from configs.schema import from_files
 from experts.config import RECORD_STEPS
-from experts.labels import DIVERGED
+from experts.labels import DIVERGED, Label
 from levelgen.sampling.distribution import Distribution
 from pipeline.look import duplicates
 from pipeline.read.select import columns_in, select
@@ -29,7 +30,6 @@ from pipeline.store.shard import stored_bytes
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 READ = (  # columns that the facts are from
     "label", "label_reason", "failed_by_noop", "steps_to_goal", "steps_to_first_success", "env_steps", "shard",
-    *duplicates.COMPARED,
 )  # fmt: skip
 SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps")
 
@@ -53,35 +53,42 @@ def inspect(split: Path, where: str | None, rows: int, as_json: bool, against: S
 
 def survey(split: Path, where: str | None = None, rows: int = 10, against: Sequence[Path] = ()) -> dict[str, Any]:
     """The facts that `inspect` prints, as JSON's types."""
-    manifest = require_manifest(split, [*READ, *columns_in(where)])
+    manifest, shown = require_manifest(split, [*READ, *columns_in(where)], compact=True), max(rows, 0)
     chosen = select(manifest.table, where)
-    solved, tried = (select(chosen, f"label IN ({names})") for names in ("'solved'", "'solved', 'unsolved'"))
-    levels, shown = duplicates.compared(chosen), max(rows, 0)
+    labels, reasons = _counts(chosen, "label"), _counts(chosen, "label_reason")
+    solved, unsolved, unsolvable = (
+        chosen.filter(pc.equal(chosen["label"], label.value))
+        for label in (Label.SOLVED, Label.UNSOLVED, Label.UNSOLVABLE)
+    )
+    tried, ids = solved.num_rows + unsolved.num_rows, chosen["level_id"].to_numpy()
     stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards)
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
     config = manifest.config or {}
     distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
-    first = chosen.column("level_id").slice(0, shown).to_pylist()
+    others = {str(other): duplicates.compared_in(other) for other in against}
+    levels = duplicates.compared_of(split, ids) if others else None
     return {
         "split": str(split),
         "config_hash": manifest.config_hash,
         "distribution": dict(zip(("name", "hash"), identified(distribution), strict=True)) if distribution else None,
         "levels": chosen.num_rows,
-        "labels": _counts(chosen, "label"),
-        "unsolvable": _counts(select(chosen, "label = 'unsolvable'"), "label_reason"),
-        "diverged": select(chosen, f"contains(label_reason, '{DIVERGED}')").num_rows,
+        "labels": labels,
+        "unsolvable": _counts(unsolvable, "label_reason"),
+        "diverged": sum(count for reason, count in reasons.items() if DIVERGED in reason),
         "failed_by_noop": _total(chosen["failed_by_noop"].to_numpy()),
-        "solve_rate": solved.num_rows / tried.num_rows if tried.num_rows else None,  # of the levels with an expert
+        "solve_rate": solved.num_rows / tried if tried else None,  # of the levels with an expert
         "steps_to_goal": _quantiles(solved, "steps_to_goal"),
         "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
-        "duplicates": duplicates.within(levels, shown),
-        "against": {str(other): duplicates.between(levels, duplicates.compared_in(other), shown) for other in against},
+        "duplicates": duplicates.within(duplicates.perhaps_alike(split, ids), shown),
+        "against": {name: duplicates.between(levels, other, shown) for name, other in others.items()},
         "env_steps": _total(chosen["env_steps"].to_numpy()),
         "env_steps_after_success": _total(solved["env_steps"].to_numpy() - solved["steps_to_first_success"].to_numpy()),
-        "env_steps_unsolved": _total(select(chosen, "label = 'unsolved'")["env_steps"].to_numpy()),
+        "env_steps_unsolved": _total(unsolved["env_steps"].to_numpy()),
         "split_bytes": stored,  # of all the split's shards, whatever the condition
         "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
-        "rows": require_manifest(split, level_ids=first).table.to_pylist() if first else [],  # with all columns
+        "rows": require_manifest(split, level_ids=ids[:shown]).table.to_pylist()
+        if len(ids[:shown])
+        else [],  # with all columns
     }
 
 

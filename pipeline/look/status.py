@@ -44,7 +44,7 @@ def look(split: Path) -> dict[str, Any]:
     except NoteError:
         raise UserError(f"The file {split / JOB} is damaged: run `levelproof generate` for this split again.") from None
     wanted = note.level_ids
-    manifest = read_manifest(split, ["label"])
+    manifest = read_manifest(split, ["label"], compact=True)
     done = inside(manifest.level_ids, wanted)
     return {
         "split": str(split),

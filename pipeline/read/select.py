@@ -3,6 +3,7 @@
 import re
 
 import duckdb
+import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import UserError
@@ -21,7 +22,7 @@ def columns_in(where: str | None) -> list[str]:
 def select(table: pa.Table, where: str | None) -> pa.Table:
     """The manifest's rows for which the SQL condition holds, sorted by level id.
 
-    `table` has the columns of the condition (`columns_in`), and any others.
+    `table` is sorted by level id, and has the columns of the condition (`columns_in`), and any others.
 
     Raises:
         UserError: DuckDB cannot use the condition.
@@ -32,10 +33,11 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
         connection.register(TABLE, table)
         connection.execute("SET enable_external_access = false")  # a condition reads the manifest, no other file
         try:
-            return connection.sql(f"SELECT * FROM {TABLE} WHERE ({where}\n) ORDER BY level_id").to_arrow_table()
+            chosen = connection.sql(f"SELECT level_id FROM {TABLE} WHERE ({where}\n)").fetchnumpy()["level_id"]
         except duckdb.Error as error:
             reason = str(error).strip().splitlines()[0]
             columns = ", ".join(COLUMNS.names)
             raise UserError(
                 f"Cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
             ) from None
+    return table.filter(np.isin(table.column("level_id").to_numpy(), chosen))

@@ -23,7 +23,7 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
         LockRefused: the file system has no locks.
     """
     with nobody_commits(split, say):
-        manifest = read_manifest(split, ["label", *DATA_COLUMNS])
+        manifest = read_manifest(split, ["label", *DATA_COLUMNS], compact=True)
         named = manifest.shards | manifest.named["experts"]
         for fragment in manifest.superseded:
             _, table = read_fragment(fragment.path, DATA_COLUMNS)

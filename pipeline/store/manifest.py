@@ -4,7 +4,7 @@ A fragment is written last and appears at once or not at all; readers see only w
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -22,20 +22,24 @@ from pipeline.errors import Failure, UserError
 from pipeline.store.checksums import digest_of, with_own
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
+from pipeline.store.runs import ascending
 from pipeline.store.schema import (
     COLUMNS,
     CONFIG_KEY,
     DIGESTS_KEY,
     HASH_KEY,
     MANIFEST_VERSION,
+    REPETITIVE,
     SEALED_KEY,
     VERSION_KEY,
+    schema_of,
 )
 
 SHOWN = 6  # differing settings that an error lists
 THREADS = 8  # fragments read at once: a shared folder takes its time for each
 ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
 ROUNDS = 20  # looks at a split that is sealed meanwhile; each takes a moment, and sealing a fragment takes seconds
+Each = Callable[[pa.Table], pa.Table]
 DATA_COLUMNS = ("shard", "experts")  # name what lies beside the manifest
 
 
@@ -109,16 +113,19 @@ def fragment_paths(split: Path) -> list[Path]:
 
 
 def read_fragment(
-    path: Path, columns: Sequence[str] | None = None, level_ids: np.ndarray | None = None
+    path: Path, columns: Sequence[str] | None = None, level_ids: np.ndarray | None = None, compact: bool = False
 ) -> tuple[Fragment, pa.Table]:
     """A fragment and its rows; with `level_ids` (ascending), at least those of these levels.
+
+    `compact`: columns that are repetitive come as dictionaries.
 
     Raises:
         FileNotFoundError: it is gone.
         Failure: it is damaged, or of another version.
     """
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        dictionaries = REPETITIVE if compact else None
+        with pq.ParquetFile(path, page_checksum_verification=True, read_dictionary=dictionaries) as file:
             metadata = file.schema_arrow.metadata or {}
             version = metadata.get(VERSION_KEY, b"?").decode()
             if version != str(MANIFEST_VERSION):
@@ -130,7 +137,7 @@ def read_fragment(
             digests, about = json.loads(metadata.get(DIGESTS_KEY, b"{}")), file.metadata
             is_sealed = SEALED_KEY in metadata
             fragment = Fragment(path, metadata[HASH_KEY].decode(), config, digests, about.num_rows, is_sealed)
-            if not file.schema_arrow.equals(COLUMNS) or true_hash != fragment.config_hash:
+            if not file.schema_arrow.equals(schema_of(COLUMNS.names, compact)) or true_hash != fragment.config_hash:
                 raise ValueError("its footer has other columns or another configuration than were written")
             groups = [i for i in range(about.num_row_groups) if _may_have(about.row_group(i), level_ids)]
             table = file.read_row_groups(groups, None if columns is None else list(columns), use_threads=False)
@@ -211,7 +218,12 @@ class Manifest:
 
 
 def read_manifest(
-    split: Path, columns: Sequence[str] | None = None, level_ids: Sequence[int] | None = None
+    split: Path,
+    columns: Sequence[str] | None = None,
+    level_ids: Sequence[int] | np.ndarray | None = None,
+    *,
+    compact: bool = False,
+    each: Each | None = None,
 ) -> Manifest:
     """The manifest of a split, one row for each level that was tried; empty where nothing is committed yet.
 
@@ -219,12 +231,16 @@ def read_manifest(
         split: the folder `{out}/{budget}/{size}`.
         columns: which to read (default: all); `level_id` is always among them.
         level_ids: whose rows (default: all); fragments without any of them, by their names, are not opened.
+        compact: columns that are repetitive come as dictionaries: of millions of rows, a tenth of the memory.
+        each: what to keep of a fragment's rows, as they come and in threads; `level_id` has to be among it.
 
     Raises:
         Failure: a fragment is damaged, or fragments of several configurations lie side by side.
     """
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
-    parts = _parts(split, names, None if level_ids is None else np.unique(np.asarray(level_ids, np.int64)))
+    asked = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))
+    read = partial(_part, names=names, level_ids=asked, compact=compact, each=each)
+    parts = _parts(split, asked, read)
     fragments = tuple(fragment for fragment, _ in parts)
     for fragment in fragments[1:]:
         if fragment.config_hash != fragments[0].config_hash:
@@ -239,14 +255,16 @@ def read_manifest(
         table, without = each_once(neighbours)
         tables.append(table)
         superseded += without
-    schema = pa.schema([COLUMNS.field(name) for name in names])
-    table = pa.concat_tables([schema.empty_table(), *tables])
+    nothing = schema_of(names, compact).empty_table()
+    table = pa.concat_tables([nothing if each is None else each(nothing), *tables]).unify_dictionaries()
     counting = [part for fragment, part in parts if fragment not in superseded]
-    named = {name: named_by(counting, name) for name in DATA_COLUMNS if name in names}
+    named = {name: named_by(counting, name) for name in DATA_COLUMNS if name in table.column_names}
     return Manifest(split, fragments, table, named, tuple(superseded))
 
 
-def _parts(split: Path, names: Sequence[str], level_ids: np.ndarray | None) -> list[tuple[Fragment, pa.Table]]:
+def _parts(
+    split: Path, level_ids: np.ndarray | None, read: Callable[[Path], tuple[Fragment, pa.Table] | None]
+) -> list[tuple[Fragment, pa.Table]]:
     """The fragments and their rows, of these levels (ascending ids; None: of all).
 
     Who seals removes fragments after there is one that has their levels. So this looks until a look finds no other
@@ -257,9 +275,9 @@ def _parts(split: Path, names: Sequence[str], level_ids: np.ndarray | None) -> l
         for look in range(ROUNDS):
             listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
             new = [one for one in listed if one not in found and _wanted(one[0], level_ids)]
-            read = list(threads.map(partial(_part, names=names, level_ids=level_ids), (path for path, _ in new)))
-            found |= {one: part for one, part in zip(new, read, strict=True) if part}
-            if look and all(part and not part[0].sealed for part in read):
+            parts = list(threads.map(read, (path for path, _ in new)))
+            found |= {one: part for one, part in zip(new, parts, strict=True) if part}
+            if look and all(part and not part[0].sealed for part in parts):
                 latest = {path: part for (path, _), part in found.items()}  # of those that had one name in turn
                 return [latest[path] for path in sorted(latest)]
     raise Failure(f"The fragments of {split} change faster than they can be read: try again when they are at rest.")
@@ -269,14 +287,18 @@ def _wanted(path: Path, level_ids: np.ndarray | None) -> bool:
     return level_ids is None or _any_within(level_ids, *ids_of(path))
 
 
-def _part(path: Path, names: Sequence[str], level_ids: np.ndarray | None) -> tuple[Fragment, pa.Table] | None:
+def _part(
+    path: Path, names: Sequence[str], level_ids: np.ndarray | None, compact: bool, each: Each | None
+) -> tuple[Fragment, pa.Table] | None:
     """A fragment and its rows; None: it is gone."""
     try:
-        fragment, table = read_fragment(path, names, level_ids)
+        fragment, table = read_fragment(path, names, level_ids, compact)
     except FileNotFoundError:
         return None
-    table = table.select(names).cast(pa.schema([COLUMNS.field(name) for name in names]))
-    return fragment, table if level_ids is None else table.filter(np.isin(_ids(table), level_ids))
+    table = table.select(names).cast(schema_of(names, compact)).unify_dictionaries()
+    if level_ids is not None:
+        table = table.filter(np.isin(_ids(table), level_ids))
+    return fragment, table if each is None else each(table)
 
 
 def _ids(table: pa.Table) -> np.ndarray:
@@ -319,7 +341,12 @@ def named_by(tables: Sequence[pa.Table], column: str) -> frozenset[str]:
 
 
 def require_manifest(
-    split: Path, columns: Sequence[str] | None = None, level_ids: Sequence[int] | None = None
+    split: Path,
+    columns: Sequence[str] | None = None,
+    level_ids: Sequence[int] | np.ndarray | None = None,
+    *,
+    compact: bool = False,
+    each: Each | None = None,
 ) -> Manifest:
     """As `read_manifest`, for questions about a split that should be there; it may have none of the levels.
 
@@ -327,7 +354,7 @@ def require_manifest(
         UserError: there is no split here, or nothing is committed in it.
         Failure: as `read_manifest`.
     """
-    manifest = read_manifest(split, columns, level_ids)
+    manifest = read_manifest(split, columns, level_ids, compact=compact, each=each)
     if not manifest.fragments and (level_ids is None or not fragment_paths(split)):
         what = f"Nothing is committed in {split} yet" if split.is_dir() else f"There is no split at {split}"
         raise UserError(f"{what}: give a folder such as data/128k/s that `levelproof generate` made.")

@@ -7,9 +7,15 @@ import numpy as np
 TOLD = 4  # runs of levels in a message
 
 
+def ascending(numbers: np.ndarray) -> np.ndarray:
+    """Sorted, each once. `np.unique` hashes whole numbers, which of millions takes twenty times as long."""
+    ordered = np.sort(numbers)
+    return ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
+
+
 def runs(numbers: Sequence[int] | np.ndarray) -> list[tuple[int, int]]:
     """First and last of each run of consecutive numbers, ascending."""
-    ordered = np.unique(np.asarray(numbers, np.int64))
+    ordered = ascending(np.asarray(numbers, np.int64))
     ends = np.flatnonzero(np.diff(ordered) != 1)
     firsts, lasts = (ordered[i] for i in (np.r_[0, ends + 1], np.r_[ends, -1])) if len(ordered) else (ordered, ordered)
     return list(zip(firsts.tolist(), lasts.tolist(), strict=True))

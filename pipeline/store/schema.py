@@ -3,7 +3,7 @@
 A fragment or shard of another version is refused with a sentence, never guessed at.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, get_args
 
@@ -77,6 +77,17 @@ COLUMNS = pa.schema(
         pa.field("command", pa.string(), nullable=False),  # makes this row again
     ]
 )
+
+# Columns of strings that are the same in many rows
+REPETITIVE = ("size", "budget", "label", "label_reason", "witness", "shard", "experts", "config_hash", "device")
+
+
+def schema_of(names: Sequence[str], compact: bool = False) -> pa.Schema:
+    """Of some columns; `compact`: what is repetitive as dictionaries."""
+    fields = [COLUMNS.field(name) for name in names]
+    as_dictionary = pa.dictionary(pa.int32(), pa.string())
+    return pa.schema([of.with_type(as_dictionary) if compact and of.name in REPETITIVE else of for of in fields])
+
 
 # Packed arrays of a shard; the number is the bits of a component. What changes along time: (level, component, 256).
 PACKED = {"dyn32": 32, "dyn8": 8, "act": 8, "lvl32": 32, "lvl8": 8, "witness": 8}

@@ -16,9 +16,9 @@ from tests.pipeline.made import made_split
 def test_one_fragment_and_few_columns_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     split, read = made_split(tmp_path, [[Label.SOLVED] * 2] * 4), []
 
-    def noted(path: Path, columns: list[str], level_ids: Any) -> object:
+    def noted(path: Path, columns: list[str], *how: Any) -> object:
         read.append((path.stem, set(columns)))
-        return read_fragment(path, columns, level_ids)
+        return read_fragment(path, columns, *how)
 
     monkeypatch.setattr(manifest, "read_fragment", noted)
     found, row = find_level(split, 5)

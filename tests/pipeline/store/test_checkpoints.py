@@ -42,9 +42,9 @@ def test_each_unit_s_experts_come_back_bit_for_bit(tmp_path: Path) -> None:
 def test_a_worker_reads_the_fragments_of_its_levels_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     split, read = made_split(tmp_path, [[Label.SOLVED] * 2] * 4), []
 
-    def noted(path: Path, columns: Sequence[str], level_ids: Any) -> object:
+    def noted(path: Path, columns: Sequence[str], *how: Any) -> object:
         read.append((path.stem, set(columns)))
-        return read_fragment(path, columns, level_ids)
+        return read_fragment(path, columns, *how)
 
     monkeypatch.setattr(manifest, "read_fragment", noted)
     assert experts_for(made_job("data", f"continue_from={split}"), [2, 3]) == {}

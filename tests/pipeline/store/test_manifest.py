@@ -167,9 +167,9 @@ def test_rows_of_some_levels_take_the_fragments_that_cover_them(
     paths = {tuple(ids): commit(tmp_path, job, list(ids)) for ids in ((0, 1, 2), (2, 5), (6, 7), (9, 20), (30,))}
     opened: list[Path] = []
 
-    def noted(path: Path, columns: list[str], level_ids: Any) -> object:
+    def noted(path: Path, columns: list[str], *how: Any) -> object:
         opened.append(path)
-        return read_fragment(path, columns, level_ids)
+        return read_fragment(path, columns, *how)
 
     monkeypatch.setattr(manifest_file, "read_fragment", noted)
     for level_ids, rows, units in (
