@@ -4,16 +4,15 @@ The new data first, then the new fragment, which counts before those that it was
 process that dies in between leaves what `leftovers.clean` removes. Knows nothing of who seals, and when.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pyarrow as pa
 
-from pipeline.store.layout import begun_path, data_path, fragment_of, new_attempt, unit_name
+from pipeline.store.layout import SHARDS, begun_path, data_path, fragment_of, new_attempt, unit_name
 from pipeline.store.leftovers import disown, drop
 from pipeline.store.manifest import (
     THREADS,
@@ -25,7 +24,8 @@ from pipeline.store.manifest import (
     write_fragment,
 )
 from pipeline.store.merge import Place, merge_shards
-from pipeline.store.schema import COLUMNS
+from pipeline.store.schema import COLUMNS, Encoding
+from pipeline.store.shard import Shard
 
 ROWS = 100_000  # of a sealed fragment, about; more: fewer files, and more to write again when some are added
 CROWD = 1_000  # unsealed neighbours that are merged, although they have not as many rows: small files are slow to read
@@ -77,10 +77,13 @@ def seal(
     moved: Callable[[int], None] = lambda _: None,
     rows_a_file: int | None = None,
 ) -> Piece:
-    """Merge these fragments and their shards; the sealed fragment. Only the writer of a split may.
+    """Merge these fragments, and their shards of each density. Only the writer of a split may.
 
     Kept experts stay where they are. `moved` and `rows_a_file` are those of `merge_shards`; `moved` is called before
     each fragment is read, too.
+
+    Returns:
+        The sealed fragment.
 
     Raises:
         Failure: a fragment or a shard is damaged; nothing has changed.
@@ -97,27 +100,32 @@ def seal(
     table, _ = each_once(parts)
     level_ids, rows = (table.column(name).to_pylist() for name in ("level_id", "row"))
     shards = {name: data_path(split, name) for name in named_by([of for _, of in parts], "shard")}
-    places = [
-        Place(shards[name], row, level_id)
-        for name, row, level_id in zip(table.column("shard").to_pylist(), rows, level_ids, strict=True)
-        if name
-    ]
+    encodings = {name: Shard(path).encoding for name, path in shards.items()}
+    places: dict[Encoding, list[Place]] = {}
+    for name, row, level_id in zip(table.column("shard").to_pylist(), rows, level_ids, strict=True):
+        if name:
+            places.setdefault(encodings[name], []).append(Place(shards[name], row, level_id))
     replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
-    attempt, about = new_attempt(split, unit_name(level_ids[0], level_ids[-1])), parts[0][0]
+    unit, about = unit_name(level_ids[0], level_ids[-1]), parts[0][0]
+    attempts = [new_attempt(split, unit) for _ in places] or [new_attempt(split, unit)]  # nearly always one
+    attempt = attempts[0]
     try:
-        begin_fragment(attempt)
-        if places:
-            merge_shards(attempt.shard, places, moved, rows_a_file)
+        for each in attempts:
+            begin_fragment(each)
+        for each, of in zip(attempts, places.values(), strict=False):
+            merge_shards(each.shard, of, moved, rows_a_file)
         disown(replaced)
-        rows_there = _in_one_shard(table, attempt.shard.relative_to(split).as_posix())
-        write_fragment(attempt, rows_there, about.config_hash, about.config, sealed=True)
+        merged = {each.shard.name: of for each, of in zip(attempts, places.values(), strict=False)}
+        write_fragment(attempt, _moved(table, merged), about.config_hash, about.config, sealed=True)
     except BaseException:
         if attempt.begun.exists():  # not committed
-            drop(attempt.shard)
-            attempt.begun.unlink(missing_ok=True)
-            for shard in replaced:
-                begun_path(shard).unlink(missing_ok=True)
+            for each in attempts:
+                drop(each.shard)
+            for mark in [*(each.begun for each in attempts), *map(begun_path, replaced)]:
+                mark.unlink(missing_ok=True)
         raise
+    for each in attempts[1:]:
+        each.begun.unlink()
     for path in paths - {attempt.fragment}:
         path.unlink(missing_ok=True)
     for shard in replaced:
@@ -125,11 +133,11 @@ def seal(
     return Piece(attempt.fragment, len(level_ids), True)
 
 
-def _in_one_shard(table: pa.Table, shard: str) -> pa.Table:
-    """The same rows, of which those with a witness have it in this shard, one after another."""
-    without = table.column("shard").is_null().to_numpy()
-    rows = pa.array(np.cumsum(~without) - 1, pa.int32(), mask=without)
-    names = pa.array(np.full(len(without), shard, object), pa.string(), mask=without)
-    for name, values in ("shard", names), ("row", rows):
-        table = table.set_column(COLUMNS.names.index(name), COLUMNS.field(name), values)
+def _moved(table: pa.Table, merged: Mapping[str, Sequence[Place]]) -> pa.Table:
+    """The same rows, with these shards as the places of their levels, one after another."""
+    now = {of.level_id: (f"{SHARDS}/{name}", row) for name, places in merged.items() for row, of in enumerate(places)}
+    found = [now.get(level_id, (None, None)) for level_id in table.column("level_id").to_pylist()]
+    for name, values in zip(("shard", "row"), zip(*found, strict=True), strict=True):
+        field = COLUMNS.field(name)
+        table = table.set_column(COLUMNS.names.index(name), field, pa.array(values, field.type))
     return table

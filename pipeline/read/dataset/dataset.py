@@ -38,6 +38,7 @@ from pipeline.runtime import own_cores
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import require_manifest
 from pipeline.store.schema import COLUMNS as ALL_COLUMNS
+from pipeline.store.schema import schema_of
 from pipeline.store.shard import open_shard
 
 READ = ("content_hash", "label", "steps_to_goal", *COLUMNS)  # columns of the manifest that are always read
@@ -70,12 +71,13 @@ class Dataset:
         if unknown := [name for name in columns if name not in ALL_COLUMNS.names]:
             raise UserError(f"There is no column {unknown[0]!r}: the manifest has {', '.join(ALL_COLUMNS.names)}.")
         self.split, self._opened_with = split, (split, where, columns, validation)
-        manifest = require_manifest(split, [*READ, *columns, *columns_in(where)])
+        manifest = require_manifest(split, [*READ, *columns, *columns_in(where)], compact=True)
         rows = select(manifest.table.filter(pc.is_valid(manifest.table["shard"])), where)  # pyright: ignore[reportAttributeAccessIssue]
         if not rows.num_rows:
             what = "has no trajectories yet" if where is None else f"has no trajectories for which {where}"
             raise UserError(f"The split {split} {what}: `levelproof inspect {split}` shows what it has.")
         check_share(validation)
+        rows = rows.cast(schema_of(rows.column_names))  # dictionaries while there are rows of all levels, no longer
         self._manifest, self._lock = rows.combine_chunks(), Lock()
         self._shard = lru_cache(OPEN_SHARDS)(open_shard)
         self.rules: TaskParams = rules_of(manifest)

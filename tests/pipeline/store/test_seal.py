@@ -2,6 +2,7 @@
 
 import errno
 import itertools
+import json
 import os
 import shutil
 import signal
@@ -248,6 +249,18 @@ def test_what_is_damaged_is_not_sealed(split: Path, made: Path) -> None:
     with pytest.raises(Failure, match="bytes of its array act are missing or not those"):
         seal(split, pieces(split))
     assert sorted(split.rglob("*")) == before
+
+
+def test_shards_of_several_densities_stay_apart(split: Path, made: Path) -> None:
+    group = next(iter((split / "shards").iterdir())) / "zarr.json"
+    document = json.loads(group.read_text())
+    document["attributes"]["task"]["frame_skip"] = 3  # another encoding of the same fields
+    group.write_text(json.dumps(document))
+    for _ in range(2):
+        seal(split, pieces(split))
+        assert whole(split) == whole(made)
+        assert_tidy(split, 1)
+        assert len(read_manifest(split).shards) == 2
 
 
 def test_a_full_disk_changes_nothing(split: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
