@@ -4,10 +4,11 @@ import numpy as np
 
 from experts.advance import advance
 from experts.config import ExpertConfig, Rule, StopConfig
-from experts.queue import empty_queue, enter
+from experts.queue import GROUP, empty_queue, enter
 from experts.slots import LevelQueue, Report, Slots
 from experts.stop import rules_of
 from experts.success import no_success
+from experts.witness import take
 from levelgen.level import Level
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
@@ -16,8 +17,11 @@ UPDATES = 10**6  # more than a benchmark waits for
 
 def endless_queue(levels: Level, config: ExpertConfig) -> LevelQueue:
     """All of these levels, with as many places."""
-    count = levels.role.shape[-1]
-    return enter(empty_queue(levels, count, UPDATES, config), levels, np.arange(count), no_success(count), config)
+    queue = empty_queue(levels, levels.role.shape[-1], UPDATES, config)
+    for first in range(0, queue.capacity, GROUP):
+        some = np.arange(first, min(first + GROUP, queue.capacity))
+        queue = enter(queue, take(levels, some), some, no_success(len(some)), config)
+    return queue
 
 
 def go_on(

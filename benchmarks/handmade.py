@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks import oracle
+from benchmarks.alone import label
 from benchmarks.report import Report, Table
 from configs.compose import compose_job
 from configs.schema import JobConfig
 from experts.labels import WITNESSED, Verdict
-from experts.train import train_levels
 from pipeline.errors import UserError
 from pipeline.read.level_files import level_at, levels_below
 from pipeline.runtime import own_cores, prepare_jax
@@ -75,7 +75,7 @@ def timed(job: JobConfig, level_id: int, origin: Origin) -> tuple[Verdict, float
     """A level's verdict, and the seconds that it took."""
     level, ids = level_at(origin), np.array([level_id])
     start = time.perf_counter()
-    (verdict,) = train_levels(level, ids, job.env_steps, job.procedure, job.task).verdicts
+    (verdict,) = label(level, ids, job.env_steps, job.procedure, job.task).verdicts
     return verdict, time.perf_counter() - start
 
 

@@ -24,7 +24,6 @@ from experts.labels import Label
 from experts.pool import Pool
 from experts.portability import survival
 from experts.procedure import Procedure
-from experts.train import begin, finish, new_pool
 from experts.witness import take
 from levelgen.files.level_file import LevelFile, write_level_file
 from levelgen.level import SIZES, Level
@@ -56,10 +55,10 @@ class Solved(NamedTuple):
 def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Iterator[Solved]:
     """Of these levels those that are solved."""
     levels = jax.tree.map(np.asarray, sample_levels(level_ids, SIZES[size]))
-    run = begin(pool, levels, level_ids)
+    run = TrainingRun(pool, levels, level_ids)
     while run.submission is None or not pool.step():
         run.look()
-    result, submission = finish(pool, run), run.submission
+    result, submission = run.finish(), run.submission
     once = replace(pool.config, replays=0)
     for at, i in enumerate(run.left.tolist()):
         verdict = result.verdicts[i]
@@ -75,7 +74,7 @@ def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Itera
 
 def measured(python: Path, size: str, count: int, first: int) -> Played:
     """How portable the witnesses of so many levels of a size are."""
-    pool = new_pool(BUDGET, Procedure())
+    pool = Pool(BUDGET, Procedure(), DEFAULT_RULES)
     ids = np.arange(first, first + count, dtype=np.int32)
     found = [of for start in range(0, count, UNIT) for of in solved(pool, ids[start : start + UNIT], size)]
     oracle.tell(f"{size}: {len(found)} of {count} levels are solved.")

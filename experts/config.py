@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
+from levelgen.bounds import require
+
 RECORD_STEPS = 256  # env steps of a record, with automatic reset inside
 MOST_DOUBLINGS = 6  # of the wait between evaluations
 MOST_COUNTED = 2**31 - 1  # env steps and updates are counted in 32 bits on the device
@@ -71,19 +73,11 @@ class ExpertConfig:
 
     def __post_init__(self) -> None:
         at_least_one = ("width", "depth", "encoding", "environments", "horizon", "epochs", "minibatches", "attempts")
-        for name in at_least_one:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
-        for name in ("learning_rate", "adam_epsilon", "max_gradient_norm"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be above 0")
-        for name in ("discount", "gae_lambda", "clip", "persistence"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be between 0 and 1")
         not_negative = ("dense_reward_scale", "value_weight", "entropy_weight", "imitation_weight", "slots")
-        for name in (*not_negative, "rehearsals", "sticky_attempts", "moved_attempts", "replays"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
+        require(self, at_least_one, 1)
+        require(self, ("learning_rate", "adam_epsilon", "max_gradient_norm"), 0, above=True)
+        require(self, ("discount", "gae_lambda", "clip", "persistence"), 0, 1)
+        require(self, (*not_negative, "rehearsals", "sticky_attempts", "moved_attempts", "replays"), 0)
         if self.steps_per_update % self.minibatches:
             raise ValueError(
                 f"minibatches is {self.minibatches}: it must divide environments x horizon = {self.steps_per_update}"
@@ -122,8 +116,7 @@ class ScoutConfig:
     rounds: int = 4  # of 16,384 env steps of persistent random play, until one has a success; 0: none
 
     def __post_init__(self) -> None:
-        if self.rounds < 0:
-            raise ValueError(f"rounds is {self.rounds}: it must not be negative")
+        require(self, ("rounds",), 0)
 
 
 @dataclass(frozen=True)
@@ -139,14 +132,9 @@ class StopConfig:
     gain: float = 0.05  # by which the best return must have grown since the rung before
 
     def __post_init__(self) -> None:
-        for name in ("successes", "first_rung"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
-        for name in ("wait", "polish", "gain"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
-        if not 0 <= self.share <= 1:
-            raise ValueError(f"share is {self.share}: it must be between 0 and 1")
+        require(self, ("successes", "first_rung"), 1)
+        require(self, ("wait", "polish", "gain"), 0)
+        require(self, ("share",), 0, 1)
 
 
 def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> None:

@@ -1,7 +1,8 @@
 """Labels, each with its reason and the evidence for it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from math import inf, nan
 
 from levelgen.proofs import Proof
 
@@ -47,18 +48,19 @@ class Verdict:
     label: Label
     label_reason: str
     failed_by_noop: bool  # doing nothing lets green touch red
-    witness: Source | None
+    witness: Source | None = None
     # of the last evaluation; NaN: there were no such attempts
-    success_rate: float  # of sampled attempts, first episodes
-    most_probable_succeeds: bool  # every episode of the attempt that takes the most probable actions
-    sticky_success_rate: float  # of attempts where an action is sometimes repeated, first episodes
-    moved_success_rate: float  # of attempts that start with slightly other velocities, first episodes
-    steps_to_goal: int | None  # env steps of the witness's first episode
-    steps_to_first_success: int | None  # env steps of training
-    env_steps: int  # of training
-    learning_curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
-    best_return: float  # of training's episodes, shaping included; -inf: none ended
-    episodes: int  # of training
+    success_rate: float = nan  # of sampled attempts, first episodes
+    most_probable_succeeds: bool = False  # every episode of the attempt that takes the most probable actions
+    sticky_success_rate: float = nan  # of attempts where an action is sometimes repeated, first episodes
+    moved_success_rate: float = nan  # of attempts that start with slightly other velocities, first episodes
+    steps_to_goal: int | None = None  # env steps of the witness's first episode
+    steps_to_first_success: int | None = None  # env steps of training
+    env_steps: int = 0  # of training
+    # per update: share of finished episodes that reached the goal; NaN: none finished
+    learning_curve: list[float] = field(default_factory=list)
+    best_return: float = -inf  # of training's episodes, shaping included; -inf: none ended
+    episodes: int = 0  # of training
     portability: float | None = None  # share of the witness's replays from moved starts that reach the goal
     evaluation_steps: int = 0  # env steps
     scout_steps: int = 0  # env steps
@@ -98,28 +100,16 @@ def unsolvable_reason(proof: Proof, fails: bool) -> str:
 
 def untrained(
     label: Label,
-    reason: str,
+    label_reason: str,
     failed_by_noop: bool,
     witness: Source | None = None,
     steps_to_goal: int | None = None,
     portability: float | None = None,
 ) -> Verdict:
     """The verdict on a level without an expert. Where none is needed, doing nothing counts as the evaluation."""
-    decided = label not in TRAINED
-    return Verdict(
-        label=label,
-        label_reason=reason,
-        failed_by_noop=failed_by_noop,
-        witness=witness,
-        success_rate=float(label in WITNESSED) if decided else float("nan"),
-        most_probable_succeeds=decided and label in WITNESSED,
-        sticky_success_rate=float("nan"),
-        moved_success_rate=float("nan"),
-        steps_to_goal=steps_to_goal,
-        steps_to_first_success=None,
-        env_steps=0,
-        learning_curve=[],
-        best_return=float("-inf"),
-        episodes=0,
-        portability=portability,
+    verdict = Verdict(
+        label, label_reason, failed_by_noop, witness, steps_to_goal=steps_to_goal, portability=portability
     )
+    if label in TRAINED:
+        return verdict
+    return replace(verdict, success_rate=float(label in WITNESSED), most_probable_succeeds=label in WITNESSED)

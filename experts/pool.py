@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int
 
 from experts.advance import advance
-from experts.config import RECORD_STEPS, ExpertConfig
+from experts.config import RECORD_STEPS, ExpertConfig, check_budget
 from experts.found import Found, nothing_found
 from experts.judge import Evaluation, Kept, Trained, Witness, candidates_of
 from experts.procedure import Procedure
@@ -72,9 +72,11 @@ class Submission:
 class Pool:
     """Slots and the queue before them. All that trains in it has one procedure and one budget."""
 
-    def __init__(self, updates: int, procedure: Procedure, rules: TaskParams) -> None:
-        self.updates, self.procedure, self.rules = updates, procedure, rules
-        self.config = procedure.expert
+    def __init__(self, budget: int, procedure: Procedure, rules: TaskParams) -> None:
+        """`budget` are env steps of an expert. Raises ValueError as `check_budget`."""
+        check_budget(budget, procedure.expert, procedure.stop)
+        self.procedure, self.config, self.rules = procedure, procedure.expert, rules
+        self.updates = self.config.updates_in(budget)
         self._stopping = rules_of(procedure.stop, self.config)
         self._shaped = replace(rules, dense_reward_scale=self.config.dense_reward_scale)
         self._slots: Slots | None = None  # these two are there once the first levels have come

@@ -46,7 +46,7 @@ def enter(
     config: ExpertConfig,
     begun: Mapping[int, Begun] = NO_EXPERTS,
 ) -> LevelQueue:
-    """The queue (used up) with more levels.
+    """The queue (used up) with more levels: some, at most GROUP.
 
     Args:
         queue: before.
@@ -56,20 +56,18 @@ def enter(
         config: what an expert is.
         begun: experts that go on, by index among these levels; they have their own success.
     """
-    for first in range(0, len(level_ids), GROUP):
-        some = range(first, min(first + GROUP, len(level_ids)))
-        fill = np.minimum(np.arange(first, first + GROUP), some[-1])
-        group, ids = take(levels, fill), level_ids[fill]
-        experts = begin(group, ids, jax.tree.map(lambda x, fill=fill: x[fill], success), config)
-        if mine := {i - first: begun[i] for i in some if i in begun}:
-            experts = jax.tree.map(np.array, experts)
-            for i, expert in mine.items():
-                for rows, row in zip(jax.tree.leaves(experts), jax.tree.leaves(expert), strict=True):
-                    rows[i] = row
-        nowhere = [queue.capacity] * (GROUP - len(some))
-        queue = _put(queue, group, ids, experts, np.array(next_indices(queue, len(some)) + nowhere))
-        queue = queue._replace(come=np.int32(int(queue.come) + len(some)))
-    return queue
+    count = len(level_ids)
+    fill = np.minimum(np.arange(GROUP), count - 1)  # a group that is not full has its last level several times
+    group, ids = take(levels, fill), level_ids[fill]
+    experts = begin(group, ids, jax.tree.map(lambda x: x[fill], success), config)
+    if begun:
+        experts = jax.tree.map(np.array, experts)
+        for i, expert in begun.items():
+            for rows, row in zip(jax.tree.leaves(experts), jax.tree.leaves(expert), strict=True):
+                rows[i] = row
+    nowhere = [queue.capacity] * (GROUP - count)
+    queue = _put(queue, group, ids, experts, np.array(next_indices(queue, count) + nowhere))
+    return queue._replace(come=np.int32(int(queue.come) + count))
 
 
 @partial(jax.jit, donate_argnames="queue")

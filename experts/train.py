@@ -1,6 +1,6 @@
 """From levels to verdicts: they are decided without an expert, or scouted, trained and judged."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -8,25 +8,17 @@ import numpy as np
 from jaxtyping import Int
 
 from experts.before import decide
-from experts.config import RECORD_STEPS, Rule, check_budget
+from experts.config import RECORD_STEPS, ExpertConfig, Rule
 from experts.found import Found, Looking
 from experts.judge import Kept, Trained, Witness, judge, repeating
-from experts.labels import WITNESSED, Label, Source, Verdict
+from experts.labels import WITNESSED, Source, Verdict
 from experts.pool import NOTHING_BEGUN, Pool, Submission, Totals
 from experts.portability import choose
-from experts.procedure import Procedure
 from experts.steps import EnvSteps
 from experts.success import Success
 from experts.witness import Record, replay, take
 from levelgen.identity.keys import level_id_array
 from levelgen.level import ACTIONS, Level
-from levelgen.task.rules import DEFAULT_RULES, TaskParams
-
-Tell = Callable[[int, float, int], None]  # totals so far: env steps, levels (parts count), solved levels
-
-
-def quiet(env_steps: int, levels: float, solved: int) -> None:
-    """Tells nobody."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +34,24 @@ class UnitResult:
 
 
 class TrainingRun:
-    """Levels on their way to their verdicts: decided at once, looked into, then in a pool."""
+    """Levels on their way to their verdicts: decided at once, looked into, then in a pool, perhaps beside others."""
 
-    def __init__(self, pool: Pool, levels: Level, level_ids: np.ndarray, begun: Mapping[int, Kept], keep: bool) -> None:
-        """The arguments are those of `begin`."""
+    def __init__(
+        self,
+        pool: Pool,
+        levels: Level,
+        level_ids: np.ndarray,
+        begun: Mapping[int, Kept] = NOTHING_BEGUN,
+        keep: bool = False,
+    ) -> None:
+        """
+        Args:
+            pool: where experts train.
+            levels: the levels, as their ids rebuild them.
+            level_ids: their ids; the seeds of all randomness.
+            begun: by level id, experts that go on with what they have left of the budget; the others begin.
+            keep: whether the result has the experts.
+        """
         self.pool, self.level_ids, self._begun, self._keep = pool, level_id_array(level_ids), begun, keep
         self.levels: Level = jax.tree.map(np.asarray, levels)
         self.before = decide(self.levels, pool.rules)
@@ -53,10 +59,6 @@ class TrainingRun:
         self.looking = Looking(*self._some(self.left), pool.procedure, pool.rules)
         self.submission: Submission | None = None  # of those that an expert is asked for
         self.look()
-
-    @property
-    def found(self) -> Found:
-        return self.looking.found
 
     def look(self) -> None:
         """Search a little further; submit to the pool once there is nothing left to search."""
@@ -66,111 +68,54 @@ class TrainingRun:
             mine = {
                 i: self._begun[level_id] for i, level_id in enumerate(level_ids.tolist()) if level_id in self._begun
             }
-            self.submission = self.pool.submit(levels, level_ids, self.found, mine, self._keep)
+            self.submission = self.pool.submit(levels, level_ids, self.looking.found, mine, self._keep)
 
     @property
     def searching(self) -> int:
         """Levels that will come to the pool."""
         return 0 if self.submission else len(self.left)
 
+    def totals(self) -> Totals:
+        """How far all levels are, those that need no expert included."""
+        looked = self.looking.env_steps
+        if self.submission is None:
+            return Totals(looked, len(self.level_ids) - len(self.left), 0)
+        now, waiting = self.pool.totals(self.submission), len(self.submission.level_ids)
+        return now._replace(env_steps=now.env_steps + looked, levels=len(self.level_ids) - waiting + now.levels)
+
+    def finish(self) -> UnitResult:
+        """Choose witnesses and give verdicts, once the submission has finished."""
+        (before, failed), left, found, submission = self.before, self.left, self.looking.found, self.submission
+        assert submission is not None
+        config, rules = self.pool.config, self.pool.rules
+        trained = submission.trained(config) if len(submission.level_ids) else as_found(found)
+        actions = np.zeros((RECORD_STEPS, ACTIONS, len(self.level_ids)), np.int32)  # doing nothing, if none are found
+        candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
+        for i, of in zip(left, trained, strict=True):
+            candidates[i] = of.candidates
+        chosen = choose(self.levels, self.level_ids, candidates, config.replays, rules)
+        for i, witness in enumerate(chosen):
+            if witness is not None:
+                actions[..., i] = witness.action
+        record = replay(self.levels, actions, rules)
+        witnesses = [chosen[i] for i in left]
+        judged = judge(trained, witnesses, take(record, left), self.pool.updates, config, failed[left])
+        verdicts = {
+            int(i): with_looks(verdict, found, at) for at, (i, verdict) in enumerate(zip(left, judged, strict=True))
+        }
+        shares = [None if witness is None else witness.portability for witness in chosen]
+        known = [
+            replace(verdict, portability=share) if verdict else verdicts[i]
+            for i, (verdict, share) in enumerate(zip(before, shares, strict=True))
+        ]
+        witnessed = np.array([verdict.label in WITNESSED for verdict in known])
+        record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
+        ended = zip(self.level_ids[left].tolist(), trained, strict=True)
+        experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
+        return UnitResult(self.level_ids, self.levels, record, known, spent_on(known, submission, config), experts)
+
     def _some(self, indices: Int[np.ndarray, " index"]) -> tuple[Level, Int[np.ndarray, " index"]]:
         return take(self.levels, indices), self.level_ids[indices]
-
-
-def train_levels(
-    levels: Level,
-    level_ids: np.ndarray,
-    budget: int,
-    procedure: Procedure,
-    rules: TaskParams = DEFAULT_RULES,
-    tell: Tell = quiet,
-    begun: Mapping[int, Kept] = NOTHING_BEGUN,
-    keep: bool = False,
-) -> UnitResult:
-    """Label the levels; train an expert for each that needs one, in a pool of their own.
-
-    Args:
-        levels: the levels, as their ids rebuild them.
-        level_ids: their ids; the seeds of all randomness.
-        budget: env steps that each expert may use.
-        procedure: how a level gets its label.
-        rules: of the task; records hold its rewards, training shapes with the configuration's.
-        tell: called after each rollout with env steps, levels and solved levels so far.
-        begun: as for `begin`.
-        keep: as for `begin`.
-
-    Raises:
-        ValueError: as `check_budget`.
-    """
-    pool = new_pool(budget, procedure, rules)
-    run = begin(pool, levels, level_ids, begun, keep)
-    while run.submission is None or not pool.step():
-        run.look()
-        tell(*totals(pool, run))
-    result = finish(pool, run)
-    solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
-    tell(result.spent.shown, len(result.verdicts), solved)
-    return result
-
-
-def begin(
-    pool: Pool,
-    levels: Level,
-    level_ids: np.ndarray,
-    begun: Mapping[int, Kept] = NOTHING_BEGUN,
-    keep: bool = False,
-) -> TrainingRun:
-    """Look into the levels that doing nothing does not decide; `TrainingRun.look` goes on with it.
-
-    Args:
-        pool: where experts train, perhaps beside those of other runs.
-        levels: the levels, as their ids rebuild them.
-        level_ids: their ids; the seeds of all randomness.
-        begun: by level id, experts that go on with what they have left of the budget; the others begin.
-        keep: whether the result has the experts.
-    """
-    return TrainingRun(pool, levels, level_ids, begun, keep)
-
-
-def totals(pool: Pool, run: TrainingRun) -> Totals:
-    """How far all levels of a run are, those that need no expert included."""
-    looked = run.looking.env_steps
-    if run.submission is None:
-        return Totals(looked, len(run.level_ids) - len(run.left), 0)
-    now, waiting = pool.totals(run.submission), len(run.submission.level_ids)
-    return now._replace(env_steps=now.env_steps + looked, levels=len(run.level_ids) - waiting + now.levels)
-
-
-def finish(pool: Pool, run: TrainingRun) -> UnitResult:
-    """Choose witnesses and give verdicts, once the run's submission has finished."""
-    level_ids, levels, (before, failed), left, found = run.level_ids, run.levels, run.before, run.left, run.found
-    submission = run.submission
-    assert submission is not None
-    trained = submission.trained(pool.config) if len(submission.level_ids) else as_found(found)
-    actions = np.zeros((RECORD_STEPS, ACTIONS, len(level_ids)), np.int32)  # doing nothing, where none are found
-    candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
-    for i, of in zip(left, trained, strict=True):
-        candidates[i] = of.candidates
-    chosen = choose(levels, level_ids, candidates, pool.config.replays, pool.rules)
-    for i, witness in enumerate(chosen):
-        if witness is not None:
-            actions[..., i] = witness.action
-    record = replay(levels, actions, pool.rules)
-    witnesses = [chosen[i] for i in left]
-    judged = judge(trained, witnesses, take(record, left), pool.updates, pool.config, failed[left])
-    verdicts = {
-        int(i): with_looks(verdict, found, at) for at, (i, verdict) in enumerate(zip(left, judged, strict=True))
-    }
-    shares = [None if witness is None else witness.portability for witness in chosen]
-    known = [
-        replace(verdict, portability=share) if verdict else verdicts[i]
-        for i, (verdict, share) in enumerate(zip(before, shares, strict=True))
-    ]
-    witnessed = np.array([verdict.label in WITNESSED for verdict in known])
-    record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
-    ended = zip(level_ids[left].tolist(), trained, strict=True)
-    experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
-    return UnitResult(level_ids, levels, record, known, spent_on(known, submission, pool), experts)
 
 
 def with_looks(verdict: Verdict, found: Found, index: int) -> Verdict:
@@ -197,23 +142,13 @@ def idling(verdict: Verdict, nothing: Int[np.ndarray, "256 6"]) -> Sequence[Witn
     return () if steps is None else (Witness(nothing, Source.NOTHING, steps),)
 
 
-def spent_on(verdicts: list[Verdict], submission: Submission, pool: Pool) -> EnvSteps:
+def spent_on(verdicts: list[Verdict], submission: Submission, config: ExpertConfig) -> EnvSteps:
     """What the levels of a submission took, and the slots that had none."""
     total = lambda name: sum(getattr(verdict, name) for verdict in verdicts)
     return EnvSteps(
         total("scout_steps"),
         total("search_steps"),
-        submission.trained_rollouts * pool.config.steps_per_update,
+        submission.trained_rollouts * config.steps_per_update,
         total("evaluation_steps"),
-        submission.idle_rollouts * pool.config.steps_per_update,
+        submission.idle_rollouts * config.steps_per_update,
     )
-
-
-def new_pool(budget: int, procedure: Procedure, rules: TaskParams = DEFAULT_RULES) -> Pool:
-    """A pool for experts of one budget, env steps.
-
-    Raises:
-        ValueError: as `check_budget`.
-    """
-    check_budget(budget, procedure.expert, procedure.stop)
-    return Pool(procedure.expert.updates_in(budget), procedure, rules)

@@ -16,10 +16,11 @@ OUTSIDE = ("benchmarks", "tests")  # the product imports neither
 MAY_IMPORT = {
     "physics.codegen": (),
     "physics": ("physics.codegen",),
+    "levelgen.bounds": (),
     "levelgen.level": ("physics",),
     "levelgen.identity": ("levelgen.level", "physics"),
-    "levelgen.sampling": ("levelgen.identity", "levelgen.level", "physics"),
-    "levelgen.task": ("levelgen.level", "physics"),
+    "levelgen.sampling": ("levelgen.identity", "levelgen.bounds", "levelgen.level", "physics"),
+    "levelgen.task": ("levelgen.bounds", "levelgen.level", "physics"),
     "levelgen.files": ("levelgen.sampling", "levelgen.task", "levelgen.level", "physics"),
     "levelgen.pictures": ("levelgen.level", "physics"),
     "levelgen": ("levelgen", "physics"),

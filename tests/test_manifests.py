@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from benchmarks.alone import label
 from configs.compose import compose_job
-from experts.train import train_levels
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
 from pipeline.store.fields import arrays_of
@@ -46,5 +46,5 @@ def test_three_levels_come_out_as_they_did() -> None:
     levels = jax.tree.map(np.asarray, sample_levels(chosen, SIZES["s"], job.distribution))
     for name, values in arrays_of(levels).items():
         np.testing.assert_allclose(values, WORLDS[name][..., chosen], rtol=1e-5, atol=1e-6, err_msg=name)
-    result = train_levels(levels, chosen, job.env_steps, job.procedure, job.task)
+    result = label(levels, chosen, job.env_steps, job.procedure, job.task)
     assert [v.label for v in result.verdicts] == ["solved", "solved", "unsolved"]

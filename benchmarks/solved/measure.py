@@ -176,7 +176,7 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
     import jax.numpy as jnp
     import numpy as np
 
-    from experts.train import train_levels
+    from benchmarks.alone import label
     from levelgen.level import size_of
     from levelgen.sampling.distribution import Distribution
     from levelgen.sampling.sampler import sample_levels
@@ -190,10 +190,10 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
             told.put(Progress(unit, totals))
 
         if not warm:
-            train_levels(levels, ids, variant.procedure.expert.steps_per_update, variant.procedure)
+            label(levels, ids, variant.procedure.expert.steps_per_update, variant.procedure)
             warm = True
         before = time.process_time()
-        result = train_levels(levels, ids, header.budget, variant.procedure, tell=report)
+        result = label(levels, ids, header.budget, variant.procedure, tell=report)
         seconds = (time.process_time() - before) / len(ids)
         rows = [row_of(int(i), v, seconds) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
         solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from experts.config import MOST_COUNTED
+from levelgen.bounds import require
 
 MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are counted in 32 bits
 
@@ -33,27 +34,14 @@ class SearchConfig:
     rounds: int = 8  # between looks of the host
 
     def __post_init__(self) -> None:
-        if self.env_steps < 0:
-            raise ValueError(f"env_steps is {self.env_steps}: it must not be negative")
-        for name in ("lanes", "segment", "stretch", "entries", "trials", "rounds"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
-        if self.entries > MOST_ENTRIES:
-            raise ValueError(f"entries is {self.entries}: an archive has at most {MOST_ENTRIES}")
-        if self.env_steps > MOST_COUNTED:
-            raise ValueError(f"env_steps is {self.env_steps}: a search can count no more than {MOST_COUNTED}")
+        require(self, ("env_steps",), 0, MOST_COUNTED)
+        require(self, ("lanes", "segment", "stretch", "trials", "rounds"), 1)
+        require(self, ("entries",), 1, MOST_ENTRIES)
+        require(self, ("nearer", "anew"), 0, 1)
+        require(self, ("width",), 0, above=True)
+        require(self, ("growth",), 1, above=True)
+        require(self, ("driven_weight", "other_weight", "velocity_seconds"), 0)
         if not self.redrawn or not all(0 < chance <= 1 for chance in self.redrawn):
             raise ValueError(f"redrawn is {self.redrawn}: give chances above 0 and at most 1")
         if self.lanes % len(self.redrawn):
             raise ValueError(f"lanes is {self.lanes}: give a multiple of {len(self.redrawn)}, the chances in redrawn")
-        if not 0 <= self.nearer <= 1:
-            raise ValueError(f"nearer is {self.nearer}: it must be between 0 and 1")
-        if not 0 <= self.anew <= 1:
-            raise ValueError(f"anew is {self.anew}: it must be between 0 and 1")
-        if self.width <= 0:
-            raise ValueError(f"width is {self.width}: it must be above 0")
-        if self.growth <= 1:
-            raise ValueError(f"growth is {self.growth}: it must be above 1")
-        for name in ("driven_weight", "other_weight", "velocity_seconds"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")

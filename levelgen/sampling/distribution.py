@@ -7,6 +7,7 @@ The defaults are the reference's random-level distribution, Kinetix 3.0.2: names
 import math
 from dataclasses import dataclass, fields
 
+from levelgen.bounds import require
 from levelgen.level import HALF_WORLD
 
 # m, largest reach of a free body from its centre: green and blue may have to fit into one half of the world
@@ -89,8 +90,10 @@ class Distribution:
     swap_chance: float = 0.5  # green and blue change roles if the floor is plain (distributions.sample_kinetix_level)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            self._check(field.name, getattr(self, field.name))
+        names = [field.name for field in fields(self)]
+        require(self, [name for name in names if name.endswith("_chance")], 0, 1)
+        require(self, names, 0)
+        require(self, ("proposals", "min_half_side", "min_radius"), 0, above=True)
         self._check_sums()
         for low, high in (
             ("min_motor_speed", "max_motor_speed"),
@@ -101,17 +104,6 @@ class Distribution:
             if getattr(self, low) > getattr(self, high):
                 raise ValueError(f"{low} is {getattr(self, low)}: it must be at most {high}, {getattr(self, high)}")
         self._check_shapes()
-
-    @staticmethod
-    def _check(name: str, value: float) -> None:
-        if not math.isfinite(value):
-            raise ValueError(f"{name} is {value}: it must be a finite number")
-        if name.endswith("_chance") and not 0 <= value <= 1:
-            raise ValueError(f"{name} is {value}: it must be between 0 and 1")
-        if value < 0:
-            raise ValueError(f"{name} is {value}: it must be 0 or more")
-        if name in ("proposals", "min_half_side", "min_radius") and value <= 0:
-            raise ValueError(f"{name} is {value}: it must be more than 0")
 
     def _check_sums(self) -> None:
         floor = self.floor_green_chance + self.floor_blue_chance + self.floor_red_chance

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from levelgen.bounds import require
 from levelgen.level import Level, Role
 from levelgen.task.actions import Controls, controls
 from physics.pairs import pairs_of
@@ -30,11 +31,8 @@ class TaskParams:
     physics: Params = field(default_factory=Params)  # constants of the engine
 
     def __post_init__(self) -> None:
-        for name in ("frame_skip", "max_timesteps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
-        if self.dense_reward_scale < 0:
-            raise ValueError(f"dense_reward_scale is {self.dense_reward_scale}: it must not be negative")
+        require(self, ("frame_skip", "max_timesteps"), 1)
+        require(self, ("dense_reward_scale",), 0)
 
 
 DEFAULT_RULES = TaskParams()

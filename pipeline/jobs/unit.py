@@ -16,7 +16,7 @@ from configs.compose import again
 from configs.schema import JobConfig
 from experts.labels import WITNESSED, Label, Verdict
 from experts.pool import Pool
-from experts.train import TrainingRun, UnitResult, begin, finish, new_pool
+from experts.train import TrainingRun, UnitResult
 from experts.witness import Record, replay, succeeds
 from levelgen.identity.content import content_hashes
 from levelgen.identity.keys import level_id_array
@@ -40,7 +40,7 @@ from pipeline.store.shard import write_shard
 
 def pool_for(job: JobConfig) -> Pool:
     """Where a job's experts train, those of several units side by side."""
-    return new_pool(job.env_steps, job.procedure, job.task)
+    return Pool(job.env_steps, job.procedure, job.task)
 
 
 def begin_unit(job: JobConfig, unit: WorkUnit, pool: Pool) -> TrainingRun:
@@ -51,17 +51,17 @@ def begin_unit(job: JobConfig, unit: WorkUnit, pool: Pool) -> TrainingRun:
     """
     ids = level_id_array(unit.level_ids)
     levels = levels_at(unit.origins) if unit.origins else sample_levels(ids, size_of(job.size), job.distribution)
-    return begin(pool, levels, ids, experts_for(job, unit.level_ids), job.keep_experts)
+    return TrainingRun(pool, levels, ids, experts_for(job, unit.level_ids), job.keep_experts)
 
 
-def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool, run: TrainingRun) -> Summary:
+def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -> Summary:
     """Judge and commit a unit whose levels have left the pool.
 
     Raises:
         Failure: a witness does not replay.
         OSError: the disk refuses; nothing is committed.
     """
-    result = finish(pool, run)
+    result = run.finish()
     check_witnesses(result, job.task)
     commit(job, split, unit, result)
     labels = [verdict.label for verdict in result.verdicts]

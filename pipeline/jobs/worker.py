@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from configs.schema import JobConfig
-from experts.train import TrainingRun, totals
+from experts.train import TrainingRun
 from pipeline.jobs.schedule import Round, UnitOutcome, WorkUnit
 from pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
 
@@ -30,8 +30,7 @@ class Worker:
         outcomes = [outcome for unit in units if unit not in self._runs and (outcome := self._begin(unit))]
         while self._runs and not outcomes and time.monotonic() < until:
             outcomes = self._step()
-        now = {unit: totals(self._pool, run) for unit, run in self._runs.items()}
-        plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}  # read without JAX
+        plain = {unit: tuple(run.totals()) for unit, run in self._runs.items()}  # read without JAX
         wants = max(0, self._pool.wants - sum(run.searching for run in self._runs.values()))
         return Round(outcomes, plain, wants)
 
@@ -58,6 +57,6 @@ class Worker:
     def _finish(self, unit: WorkUnit) -> UnitOutcome:
         run = self._runs.pop(unit)
         try:
-            return UnitOutcome(unit, finish_unit(self._job, self._split, unit, self._pool, run))
+            return UnitOutcome(unit, finish_unit(self._job, self._split, unit, run))
         except Exception as error:
             return failure(self._split, unit, error)

@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks.alone import label
 from experts.before import decide, facts_of
 from experts.config import RECORD_STEPS, ExpertConfig
 from experts.labels import Label, Verdict
 from experts.procedure import Procedure
-from experts.train import train_levels
 from experts.witness import replay, succeeds, take
 from levelgen.level import SIZES, Level
 from levelgen.proofs import Proof
@@ -71,7 +71,7 @@ def test_nobody_trains_on_what_is_decided(levels: Level, verdicts: list[Verdict 
     """An expert of this configuration could not even be made: it would need a terabyte."""
     trivial, unsolvable = indices(verdicts, Label.TRIVIAL)[:3], indices(verdicts, Label.UNSOLVABLE)[:2]
     at = np.array([*trivial, *unsolvable])
-    result = train_levels(take(levels, at), at, 10**9, Procedure(expert=ExpertConfig(width=10**6, depth=2)))
+    result = label(take(levels, at), at, 10**9, Procedure(expert=ExpertConfig(width=10**6, depth=2)))
     assert [v.label for v in result.verdicts] == [Label.TRIVIAL] * 3 + [Label.UNSOLVABLE] * 2
     np.testing.assert_array_equal(succeeds(result.record.done, result.record.goal), [True] * 3 + [False] * 2)
     assert not np.any(result.record.action)

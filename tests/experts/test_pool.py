@@ -32,7 +32,7 @@ def alone(levels: Level) -> list[Trained]:
 
 
 def new_pool() -> Pool:
-    return Pool(UPDATES, untouched(SOLVED), DEFAULT_RULES)
+    return Pool(UPDATES * CONFIG.steps_per_update, untouched(SOLVED), DEFAULT_RULES)
 
 
 def part(levels: Level, at: range) -> tuple[Level, np.ndarray]:

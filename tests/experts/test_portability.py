@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.alone import label
 from experts import portability
 from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
 from experts.judge import Witness, repeating
@@ -17,7 +18,7 @@ from experts.rollout import repeat
 from experts.scout import scout
 from experts.search.config import SearchConfig
 from experts.success import Success
-from experts.train import UnitResult, train_levels
+from experts.train import UnitResult
 from experts.witness import replay, take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
@@ -131,7 +132,7 @@ def test_a_level_with_two_ways_has_the_portable_one(levels: Level, witnesses: li
 
 def labelled(levels: Level, replays: int) -> UnitResult:
     procedure = Procedure(ONCE, SearchConfig(env_steps=0), ExpertConfig(replays=replays), StopConfig(rule=Rule.NONE))
-    return train_levels(levels, IDS, 4096, procedure)
+    return label(levels, IDS, 4096, procedure)
 
 
 def test_every_witness_has_its_portability_and_nothing_else_has(levels: Level, shares: np.ndarray) -> None:

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.alone import label
 from experts.config import RECORD_STEPS, Rule, ScoutConfig, StopConfig
 from experts.labels import Label, Source
 from experts.scout import REDRAWN, STEPS_PER_ROUND, Scouted, persistent, scout, shortest
-from experts.train import train_levels
 from experts.witness import replay, take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
@@ -92,7 +92,7 @@ def test_the_shortest_success_counts() -> None:
 
 def test_without_experts_labels_rest_on_what_was_found(levels: Level, found: Scouted) -> None:
     procedure = replace(untouched(StopConfig(rule=Rule.NONE)), scout=TWICE)
-    result = train_levels(levels, IDS, 1024, procedure)
+    result = label(levels, IDS, 1024, procedure)
     for verdict, length, steps in zip(result.verdicts, found.success.length, found.env_steps, strict=True):
         assert verdict.label is (Label.SOLVED if length else Label.UNSOLVED)
         assert verdict.witness is (Source.SCOUT if length else None)

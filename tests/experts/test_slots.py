@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks.alone import label
 from experts import advance as advance_module
 from experts.advance import advance
 from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
@@ -18,7 +19,6 @@ from experts.queue import empty_queue, enter
 from experts.slots import LevelQueue, Mode, empty_slots
 from experts.stop import rules_of
 from experts.success import Success, no_success
-from experts.train import train_levels
 from experts.witness import take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
@@ -33,7 +33,7 @@ UPDATES = 24  # 12,288 env steps
 def train(
     levels: Level, level_ids: np.ndarray, updates: int, config: ExpertConfig, stopping: StopConfig, **how: Any
 ) -> tuple[list[Trained], Submission]:
-    pool = Pool(updates, untouched(stopping, config), DEFAULT_RULES)
+    pool = Pool(updates * config.steps_per_update, untouched(stopping, config), DEFAULT_RULES)
     submission = pool.submit(levels, level_ids, **how)
     while not pool.step():
         pass
@@ -125,13 +125,13 @@ def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) ->
     for i in never:
         assert len(halved[i].curve) in (4, 8)  # at the first rung there is nothing to compare with
     assert submission.trained_rollouts == sum(len(of.curve) for of in halved)
-    verdicts = train_levels(levels, IDS, UPDATES * 512, untouched(HALVED)).verdicts
+    verdicts = label(levels, IDS, UPDATES * 512, untouched(HALVED)).verdicts
     reasons = {i: verdict.label_reason for i, verdict in enumerate(verdicts) if verdict.label is Label.UNSOLVED}
     assert all("at a rung the best return had not grown" in reasons[i] for i in never)
 
 
 def test_a_success_of_training_is_a_witness_where_evaluation_has_none(levels: Level) -> None:
-    verdicts = train_levels(levels, IDS, UPDATES * 512, untouched(replace(WHOLE, successes=4))).verdicts
+    verdicts = label(levels, IDS, UPDATES * 512, untouched(replace(WHOLE, successes=4))).verdicts
     for verdict in verdicts:
         if verdict.steps_to_first_success is not None:
             assert verdict.label is Label.SOLVED
@@ -191,7 +191,7 @@ def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level
         training = training._replace(train_state=training.train_state._replace(params=params), success=success)
         begun[int(IDS[i])] = kept._replace(begun=kept.begun._replace(training=training))
     some, budget = take(levels, np.arange(2)), 2 * UPDATES * 512
-    for verdict in train_levels(some, IDS[:2], budget, untouched(WHOLE), begun=begun).verdicts:
+    for verdict in label(some, IDS[:2], budget, untouched(WHOLE), begun=begun).verdicts:
         assert verdict.label is Label.UNSOLVED
         assert verdict.env_steps == (UPDATES + 1) * 512
         assert f"its network's numbers stopped being finite after {verdict.env_steps} env steps" in verdict.label_reason

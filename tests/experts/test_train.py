@@ -5,13 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.alone import label
 from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
 from experts.labels import Label
-from experts.train import UnitResult, new_pool, train_levels
+from experts.pool import Pool
+from experts.train import UnitResult
 from experts.witness import LANES, replay, steps_to_goal, succeeds
 from levelgen.level import SIZES, Level
 from levelgen.sampling.distribution import Distribution
 from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, IDS, WHOLE, untouched
 
 UPDATES = 24
@@ -30,7 +33,7 @@ def reports() -> list[tuple[int, float, int]]:
 
 @pytest.fixture(scope="module")
 def result(levels: Level, reports) -> UnitResult:
-    return train_levels(levels, IDS, BUDGET, untouched(WHOLE), tell=lambda *now: reports.append(now))
+    return label(levels, IDS, BUDGET, untouched(WHOLE), tell=lambda *now: reports.append(now))
 
 
 def same(a, b) -> None:
@@ -64,7 +67,7 @@ def test_a_solved_level_has_a_witness_and_no_other_has(levels: Level, result: Un
 
 def test_a_result_depends_on_the_level_alone(levels: Level, result: UnitResult) -> None:
     at = [4, 1, 2]
-    some = train_levels(jax.tree.map(lambda x: x[..., at], levels), IDS[at], BUDGET, untouched(WHOLE))
+    some = label(jax.tree.map(lambda x: x[..., at], levels), IDS[at], BUDGET, untouched(WHOLE))
     for i, verdict in zip(at, some.verdicts, strict=True):
         np.testing.assert_equal(vars(verdict), vars(result.verdicts[i]))
     same(some.record, jax.tree.map(lambda x: x[..., at], result.record))
@@ -109,9 +112,7 @@ def test_a_record_starts_anew_after_each_end(levels: Level) -> None:
 
 def test_levels_that_all_need_no_expert() -> None:
     trivial = np.array([1])
-    result = train_levels(
-        sample_levels(jnp.asarray(trivial), SIZES["s"], Distribution()), trivial, BUDGET, untouched(WHOLE)
-    )
+    result = label(sample_levels(jnp.asarray(trivial), SIZES["s"], Distribution()), trivial, BUDGET, untouched(WHOLE))
     assert [v.label for v in result.verdicts] == [Label.TRIVIAL]
     assert (result.spent.trained, result.spent.idle) == (0, 0)
 
@@ -128,11 +129,11 @@ def test_levels_that_all_need_no_expert() -> None:
 )
 def test_a_budget_that_cannot_be_used_is_refused(budget: int, stopping: StopConfig, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        new_pool(budget, untouched(stopping))
+        Pool(budget, untouched(stopping), DEFAULT_RULES)
 
 
 def test_the_largest_budget_is_accepted() -> None:
-    assert new_pool(2**31 - 1, untouched(StopConfig(wait=2**24))).updates == 2**22 - 1
+    assert Pool(2**31 - 1, untouched(StopConfig(wait=2**24)), DEFAULT_RULES).updates == 2**22 - 1
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.alone import label
 from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
 from experts.labels import Label, Source
 from experts.procedure import Procedure
@@ -19,7 +20,6 @@ from experts.search.search import Searched, search, side_by_side
 from experts.search.shorten import shorten
 from experts.steps import EnvSteps
 from experts.success import Success
-from experts.train import train_levels
 from experts.witness import replay, take
 from levelgen.identity.keys import GENERATOR
 from levelgen.level import Level
@@ -207,7 +207,7 @@ def test_a_label_rests_on_what_was_found() -> None:
     """Scouts first, a search where they find nothing; and every env step is counted."""
     some = np.array([0, 1, 2])
     procedure = Procedure(ScoutConfig(rounds=1), CONFIG, ExpertConfig(), StopConfig(rule=Rule.NONE))
-    result = train_levels(take(levels(), some), IDS[some], 2048, procedure)
+    result = label(take(levels(), some), IDS[some], 2048, procedure)
     for i, verdict in zip(some, result.verdicts, strict=True):
         length = int(found().success.length[i])
         assert verdict.label is (Label.SOLVED if length else Label.UNSOLVED)

@@ -241,12 +241,12 @@ def test_ids_out_of_range_are_refused(level_id: int) -> None:
     [
         ({"motor_chance": 1.3}, "motor_chance is 1.3: it must be between 0 and 1"),
         ({"floor_red_chance": -0.1}, "floor_red_chance is -0.1: it must be between 0 and 1"),
-        ({"hidden_penalty": -1.0}, "hidden_penalty is -1.0: it must be 0 or more"),
-        ({"proposals": 0}, "proposals is 0: it must be more than 0"),
+        ({"hidden_penalty": -1.0}, "hidden_penalty is -1.0: it must be at least 0"),
+        ({"proposals": 0}, "proposals is 0: it must be above 0"),
         ({"max_limit": float("nan")}, "max_limit is nan: it must be a finite number"),
         ({"max_motor_speed": 0.1}, "min_motor_speed is 0.4: it must be at most max_motor_speed, 0.1"),
         ({"connected_circle_chance": 2.0}, "connected_circle_chance is 2.0: it must be between 0 and 1"),
-        ({"motor_only_weight": -1.0}, "motor_only_weight is -1.0: it must be 0 or more"),
+        ({"motor_only_weight": -1.0}, "motor_only_weight is -1.0: it must be at least 0"),
         (
             {"motor_only_weight": 0.0, "thruster_only_weight": 0.0, "motor_and_thruster_weight": 0.0},
             "motor_and_thruster_weight is 0: one of motor_only_weight, thruster_only_weight and "

@@ -7,9 +7,10 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks.alone import label
 from configs.schema import JobConfig
 from experts.labels import Label
-from experts.train import UnitResult, train_levels
+from experts.train import UnitResult
 from experts.witness import Record, replay
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
@@ -36,7 +37,7 @@ def result(job: JobConfig) -> UnitResult:
     """Real levels, experts and witnesses."""
     ids = np.array(UNIT.level_ids, np.int32)
     levels = sample_levels(ids, SIZES[job.size], job.distribution)
-    result = train_levels(levels, ids, job.env_steps, job.procedure, job.task)
+    result = label(levels, ids, job.env_steps, job.procedure, job.task)
     assert Label.SOLVED in [verdict.label for verdict in result.verdicts], "the tests need a solved level"
     return result
 

@@ -1,0 +1,19 @@
+"""Bounds of settings, looked at where a dataclass of them is made."""
+
+from collections.abc import Iterable
+from math import inf, isfinite
+from typing import Any
+
+
+def require(settings: Any, names: Iterable[str], least: float, most: float = inf, above: bool = False) -> None:
+    """Refuse settings that are not finite, below `least` (if `above`: or equal to it) or beyond `most`.
+
+    Raises:
+        ValueError: one is; the message starts with its name.
+    """
+    for name in names:
+        value = getattr(settings, name)
+        if not isfinite(value) or not least <= value <= most or (above and value == least):
+            within = f"at least {least}" if most == inf else f"between {least} and {most}"
+            wanted = "a finite number" if not isfinite(value) else f"above {least}" if above else within
+            raise ValueError(f"{name} is {value}: it must be {wanted}")
