@@ -3,7 +3,6 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from itertools import product
@@ -27,6 +26,7 @@ ConfigStore.instance().store(name="code", node=plain(JobConfig()))  # where conf
 # Results that are not settings, or have their own word
 BY_HAND = frozenset({"size", "distribution", "budget", "sampler_version"})
 WORDS = frozenset({"size", "levels", "level_files", "budget", "out", "continue_from"})  # kept as typed: 007 stays 007
+FOLDERS = ("procedure", "distribution")  # of presets
 OF_RANDOM_LEVELS = ("size", "levels", "first_level", "distribution")
 
 
@@ -73,24 +73,25 @@ def presets() -> dict[str, list[str]]:
     }
 
 
+@cache
 def again(job: JobConfig) -> str:
     """The shortest command, but for `out` and which levels, with the same results as `job`."""
-    fixed, wanted = [f"budget={job.budget}"], flat(job.results)
+    fixed, wanted, default = [f"budget={job.budget}"], flat(job.results), flat(_default().results)
     if not job.level_files:
         fixed.insert(0, f"size={job.size}")
     commands = []
-    for words in product(*(_words(folder) for folder in ("procedure", "distribution"))):
-        named = [word for word in words if word]
-        # with its own budget: the job's may be too small for its experts
-        start = flat(replace(_started(words), size=job.size, level_files=job.level_files).results)
+    for names in product(*(presets()[folder] for folder in FOLDERS)):
+        named = dict(zip(FOLDERS, names, strict=True))
+        words = [f"{folder}={name}" for folder, name in named.items() if name != chosen()[folder]]
+        start = default | {key: value for preset in named.items() for key, value in _changes(*preset).items()}
         changed = [typed_as(key, value) for key, value in wanted.items() if key not in BY_HAND and start[key] != value]
-        commands.append(shlex.join(["levelproof", "generate", *fixed, *named, *changed]))
+        commands.append(shlex.join(["levelproof", "generate", *fixed, *words, *changed]))
     return min(commands, key=len)
 
 
 def words_for(results: Mapping[str, Any]) -> list[str]:
     """The settings, but for the budget, that a job with these `JobConfig.results` has and the default has not."""
-    default, known = flat(_started(()).results), flat(results)
+    default, known = flat(_default().results), flat(results)
     changed = [name for name in known if name not in BY_HAND and known[name] != default.get(name, ...)]
     size = [] if from_files(results) else [f"size={results['size']}"]
     return [*size, *(typed_as(name, known[name]) for name in changed)]
@@ -102,20 +103,28 @@ def typed_as(name: str, value: Any) -> str:
 
 
 @cache
-def _started(words: tuple[str, ...]) -> JobConfig:
-    """The job that these words describe, some of which may be empty."""
-    return compose_job([word for word in words if word])
+def _default() -> JobConfig:
+    return compose_job([])
 
 
-def _words(folder: str) -> list[str]:
-    """What chooses each preset of a folder; for the one that is there already, nothing."""
-    return [f"{folder}={name}" if name != chosen()[folder] else "" for name in presets()[folder]]
+@cache
+def _written(folder: str, name: str) -> dict[str, Any]:
+    """What stands in a preset's file: without Hydra, which takes a hundred times as long to compose all settings."""
+    written = OmegaConf.to_container(OmegaConf.load(str(files("configs") / folder / f"{name}.yaml")))
+    assert isinstance(written, dict)
+    return {str(key): value for key, value in written.items()}
+
+
+def _changes(folder: str, name: str) -> dict[str, Any]:
+    """The settings that a preset changes: those of the group that its folder is called after, or any."""
+    written = _written(folder, name)
+    return flat({folder: written} if folder in JobConfig.__annotations__ else written)
 
 
 @cache
 def distributions() -> dict[str, Distribution]:
     """The presets in configs/distribution/ by name."""
-    return {name: compose_job([f"distribution={name}"]).distribution for name in presets()["distribution"]}
+    return {name: typed(Distribution, _written("distribution", name)) for name in presets()["distribution"]}
 
 
 def identified(distribution: Distribution) -> tuple[str | None, str]:

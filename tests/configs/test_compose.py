@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from configs.compose import again, compose_job, distributions, identified
+from configs.compose import FOLDERS, again, chosen, compose_job, distributions, identified, presets
 from configs.errors import ConfigError
 from configs.schema import WITHOUT_EFFECT
 from experts.config import ExpertConfig
@@ -138,6 +138,13 @@ def test_a_preset_is_called_by_its_name() -> None:
     assert again(job) == "levelproof generate size=m budget=5k distribution=clutter"
     spelled = [f"distribution.{key}={value}" for key, value in dataclasses.asdict(job.distribution).items()]
     assert again(compose_job(["size=m", "budget=5k", *spelled])) == again(job)
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_presets_are_read_as_hydra_composes_them(folder: str) -> None:
+    for name in presets()[folder]:
+        job = compose_job([f"{folder}={name}", "budget=1M"])
+        assert again(job).split()[4:] == ([f"{folder}={name}"] if name != chosen()[folder] else []), again(job)
 
 
 def test_the_default_distribution_is_that_of_kinetix() -> None:
