@@ -29,6 +29,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "families": ("benchmarks.families", "how many levels of each distribution need no expert, and a sheet of each"),
     "portability": ("benchmarks.portability", "how many witnesses reach the goal in the reference"),
     "handmade": ("benchmarks.handmade", "what it takes to label the reference's 74 handmade levels, one by one"),
+    "storage": ("benchmarks.storage", "bytes per transition of each density, and trajectories/s written and read"),
     "manifest": ("benchmarks.manifest", "how long commands take to start on a split of millions of levels"),
     "readme": ("benchmarks.readme", "the README's commands in a fresh clone and environment"),
 }

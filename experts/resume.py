@@ -38,14 +38,14 @@ class KnownStates(NamedTuple):
     """States of a record to go on from, wherever playing has led to."""
 
     state: State  # [256, ..., level]
-    last_distance: Array | None  # m, [256, level]; None: as the step that leads there gives it
+    last_distance: Any  # m, [256, level]; None: as the step that leads there gives it
     known: Bool[np.ndarray, "256 level"]  # which of them there are
 
 
 class Resumed(NamedTuple):
     """What playing gave."""
 
-    fields: dict[str, np.ndarray]  # of `Record`, by their paths: [256, ..., level]
+    fields: dict[str, Any]  # arrays of `Record`, by their paths: [256, ..., level]
     checksum: UInt32[np.ndarray, "256 level"] | None  # of each row's state, where playing led to it by itself
     agrees: Bool[np.ndarray, "256 level"]  # whether each step ends its episode as the record has it
 
@@ -101,11 +101,18 @@ def timesteps(done: Bool[np.ndarray, "256 level"]) -> Int[np.ndarray, "256 level
     return row - np.maximum.accumulate(np.where(begins, row, 0), axis=0)
 
 
-def checksum(states: TaskState, rows: Int[Array, "row #lane"]) -> UInt32[Array, "row lane"]:
-    """Of every bit of each state, [row, ..., lane], and of the row of the record at which it stands.
+def checksum(states: TaskState, rows: Any) -> Any:
+    """Of every bit of each state, [row, ..., lane], and of where in the record it stands; of numpy arrays as of JAX's.
 
     The words of a state in the order of `TaskState`, each mixed with its number in the record, and all added: any
-    change of one word changes the sum, any other does with probability 1 - 2^-32. Of numpy arrays as of JAX's.
+    change of one word changes the sum, any other does with probability 1 - 2^-32.
+
+    Args:
+        states: the states of some rows.
+        rows: which rows of a record they are, int [row, lane]; one lane stands for all.
+
+    Returns:
+        uint32 [row, lane].
     """
     words = [_words(x) for x in jax.tree.leaves(states)]
     number = rows.astype(np.uint32) * np.uint32(sum(x.shape[1] for x in words))
@@ -117,12 +124,13 @@ def checksum(states: TaskState, rows: Int[Array, "row #lane"]) -> UInt32[Array, 
     return total
 
 
-def _words(x: Array) -> UInt32[Array, "row word lane"]:
+def _words(x: Any) -> Any:
+    """[row, word, lane]"""
     bits = x.view(np.uint32) if x.dtype == np.float32 else x.astype(np.uint32)
     return bits.reshape(len(x), int(np.prod(x.shape[1:-1])), x.shape[-1])
 
 
-def mixed(x: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
+def mixed(x: Any) -> Any:
     """The finalizer of MurmurHash3: every bit of a word decides about half of the others; no two words become one."""
     x = (x ^ (x >> 16)) * MIX_A
     x = (x ^ (x >> 13)) * MIX_B

@@ -7,7 +7,7 @@ are others than the checksums say, key frames are the truth, and states between 
 """
 
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -118,9 +118,10 @@ def _played(stored: Mapping[str, np.ndarray]) -> tuple[Level, Moves]:
     return tree_of(Level, stored, "level/"), Moves(*(stored[name] for name in MOVES))
 
 
-def task_states(arrays: Mapping[str, np.ndarray], path: str, timestep: np.ndarray) -> TaskState:
+def task_states(arrays: Mapping[str, np.ndarray], path: str, timestep: Any) -> TaskState:
     """States and last distances that are called so, [row, ..., level]."""
-    return TaskState(tree_of(State, arrays, path), timestep, arrays[path.removesuffix("state/") + "last_distance"])
+    distance: Any = arrays[path.removesuffix("state/") + "last_distance"]
+    return TaskState(tree_of(State, arrays, path), timestep, distance)
 
 
 def key_rows(

@@ -175,14 +175,15 @@ class Shard:
 
 
 def read_together(
-    parts: Sequence[tuple[Shard, Sequence[int]]], fields: Iterable[str] | None = None
+    parts: Sequence[tuple[Shard, Sequence[int]]], fields: Iterable[str] | None = None, exactly: bool = False
 ) -> dict[str, np.ndarray]:
     """Named arrays of rows of shards of one size, one part after another; level axis FIRST, then time.
 
     What a shard holds along time is given as a view of the packed arrays, whose time is the last axis.
 
     Raises:
-        Failure: a chunk is missing or damaged, or holds what a level or a record of this size cannot.
+        Failure: a chunk is missing or damaged, or holds what a level or a record of this size cannot; or, if it has to
+            be `exactly` as it was stored, the engine gives other states on this machine.
     """
     wanted = None if fields is None else set(fields)
     table = [field for field in table_for(parts[0][0].size) if wanted is None or field.name in wanted]
@@ -191,7 +192,7 @@ def read_together(
         by_encoding.setdefault(shard.encoding, []).append(i)
     found = [_read_alike([parts[i] for i in alike], table) for alike in by_encoding.values()]
     for alike, of in zip(by_encoding.values(), found, strict=True):
-        _warn([parts[i] for i in alike], of.unlike)
+        _tell([parts[i] for i in alike], of.unlike, exactly)
     if len(found) == 1:
         return found[0].arrays
     ends = np.cumsum([0] + [len(rows) for _, rows in parts])
@@ -227,18 +228,19 @@ def _slices(parts: Sequence[tuple[Shard, Sequence[int]]]) -> list[slice]:
     return [slice(end - len(rows), end) for end, (_, rows) in zip(ends, parts, strict=True)]
 
 
-def _warn(parts: Sequence[tuple[Shard, Sequence[int]]], unlike: np.ndarray) -> None:
+def _tell(parts: Sequence[tuple[Shard, Sequence[int]]], unlike: np.ndarray, refuse: bool) -> None:
     """Say it where this machine's states are not those that were stored."""
     for (shard, rows), mine in zip(parts, _slices(parts), strict=True):
         if len(wrong := np.flatnonzero(unlike[mine] >= 0)):
             first = int(wrong[0])
-            warnings.warn(
+            what = (
                 f"On this machine the engine computes other states than those that were stored of {len(wrong)} of "
                 f"{len(rows)} levels of the shard {shard.path}, of level {shard.level_ids[rows[first]]} from step "
-                f"{unlike[mine][first]} on: between key frames, states are this machine's own.",
-                EngineDiffers,
-                stacklevel=3,
+                f"{unlike[mine][first]} on"
             )
+            if refuse:
+                raise Failure(f"{what}: read it with a machine and versions such as it was made with.")
+            warnings.warn(f"{what}: between key frames, states are this machine's own.", EngineDiffers, stacklevel=3)
 
 
 def _named(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec], size: Size) -> dict[str, np.ndarray]:

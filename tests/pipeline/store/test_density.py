@@ -26,10 +26,11 @@ from levelgen.sampling.distribution import Distribution
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
 from pipeline.errors import Failure
-from pipeline.store import density
+from pipeline.store import convert, density
 from pipeline.store.contents import table_for
 from pipeline.store.density import CHECKSUM, key_rows, task_states
 from pipeline.store.fields import arrays_of, same_bits, tree_of
+from pipeline.store.merge import Place
 from pipeline.store.packing import pack, unpack
 from pipeline.store.schema import Encoding, field_table
 from pipeline.store.shard import EngineDiffers, Shard, read_together, stored_bytes, write_shard
@@ -200,8 +201,8 @@ def test_a_checksum_that_differs_is_told(tmp_path: Path) -> None:
 
 def test_ends_of_episodes_that_differ_are_told(tmp_path: Path) -> None:
     """They are those that were stored, and what the engine thinks of them is not asked."""
-    for kind, run in (("resume", 1), ("witness", 32)):
-        shard = write(tmp_path, Encoding(kind))
+    for encoding, run in ((Encoding("resume"), 1), (WITNESS, 32)):
+        shard = write(tmp_path, encoding)
         done = played()["record/done"]
         level = int(np.flatnonzero(done.any(0))[0])
         row = int(done[:, level].argmax())
@@ -364,3 +365,27 @@ def test_trees_of_states_are_those_of_records() -> None:
         "last_distance",
     ]
     assert isinstance(tree_of(Level, played(), "level/"), Level)
+
+
+def test_conversion_takes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever densities they come from, in the order of places."""
+    monkeypatch.setattr(convert, "LEVELS", 2)
+    witness, full = write(tmp_path, WITNESS), write(tmp_path, Encoding())
+    places = [Place(of.path, row, IDS[row]) for of, row in ((full, 0), (witness, 1), (witness, 2))]
+    paths = iter(tmp_path / f"{i}.zarr" for i in range(9))
+    found = list(convert.convert(places, "resume", 32, paths))
+    assert [[place.level_id for place in of] for of in found] == [IDS[:2], IDS[2:3]]
+    for place in (place for of in found for place in of):
+        shard = Shard(place.shard)
+        assert (shard.encoding.density, shard.level_ids[place.row]) == ("resume", place.level_id)
+        i = IDS.index(place.level_id)
+        assert_same(shard.read([place.row]), {name: x[..., i : i + 1] for name, x in played().items()})
+
+
+def test_states_of_another_machine_are_not_converted(tmp_path: Path, keyed: tuple[int, int]) -> None:
+    """What they were cannot be told from this machine's."""
+    level, row = keyed
+    shard = changed(write(tmp_path, WITNESS), lambda stored: ulp(stored, "key/state/position", 0, level))
+    with pytest.raises(Failure, match=f"other states than those that were stored of 1 of 1 .* {row} on: read"):
+        list(convert.convert([Place(shard.path, level, IDS[level])], "full", 32, iter([tmp_path / "new.zarr"])))
+    assert not (tmp_path / "new.zarr").exists()

@@ -1,0 +1,144 @@
+"""What a transition takes on the disk in each density, and how fast trajectories are written and read, on one core.
+
+All trajectories of a split are put into one shard of each density. `resume` and `witness` are written with the check
+that everything comes back, and read through the engine where it has to compute.
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pyarrow.compute as pc
+
+from benchmarks import oracle
+from benchmarks.report import Report, Table
+from configs.schema import Density
+from experts.config import RECORD_STEPS
+from levelgen.level import SIZES
+from pipeline.errors import UserError
+from pipeline.read.rows import COLUMNS, read_rows
+from pipeline.runtime import own_cores, prepare_jax
+from pipeline.store.manifest import require_manifest
+from pipeline.store.schema import Encoding
+from pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
+
+PUBLISHED = {"s": 80, "m": 111, "l": 306}  # bytes per transition, Kinetix's 1M splits
+BATCH = 64  # random trajectories that are read at once
+FIELDS: Mapping[str, Sequence[str] | None] = {
+    "every field": None,
+    "positions": ("record/state/position", "record/state/rotation"),
+    "actions": ("record/action", "record/done"),
+}
+SECONDS = 1.5  # of each measurement, at least
+BUDGET, LEVELS = "64k", {"s": 256, "m": 128, "l": 96}  # of splits that are made for this
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("split", type=Path, nargs="*", help=f"splits (default: made, experts of {BUDGET} env steps)")
+
+
+def run(given: argparse.Namespace) -> Report:
+    prepare_jax(own_cores()[0])
+    with _splits(given.split) as splits:
+        results = [result for split in splits for result in measured(split)]
+    head = (
+        "size",
+        "trajectories",
+        "density",
+        "bytes",
+        "of full",
+        "published",
+        "written/s",
+        *(f"{of}/s" for of in FIELDS),
+    )
+    return Report(
+        title="Storage",
+        results=results,
+        tables=[Table(head, [row(of) for of in results])],
+        notes=[
+            "*bytes* per transition, of all files of one shard; *published*: of the reference's 1M splits. *written/s* "
+            "and the columns after it: trajectories a second and core, written all at once, and read in random batches "
+            f"of {BATCH} to arrays of {', '.join(FIELDS)}; the files are in the system's cache, and programs are "
+            "compiled before. Key frames of `witness` every 32 steps.",
+        ],
+    )
+
+
+@contextmanager
+def _splits(given: Sequence[Path]) -> Iterator[Sequence[Path]]:
+    if given:
+        yield given
+        return
+    with tempfile.TemporaryDirectory() as out:
+        for size, levels in LEVELS.items():
+            words = ("generate", f"size={size}", f"levels={levels}", f"budget={BUDGET}", f"out={out}")
+            oracle.tell(f"levelproof {' '.join(words)}")
+            command = [sys.executable, "-m", "levelproof", *words]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=dict(oracle.our_environment()))
+        yield [Path(out) / BUDGET / size for size in SIZES]
+
+
+def measured(split: Path) -> Iterator[dict[str, Any]]:
+    """What each density takes for the trajectories of a split."""
+    rows = require_manifest(split, [*COLUMNS, "label"]).table
+    rows = rows.filter(pc.is_valid(rows["shard"])).filter(pc.equal(rows["label"], "solved"))  # pyright: ignore[reportAttributeAccessIssue]
+    if not rows.num_rows:
+        raise UserError(f"The split {split} has no solved levels to measure: give another one.")
+    size, ids = rows["size"][0].as_py(), rows["level_id"].to_pylist()
+    encoding = open_shard(split, rows["shard"][0].as_py(), size).encoding
+    arrays, full = read_rows(split, rows), None
+    for density in get_args(Density):
+        oracle.tell(f"{size}: {density}, {len(ids)} trajectories")
+        with tempfile.TemporaryDirectory() as folder:
+            found = _stored(Path(folder), ids, arrays, replace(encoding, density=density))
+        full = full or found["bytes_per_transition"]
+        about = {"size": size, "trajectories": len(ids), "density": density, "published": PUBLISHED.get(size)}
+        yield about | found | {"of_full": found["bytes_per_transition"] / full}
+
+
+def _stored(
+    folder: Path, level_ids: Sequence[int], arrays: Mapping[str, np.ndarray], encoding: Encoding
+) -> dict[str, Any]:
+    """What all of these take as one shard in this folder."""
+    paths = (folder / f"{i}.zarr" for i in count())
+    written = per_second(lambda: write_shard(next(paths), level_ids, arrays, encoding), len(level_ids))
+    shard, rng = Shard(folder / "0.zarr"), np.random.default_rng(0)
+    batch = lambda: rng.choice(len(level_ids), BATCH).tolist()
+    return {
+        "bytes_per_transition": stored_bytes(shard.path) / len(level_ids) / RECORD_STEPS,
+        "written_per_second": written,
+        "read_per_second": {
+            of: per_second(lambda fields=fields: shard.read(batch(), fields), BATCH) for of, fields in FIELDS.items()
+        },
+    }
+
+
+def per_second(work: Callable[[], Any], trajectories: int) -> float:
+    """Of so many trajectories each time; the first time is not counted."""
+    work()
+    start, times = time.perf_counter(), 0
+    while (taken := time.perf_counter() - start) < SECONDS:
+        work()
+        times += 1
+    return trajectories * times / taken
+
+
+def row(of: Mapping[str, Any]) -> list[str]:
+    return [
+        of["size"],
+        f"{of['trajectories']:,}",
+        of["density"],
+        f"{of['bytes_per_transition']:.1f}",
+        f"{of['of_full']:.0%}",
+        str(of["published"] or "-"),
+        *(f"{rate:,.0f}" for rate in (of["written_per_second"], *of["read_per_second"].values())),
+    ]
