@@ -115,6 +115,11 @@ class JobConfig:
         return Procedure(self.scout, self.search, self.expert, self.stop)
 
     @property
+    def stored(self) -> str:
+        """How its records are stored."""
+        return stored_as(self.density, self.key_every)
+
+    @property
     def env_steps(self) -> int:
         """The budget as a number."""
         return parse_count(self.budget, "budget")
@@ -131,6 +136,11 @@ class JobConfig:
     def hash(self) -> str:
         """Short hash of `results`: other hash, other split."""
         return hash_of(self.results)
+
+
+def stored_as(density: Density, key_every: int = KEY_EVERY) -> str:
+    """A density in the words of settings."""
+    return f"density={density}" + (f" key_every={key_every}" if density == "witness" else "")
 
 
 def from_files(results: Mapping[str, Any]) -> bool:

@@ -126,7 +126,7 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
                 shard_arrays(result.levels, result.record, kept),
                 Encoding(job.density, job.key_every, job.task),
             )
-        write_fragment(paths, rows, job.hash, job.results)
+        write_fragment(paths, rows, job.hash, job.results, densities=[job.stored])
 
 
 def shard_arrays(levels: Level, record: Record, kept: list[int]) -> dict[str, np.ndarray]:

@@ -4,20 +4,20 @@ A fragment is written last and appears at once or not at all; readers see only w
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from os import DirEntry
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from configs.convert import flat
-from configs.schema import hash_of
+from configs.schema import KEYS_EVERY, Density, hash_of, stored_as
 from pipeline.errors import Failure, UserError
 from pipeline.store.checksums import digest_of, with_own
 from pipeline.store.disk import flush, flush_entry
@@ -26,6 +26,7 @@ from pipeline.store.runs import ascending
 from pipeline.store.schema import (
     COLUMNS,
     CONFIG_KEY,
+    DENSITIES_KEY,
     DIGESTS_KEY,
     HASH_KEY,
     MANIFEST_VERSION,
@@ -35,6 +36,8 @@ from pipeline.store.schema import (
     schema_of,
 )
 
+FULL = (stored_as("full"),)
+DENSITIES = {stored_as(density, every) for density in get_args(Density) for every in KEYS_EVERY}
 SHOWN = 6  # differing settings that an error lists
 THREADS = 8  # fragments read at once: a shared folder takes its time for each
 ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
@@ -53,6 +56,7 @@ class Fragment:
     digests: dict[str, str]  # of the shards and checkpoints that its rows name
     rows: int
     sealed: bool
+    densities: frozenset[str]  # how its shards were to be stored (`configs.schema.stored_as`)
 
 
 def begin_fragment(attempt: Attempt) -> None:
@@ -72,6 +76,7 @@ def write_fragment(
     config_hash: str,
     config: Mapping[str, Any],
     sealed: bool = False,
+    densities: Iterable[str] = FULL,
 ) -> None:
     """Commit a unit, or many that are sealed: write their manifest rows to the attempt's fragment, durably and in one
     step.
@@ -86,6 +91,7 @@ def write_fragment(
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
         HASH_KEY: config_hash.encode(),
         CONFIG_KEY: json.dumps(config, sort_keys=True).encode(),
+        DENSITIES_KEY: json.dumps(sorted(densities)).encode(),
         DIGESTS_KEY: json.dumps(_digests(attempt.fragment.parent.parent, table)).encode(),
     }
     metadata |= {SEALED_KEY: b"1"} if sealed else {}
@@ -135,8 +141,17 @@ def read_fragment(
                 )
             config, true_hash = _config_in(metadata[CONFIG_KEY])
             digests, about = json.loads(metadata.get(DIGESTS_KEY, b"{}")), file.metadata
-            is_sealed = SEALED_KEY in metadata
-            fragment = Fragment(path, metadata[HASH_KEY].decode(), config, digests, about.num_rows, is_sealed)
+            fragment = Fragment(
+                path,
+                metadata[HASH_KEY].decode(),
+                config,
+                digests,
+                about.num_rows,
+                SEALED_KEY in metadata,
+                frozenset(map(str, json.loads(metadata[DENSITIES_KEY])))
+                if DENSITIES_KEY in metadata
+                else frozenset(FULL),
+            )
             if not file.schema_arrow.equals(schema_of(COLUMNS.names, compact)) or true_hash != fragment.config_hash:
                 raise ValueError("its footer has other columns or another configuration than were written")
             groups = [i for i in range(about.num_row_groups) if _may_have(about.row_group(i), level_ids)]
@@ -164,6 +179,13 @@ def _may_have(group: pq.RowGroupMetaData, level_ids: np.ndarray | None) -> bool:
 def _any_within(ordered: np.ndarray, first: int, last: int) -> bool:
     low, high = np.searchsorted(ordered, [first, last + 1])
     return bool(low < high)
+
+
+def _densities_in(metadata: Mapping[bytes, bytes]) -> frozenset[str]:
+    found = json.loads(metadata.get(DENSITIES_KEY, json.dumps(FULL)))
+    if not all(density in DENSITIES for density in found):
+        raise ValueError("it says that shards are stored as none is")
+    return frozenset(found)
 
 
 @lru_cache(maxsize=8)

@@ -107,6 +107,7 @@ def seal(
             places.setdefault(encodings[name], []).append(Place(shards[name], row, level_id))
     replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
     unit, about = unit_name(level_ids[0], level_ids[-1]), parts[0][0]
+    densities = frozenset[str]().union(*(fragment.densities for fragment, _ in parts))
     attempts = [new_attempt(split, unit) for _ in places] or [new_attempt(split, unit)]  # nearly always one
     attempt = attempts[0]
     try:
@@ -116,7 +117,7 @@ def seal(
             merge_shards(each.shard, of, moved, rows_a_file)
         disown(replaced)
         merged = {each.shard.name: of for each, of in zip(attempts, places.values(), strict=False)}
-        write_fragment(attempt, _moved(table, merged), about.config_hash, about.config, sealed=True)
+        write_fragment(attempt, _moved(table, merged), about.config_hash, about.config, True, densities)
     except BaseException:
         if attempt.begun.exists():  # not committed
             for each in attempts:

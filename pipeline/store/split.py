@@ -18,7 +18,8 @@ def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, 
     """The job's split, locked, cleaned, and of this configuration; with what is committed.
 
     Raises:
-        UserError: it cannot be written or locked, is being written, or was made with another configuration.
+        UserError: it cannot be written or locked, is being written, or was made with another configuration or
+            density.
         Failure: a fragment is damaged.
     """
     split = split_path(job.out, job.budget, job.size)
@@ -28,6 +29,12 @@ def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, 
             raise UserError(
                 f"The split {split} was made with another configuration ({changes}): "
                 "use the same settings, or another folder with out=NAME."
+            )
+        stored = {density for fragment in manifest.fragments for density in fragment.densities}
+        if stored and job.stored not in stored:
+            raise UserError(
+                f"The split {split} has {', '.join(sorted(stored))}, and this asks for {job.stored}: "
+                "use the same, or another folder with out=NAME."
             )
         yield split, manifest
 

@@ -42,6 +42,18 @@ def test_another_configuration_is_refused_with_every_difference(tmp_path: Path, 
         pass
 
 
+def test_another_density_is_refused(tmp_path: Path, job: JobConfig) -> None:
+    """Or whoever forgets to say it again would get a split of two."""
+    with writing(job, print) as (split, _):
+        committed(job, split)
+    words = ["density=witness", "key_every=16"]
+    with (
+        pytest.raises(UserError, match="has density=full, and this asks for density=witness key_every=16: use"),
+        writing(made_job(str(tmp_path / "data"), *words), print),
+    ):
+        pass
+
+
 def test_more_levels_are_no_other_configuration(tmp_path: Path, job: JobConfig) -> None:
     with writing(job, print) as (split, _):
         committed(job, split)
