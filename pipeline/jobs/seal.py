@@ -48,7 +48,8 @@ def seal_split(split: Path, rows: int | None, console: Console) -> None:
     merged = sum(map(len, groups))
     levels, fragments = sum(piece.rows for piece in pieces), len(pieces) - merged + len(groups)
     done = f"{merged:,} fragments were merged into {len(groups):,}" if groups else "there was nothing to seal"
-    print(f"{split}: {done}; it has {levels:,} levels in {fragments:,} fragments now.")
+    now = f"{fragments:,} fragment{'s' if fragments > 1 else ''}"
+    print(f"{split}: {done}; it has {levels:,} levels in {now} now.")
     print(f"Next:  levelproof inspect {shlex.quote(str(split))}")
 
 

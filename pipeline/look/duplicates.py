@@ -69,14 +69,14 @@ def perhaps_alike(split: Path, level_ids: np.ndarray) -> pa.Table:
 
 
 def _numbers_of_halves(rows: pa.Table) -> pa.Table:
-    halves = {name: _numbers(pc.list_element(rows["signature"], i)) for i, name in enumerate(HALVES)}
-    return pa.table({"level_id": rows["level_id"], **halves})
+    part = lambda i: pc.list_element(rows["signature"], i)  # pyright: ignore[reportAttributeAccessIssue]
+    return pa.table({"level_id": rows["level_id"], **{name: _numbers(part(i)) for i, name in enumerate(HALVES)}})
 
 
 def _numbers(texts: pa.ChunkedArray) -> np.ndarray:
     """A number for each text, the same for the same text and hardly ever for two."""
     array = pa.concat_arrays(texts.chunks) if texts.num_chunks else pa.array([], pa.string())
-    widths = pc.binary_length(array).to_numpy()
+    widths = pc.binary_length(array).to_numpy()  # pyright: ignore[reportAttributeAccessIssue]
     if not len(widths) or (widths != widths[0]).any() or widths[0] > 8 * len(FACTORS):
         return np.fromiter(map(hash, array.to_pylist()), np.int64)
     width = int(widths[0])

@@ -57,7 +57,7 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
     chosen = select(manifest.table, where)
     labels, reasons = _counts(chosen, "label"), _counts(chosen, "label_reason")
     solved, unsolved, unsolvable = (
-        chosen.filter(pc.equal(chosen["label"], label.value))
+        chosen.filter(pc.equal(chosen["label"], label.value))  # pyright: ignore[reportAttributeAccessIssue]
         for label in (Label.SOLVED, Label.UNSOLVED, Label.UNSOLVABLE)
     )
     tried, ids = solved.num_rows + unsolved.num_rows, chosen["level_id"].to_numpy()

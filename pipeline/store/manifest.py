@@ -84,9 +84,8 @@ def write_fragment(
     Raises:
         OSError: the disk refuses; no fragment is there then, or the one that was there before.
     """
-    table = rows
-    if not isinstance(table, pa.Table):
-        table = pa.Table.from_pylist([dict(row) for row in table], schema=COLUMNS)
+    is_table = isinstance(rows, pa.Table)
+    table: Any = rows if is_table else pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS)
     metadata = {
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
         HASH_KEY: config_hash.encode(),
