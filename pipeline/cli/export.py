@@ -12,6 +12,7 @@ EXAMPLE = """\
 levelproof export data/128k/s 7 -o level.json          a level that Kinetix opens
 levelproof export data/128k/s --format kinetix -o k    a data set that Kinetix' reader opens
 levelproof export data/128k/s --format kinetix -o k --where "steps_to_goal < 64"
+levelproof export data/128k/s --format minari -o m     a data set of offline RL
 levelproof export data/128k/s --format parquet -o t    levels and manifest as a table"""
 JSON = "json"  # one level; all others take a split
 WHERE = (
@@ -32,8 +33,16 @@ def _parquet(split: Path, where: str | None, out: Path) -> None:
     export_parquet(split, where, out)
 
 
+def _minari(split: Path, where: str | None, out: Path, actions: str = "multi_discrete") -> None:
+    from pipeline.read.minari.episodes import ActionKind
+    from pipeline.read.minari.export import export_minari
+
+    export_minari(split, where, out, ActionKind(actions))
+
+
 # What writes the levels of a split for which a condition holds (None: each format's own) to a new file or folder
-FORMATS: dict[str, Callable[[Path, str | None, Path], None]] = {"kinetix": _kinetix, "parquet": _parquet}
+FORMATS: dict[str, Callable[..., None]] = {"kinetix": _kinetix, "minari": _minari, "parquet": _parquet}
+ACTIONS = ("multi_discrete", "combined", "continuous")  # pipeline.read.minari.episodes.ActionKind
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help=f"a level of the split, for {JSON}")
     parser.add_argument("--format", choices=(JSON, *FORMATS), default=JSON, help=f"what to write (default: {JSON})")
     parser.add_argument("--where", metavar="SQL", help=WHERE)
+    parser.add_argument("--actions", choices=ACTIONS, help=f"how minari has actions (default: {ACTIONS[0]})")
     parser.add_argument("-o", "--out", type=Path, help=f"file or folder to write (default, of {JSON}: level.json)")
 
 
@@ -63,4 +73,6 @@ def run(arguments: argparse.Namespace) -> None:
         )
     if out is None:
         raise UserError(f"Where to? Name what to write with -o, as in -o {arguments.format}.")
-    FORMATS[arguments.format](split, where, out)
+    if arguments.actions and arguments.format != "minari":
+        raise UserError(f"--actions is for --format minari: leave it out for {arguments.format}.")
+    FORMATS[arguments.format](split, where, out, *filter(None, [arguments.actions]))

@@ -1,14 +1,18 @@
 """Rows of a manifest for which an SQL condition holds, by DuckDB."""
 
 import re
+from pathlib import Path
 
 import duckdb
 import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import UserError
+from pipeline.store.manifest import require_manifest
 from pipeline.store.schema import COLUMNS
 
+SOLVED = "label = 'solved'"  # exported where nothing else is asked for
+WITNESSED = ("level_id", "size", "budget", "shard", "row")  # columns that exporters read
 TABLE = "manifest"  # its name in SQL
 ALL_OF_THEM = {TABLE, "columns"}  # words of conditions that can mean every column
 
@@ -41,3 +45,17 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
                 f"Cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
             ) from None
     return table.filter(np.isin(table.column("level_id").to_numpy(), chosen))
+
+
+def witnessed(split: Path, where: str) -> pa.Table:
+    """Rows of the levels that have a witness and for which a condition holds, by level id, with what reads them.
+
+    Raises:
+        UserError: there is none.
+        Failure: a fragment is damaged.
+    """
+    rows = select(require_manifest(split, [*columns_in(where), *WITNESSED]).table, where)
+    rows = rows.filter(rows.column("shard").is_valid())
+    if not rows.num_rows:
+        raise UserError(f"No level of {split} for which {where} holds has a witness: choose others with --where.")
+    return rows

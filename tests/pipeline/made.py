@@ -118,13 +118,14 @@ def made_job(out: str = "data", *overrides: str) -> JobConfig:
     return compose_job([f"out={out}", "executor=inline", *overrides])
 
 
-def played_split(folder: Path) -> Path:
-    """A real split in `folder`: levels of size s under random actions; what reaches the goal is `solved`."""
+def played_split(folder: Path, held: int = 16) -> Path:
+    """A real split in `folder`: levels of size s under random actions, each held for so many steps; what reaches the
+    goal is `solved`."""
     job = made_job(str(folder), "size=s", f"levels={PLAYED}")
     ids = np.arange(PLAYED, dtype=np.int32)
     levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
     rng = np.random.default_rng(0)
-    action = np.repeat(rng.integers(0, 2, (16, 6, PLAYED)), 16, axis=0).astype(np.int32)
+    action = np.repeat(rng.integers(0, 2, (RECORD_STEPS // held, 6, PLAYED)), held, axis=0).astype(np.int32)
     record = replay(levels, action, job.task)
     solved = succeeds(np.asarray(record.done), np.asarray(record.goal))
     assert 1 < solved.sum() < PLAYED

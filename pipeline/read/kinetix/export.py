@@ -2,24 +2,20 @@
 
 from pathlib import Path
 
-import pyarrow as pa
 from rich.console import Console
 from rich.progress import track
 
 from experts.config import RECORD_STEPS
 from experts.witness import Record
 from levelgen.level import Level, size_of
-from pipeline.errors import UserError
 from pipeline.read.created import new_folder
 from pipeline.read.kinetix.records import dtype_of, trajectories_of
 from pipeline.read.kinetix.zarr2 import ROWS, write_array, write_chunk, write_group
-from pipeline.read.rows import COLUMNS, read_rows
-from pipeline.read.select import columns_in, select
+from pipeline.read.rows import read_rows
+from pipeline.read.select import SOLVED, witnessed
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
-from pipeline.store.manifest import require_manifest
 
-DEFAULT = "label = 'solved'"
 BLOCK = 4 * ROWS  # trajectories in memory at a time
 ARRAY = 64 * ROWS  # trajectories of an array: the reference shuffles arrays, and what they have
 
@@ -31,7 +27,7 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
         UserError: no split, no such level, a condition that DuckDB cannot use, or `out` is there already.
         Failure: the split is damaged.
     """
-    rows = witnessed(split, where or DEFAULT)
+    rows = witnessed(split, where or SOLVED)
     prepare_jax()
     console, count = Console(stderr=True), rows.num_rows
     with new_folder(out) as folder:
@@ -51,20 +47,6 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
         f"{out}: {count} trajectories of {split}, {stored / (count * RECORD_STEPS):.0f} bytes per transition.\n"
         f'Next:  kinetix.data.TrajectoryDatasetManager("{out}", batch_size=64)'
     )
-
-
-def witnessed(split: Path, where: str) -> pa.Table:
-    """Rows of the levels that have a witness and for which a condition holds, by level id.
-
-    Raises:
-        UserError: there is none.
-    """
-    manifest = require_manifest(split, [*columns_in(where), *COLUMNS])
-    rows = select(manifest.table, where)
-    rows = rows.filter(rows.column("shard").is_valid())
-    if not rows.num_rows:
-        raise UserError(f"No level of {split} for which {where} holds has a witness: choose others with --where.")
-    return rows
 
 
 def name_of_array(number: int) -> str:
