@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.read.export import export
+from pipeline.read.parquet import export_parquet
 from pipeline.store.manifest import read_manifest
 from tests.pipeline.made import played_split
 
@@ -23,11 +24,12 @@ PAGES = [page for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where a reader is who has typed the commands: the README's split, and a level of it as a file."""
+    """Where a reader is who has typed the commands: the README's split, and levels of it as files."""
     folder = tmp_path_factory.mktemp("reader")
     split = played_split(folder / "data")
     assert split == folder / "data/128k/s"
     export(split, int(read_manifest(split).level_ids[0]), folder / "level.json")
+    export_parquet(split, None, folder / "levels")
     return folder
 
 

@@ -49,7 +49,7 @@ def card(splits: Sequence[Path], out: Path | None, wishes: Wishes) -> None:
     folder = out.absolute().parent.resolve()
     _require_ours(out)
     paths = [_below(folder, split) for split in splits]
-    manifests = [require_manifest(split, ASKED) for split in splits]
+    manifests = [require_manifest(split, ASKED, compact=True) for split in splits]
     facts = [_facts(path, manifest) for path, manifest in zip(paths, manifests, strict=True)]
     with writing_to(out):
         for name in (PREVIEW, FIGURES):

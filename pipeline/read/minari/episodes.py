@@ -7,7 +7,7 @@ row is the level's start again: the engine makes that step anew.
 from collections.abc import Iterator
 from enum import StrEnum
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,18 +66,19 @@ def episodes_of(
             ends = np.append(np.flatnonzero(one.done[:-1]), RECORD_STEPS - 1) + 1
             for first, end in zip([0, *ends], ends, strict=False):
                 steps = slice(first, end)
-                yield _episode(level_ids[lanes[i]], one, steps, before[i], after[i], mask[:, i], rules, kind)
+                yield _episode(int(level_ids[lanes[i]]), one, steps, before[i], after[i], mask[:, i], rules, kind)
 
 
 def _episode(
-    level_id, record: Record, steps: slice, before, after, mask, rules: TaskParams, kind: ActionKind
+    level_id: int, record: Any, steps: slice, before: np.ndarray, after: np.ndarray, mask, rules, kind
 ) -> Episode:
+    """Some steps of one level's record."""
     done, goal = record.done[steps], record.goal[steps]
     late = done & ~goal & (record.timestep[steps] + 1 >= rules.max_timesteps)
     truncated = late.copy()
     truncated[-1] |= not done[-1]  # the record is over, the episode is not
     return Episode(
-        int(level_id),
+        level_id,
         np.concatenate([before[steps], after[steps][-1:]]),
         written(record.action[steps], kind),
         record.reward[steps],

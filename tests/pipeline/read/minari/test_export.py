@@ -1,5 +1,6 @@
 """Witnesses as a Minari dataset: opened by the library, and equal to what the environment gives."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +124,7 @@ def test_what_cannot_be_is_refused(split: Path, tmp_path: Path, capsys, monkeypa
     command = ["export", str(split), "-o", str(tmp_path / "out"), "--format"]
     assert main([*command, "minari", "--where", "level_id < 0"]) == 2
     assert main([*command, "parquet", "--actions", "combined"]) == 2
-    monkeypatch.setitem(__import__("sys").modules, "minari", None)
+    monkeypatch.setitem(sys.modules, "minari", None)
     assert main([*command, "minari"]) == 2
     nothing, actions, missing = capsys.readouterr().err.splitlines()
     assert "for which level_id < 0 holds has a witness" in nothing
