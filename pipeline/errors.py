@@ -1,5 +1,6 @@
 """What can go wrong, as exit codes. Each message is one sentence: what is wrong, where, what to do."""
 
+import re
 from enum import IntEnum
 
 
@@ -17,6 +18,10 @@ class LevelproofError(Exception):
     """An error with a sentence for the user and an exit code."""
 
     exit_code = Exit.FAILED
+
+    def __str__(self) -> str:
+        """With URLs as they were typed: a Path makes `s3:/` of `s3://`."""
+        return re.sub(r"\b(s3|gs|https?|hf):/(?=[^/])", r"\1://", super().__str__())
 
 
 class UserError(LevelproofError):

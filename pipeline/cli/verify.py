@@ -16,5 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Exit:
     from pipeline.read.verify import verify
+    from pipeline.store.remote import require_folder
 
+    require_folder(arguments.split, "verify it")
     return verify(arguments.split, arguments.json)

@@ -25,6 +25,7 @@ from pipeline.look import duplicates
 from pipeline.read.select import columns_in, select
 from pipeline.store.layout import data_path
 from pipeline.store.manifest import require_manifest
+from pipeline.store.remote import as_typed, is_listed
 from pipeline.store.shard import stored_bytes
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
@@ -61,14 +62,14 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
         for label in (Label.SOLVED, Label.UNSOLVED, Label.UNSOLVABLE)
     )
     tried, ids = solved.num_rows + unsolved.num_rows, chosen["level_id"].to_numpy()
-    stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards)
+    stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards) if is_listed(split) else None
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
     config = manifest.config or {}
     distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
     others = {str(other): duplicates.compared_in(other) for other in against}
     levels = duplicates.compared_of(split, ids) if others else None
     return {
-        "split": str(split),
+        "split": as_typed(split),
         "config_hash": manifest.config_hash,
         "distribution": dict(zip(("name", "hash"), identified(distribution), strict=True)) if distribution else None,
         "levels": chosen.num_rows,
@@ -85,7 +86,7 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
         "env_steps_after_success": _total(solved["env_steps"].to_numpy() - solved["steps_to_first_success"].to_numpy()),
         "env_steps_unsolved": _total(unsolved["env_steps"].to_numpy()),
         "split_bytes": stored,  # of all the split's shards, whatever the condition
-        "bytes_per_transition": stored / (kept * RECORD_STEPS) if kept else None,
+        "bytes_per_transition": stored / (kept * RECORD_STEPS) if stored and kept else None,
         "rows": require_manifest(split, level_ids=ids[:shown]).table.to_pylist()
         if len(ids[:shown])
         else [],  # with all columns
@@ -127,7 +128,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         "duplicates": duplicates.told(facts["duplicates"]),
         **{f"duplicates in {other}": duplicates.told(found) for other, found in facts["against"].items()},
         "training env steps": _steps_told(facts),
-        "shards": f"{facts['split_bytes']:,} bytes",
+        "shards": f"{facts['split_bytes']:,} bytes" if facts["split_bytes"] is not None else None,
         "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
     }
     for name, text in lines.items():

@@ -9,6 +9,7 @@ from pipeline.store.job_note import NoteError, read_note
 from pipeline.store.layout import JOB, QUARANTINE
 from pipeline.store.locks import is_written
 from pipeline.store.manifest import read_manifest
+from pipeline.store.remote import require_folder
 from pipeline.store.runs import inside
 
 
@@ -35,6 +36,7 @@ def status(split: Path, as_json: bool) -> None:
 
 def look(split: Path) -> dict[str, Any]:
     """The facts that `status` prints."""
+    require_folder(split, "see how far it is")
     try:
         note = read_note(split)
     except FileNotFoundError:

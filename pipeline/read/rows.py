@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from pipeline.errors import Failure
 from pipeline.store.manifest import read_manifest
+from pipeline.store.remote import at_once
 from pipeline.store.shard import Shard, open_shard, read_together
 
 COLUMNS = ("level_id", "size", "shard", "row")  # that rows need to be read
@@ -74,7 +75,8 @@ def read_placed(
     by_shard: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         by_shard.setdefault(name, []).append(i)
-    parts = [(opened(split, name, sizes[mine[0]]), [row[i] for i in mine]) for name, mine in by_shard.items()]
+    shards = at_once(split, lambda name, mine: opened(split, name, sizes[mine[0]]), by_shard, by_shard.values())
+    parts = [(shard, [row[i] for i in mine]) for shard, mine in zip(shards, by_shard.values(), strict=True)]
     order = [i for mine in by_shard.values() for i in mine]
     for (shard, held), mine in zip(parts, by_shard.values(), strict=True):
         known = [shard.level_ids[k] if 0 <= k < len(shard.level_ids) else None for k in held]

@@ -8,6 +8,7 @@ an index is read once, and Blosc decodes into the caller's buffer without Python
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from numcodecs import blosc  # pyright: ignore[reportAttributeAccessIssue]
 
 from pipeline.store.contents import ContentsError
+from pipeline.store.remote import RemoteFile, bytes_of, is_remote
 
 CHECKSUM = 4  # bytes of a CRC-32C
 ENTRY = 16  # bytes of an index for each chunk: where it starts, and how many bytes it has
@@ -36,7 +38,7 @@ class Chunks:
             OSError, ValueError, KeyError, TypeError: it is missing or damaged.
         """
         self.shard, self.name, self.shape = shard, name, shape
-        about = json.loads(ordinary_file(shard, f"{name}/zarr.json").read_bytes())
+        about = json.loads(read_whole(shard, f"{name}/zarr.json"))
         if [about[key] for key in ("node_type", "shape", "data_type")] != ["array", [*shape], str(dtype)]:
             raise ContentsError(f"its array {name} has not the shape and type that its fields need")
         self.rows_a_file = _rows_a_file(about, shape)
@@ -54,15 +56,12 @@ class Chunks:
         for i, row in enumerate(rows if out.size else ()):
             by_file.setdefault(row // self.rows_a_file, []).append(i)
         for number, mine in by_file.items():
-            file = self._opened(number)
-            try:
+            with closing(self._opened(number)) as file:
                 if number not in self._indices:
                     self._indices[number] = self._index(file)
-                for i in mine:
-                    first, length = self._indices[number][rows[i] % self.rows_a_file].tolist()
-                    self._decode(os.pread(file, length, first), out[i])
-            finally:
-                os.close(file)
+                places = self._indices[number][[rows[i] % self.rows_a_file for i in mine]].tolist()
+                for i, stored in zip(mine, file.read(places), strict=True):
+                    self._decode(stored, out[i])
 
     def encoded(self, rows: Iterable[int]) -> Iterator[bytes]:
         """The chunks of these rows as they are stored, each with a checksum that is right.
@@ -71,27 +70,24 @@ class Chunks:
             ContentsError, OSError, ValueError: one is missing or damaged.
         """
         for number, mine in groupby(rows, lambda row: row // self.rows_a_file):
-            file = self._opened(number)
-            try:
-                index = self._index(file)
-                for row in mine:
-                    first, length = index[row % self.rows_a_file].tolist()
-                    chunk = os.pread(file, length, first)
+            with closing(self._opened(number)) as file:
+                places = self._index(file)[[row % self.rows_a_file for row in mine]].tolist()
+                for chunk in file.read(places):
                     self._checked(chunk)
                     yield chunk
-            finally:
-                os.close(file)
 
-    def _opened(self, number: int) -> int:
+    def _opened(self, number: int) -> "LocalFile | RemoteFile":
         name = file_name(self.name, number, len(self.shape))
-        path = self.shard / name if number in self._indices else ordinary_file(self.shard, name)
-        return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        if is_remote(self.shard):
+            return RemoteFile(self.shard / name)
+        return LocalFile(self.shard / name if number in self._indices else ordinary_file(self.shard, name))
 
-    def _index(self, file: int) -> np.ndarray:
-        end, length = os.fstat(file).st_size, ENTRY * self.rows_a_file + CHECKSUM
+    def _index(self, file: "LocalFile | RemoteFile") -> np.ndarray:
+        end, length = file.size, ENTRY * self.rows_a_file + CHECKSUM
         if length > end:
             raise ContentsError(f"a file of its array {self.name} is cut off")
-        index = np.frombuffer(self._checked(os.pread(file, length, end - length)), "<u8").reshape(-1, 2)
+        (stored,) = file.read([(end - length, length)])
+        index = np.frombuffer(self._checked(stored), "<u8").reshape(-1, 2)
         return np.where(index.max(1, keepdims=True) > end, 0, index)  # what lies outside is as if it had no byte
 
     def _checked(self, data: bytes) -> bytes:
@@ -107,6 +103,33 @@ class Chunks:
         if len(chunk) < BLOSC_HEADER or sizes != [out.nbytes, len(chunk)]:
             raise ContentsError(f"a chunk of its array {self.name} has another size than it should")
         blosc.decompress(chunk, out)
+
+
+class LocalFile:
+    """One file of a shard in a folder, open for reading."""
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+
+    @property
+    def size(self) -> int:
+        return os.fstat(self._descriptor).st_size
+
+    def read(self, places: Iterable[tuple[int, int]]) -> Iterator[bytes]:
+        """The bytes at these places, first byte and number of bytes, in turn."""
+        return (os.pread(self._descriptor, length, first) for first, length in places)
+
+    def close(self) -> None:
+        os.close(self._descriptor)
+
+
+def read_whole(shard: Path, name: str) -> bytes:
+    """A small file of a shard.
+
+    Raises:
+        ContentsError, OSError: it is no ordinary file, or cannot be read.
+    """
+    return bytes_of(shard / name) if is_remote(shard) else ordinary_file(shard, name).read_bytes()
 
 
 def file_name(array: str, number: int, axes: int) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.errors import Failure
+from pipeline.store.remote import fragments_in, is_remote
 
 FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE = "manifest", "shards", "experts", "quarantine"
 WRITER_LOCK, COMMIT_LOCK, JOB = ".writer.lock", ".commit.lock", "job.json"
@@ -94,6 +95,9 @@ def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[
     Links are of no kind, whatever they lead to. With each path goes the number by which the file system knows what
     has this name now.
     """
+    if is_remote(split):
+        found = fragments_in(split / folder) if folder == MANIFEST else {}
+        return {path: hash(about) for path, about in found.items() if paths.fullmatch(f"{folder}/{path.name}")}
     if not (split / folder).is_dir():
         return {}
     with os.scandir(split / folder) as found:

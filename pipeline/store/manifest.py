@@ -22,6 +22,7 @@ from pipeline.errors import Failure, UserError
 from pipeline.store.checksums import digest_of, with_own
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
+from pipeline.store.remote import bytes_of, is_remote, mended
 from pipeline.store.runs import ascending
 from pipeline.store.schema import (
     COLUMNS,
@@ -130,7 +131,8 @@ def read_fragment(
     """
     try:
         dictionaries = REPETITIVE if compact else None
-        with pq.ParquetFile(path, page_checksum_verification=True, read_dictionary=dictionaries) as file:
+        source = pa.BufferReader(bytes_of(path)) if is_remote(path) else path
+        with pq.ParquetFile(source, page_checksum_verification=True, read_dictionary=dictionaries) as file:
             metadata = file.schema_arrow.metadata or {}
             version = metadata.get(VERSION_KEY, b"?").decode()
             if version != str(MANIFEST_VERSION):
@@ -162,7 +164,7 @@ def read_fragment(
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:
         raise Failure(
             f"The fragment {path} is damaged ({type(error).__name__}): "
-            "delete it and run the same `levelproof generate` again to remake its levels."
+            + mended(path, "delete it and run the same `levelproof generate` again to remake its levels.")
         ) from error
     return fragment, table
 

@@ -19,7 +19,7 @@ from configs.schema import MOST_FRAME_SKIP
 from levelgen.level import name_of
 from physics.types import Size
 from pipeline.errors import Failure
-from pipeline.store.chunks import Chunks, ordinary_file
+from pipeline.store.chunks import Chunks, read_whole
 from pipeline.store.contents import (
     FULL,
     ContentsError,
@@ -34,6 +34,7 @@ from pipeline.store.disk import flush
 from pipeline.store.fields import same_bits
 from pipeline.store.layout import data_path, fragment_of
 from pipeline.store.packing import empty, pack, unpack
+from pipeline.store.remote import at_once, is_remote, mended, stored_in
 from pipeline.store.schema import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
 
 FORMAT = "levelproof.shard"
@@ -114,7 +115,7 @@ class Shard:
         """
         self.path = path
         try:
-            about = json.loads(ordinary_file(path, "zarr.json").read_bytes())
+            about = json.loads(read_whole(path, "zarr.json"))
             if (about["zarr_format"], about["node_type"]) != (3, "group"):
                 raise ContentsError("it is no group of zarr v3")
             attributes = about["attributes"]
@@ -209,9 +210,12 @@ def _read_alike(parts: Sequence[tuple[Shard, Sequence[int]]], table: Sequence[Fi
     chosen = [field for field in known if field.name in names]
     packed = empty(known, dict.fromkeys(field.array for field in chosen), sum(len(rows) for _, rows in parts))
     slices = _slices(parts)
-    for (shard, rows), mine in zip(parts, slices, strict=True):
-        with _reading(shard):
-            shard.put(rows, {name: x[mine] for name, x in packed.items()})
+
+    def put(part: tuple[Shard, Sequence[int]], mine: slice) -> None:
+        with _reading(part[0]):
+            part[0].put(part[1], {name: x[mine] for name, x in packed.items()})
+
+    at_once(parts[0][0].path, put, parts, slices)
     try:
         stored = _named(packed, chosen, size)
     except ValueError:  # one of them holds what it cannot
@@ -262,7 +266,9 @@ def damaged(shard: Path, error: Exception) -> Failure:
     reason = str(error) if isinstance(error, ContentsError) else type(error).__name__
     return Failure(
         f"The shard {shard} is missing or damaged ({reason}): "
-        f"delete {fragment_of(shard)} and run the same `levelproof generate` again to remake its levels."
+        + mended(
+            shard, f"delete {fragment_of(shard)} and run the same `levelproof generate` again to remake its levels."
+        )
     )
 
 
@@ -277,5 +283,7 @@ def open_shard(split: Path, name: str, size: str) -> Shard:
 
 def stored_bytes(path: Path) -> int:
     """Bytes of all files of a shard; what links lead to is not its own."""
+    if is_remote(path):
+        return sum(about.size for about in stored_in(path).values())
     about = (entry.lstat() for entry in path.rglob("*"))
     return sum(file.st_size for file in about if stat.S_ISREG(file.st_mode))

@@ -11,6 +11,7 @@ from pipeline.store.layout import FOLDERS, JOB, split_path
 from pipeline.store.leftovers import clean
 from pipeline.store.locks import committing, only_writer
 from pipeline.store.manifest import Manifest, differences, told
+from pipeline.store.remote import require_folder
 
 
 @contextmanager
@@ -47,6 +48,7 @@ def taken(split: Path, say: Callable[[str], None]) -> Iterator[Manifest]:
         UserError: it cannot be written or locked, or is being written.
         Failure: a fragment is damaged.
     """
+    require_folder(split, "write to it")
     _make_writable(split)
     _require_own_folders(split)
     with only_writer(split):

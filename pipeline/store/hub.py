@@ -1,0 +1,101 @@
+"""Datasets on Hugging Face's hub: `hf://datasets/USER/NAME[@REVISION]/PATH`, by the hub's two endpoints for files."""
+
+import json
+import os
+import random
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.error import HTTPError, URLError
+from urllib.parse import quote
+from urllib.request import Request, urlopen
+
+from pipeline.errors import Failure, UserError
+
+ATTEMPTS = 6
+PAUSE = 0.5  # s before the second attempt, at most; twice that before each further one
+TIMEOUT = 30  # s of one attempt
+NEXT = re.compile(r'<([^<>]+)>; *rel="next"')  # of the header Link: where a long list goes on
+
+
+class Repository(NamedTuple):
+    """A dataset at a revision: a branch, a tag or a commit."""
+
+    name: str
+    revision: str
+
+
+def split_url(parts: Sequence[str]) -> tuple[Repository, str]:
+    """What the parts of a URL behind `hf://` say: a repository, and a path in it.
+
+    Raises:
+        UserError: they say something else.
+    """
+    if len(parts) < 3 or parts[0] != "datasets":
+        raise UserError(
+            f"The URL hf://{'/'.join(parts)} is none of a dataset: give one such as hf://datasets/USER/NAME/1M/s."
+        )
+    name, _, revision = parts[2].partition("@")
+    return Repository(f"{parts[1]}/{name}", revision or "main"), "/".join(parts[3:])
+
+
+def resolve_url(repository: Repository) -> str:
+    """Below it are the files."""
+    return f"{_endpoint()}/datasets/{repository.name}/resolve/{quote(repository.revision, safe='')}"
+
+
+def sign_in() -> dict[str, Any]:
+    """Options of an HTTP client: the token of HF_TOKEN, or of `hf auth login`."""
+    home = Path(os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface")
+    token = os.environ.get("HF_TOKEN") or ""
+    if not token and (home / "token").is_file():
+        token = (home / "token").read_text()
+    return {"default_headers": {"authorization": f"Bearer {token.strip()}"}} if token.strip() else {}
+
+
+def files_below(repository: Repository, folder: str) -> dict[str, tuple[str, int]]:
+    """Of every file below a folder, its hash and its bytes; none where there is no such folder.
+
+    Raises:
+        UserError: there is no such repository, or it may not be read.
+        Failure: the hub does not answer.
+    """
+    revision = quote(repository.revision, safe="")
+    url = f"{_endpoint()}/api/datasets/{repository.name}/tree/{revision}/{quote(folder)}?recursive=true"
+    found: dict[str, tuple[str, int]] = {}
+    while url:
+        entries, url = _page(url)
+        found |= {entry["path"]: (entry["oid"], entry["size"]) for entry in entries if entry["type"] == "file"}
+    return found
+
+
+def _page(url: str) -> tuple[list[dict[str, Any]], str]:
+    """Some entries, and where there are more."""
+    headers = sign_in().get("default_headers", {})
+    reason: object = ""
+    for attempt in range(ATTEMPTS):
+        try:
+            with urlopen(Request(url, headers=headers), timeout=TIMEOUT) as answer:
+                more = NEXT.search(answer.headers.get("Link", ""))
+                return json.loads(answer.read()), more[1] if more else ""
+        except HTTPError as error:
+            if error.code == 404:
+                return [], ""
+            if error.code in (401, 403):
+                raise UserError(
+                    f"There is no dataset at {url}, or not for you: check the URL, and set HF_TOKEN if it needs one."
+                ) from None
+            if error.code not in (408, 429) and error.code < 500:
+                raise Failure(f"The hub refuses {url} ({error.code} {error.reason}): check the URL.") from None
+            reason = error.code
+        except (URLError, OSError, ValueError) as error:
+            reason = getattr(error, "reason", error)
+        if attempt < ATTEMPTS - 1:
+            time.sleep(random.uniform(0.5, 1) * PAUSE * 2**attempt)
+    raise Failure(f"The hub does not answer at {url} ({reason}): check the network, and try again.")
+
+
+def _endpoint() -> str:
+    return os.environ.get("HF_ENDPOINT", "https://huggingface.co").rstrip("/")

@@ -1,0 +1,345 @@
+"""Splits in object stores and on web servers, read in blocks through a cache on this machine.
+
+A path whose first part is `s3:`, `gs:`, `https:`, `http:` or `hf:` stands for the URL: `Path("s3://bucket/split")` is
+such a one, whatever becomes of its slashes. So whoever reads a split has a Path, and only this knows where it lies.
+"""
+
+import os
+import random
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
+from functools import lru_cache
+from hashlib import sha256
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+from pipeline.errors import Failure, LevelproofError, UserError
+from pipeline.runtime import cache_folder
+from pipeline.store import hub
+from pipeline.store.block_cache import BlockCache
+
+if TYPE_CHECKING:
+    from obstore.store import ObjectStore
+
+BUCKETS, WEB, HUB = ("s3:", "gs:"), ("https:", "http:"), ("hf:",)
+INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for servers that do not list
+BLOCK = 2**20  # bytes; of 4 MB, random trajectories of 10 kB would fetch four times as much
+MOST_BLOCKS = 8  # of one request: neighbours are fetched together
+REQUESTS = 16  # at once
+CACHE_GB = "LEVELPROOF_CACHE_GB"
+RETRIES: dict[str, Any] = {
+    "max_retries": 8,  # of a request that is throttled, refused, cut off or not answered; with jitter
+    "retry_timeout": timedelta(seconds=60),
+    "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=8), "base": 2},
+}
+PATIENCE = {"connect_timeout": timedelta(seconds=5), "timeout": timedelta(seconds=60), "allow_http": True}
+SIGN_IN = {
+    "s3:": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket",
+    "gs:": "set GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for a public bucket",
+    "hf:": "set HF_TOKEN, or run `hf auth login`",
+}
+# In what obstore says of a request that failed:
+STATUS = re.compile(r"status code: (\d{3}[A-Za-z ]*)")
+TRIED = re.compile(rf"{STATUS.pattern}|after \d+ retries|Range request not supported")  # it would fail again
+CLOUD = re.compile(r"latest/api/token|computeMetadata")  # where a cloud's machines get credentials
+COPY = {"s3:": "aws s3 sync", "gs:": "gcloud storage rsync -r", "hf:": "hf download"}
+
+T = TypeVar("T")
+
+
+class Stored(NamedTuple):
+    """What a store says of a file."""
+
+    tag: str  # another one for other bytes
+    size: int  # bytes
+
+
+def is_remote(path: Path) -> bool:
+    return bool(path.parts) and path.parts[0] in (*BUCKETS, *WEB, *HUB)
+
+
+def is_listed(split: Path) -> bool:
+    """Whether all files of a split can be listed."""
+    return not (split.parts and split.parts[0] in WEB)
+
+
+def as_typed(path: Path) -> str:
+    """A path as its user knows it."""
+    return "//".join([path.parts[0], "/".join(path.parts[1:])]) if is_remote(path) else str(path)
+
+
+def require_folder(split: Path, what: str) -> None:
+    """For what cannot be done from afar.
+
+    Raises:
+        UserError: the split is not on this machine.
+    """
+    if is_remote(split):
+        how = COPY.get(split.parts[0], "wget -r")
+        raise UserError(f"To {what}, {as_typed(split)} has to be a folder on this machine: copy it with `{how}` first.")
+
+
+def mended(path: Path, here: str) -> str:
+    """What to do about a damaged file: other things than `here` where it is not on this machine."""
+    return "open the split again, and if that does not help upload it again." if is_remote(path) else here
+
+
+def at_once(path: Path, work: Callable[..., T], *items: Iterable[Any]) -> list[T]:
+    """`map`; in threads where the path is remote, so that requests do not wait for each other."""
+    if not is_remote(path):
+        return list(map(work, *items))
+    with ThreadPoolExecutor(REQUESTS) as threads:
+        return list(threads.map(work, *items))
+
+
+def stored_in(folder: Path) -> dict[Path, Stored]:
+    """All files below a folder of a split, as the store has them now.
+
+    Raises:
+        UserError: there is no such bucket, or it may not be read.
+        Failure: the store does not answer.
+    """
+    store, key = _place(folder)
+    if folder.parts[0] in HUB:
+        repository, key = hub.split_url(folder.parts[1:])
+        found = {name: Stored(*about) for name, about in hub.files_below(repository, key).items()}
+    else:
+        listed = _ask(folder, lambda: _obstore().list(store, prefix=key).collect())
+        found = {entry["path"]: Stored(_tag(entry), entry["size"]) for entry in listed}
+    return {folder / name[len(key) + 1 :]: about for name, about in found.items() if name.startswith(f"{key}/")}
+
+
+def fragments_in(folder: Path) -> dict[Path, Stored]:
+    """What may be a fragment in the manifest's folder; what was known of the split's other files is forgotten.
+
+    Raises:
+        UserError, Failure: as `stored_in`; or there is no index on a web server.
+    """
+    for known in list(_known):
+        if folder.parent in known.parents:
+            _known.pop(known, None)
+    if folder.parts[0] not in WEB:
+        found = _known[folder] = stored_in(folder)
+        return found
+    store, key = _place(folder / INDEX)
+    try:
+        text = _ask(folder / INDEX, lambda: bytes(_obstore().get(store, key).bytes())).decode(errors="replace")
+    except FileNotFoundError:
+        raise UserError(
+            f"There is no split at {as_typed(folder.parent)}, or its server was not told what it has: a split on a web "
+            f"server needs {folder.name}/{INDEX}, which `ls manifest > manifest/{INDEX}` makes in its folder."
+        ) from None
+    return {folder / name: Stored("", 0) for name in text.split() if "/" not in name}
+
+
+def bytes_of(path: Path) -> bytes:
+    """A whole file.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        UserError, Failure: as `stored_in`.
+    """
+    file = RemoteFile(path)
+    return b"".join(file.read([(0, file.size)]))
+
+
+class RemoteFile:
+    """One file, open for reading."""
+
+    def __init__(self, path: Path) -> None:
+        """Ask what is stored under this name, if it is not known yet.
+
+        Raises:
+            FileNotFoundError: nothing.
+            UserError, Failure: as `stored_in`.
+        """
+        self.path, self._about = path, _look_up(path)
+        self.size = self._about.size
+        names = f"{as_typed(path)}\n{self._about.tag}\n{self.size}\n{BLOCK}"
+        self._name, self._cache = sha256(names.encode()).hexdigest()[:32], _cache()
+
+    def read(self, places: Sequence[tuple[int, int]]) -> Iterator[bytes]:
+        """The bytes at these places, first byte and number of bytes, in turn; requests for what is missing go first.
+
+        Raises:
+            OSError: the file has changed.
+            UserError, Failure: as `stored_in`; or the cache's folder cannot be written.
+        """
+        wanted = {n for first, length in places for n in range(first // BLOCK, -(-(first + length) // BLOCK))}
+        missing = [n for n in sorted(wanted) if not self._cache.has(self._block(n))]
+        if missing:
+            at_once(self.path, self._keep, _runs(missing))
+        for first, length in places:
+            blocks = range(first // BLOCK, -(-(first + length) // BLOCK))
+            yield b"".join(self._part(n, max(first - n * BLOCK, 0), first + length - n * BLOCK) for n in blocks)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _block(self, n: int) -> str:
+        return f"{self._name}-{n}"
+
+    def _part(self, n: int, first: int, last: int) -> bytes:
+        """Of a block; fetched again where others needed its place in the cache."""
+        part = self._cache.read(self._block(n), first, min(last, BLOCK))
+        return self._fetch([n])[first:last][: BLOCK - first] if part is None else part
+
+    def _keep(self, run: Sequence[int]) -> None:
+        self._fetch(run)
+
+    def _fetch(self, run: Sequence[int]) -> bytes:
+        """Blocks that are neighbours, in one request."""
+        store, key = _place(self.path)
+        first, last = run[0] * BLOCK, min((run[-1] + 1) * BLOCK, self.size)
+        whole = (first, last) == (0, self.size)  # which servers that know no ranges give, too
+        options = {} if whole else {"range": (first, last)}
+
+        def request() -> tuple[Any, bytes]:
+            answer = _obstore().get(store, key, options=options)
+            return answer.meta, bytes(answer.bytes())
+
+        about, data = _ask(self.path, request)
+        tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's servers have others
+        if (tag, about["size"], len(data)) != (*self._about, last - first):
+            _known.pop(_folder_of(self.path), None)
+            raise OSError(f"{as_typed(self.path)} has changed")
+        for i, n in enumerate(run):
+            self._cache.put(self._block(n), data[i * BLOCK : (i + 1) * BLOCK])
+        return data
+
+
+_known: dict[Path, dict[Path, Stored]] = {}  # by folder: of files that were looked up or listed
+
+
+def _folder_of(path: Path) -> Path:
+    """What is listed to learn of a file: its shard, or the folder it is in."""
+    return next((folder for folder in path.parents if folder.suffix == ".zarr"), path.parent)
+
+
+def _look_up(path: Path) -> Stored:
+    folder = _folder_of(path)
+    files = _known.get(folder)
+    if files is None:
+        files = _known[folder] = {} if path.parts[0] in WEB else stored_in(folder)
+    if path not in files and path.parts[0] in WEB:
+        store, key = _place(path)
+        about = _ask(path, lambda: _obstore().head(store, key))
+        files[path] = Stored(_tag(about), about["size"])
+    if path not in files:
+        raise FileNotFoundError(as_typed(path))
+    return files[path]
+
+
+def _tag(about: Any) -> str:
+    """Stores agree on a file's entity tag, but not on what is around it; servers without tags have a time."""
+    return (about["e_tag"] or about["last_modified"].isoformat()).removeprefix("W/").strip('"')
+
+
+def _runs(numbers: Iterable[int]) -> list[list[int]]:
+    """Ascending numbers, cut where they are no neighbours, and where there are too many."""
+    runs: list[list[int]] = []
+    for n in numbers:
+        if runs and runs[-1][-1] == n - 1 and len(runs[-1]) < MOST_BLOCKS:
+            runs[-1].append(n)
+        else:
+            runs.append([n])
+    return runs
+
+
+def _place(path: Path) -> tuple["ObjectStore", str]:
+    """The store that a path is in, and its key there."""
+    _require_own_process()
+    if path.parts[0] in HUB:
+        repository, key = hub.split_url(path.parts[1:])
+        return _store("hf:", repository), key
+    if len(path.parts) < 2:
+        raise UserError(f"The URL {as_typed(path)} names no split: give one such as s3://bucket/data/128k/s.")
+    return _store(path.parts[0], path.parts[1]), "/".join(path.parts[2:])
+
+
+@lru_cache(maxsize=64)
+def _store(scheme: str, root: Any) -> "ObjectStore":
+    url, options = f"{scheme}//{root}", PATIENCE
+    if scheme in HUB:
+        url, options = hub.resolve_url(root), PATIENCE | hub.sign_in()
+    make = _obstore().store.from_url if scheme in BUCKETS else _obstore().store.HTTPStore
+    return make(url, client_options=options, retry_config=RETRIES)
+
+
+def _obstore() -> Any:
+    try:
+        import obstore.exceptions
+        import obstore.store
+    except ImportError:
+        raise UserError(
+            "Splits that are not on this machine are read with obstore: pip install 'levelproof[remote]'."
+        ) from None
+    return obstore
+
+
+@lru_cache(maxsize=1)
+def _first_process() -> int:
+    """The one that uses stores, whose threads a forked process does not have."""
+    return os.getpid()
+
+
+def _require_own_process() -> None:
+    if _first_process() != os.getpid():
+        raise UserError(
+            "A forked process cannot read splits that are not on this machine: start it with "
+            "multiprocessing_context='forkserver'."
+        )
+
+
+def _cache() -> BlockCache:
+    most = os.environ.get(CACHE_GB, "10")
+    if not re.fullmatch(r"\d+(\.\d+)?", most):
+        raise UserError(f"{CACHE_GB} is {most!r}: give the gigabytes to keep of splits that are read from elsewhere.")
+    return _cache_in(cache_folder() / "remote", int(float(most) * 1e9))
+
+
+@lru_cache(maxsize=8)
+def _cache_in(folder: Path, most: int) -> BlockCache:
+    return BlockCache(folder, most)
+
+
+def _ask(path: Path, request: Callable[[], T]) -> T:
+    """What a request gives; made again where an answer was cut off, which obstore does not do for lists.
+
+    Raises:
+        FileNotFoundError: the store has no such file.
+        UserError: it has no such bucket, or it may not be read.
+        Failure: it does not answer.
+    """
+    exceptions, end = _obstore().exceptions, time.monotonic() + RETRIES["retry_timeout"].total_seconds()
+    for attempt in count():
+        try:
+            return request()
+        except FileNotFoundError:
+            raise FileNotFoundError(as_typed(path)) from None
+        except exceptions.BaseError as error:
+            text = str(error)
+            if TRIED.search(text) or time.monotonic() > end:
+                raise _explained(path, text) from None
+            time.sleep(random.uniform(0, min(0.1 * 2**attempt, 5)))
+    raise AssertionError("unreachable")
+
+
+def _explained(path: Path, text: str) -> LevelproofError:
+    """A sentence for what obstore says of a request that failed."""
+    url, how = as_typed(path), SIGN_IN.get(path.parts[0], "copy the split to a folder first")
+    if "NoSuchBucket" in text:
+        return UserError(f"There is no bucket {path.parts[1]!r}: check {url}.")
+    if CLOUD.search(text):
+        return UserError(f"There are no credentials to read {url} with: {how}.")
+    if "Range request not supported" in text:
+        return Failure(f"The server of {url} gives no parts of files: copy the split to a folder first.")
+    found = STATUS.search(text)
+    said = found[1].strip() if found else "it does not answer"
+    if said.startswith(("401", "403")):
+        return UserError(f"The store does not let you read {url} ({said}): {how}.")
+    return Failure(f"Cannot read {url} ({said}): check the network and the URL, and try again.")

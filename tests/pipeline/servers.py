@@ -1,0 +1,222 @@
+"""Servers on loopback that splits are read from, and what can go wrong between them and a reader."""
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+from typing import NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+HOST = "127.0.0.1"
+PATIENCE = 60  # s
+PAGE = 10  # keys of a page of S3's lists
+
+
+class Answer(NamedTuple):
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+
+Answers = Callable[[str, str, dict[str, str]], Answer]  # of a method, a path and the request's headers
+
+
+class Server:
+    """Answers requests by a function, writes them down, and may spoil every so many of them."""
+
+    def __init__(self, answers: Answers) -> None:
+        self.log: list[str] = []  # "GET /path bytes=0-99"
+        self.count, self.every, self.spoiled = 0, 0, "busy"
+        server = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def answer(self) -> None:
+                server.count += 1
+                server.log.append(f"{self.command} {self.path} {self.headers.get('Range', '')}".strip())
+                spoiled = bool(server.every) and server.count % server.every == 0
+                if spoiled and server.spoiled == "busy":
+                    self.give(Answer(503, {}, b"<Error><Code>SlowDown</Code></Error>"))
+                    return
+                given = answers(self.command, self.path, {name.lower(): x for name, x in self.headers.items()})
+                self.give(given, cut_off=spoiled)
+
+            def give(self, given: Answer, cut_off: bool = False) -> None:
+                self.send_response(given.status)
+                for name, value in {"Content-Length": str(len(given.body)), **given.headers}.items():
+                    self.send_header(name, value)
+                self.end_headers()
+                if self.command != "HEAD":
+                    self.wfile.write(given.body[: len(given.body) // 2] if cut_off else given.body)
+                if cut_off:
+                    self.close_connection = True
+
+            do_GET = do_HEAD = answer  # noqa: N815
+
+            def log_message(self, *_: object) -> None:
+                """Not on the terminal."""
+
+        self._server = ThreadingHTTPServer((HOST, 0), Handler)
+        self._server.daemon_threads = True
+        self.url = f"http://{HOST}:{self._server.server_port}"
+        Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
+
+    def spoil(self, every: int, how: str = "busy") -> None:
+        """Answer every so many requests with "busy", or cut answers off ("cut")."""
+        self.every, self.spoiled = every, how
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+
+@contextmanager
+def serving(answers: Answers) -> Iterator[Server]:
+    server = Server(answers)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def files_of(folder: Path) -> Answers:
+    """A web server that gives the files below a folder, or parts of them."""
+
+    def answers(_: str, path: str, headers: dict[str, str]) -> Answer:
+        file = folder / urlsplit(path).path.lstrip("/")
+        if not file.is_file():
+            return Answer(404, {}, b"")
+        data = file.read_bytes()
+        told = {"ETag": f'"{tag_of(file)}"'}
+        if asked := re.fullmatch(r"bytes=(\d+)-(\d+)", headers.get("range", "")):
+            first, last = int(asked[1]), min(int(asked[2]), len(data) - 1)
+            told["Content-Range"] = f"bytes {first}-{last}/{len(data)}"
+            return Answer(206, told, data[first : last + 1])
+        return Answer(200, told, data)
+
+    return answers
+
+
+def bucket_of(folder: Path) -> Answers:
+    """As much of S3 as readers ask for: the folder's entries are buckets, and keys are listed in pages."""
+    files = files_of(folder)
+
+    def answers(method: str, path: str, headers: dict[str, str]) -> Answer:
+        asked = urlsplit(path)
+        query = {name: values[0] for name, values in parse_qs(asked.query).items()}
+        bucket = folder / asked.path.strip("/").partition("/")[0]
+        if not bucket.is_dir():
+            return Answer(404, {}, b"<Error><Code>NoSuchBucket</Code></Error>")
+        if "list-type" not in query:
+            return files(method, path, headers)
+        below = sorted(file.relative_to(bucket).as_posix() for file in bucket.rglob("*") if file.is_file())
+        below = [key for key in below if key.startswith(query.get("prefix", ""))]
+        first = int(query.get("continuation-token", 0))
+        listed = "".join(
+            f"<Contents><Key>{key}</Key><LastModified>2026-01-01T00:00:00.000Z</LastModified>"
+            f"<ETag>&quot;{tag_of(bucket / key)}&quot;</ETag>"
+            f"<Size>{(bucket / key).stat().st_size}</Size></Contents>"
+            for key in below[first : first + PAGE]
+        )
+        if first + PAGE < len(below):
+            listed += f"<NextContinuationToken>{first + PAGE}</NextContinuationToken>"
+        return Answer(200, {}, f"<ListBucketResult>{listed}</ListBucketResult>".encode())
+
+    return answers
+
+
+def tag_of(file: Path) -> str:
+    about = file.stat()
+    return f"{about.st_ino:x}-{about.st_mtime_ns:x}-{about.st_size:x}"
+
+
+def hub_of(folder: Path, dataset: str, token: str, page: int) -> Answers:
+    """The hub's two endpoints for the files of a dataset: lists in pages, and redirects to where files are."""
+    resolved, listed = f"/datasets/{dataset}/resolve/main/", f"/api/datasets/{dataset}/tree/main/"
+    files = files_of(folder)
+
+    def answers(method: str, path: str, headers: dict[str, str]) -> Answer:
+        if path.startswith("/elsewhere/"):
+            return files(method, path.removeprefix("/elsewhere"), headers)
+        if headers.get("authorization") != f"Bearer {token}":
+            return Answer(401, {}, b"{}")
+        if path.startswith(resolved):
+            return Answer(302, {"Location": f"/elsewhere/{path.removeprefix(resolved)}"}, b"")
+        if not path.startswith(listed):
+            return Answer(404, {}, b"{}")
+        asked = urlsplit(path)
+        below = [file for file in sorted((folder / asked.path.removeprefix(listed)).rglob("*")) if file.is_file()]
+        first = int((re.findall(r"cursor=(\d+)", asked.query) or ["0"])[0])
+        entries = [
+            {
+                "type": "file",
+                "path": file.relative_to(folder).as_posix(),
+                "size": file.stat().st_size,
+                "oid": tag_of(file),
+            }
+            for file in below[first : first + page]
+        ]
+        more = f'<http://{headers["host"]}{asked.path}?recursive=true&cursor={first + page}>; rel="next"'
+        return Answer(200, {"Link": more} if first + page < len(below) else {}, json.dumps(entries).encode())
+
+    return answers
+
+
+def before(host: str, port: int) -> Answers:
+    """A server that asks another one."""
+
+    def answers(method: str, path: str, headers: dict[str, str]) -> Answer:
+        connection = HTTPConnection(host, port, timeout=PATIENCE)
+        try:
+            connection.request(method, path, headers=headers)
+            given = connection.getresponse()
+            kept = {name: x for name, x in given.getheaders() if name.lower() in ("etag", "last-modified")}
+            kept |= {name: x for name, x in given.getheaders() if name.lower() in ("content-range", "content-length")}
+            return Answer(given.status, kept, given.read())
+        finally:
+            connection.close()
+
+    return answers
+
+
+@contextmanager
+def s3_process() -> Iterator[tuple[str, int]]:
+    """A process that serves S3, moto's, with a bucket named `bucket`; where it listens."""
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        port = probe.getsockname()[1]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "moto.server", "-H", HOST, "-p", str(port)],
+        env=os.environ | {"AWS_ACCESS_KEY_ID": "moto", "AWS_SECRET_ACCESS_KEY": "moto"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        end = time.monotonic() + PATIENCE
+        while process.poll() is None:
+            try:
+                socket.create_connection((HOST, port)).close()
+                break
+            except OSError:
+                assert time.monotonic() < end
+                time.sleep(0.05)
+        keys = {"aws_access_key_id": "any", "aws_secret_access_key": "any", "region_name": "us-east-1"}
+        pytest.importorskip("boto3").client("s3", endpoint_url=f"http://{HOST}:{port}", **keys).create_bucket(
+            Bucket="bucket"
+        )
+        yield HOST, port
+    finally:
+        process.terminate()
+        process.wait()

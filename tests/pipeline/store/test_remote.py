@@ -1,0 +1,330 @@
+"""A split that lies elsewhere reads as the same split in a folder, or one sentence says why not."""
+
+import json
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import obstore
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from obstore.store import MemoryStore, S3Store
+
+import levelproof
+from experts.labels import Label
+from pipeline.errors import Failure, LevelproofError, UserError
+from pipeline.read.rows import read_rows
+from pipeline.store import hub, remote
+from pipeline.store.fields import same_bits
+from pipeline.store.manifest import read_manifest, require_manifest
+from tests.pipeline.command import ROOT, assert_refused
+from tests.pipeline.command import here as command
+from tests.pipeline.made import made_split
+from tests.pipeline.servers import HOST, Answer, Server, before, bucket_of, files_of, hub_of, s3_process, serving
+
+UNITS = [[Label.SOLVED] * 2, [Label.UNSOLVED, Label.SOLVED, Label.SOLVED], [Label.SOLVED] * 4]
+KEYS = {"access_key_id": "any", "secret_access_key": "any", "region": "us-east-1"}
+S3 = Path("s3://bucket/data/s")
+BLOCK = 2**16  # a level of size s is several
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_split(tmp_path_factory.mktemp("made"), UNITS)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Small blocks, a cache of its own, little patience, and nothing known of any store."""
+    monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(remote, "BLOCK", BLOCK)
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=2))
+    monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
+    monkeypatch.setattr(hub, "PAUSE", 0.005)
+    for name in [name for name in os.environ if name.startswith(("AWS_", "HF_", "GOOGLE_"))]:
+        monkeypatch.delenv(name)
+    forget()
+
+
+def forget() -> None:
+    """What a process knows, as if another one began."""
+    remote._known.clear()
+    remote._store.cache_clear()
+    remote._cache_in.cache_clear()
+
+
+class Bucket(NamedTuple):
+    """A bucket behind a server that counts and spoils requests."""
+
+    server: Server
+    put: Callable[[str, bytes], Any]  # under a key
+
+
+@pytest.fixture(scope="module", params=["little", pytest.param("moto", marks=pytest.mark.campaign)])
+def made_bucket(split: Path, request: pytest.FixtureRequest, tmp_path_factory: Any) -> Iterator[Bucket]:
+    """With the split in it: of the few lines of S3 that readers need, or of moto in a process."""
+    if request.param == "little":
+        folder = tmp_path_factory.mktemp("s3")
+        shutil.copytree(split, folder / "bucket/data/s")
+        with serving(bucket_of(folder)) as server:
+            yield Bucket(server, lambda key, data: (folder / "bucket" / key).write_bytes(data))
+        return
+    with s3_process() as (host, port), serving(before(host, port)) as server:
+        options = {"endpoint": f"http://{host}:{port}", "client_options": {"allow_http": True}}
+        store = S3Store("bucket", **KEYS, **options)  # pyright: ignore[reportArgumentType]
+        for file in (file for file in split.rglob("*") if file.is_file()):
+            obstore.put(store, f"data/s/{file.relative_to(split).as_posix()}", file)
+        yield Bucket(server, lambda key, data: obstore.put(store, key, data))
+
+
+@pytest.fixture
+def bucket(made_bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> Bucket:
+    for name, value in {**KEYS, "endpoint_url": made_bucket.server.url}.items():
+        monkeypatch.setenv(f"AWS_{name}".upper(), value)
+    made_bucket.server.spoil(0)
+    made_bucket.server.log.clear()
+    return made_bucket
+
+
+def witnessed(split: Path) -> pa.Table:
+    table = require_manifest(split).table
+    return table.filter(pc.is_valid(table["shard"]))  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def require_same(there: Path, here: Path) -> None:
+    """Manifest and records, bit for bit."""
+    assert read_manifest(there).table.equals(read_manifest(here).table)
+    rows = witnessed(there).take([7, 0, 3, 1, 6, 0])
+    found, true = read_rows(there, rows), read_rows(here, rows)
+    assert found.keys() == true.keys()
+    assert all(same_bits(found[name], true[name]).all() for name in true)
+
+
+def data_requests(server: Server) -> list[str]:
+    return [line for line in server.log if line.startswith("GET") and "list-type" not in line]
+
+
+def test_a_path_stands_for_a_url() -> None:
+    for url in ("s3://bucket/data/s", "gs://b", "https://host:80/a", "hf://datasets/user/name@v1/1M/s"):
+        assert remote.is_remote(Path(url))
+        assert remote.as_typed(Path(url)) == url
+        assert str(UserError(f"There is no split at {Path(url)}.")) == f"There is no split at {url}."
+    assert not remote.is_remote(Path("data/s"))
+    assert not remote.is_remote(Path())
+
+
+@settings(max_examples=40, deadline=None)
+@given(size=st.integers(0, 5000), most=st.sampled_from([0, 700, 10**6]), data=st.data())
+def test_any_places_of_a_file(size: int, most: int, data: st.DataObject, tmp_path_factory: Any) -> None:
+    content = np.random.default_rng(size).bytes(size)
+    store, folder = MemoryStore(), tmp_path_factory.mktemp("cache")
+    obstore.put(store, "shards/x.zarr/c/0", content)
+    place = st.integers(0, size).flatmap(lambda first: st.tuples(st.just(first), st.integers(0, size - first)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(remote, "BLOCK", 256)
+        patch.setattr(remote, "_store", lambda *_: store)
+        patch.setattr(remote, "_cache", lambda: remote.BlockCache(folder, most))
+        for _ in range(2):
+            remote._known.clear()
+            file = remote.RemoteFile(Path("s3://bucket/shards/x.zarr/c/0"))
+            places = data.draw(st.lists(place, max_size=6))
+            assert list(file.read(places)) == [content[first : first + length] for first, length in places]
+
+
+def test_a_split_in_s3_reads_as_in_its_folder(bucket: Bucket, split: Path) -> None:
+    require_same(S3, split)
+    assert data_requests(bucket.server)
+
+
+def test_a_split_in_s3_opens_as_its_folder_does(bucket: Bucket, split: Path) -> None:
+    there, here = (levelproof.open(path, where="label = 'solved'", validation=0.0) for path in (S3, split))
+    assert there.manifest.equals(here.manifest)
+    words: dict[str, Any] = {"batch": 3, "seed": 0, "observation": None, "fields": ["record/state/position"]}
+    for one, other in zip(there.batches(**words), here.batches(**words), strict=True):
+        assert one.level_id.tolist() == other.level_id.tolist()
+        assert same_bits(one.fields["record/state/position"], other.fields["record/state/position"]).all()
+    again = pickle.loads(pickle.dumps(there))
+    assert same_bits(
+        np.asarray(again.state(4, 17).level.state.position), np.asarray(here.state(4, 17).level.state.position)
+    ).all()
+
+
+def test_the_second_time_nothing_is_fetched(bucket: Bucket, split: Path) -> None:
+    require_same(S3, split)
+    forget()
+    bucket.server.log.clear()
+    require_same(S3, split)
+    assert bucket.server.log
+    assert data_requests(bucket.server) == []
+
+
+def test_one_trajectory_fetches_blocks_and_not_its_shard(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote, "BLOCK", 2**12)
+    monkeypatch.setattr(remote, "MOST_BLOCKS", 1)
+    rows = witnessed(S3)
+    bucket.server.log.clear()
+    read_rows(S3, rows.slice(5, 1), ["record/action"])
+    whole = sum(about.size for about in remote.stored_in(S3 / rows["shard"][5].as_py()).values())
+    assert 2**12 * len(data_requests(bucket.server)) < whole / 4
+
+
+def test_what_changed_is_fetched_again(bucket: Bucket, split: Path, tmp_path: Path) -> None:
+    require_same(S3, split)
+    other = Path(shutil.copytree(split, tmp_path / "s"))
+    shard = sorted((other / "shards").iterdir())[0]
+    file = next(file for file in shard.rglob("*") if file.is_file() and "act/c" in file.as_posix())
+    file.write_bytes(bytes(file.stat().st_size))
+    key = f"data/s/{file.relative_to(other).as_posix()}"
+    try:
+        bucket.put(key, file.read_bytes())
+        with pytest.raises(Failure, match="open the split again"):
+            require_same(S3, split)
+    finally:
+        bucket.put(key, (split / file.relative_to(other)).read_bytes())
+    require_same(S3, split)
+
+
+def test_a_file_that_changes_between_two_blocks_is_noticed(bucket: Bucket, split: Path) -> None:
+    key, path = "data/s/shards/x", S3 / "shards/x"
+    bucket.put(key, bytes(3 * BLOCK))
+    file = remote.RemoteFile(path)
+    assert next(file.read([(0, 10)])) == bytes(10)
+    bucket.put(key, b"1" * 3 * BLOCK)
+    with pytest.raises(OSError, match=r"s3://bucket/data/s/shards/x has changed"):
+        next(file.read([(BLOCK, 10)]))
+    assert next(remote.RemoteFile(path).read([(BLOCK, 10)])) == b"1" * 10
+
+
+@pytest.mark.parametrize("how", ["busy", "cut"])
+def test_a_store_that_throttles_or_cuts_off_gives_the_right_bits(bucket: Bucket, split: Path, how: str) -> None:
+    bucket.server.spoil(3, how)
+    require_same(S3, split)
+
+
+def test_a_store_that_dies_is_one_sentence_in_bounded_time(bucket: Bucket) -> None:
+    rows = witnessed(S3)
+    bucket.server.spoil(1)
+    start = time.monotonic()
+    with pytest.raises(Failure, match=r"Cannot read s3://bucket/data/s/.* \(503 Service Unavailable\)"):
+        read_rows(S3, rows)
+    assert time.monotonic() - start < 15
+
+
+@pytest.mark.parametrize(
+    ("url", "environment", "kind", "sentence"),
+    [
+        ("s3://bucket/data/none", {}, UserError, "There is no split at s3://bucket/data/none"),
+        ("s3://nobody/data/s", {}, UserError, "There is no bucket 'nobody': check s3://nobody/data/s"),
+        ("s3://bucket/data/s", {"AWS_ENDPOINT_URL": f"http://{HOST}:1"}, Failure, r"\(it does not answer\)"),
+        ("hf://models/user/name", {}, UserError, "hf://models/user/name/manifest is none of a dataset"),
+        ("s3://bucket/data/s", {"LEVELPROOF_CACHE_GB": "much"}, UserError, "LEVELPROOF_CACHE_GB is 'much'"),
+    ],
+)
+def test_what_is_not_there_is_one_sentence(
+    bucket: Bucket,
+    monkeypatch: pytest.MonkeyPatch,
+    url: str,
+    environment: dict,
+    kind: type[LevelproofError],
+    sentence: str,
+) -> None:
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(kind, match=sentence):
+        require_manifest(Path(url))
+
+
+def test_credentials_that_are_missing_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_METADATA_ENDPOINT", f"http://{HOST}:1")  # where they would be on Amazon's machines
+    with pytest.raises(UserError, match=r"no credentials to read s3://.*AWS_ACCESS_KEY_ID.*AWS_SKIP_SIGNATURE"):
+        read_manifest(S3)
+
+
+def test_credentials_that_do_not_suffice_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(lambda *_: Answer(403, {}, b"<Error><Code>AccessDenied</Code></Error>")) as server:
+        for name, value in {**KEYS, "endpoint_url": server.url}.items():
+            monkeypatch.setenv(f"AWS_{name}".upper(), value)
+        with pytest.raises(UserError, match="does not let you read s3://bucket"):
+            read_manifest(S3)
+
+
+def test_a_split_on_a_web_server(split: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(split, tmp_path / "www" / "s"))
+    with serving(files_of(tmp_path / "www")) as server:
+        there = Path(f"{server.url}/s")
+        with pytest.raises(UserError, match=r"needs manifest/index\.txt, which `ls manifest > manifest/index\.txt`"):
+            read_manifest(there)
+        subprocess.run("ls manifest > manifest/index.txt", shell=True, check=True, cwd=folder)
+        require_same(there, split)
+        server.log.clear()
+        forget()
+        require_same(there, split)
+        assert [line for line in server.log if line.startswith("GET") and "index.txt" not in line] == []
+        server.spoil(3, "cut")
+        forget()
+        shutil.rmtree(os.environ["LEVELPROOF_CACHE_DIR"])
+        require_same(there, split)
+
+
+def test_a_split_on_the_hub(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(split, tmp_path / "repository" / "1M" / "s")
+    there = Path("hf://datasets/user/name/1M/s")
+    with serving(hub_of(tmp_path / "repository", "user/name", "secret", page=2)) as server:
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+        monkeypatch.setenv("HF_HOME", str(tmp_path))
+        with pytest.raises(UserError, match="set HF_TOKEN"):
+            read_manifest(there)
+        (tmp_path / "token").write_text("secret\n")
+        forget()
+        server.spoil(4)
+        require_same(there, split)
+        server.spoil(0)
+        server.log.clear()
+        forget()
+        require_same(there, split)
+        assert [line for line in server.log if "/resolve/" in line] == []
+        with pytest.raises(UserError, match="There is no split at hf://datasets/user/name/2M/s"):
+            require_manifest(Path("hf://datasets/user/name/2M/s"))
+
+
+def test_commands_that_read_take_urls_and_others_say_what_they_need(
+    bucket: Bucket, split: Path, tmp_path: Path
+) -> None:
+    there, here = (json.loads(command(["inspect", str(path), "--json"], tmp_path).stdout) for path in (S3, split))
+    assert there.pop("split") == "s3://bucket/data/s"
+    assert here.pop("split") == str(split)
+    assert there == here
+    for words in (["verify", "s3://bucket/data/s"], ["status", "s3://bucket/data/s"], ["seal", "s3://bucket/data/s"]):
+        assert_refused(command(words, tmp_path), 2, "copy it with `aws s3 sync` first")
+
+
+def test_a_forked_process_is_told_how_to_start(tmp_path: Path) -> None:
+    """Its threads would not be there: it would wait forever, and so would the process that it is of."""
+    code = (
+        "import os\nfrom pathlib import Path\nfrom pipeline.store import remote\n"
+        "remote._place(Path('s3://bucket/data'))\n"
+        "child = os.fork()\n"
+        "try:\n    remote.bytes_of(Path('s3://bucket/data')) if not child else os.waitpid(child, 0)\n"
+        "except Exception as error:\n    print(error, flush=True)\n    os._exit(1)\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=60)
+    assert "multiprocessing_context='forkserver'" in done.stdout
+    assert not done.stderr
+
+
+def test_without_obstore_a_sentence_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "obstore", None)
+    with pytest.raises(UserError, match=r"pip install 'levelproof\[remote\]'"):
+        read_manifest(S3)
