@@ -5,13 +5,19 @@ import argparse
 from pipeline.cli.command import add_split
 
 DOES = "merge a split's many small files into few large ones"
-EXAMPLE = "levelproof seal data/128k/s"
+EXAMPLE = """levelproof seal data/128k/s
+levelproof seal data/128k/s --density witness --key-every 16"""
 ROWS = "rows of a sealed fragment, about (default: 100,000)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
     parser.add_argument("--rows", type=int, metavar="N", help=ROWS)
+    parser.add_argument(
+        "--density", choices=("full", "resume", "witness"), help="how much of each record is stored then"
+    )
+    every = "env steps between key frames of --density witness (default: 32)"
+    parser.add_argument("--key-every", type=int, default=32, metavar="K", help=every)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -19,4 +25,4 @@ def run(arguments: argparse.Namespace) -> None:
 
     from pipeline.jobs.seal import seal_split
 
-    seal_split(arguments.split, arguments.rows, Console(stderr=True))
+    seal_split(arguments.split, arguments.rows, Console(stderr=True), arguments.density, arguments.key_every)

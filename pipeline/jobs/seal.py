@@ -12,9 +12,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from configs.schema import KEY_EVERY, KEYS_EVERY, Density, stored_as
 from pipeline.errors import Failure, LevelproofError, UserError
 from pipeline.jobs.progress import say
 from pipeline.jobs.schedule import WorkUnit
+from pipeline.runtime import prepare_jax
 from pipeline.store import seal as store
 from pipeline.store.disk import REFUSALS
 from pipeline.store.layout import fragment_path, unit_name
@@ -23,8 +25,12 @@ from pipeline.store.seal import Piece, seal
 from pipeline.store.split import taken
 
 
-def seal_split(split: Path, rows: int | None, console: Console) -> None:
+def seal_split(
+    split: Path, rows: int | None, console: Console, density: Density | None = None, key_every: int = KEY_EVERY
+) -> None:
     """Seal all of a split that is not, in fragments of about so many rows (default: `store.seal.ROWS`).
+
+    With a `density`, what is stored otherwise is converted, sealed or not.
 
     Raises:
         UserError: there is no split, it cannot be written, or somebody writes to it.
@@ -32,17 +38,27 @@ def seal_split(split: Path, rows: int | None, console: Console) -> None:
     """
     if rows is not None and rows < 1:
         raise UserError(f"A sealed fragment cannot have {rows} rows: give --rows a number from 1.")
+    if key_every not in KEYS_EVERY:
+        raise UserError(f"--key-every is {key_every}: choose one of {', '.join(map(str, KEYS_EVERY))}.")
     require_manifest(split, [])
+    if density:
+        prepare_jax()
+    wanted = (density, key_every) if density else None
     with taken(split, partial(say, console)) as manifest:
         pieces = list(map(Piece.of, manifest.counting))
         groups = store.plan(pieces, rows or store.ROWS)
+        if wanted:
+            others = {fragment.path for fragment in manifest.counting if fragment.densities != {stored_as(*wanted)}}
+            groups += [[piece] for piece in pieces if piece.path in others and not any(piece in of for of in groups)]
         columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
             task = bar.add_task("levels sealed", total=sum(piece.rows for group in groups for piece in group))
+            done = 0
             try:
                 for group in groups:
-                    seal(split, group)
-                    bar.advance(task, sum(piece.rows for piece in group))
+                    done += sum(piece.rows for piece in group)
+                    seal(split, group, density=wanted, converted=partial(bar.advance, task))
+                    bar.update(task, completed=done)
             except OSError as error:
                 raise _refused(split, error) from error
     merged = sum(map(len, groups))

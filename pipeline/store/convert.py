@@ -1,6 +1,6 @@
 """From one density to another: what is read is written again, a few levels at a time."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -14,14 +14,16 @@ from pipeline.store.shard import Shard, read_together, write_shard
 LEVELS = 256  # that are in memory at a time; of size l, 300 MB
 
 
-def convert(places: Sequence[Place], density: Density, key_every: int, paths: Iterator[Path]) -> Iterator[list[Place]]:
-    """Write the trajectories at these places in another density, so many to a new shard at each path, durably.
+def convert(
+    places: Sequence[Place], density: Density, key_every: int, another: Callable[[], Path]
+) -> Iterator[list[Place]]:
+    """Write the trajectories at these places in another density, so many to a new shard, durably.
 
     Args:
         places: of one size and one set of rules.
         density: that they are to have.
         key_every: env steps between key frames of `witness`.
-        paths: of new shards, as many as it takes.
+        another: gives the path of each.
 
     Yields:
         Where they lie then, shard after shard.
@@ -35,6 +37,6 @@ def convert(places: Sequence[Place], density: Density, key_every: int, paths: It
         by_shard = groupby(some, lambda place: place.shard)
         parts = [(Shard(path), [place.row for place in of]) for path, of in by_shard]
         arrays = {name: np.moveaxis(x, 0, -1) for name, x in read_together(parts, exactly=True).items()}
-        encoding, path = replace(parts[0][0].encoding, density=density, key_every=key_every), next(paths)
+        encoding, path = replace(parts[0][0].encoding, density=density, key_every=key_every), another()
         write_shard(path, [place.level_id for place in some], arrays, encoding)
         yield [Place(path, row, place.level_id) for row, place in enumerate(some)]

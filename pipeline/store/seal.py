@@ -6,12 +6,15 @@ process that dies in between leaves what `leftovers.clean` removes. Knows nothin
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
 import pyarrow as pa
 
+from configs.schema import Density, stored_as
+from pipeline.store.convert import convert
 from pipeline.store.layout import SHARDS, begun_path, data_path, fragment_of, new_attempt, unit_name
 from pipeline.store.leftovers import disown, drop
 from pipeline.store.manifest import (
@@ -76,17 +79,20 @@ def seal(
     pieces: Sequence[Piece],
     moved: Callable[[int], None] = lambda _: None,
     rows_a_file: int | None = None,
+    density: tuple[Density, int] | None = None,
+    converted: Callable[[int], None] = lambda _: None,
 ) -> Piece:
     """Merge these fragments, and their shards of each density. Only the writer of a split may.
 
     Kept experts stay where they are. `moved` and `rows_a_file` are those of `merge_shards`; `moved` is called before
-    each fragment is read, too.
+    each fragment is read, too. With a `density` and its `key_every`, all shards get that one;
+    `converted` is called with how many levels have.
 
     Returns:
         The sealed fragment.
 
     Raises:
-        Failure: a fragment or a shard is damaged; nothing has changed.
+        Failure: a fragment or a shard is damaged, or the engine cannot convert it; nothing has changed.
         OSError: the disk refuses; nothing has changed.
     """
 
@@ -107,12 +113,15 @@ def seal(
             places.setdefault(encodings[name], []).append(Place(shards[name], row, level_id))
     replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
     unit, about = unit_name(level_ids[0], level_ids[-1]), parts[0][0]
-    densities = frozenset[str]().union(*(fragment.densities for fragment, _ in parts))
-    attempts = [new_attempt(split, unit) for _ in places] or [new_attempt(split, unit)]  # nearly always one
-    attempt = attempts[0]
+    densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(of.densities for of, _ in parts))
+    count = len(places) if density is None else 1
+    attempts = [new_attempt(split, unit) for _ in range(count or 1)]  # nearly always one
+    attempt, between = attempts[0], list[Path]()
     try:
         for each in attempts:
             begin_fragment(each)
+        if density:
+            places = _converted(places, density, lambda: _another(split, unit, between), converted)
         for each, of in zip(attempts, places.values(), strict=False):
             merge_shards(each.shard, of, moved, rows_a_file)
         disown(replaced)
@@ -125,6 +134,9 @@ def seal(
             for mark in [*(each.begun for each in attempts), *map(begun_path, replaced)]:
                 mark.unlink(missing_ok=True)
         raise
+    finally:
+        for shard in between:
+            drop(shard)
     for each in attempts[1:]:
         each.begun.unlink()
     for path in paths - {attempt.fragment}:
@@ -132,6 +144,33 @@ def seal(
     for shard in replaced:
         drop(shard)
     return Piece(attempt.fragment, len(level_ids), True)
+
+
+def _converted(
+    places: Mapping[Encoding, list[Place]],
+    density: tuple[Density, int],
+    another: Callable[[], Path],
+    converted: Callable[[int], None],
+) -> dict[Encoding, list[Place]]:
+    """Where all of them lie when those of another density are written again, in the order of level ids."""
+    found, wanted = [], None
+    for encoding, of in places.items():
+        wanted = replace(encoding, density=density[0], key_every=density[1])
+        if encoding.as_json() == wanted.as_json():
+            found += of
+            continue
+        for some in convert(of, *density, another):
+            found += some
+            converted(len(some))
+    return {wanted: sorted(found, key=lambda place: place.level_id)} if wanted else {}
+
+
+def _another(split: Path, unit: str, between: list[Path]) -> Path:
+    """A shard that is needed until its trajectories are merged."""
+    attempt = new_attempt(split, unit)
+    begin_fragment(attempt)
+    between.append(attempt.shard)
+    return attempt.shard
 
 
 def _moved(table: pa.Table, merged: Mapping[str, Sequence[Place]]) -> pa.Table:

@@ -1,5 +1,6 @@
 """Densities: the same bits come back from each, and what is computed again is held to checksums and key frames."""
 
+import errno
 import json
 import shutil
 import warnings
@@ -20,21 +21,30 @@ from configs.errors import ConfigError
 from configs.schema import KEYS_EVERY
 from experts import resume
 from experts.resume import checksum, timesteps
+from experts.steps import EnvSteps
+from experts.train import UnitResult
 from experts.witness import Record, replay
 from levelgen.level import SIZES, Level
 from levelgen.sampling.distribution import Distribution
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
-from pipeline.errors import Failure
-from pipeline.store import convert, density
+from pipeline.cli.main import main
+from pipeline.errors import Failure, UserError
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.jobs.unit import commit
+from pipeline.read.rows import read_rows
+from pipeline.store import convert, density, seal
 from pipeline.store.contents import table_for
 from pipeline.store.density import CHECKSUM, key_rows, task_states
 from pipeline.store.fields import arrays_of, same_bits, tree_of
+from pipeline.store.layout import split_path
+from pipeline.store.manifest import read_manifest
 from pipeline.store.merge import Place
 from pipeline.store.packing import pack, unpack
 from pipeline.store.schema import Encoding, field_table
 from pipeline.store.shard import EngineDiffers, Shard, read_together, stored_bytes, write_shard
-from tests.pipeline.made import made_fields
+from pipeline.store.split import writing
+from tests.pipeline.made import made_fields, made_job, made_verdict
 
 IDS = [5, 9, 12, 13]
 NAME = "shards/000000000005-000000000013-0123abcd.zarr"
@@ -373,7 +383,7 @@ def test_conversion_takes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: py
     witness, full = write(tmp_path, WITNESS), write(tmp_path, Encoding())
     places = [Place(of.path, row, IDS[row]) for of, row in ((full, 0), (witness, 1), (witness, 2))]
     paths = iter(tmp_path / f"{i}.zarr" for i in range(9))
-    found = list(convert.convert(places, "resume", 32, paths))
+    found = list(convert.convert(places, "resume", 32, lambda: next(paths)))
     assert [[place.level_id for place in of] for of in found] == [IDS[:2], IDS[2:3]]
     for place in (place for of in found for place in of):
         shard = Shard(place.shard)
@@ -387,5 +397,68 @@ def test_states_of_another_machine_are_not_converted(tmp_path: Path, keyed: tupl
     level, row = keyed
     shard = changed(write(tmp_path, WITNESS), lambda stored: ulp(stored, "key/state/position", 0, level))
     with pytest.raises(Failure, match=f"other states than those that were stored of 1 of 1 .* {row} on: read"):
-        list(convert.convert([Place(shard.path, level, IDS[level])], "full", 32, iter([tmp_path / "new.zarr"])))
+        list(convert.convert([Place(shard.path, level, IDS[level])], "full", 32, lambda: tmp_path / "new.zarr"))
     assert not (tmp_path / "new.zarr").exists()
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    """Of two units, each with two of the records."""
+    fields, job = played(), made_job(str(tmp_path / "data"), "size=s")
+    path = split_path(job.out, job.budget, job.size)
+    path.mkdir(parents=True)
+    for ids in ((0, 1), (2, 3)):
+        mine = {name: x[..., ids] for name, x in fields.items()}
+        level, record = tree_of(Level, mine, "level/"), tree_of(Record, mine, "record/")
+        verdicts = [made_verdict(), made_verdict()]
+        commit(job, path, WorkUnit(ids), UnitResult(np.array(ids), level, record, verdicts, EnvSteps()))
+    return path
+
+
+def levelproof(*words: object) -> int:
+    return main([str(word) for word in words])
+
+
+def assert_whole(split: Path, density: str) -> None:
+    rows = read_manifest(split).table
+    assert rows["level_id"].to_pylist() == [0, 1, 2, 3]
+    assert_same(read_rows(split, rows), played())
+    assert {Shard(split / name).encoding.density for name in rows["shard"].to_pylist()} == {density}
+    shards = {f"shards/{path.name}" for path in (split / "shards").iterdir()}
+    assert shards == set(rows["shard"].to_pylist())  # and nothing else is there
+    assert len(list((split / "manifest").iterdir())) == len(read_manifest(split).fragments)
+
+
+def test_a_split_becomes_another_density_and_the_same_again(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert levelproof("seal", split, "--rows", 2, "--density", "witness", "--key-every", 16) == 0
+    assert_whole(split, "witness")
+    (fragment, *_) = read_manifest(split).fragments
+    assert fragment.densities == {"density=witness key_every=16"}
+    other = made_job(str(split.parents[1]))
+    with pytest.raises(UserError, match="has density=witness key_every=16"), writing(other, print):
+        pass
+    assert levelproof("seal", split, "--rows", 2, "--density", "witness", "--key-every", 16) == 0
+    assert "there was nothing to seal" in capsys.readouterr().out
+    assert levelproof("seal", split, "--density", "full") == 0
+    assert_whole(split, "full")
+    assert levelproof("seal", split, "--density", "witness", "--key-every", 5) == 2
+    assert "--key-every is 5: choose one of 2, 4" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("step", ["write_shard", "merge_shards", "write_fragment"])
+def test_a_conversion_that_fails_changes_nothing(split: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(convert if step == "write_shard" else seal, step, fail)
+    assert levelproof("seal", split, "--density", "resume") == 1
+    assert_whole(split, "full")
+
+
+def test_a_split_of_two_densities_is_read_and_becomes_one(split: Path) -> None:
+    first, _ = read_manifest(split, []).fragments
+    seal.seal(split, [seal.Piece.of(first)], density=("resume", 32))
+    rows = read_manifest(split).table
+    assert_same(read_rows(split, rows), played())
+    assert levelproof("seal", split, "--density", "witness") == 0
+    assert_whole(split, "witness")
