@@ -120,3 +120,29 @@ def test_intervals_are_wilsons() -> None:
     assert np.allclose(Share(81, 263).interval, (0.2552, 0.3662), atol=1e-4)  # Newcombe, 1998
     assert Share(0, 10).interval == pytest.approx((0.0, 0.2775), abs=1e-4)
     assert Share(10, 10).interval == pytest.approx((0.7225, 1.0), abs=1e-4)
+
+
+@pytest.mark.campaign
+def test_the_hub_s_own_libraries_read_it(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    datasets, hub = (pytest.importorskip(name) for name in ("datasets", "huggingface_hub"))
+    cache = str(tmp_path / "cache")
+    shown = datasets.load_dataset(str(dataset), cache_dir=cache)  # the default subset
+    assert shown["128k_s"].num_rows == 12
+    assert all(isinstance(shown["128k_s"].features[name], datasets.Image) for name in PICTURES)
+    assert {picture.width for picture in shown["128k_s"]["start"]} == {PIXELS}
+    manifest = datasets.load_dataset(str(dataset), "64k-s", split="levels", cache_dir=cache)
+    assert manifest["label"][:] == ["unsolved"] * 3
+    card = hub.DatasetCard.load(dataset / "README.md", ignore_metadata_errors=False)
+    assert (card.data.license, card.data.pretty_name) == ("cc-by-4.0", "levels")
+    assert hub.DatasetCardData(**card.data.to_dict()).to_dict() == card.data.to_dict()
+
+
+@pytest.mark.campaign
+def test_the_page_s_python_runs(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As its reader has the data: below `data`, in a folder of his own."""
+    (tmp_path / "data").symlink_to(dataset)
+    monkeypatch.chdir(tmp_path)
+    (block,) = re.findall(r"^```python\n(.*?)^```", (dataset / "README.md").read_text(), re.DOTALL | re.MULTILINE)
+    seen: dict[str, Any] = {}
+    exec(compile(block, "README.md", "exec"), seen)
+    assert seen["batch"].observation.shape[:2] == (64, 256)
