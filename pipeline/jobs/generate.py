@@ -132,6 +132,6 @@ def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, queue: UnitQue
         print(f"Given up: {levels_text([unit])}, for the reason in {quarantine_path(split, unit.name)}")
     if total:
         print(f"Next:  levelproof inspect {folder}")
-    solved = pc.index(manifest.table.column("label"), Label.SOLVED.value).as_py()
+    solved = pc.index(manifest.table.column("label").cast("string"), Label.SOLVED.value).as_py()
     if solved >= 0:
         print(f"       levelproof show {folder} {manifest.level_ids[solved]} -o level.gif")
