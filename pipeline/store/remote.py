@@ -1,4 +1,4 @@
-"""Splits in object stores and on web servers, read in blocks through a cache on this machine.
+"""Splits in object stores and on web servers, read in pieces through a cache on this machine.
 
 A path whose first part is `s3:`, `gs:`, `https:`, `http:` or `hf:` stands for the URL: `Path("s3://bucket/split")` is
 such a one, whatever becomes of its slashes. So whoever reads a split has a Path, and only this knows where it lies.
@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from pipeline.errors import Failure, LevelproofError, UserError
 from pipeline.runtime import cache_folder
 from pipeline.store import hub
-from pipeline.store.block_cache import BlockCache
+from pipeline.store.pieces import PieceCache
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
 BUCKETS, WEB, HUB = ("s3:", "gs:"), ("https:", "http:"), ("hf:",)
 INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for servers that do not list
-BLOCK = 2**20  # bytes; of 4 MB, random trajectories of 10 kB would fetch four times as much
-MOST_BLOCKS = 8  # of one request: neighbours are fetched together
+PIECE = 2**20  # bytes; of 4 MB, random trajectories of 10 kB would fetch four times as much
+MOST_PIECES = 8  # of one request: neighbours are fetched together
 REQUESTS = 16  # at once
 CACHE_GB = "LEVELPROOF_CACHE_GB"
 RETRIES: dict[str, Any] = {
@@ -159,7 +159,7 @@ class RemoteFile:
         """
         self.path, self._about = path, _look_up(path)
         self.size = self._about.size
-        names = f"{as_typed(path)}\n{self._about.tag}\n{self.size}\n{BLOCK}"
+        names = f"{as_typed(path)}\n{self._about.tag}\n{self.size}\n{PIECE}"
         self._name, self._cache = sha256(names.encode()).hexdigest()[:32], _cache()
 
     def read(self, places: Sequence[tuple[int, int]]) -> Iterator[bytes]:
@@ -169,32 +169,32 @@ class RemoteFile:
             OSError: the file has changed.
             UserError, Failure: as `stored_in`; or the cache's folder cannot be written.
         """
-        wanted = {n for first, length in places for n in range(first // BLOCK, -(-(first + length) // BLOCK))}
-        missing = [n for n in sorted(wanted) if not self._cache.has(self._block(n))]
+        wanted = {n for first, length in places for n in range(first // PIECE, -(-(first + length) // PIECE))}
+        missing = [n for n in sorted(wanted) if not self._cache.has(self._piece(n))]
         if missing:
             at_once(self.path, self._keep, _runs(missing))
         for first, length in places:
-            blocks = range(first // BLOCK, -(-(first + length) // BLOCK))
-            yield b"".join(self._part(n, max(first - n * BLOCK, 0), first + length - n * BLOCK) for n in blocks)
+            pieces = range(first // PIECE, -(-(first + length) // PIECE))
+            yield b"".join(self._part(n, max(first - n * PIECE, 0), first + length - n * PIECE) for n in pieces)
 
     def close(self) -> None:
         """Nothing is held."""
 
-    def _block(self, n: int) -> str:
+    def _piece(self, n: int) -> str:
         return f"{self._name}-{n}"
 
     def _part(self, n: int, first: int, last: int) -> bytes:
-        """Of a block; fetched again where others needed its place in the cache."""
-        part = self._cache.read(self._block(n), first, min(last, BLOCK))
-        return self._fetch([n])[first:last][: BLOCK - first] if part is None else part
+        """Of a piece; fetched again where others needed its place in the cache."""
+        part = self._cache.read(self._piece(n), first, min(last, PIECE))
+        return self._fetch([n])[first:last][: PIECE - first] if part is None else part
 
     def _keep(self, run: Sequence[int]) -> None:
         self._fetch(run)
 
     def _fetch(self, run: Sequence[int]) -> bytes:
-        """Blocks that are neighbours, in one request."""
+        """Pieces that are neighbours, in one request."""
         store, key = _place(self.path)
-        first, last = run[0] * BLOCK, min((run[-1] + 1) * BLOCK, self.size)
+        first, last = run[0] * PIECE, min((run[-1] + 1) * PIECE, self.size)
         whole = (first, last) == (0, self.size)  # which servers that know no ranges give, too
         options = {} if whole else {"range": (first, last)}
 
@@ -208,7 +208,7 @@ class RemoteFile:
             _known.pop(_folder_of(self.path), None)
             raise OSError(f"{as_typed(self.path)} has changed")
         for i, n in enumerate(run):
-            self._cache.put(self._block(n), data[i * BLOCK : (i + 1) * BLOCK])
+            self._cache.put(self._piece(n), data[i * PIECE : (i + 1) * PIECE])
         return data
 
 
@@ -243,7 +243,7 @@ def _runs(numbers: Iterable[int]) -> list[list[int]]:
     """Ascending numbers, cut where they are no neighbours, and where there are too many."""
     runs: list[list[int]] = []
     for n in numbers:
-        if runs and runs[-1][-1] == n - 1 and len(runs[-1]) < MOST_BLOCKS:
+        if runs and runs[-1][-1] == n - 1 and len(runs[-1]) < MOST_PIECES:
             runs[-1].append(n)
         else:
             runs.append([n])
@@ -295,7 +295,7 @@ def _require_own_process() -> None:
         )
 
 
-def _cache() -> BlockCache:
+def _cache() -> PieceCache:
     most = os.environ.get(CACHE_GB, "10")
     if not re.fullmatch(r"\d+(\.\d+)?", most):
         raise UserError(f"{CACHE_GB} is {most!r}: give the gigabytes to keep of splits that are read from elsewhere.")
@@ -303,8 +303,8 @@ def _cache() -> BlockCache:
 
 
 @lru_cache(maxsize=8)
-def _cache_in(folder: Path, most: int) -> BlockCache:
-    return BlockCache(folder, most)
+def _cache_in(folder: Path, most: int) -> PieceCache:
+    return PieceCache(folder, most)
 
 
 def _ask(path: Path, request: Callable[[], T]) -> T:

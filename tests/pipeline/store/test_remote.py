@@ -36,7 +36,7 @@ from tests.pipeline.servers import HOST, Answer, Server, before, bucket_of, file
 UNITS = [[Label.SOLVED] * 2, [Label.UNSOLVED, Label.SOLVED, Label.SOLVED], [Label.SOLVED] * 4]
 KEYS = {"access_key_id": "any", "secret_access_key": "any", "region": "us-east-1"}
 S3 = Path("s3://bucket/data/s")
-BLOCK = 2**16  # a level of size s is several
+PIECE = 2**16  # a level of size s is several
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +46,9 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Small blocks, a cache of its own, little patience, and nothing known of any store."""
+    """Small pieces, a cache of its own, little patience, and nothing known of any store."""
     monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(remote, "BLOCK", BLOCK)
+    monkeypatch.setattr(remote, "PIECE", PIECE)
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=2))
     monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
     monkeypatch.setattr(hub, "PAUSE", 0.005)
@@ -132,9 +132,9 @@ def test_any_places_of_a_file(size: int, most: int, data: st.DataObject, tmp_pat
     obstore.put(store, "shards/x.zarr/c/0", content)
     place = st.integers(0, size).flatmap(lambda first: st.tuples(st.just(first), st.integers(0, size - first)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(remote, "BLOCK", 256)
+        patch.setattr(remote, "PIECE", 256)
         patch.setattr(remote, "_store", lambda *_: store)
-        patch.setattr(remote, "_cache", lambda: remote.BlockCache(folder, most))
+        patch.setattr(remote, "_cache", lambda: remote.PieceCache(folder, most))
         for _ in range(2):
             remote._known.clear()
             file = remote.RemoteFile(Path("s3://bucket/shards/x.zarr/c/0"))
@@ -169,9 +169,9 @@ def test_the_second_time_nothing_is_fetched(bucket: Bucket, split: Path) -> None
     assert data_requests(bucket.server) == []
 
 
-def test_one_trajectory_fetches_blocks_and_not_its_shard(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote, "BLOCK", 2**12)
-    monkeypatch.setattr(remote, "MOST_BLOCKS", 1)
+def test_one_trajectory_fetches_pieces_and_not_its_shard(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote, "PIECE", 2**12)
+    monkeypatch.setattr(remote, "MOST_PIECES", 1)
     rows = witnessed(S3)
     bucket.server.log.clear()
     read_rows(S3, rows.slice(5, 1), ["record/action"])
@@ -195,15 +195,15 @@ def test_what_changed_is_fetched_again(bucket: Bucket, split: Path, tmp_path: Pa
     require_same(S3, split)
 
 
-def test_a_file_that_changes_between_two_blocks_is_noticed(bucket: Bucket, split: Path) -> None:
+def test_a_file_that_changes_between_two_pieces_is_noticed(bucket: Bucket, split: Path) -> None:
     key, path = "data/s/shards/x", S3 / "shards/x"
-    bucket.put(key, bytes(3 * BLOCK))
+    bucket.put(key, bytes(3 * PIECE))
     file = remote.RemoteFile(path)
     assert next(file.read([(0, 10)])) == bytes(10)
-    bucket.put(key, b"1" * 3 * BLOCK)
+    bucket.put(key, b"1" * 3 * PIECE)
     with pytest.raises(OSError, match=r"s3://bucket/data/s/shards/x has changed"):
-        next(file.read([(BLOCK, 10)]))
-    assert next(remote.RemoteFile(path).read([(BLOCK, 10)])) == b"1" * 10
+        next(file.read([(PIECE, 10)]))
+    assert next(remote.RemoteFile(path).read([(PIECE, 10)])) == b"1" * 10
 
 
 @pytest.mark.parametrize("how", ["busy", "cut"])

@@ -1,4 +1,4 @@
-"""Blocks on the disk: the bytes that were put there or none, within the bound, whatever processes and disks do."""
+"""Pieces on the disk: the bytes that were put there or none, within the bound, whatever processes and disks do."""
 
 import os
 from pathlib import Path
@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import Failure
-from pipeline.store.block_cache import CHECKSUM, PARTS, BlockCache
+from pipeline.store.pieces import CHECKSUM, PARTS, PieceCache
 
-LONGEST = 40  # bytes of a block
+LONGEST = 40  # bytes of a piece
 
 
-def block(n: int) -> bytes:
+def piece(n: int) -> bytes:
     return bytes((n * 7 + i) % 256 for i in range(1 + (n * 13) % LONGEST))
 
 
@@ -26,11 +26,11 @@ def stored_bytes(folder: Path) -> int:
     steps=st.lists(st.tuples(st.sampled_from(["put", "read", "flip", "cut"]), st.integers(0, 7), st.booleans())),
     most=st.integers(0, 200),
 )
-def test_a_block_is_right_or_not_there(steps: list, most: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_piece_is_right_or_not_there(steps: list, most: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("cache")
-    caches = [BlockCache(folder, most) for _ in range(2)]  # two processes
+    caches = [PieceCache(folder, most) for _ in range(2)]  # two processes
     for what, n, which in steps:
-        name, whole = f"name-{n}", block(n)
+        name, whole = f"name-{n}", piece(n)
         if what == "put":
             caches[which].put(name, whole)
             assert stored_bytes(folder) <= most + 2 * (most // PARTS + LONGEST + CHECKSUM)
@@ -40,13 +40,13 @@ def test_a_block_is_right_or_not_there(steps: list, most: int, tmp_path_factory:
         elif (path := folder / name).exists():  # a disk that lost something; then the processes start again
             data = path.read_bytes()
             path.write_bytes(data[:-1] if what == "cut" else bytes([data[0] ^ 1]) + data[1:])
-            caches = [BlockCache(folder, most) for _ in range(2)]
+            caches = [PieceCache(folder, most) for _ in range(2)]
             assert caches[which].read(name, 0, len(whole)) is None
             assert not path.exists()
 
 
 def test_what_was_used_last_stays(tmp_path: Path) -> None:
-    cache = BlockCache(tmp_path, 10 * (100 + CHECKSUM))
+    cache = PieceCache(tmp_path, 10 * (100 + CHECKSUM))
     for n in range(10):
         cache.put(str(n), bytes(100))
         path = tmp_path / str(n)
@@ -60,10 +60,10 @@ def test_what_was_used_last_stays(tmp_path: Path) -> None:
     assert not {"1", "2"} & left
 
 
-def test_what_a_killed_process_left_is_no_block_and_goes(tmp_path: Path) -> None:
+def test_what_a_killed_process_left_is_no_piece_and_goes(tmp_path: Path) -> None:
     (tmp_path / ".name-0.0a1b2c3d").write_bytes(bytes(500))
     os.utime(tmp_path / ".name-0.0a1b2c3d", (0, 0))
-    cache = BlockCache(tmp_path, 400)
+    cache = PieceCache(tmp_path, 400)
     assert cache.read("name-0", 0, 1) is None
     cache.put("name-0", b"x")
     assert [path.name for path in tmp_path.iterdir()] == ["name-0"]
@@ -72,4 +72,4 @@ def test_what_a_killed_process_left_is_no_block_and_goes(tmp_path: Path) -> None
 def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(Failure, match=r"Cannot write to the cache folder .* LEVELPROOF_CACHE_DIR"):
-        BlockCache(tmp_path / "file" / "cache", 100).put("name", b"x")
+        PieceCache(tmp_path / "file" / "cache", 100).put("name", b"x")

@@ -1,4 +1,4 @@
-"""Blocks of files that lie elsewhere, kept in a folder: bounded, shared by processes, each whole or not there."""
+"""Pieces of files that lie elsewhere, kept in a folder: bounded, shared by processes, each whole or not there."""
 
 import os
 import secrets
@@ -10,27 +10,27 @@ import google_crc32c
 
 from pipeline.errors import Failure
 
-CHECKSUM = 4  # bytes of a CRC-32C behind each block: a machine that lost its power may have kept other bytes
-USED = 60.0  # s; a block is marked as used once in this time
+CHECKSUM = 4  # bytes of a CRC-32C behind each piece: a machine that lost its power may have kept other bytes
+USED = 60.0  # s; a piece is marked as used once in this time
 LEFT = 0.9  # share of the bound that is left when it was exceeded
-ABANDONED = 3600.0  # s; who writes a block for longer was killed
+ABANDONED = 3600.0  # s; who writes a piece for longer was killed
 PARTS = 16  # the folder is looked through each time that this part of the bound was added
 
 
-class BlockCache:
-    """A folder of blocks under names that say what is in them: a name's bytes never change."""
+class PieceCache:
+    """A folder of pieces under names that say what is in them: a name's bytes never change."""
 
     def __init__(self, folder: Path, most: int) -> None:
-        """`most` bytes are kept, a sixteenth more by each process that adds blocks."""
+        """`most` bytes are kept, a sixteenth more by each process that adds pieces."""
         self.folder, self.most = folder, most
-        self._added = most  # the first block looks what is there
+        self._added = most  # the first piece looks what is there
         self._checked: set[str] = set()  # names whose bytes this process has seen to be right
 
     def has(self, name: str) -> bool:
         return (self.folder / name).exists()
 
     def read(self, name: str, first: int, last: int) -> bytes | None:
-        """Bytes of a block; None: it is not there, or was damaged and is not there any more."""
+        """Bytes of a piece; None: it is not there, or was damaged and is not there any more."""
         path = self.folder / name
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
@@ -47,15 +47,15 @@ class BlockCache:
             return None
         finally:
             os.close(descriptor)
-        block, checksum = data[:-CHECKSUM], int.from_bytes(data[-CHECKSUM:], "little")
-        if len(data) <= CHECKSUM or google_crc32c.value(block) != checksum:
+        piece, checksum = data[:-CHECKSUM], int.from_bytes(data[-CHECKSUM:], "little")
+        if len(data) <= CHECKSUM or google_crc32c.value(piece) != checksum:
             path.unlink(missing_ok=True)
             return None
         self._checked.add(name)
-        return block[first:last]
+        return piece[first:last]
 
-    def put(self, name: str, block: bytes) -> None:
-        """Keep a block, which appears at once or not at all.
+    def put(self, name: str, piece: bytes) -> None:
+        """Keep a piece, which appears at once or not at all.
 
         Raises:
             Failure: the folder cannot be written.
@@ -63,7 +63,7 @@ class BlockCache:
         temporary = self.folder / f".{name}.{secrets.token_hex(4)}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(block + google_crc32c.value(block).to_bytes(CHECKSUM, "little"))
+            temporary.write_bytes(piece + google_crc32c.value(piece).to_bytes(CHECKSUM, "little"))
             temporary.replace(self.folder / name)
         except OSError as error:
             with suppress(OSError):
@@ -73,7 +73,7 @@ class BlockCache:
                 "make room there, or set LEVELPROOF_CACHE_DIR to another folder."
             ) from None
         self._checked.add(name)
-        self._added += len(block) + CHECKSUM
+        self._added += len(piece) + CHECKSUM
         if self._added > self.most // PARTS:
             self._added = 0
             self._make_room()
