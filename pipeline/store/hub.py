@@ -73,13 +73,15 @@ def files_below(repository: Repository, folder: str) -> dict[str, tuple[str, int
 
 def _page(url: str) -> tuple[list[dict[str, Any]], str]:
     """Some entries, and where there are more."""
-    headers = sign_in().get("default_headers", {})
-    reason: object = ""
+    request, reason = Request(url), ""
+    for name, value in sign_in().get("default_headers", {}).items():
+        request.add_unredirected_header(name, value)  # for nobody but the hub
     for attempt in range(ATTEMPTS):
         try:
-            with urlopen(Request(url, headers=headers), timeout=TIMEOUT) as answer:
+            with urlopen(request, timeout=TIMEOUT) as answer:
                 more = NEXT.search(answer.headers.get("Link", ""))
-                return json.loads(answer.read()), more[1] if more else ""
+                follows = more[1] if more and more[1].startswith(f"{_endpoint()}/") else ""
+                return json.loads(answer.read()), follows
         except HTTPError as error:
             if error.code == 404:
                 return [], ""
@@ -89,9 +91,9 @@ def _page(url: str) -> tuple[list[dict[str, Any]], str]:
                 ) from None
             if error.code not in (408, 429) and error.code < 500:
                 raise Failure(f"The hub refuses {url} ({error.code} {error.reason}): check the URL.") from None
-            reason = error.code
+            reason = str(error.code)
         except (URLError, OSError, ValueError) as error:
-            reason = getattr(error, "reason", error)
+            reason = str(getattr(error, "reason", error))
         if attempt < ATTEMPTS - 1:
             time.sleep(random.uniform(0.5, 1) * PAUSE * 2**attempt)
     raise Failure(f"The hub does not answer at {url} ({reason}): check the network, and try again.")

@@ -30,6 +30,7 @@ INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for ser
 PIECE = 2**20  # bytes; of 4 MB, random trajectories of 10 kB would fetch four times as much
 MOST_PIECES = 8  # of one request: neighbours are fetched together
 REQUESTS = 16  # at once
+MOST_WHOLE = 2**31  # bytes of a file that is read as a whole: fragments, and what arrays say of themselves
 CACHE_GB = "LEVELPROOF_CACHE_GB"
 RETRIES: dict[str, Any] = {
     "max_retries": 8,  # of a request that is throttled, refused, cut off or not answered; with jitter
@@ -44,7 +45,7 @@ SIGN_IN = {
 }
 # In what obstore says of a request that failed:
 STATUS = re.compile(r"status code: (\d{3}[A-Za-z ]*)")
-TRIED = re.compile(rf"{STATUS.pattern}|after \d+ retries|Range request not supported")  # it would fail again
+CUT_OFF, SILENT = "response body error", "HTTP error"  # of an answer that ends early, and where there is none
 CLOUD = re.compile(r"latest/api/token|computeMetadata")  # where a cloud's machines get credentials
 COPY = {"s3:": "aws s3 sync", "gs:": "gcloud storage rsync -r", "hf:": "hf download"}
 
@@ -140,10 +141,12 @@ def bytes_of(path: Path) -> bytes:
     """A whole file.
 
     Raises:
-        FileNotFoundError: it is not there.
+        OSError: it is not there, or larger than MOST_WHOLE.
         UserError, Failure: as `stored_in`.
     """
     file = RemoteFile(path)
+    if file.size > MOST_WHOLE:
+        raise OSError(f"{as_typed(path)} is larger than it can be")
     return b"".join(file.read([(0, file.size)]))
 
 
@@ -308,7 +311,7 @@ def _cache_in(folder: Path, most: int) -> PieceCache:
 
 
 def _ask(path: Path, request: Callable[[], T]) -> T:
-    """What a request gives; made again where an answer was cut off, which obstore does not do for lists.
+    """What a request gives; made again where an answer was cut off, which obstore itself seldom does.
 
     Raises:
         FileNotFoundError: the store has no such file.
@@ -323,7 +326,7 @@ def _ask(path: Path, request: Callable[[], T]) -> T:
             raise FileNotFoundError(as_typed(path)) from None
         except exceptions.BaseError as error:
             text = str(error)
-            if TRIED.search(text) or time.monotonic() > end:
+            if CUT_OFF not in text or time.monotonic() > end:
                 raise _explained(path, text) from None
             time.sleep(random.uniform(0, min(0.1 * 2**attempt, 5)))
     raise AssertionError("unreachable")
@@ -339,7 +342,7 @@ def _explained(path: Path, text: str) -> LevelproofError:
     if "Range request not supported" in text:
         return Failure(f"The server of {url} gives no parts of files: copy the split to a folder first.")
     found = STATUS.search(text)
-    said = found[1].strip() if found else "it does not answer"
+    said = found[1].strip() if found else "it does not answer" if SILENT in text else text.splitlines()[0]
     if said.startswith(("401", "403")):
         return UserError(f"The store does not let you read {url} ({said}): {how}.")
     return Failure(f"Cannot read {url} ({said}): check the network and the URL, and try again.")

@@ -9,12 +9,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from email.utils import formatdate
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 from typing import NamedTuple
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, unquote, urlsplit
 
 import pytest
 
@@ -95,11 +96,11 @@ def files_of(folder: Path) -> Answers:
     """A web server that gives the files below a folder, or parts of them."""
 
     def answers(_: str, path: str, headers: dict[str, str]) -> Answer:
-        file = folder / urlsplit(path).path.lstrip("/")
+        file = folder / unquote(urlsplit(path).path.lstrip("/"))
         if not file.is_file():
             return Answer(404, {}, b"")
         data = file.read_bytes()
-        told = {"ETag": f'"{tag_of(file)}"'}
+        told = {"ETag": f'"{tag_of(file)}"', "Last-Modified": formatdate(file.stat().st_mtime, usegmt=True)}
         if asked := re.fullmatch(r"bytes=(\d+)-(\d+)", headers.get("range", "")):
             first, last = int(asked[1]), min(int(asked[2]), len(data) - 1)
             told["Content-Range"] = f"bytes {first}-{last}/{len(data)}"
