@@ -43,7 +43,9 @@ WITHOUT_EFFECT = frozenset(
         "key_every",
     }
 )
-FROM_FILES = "files"  # in the results of level files, where those of random levels have their distribution
+# In the results of levels that no id makes, where those of random levels have their distribution
+FROM_FILES, FROM_RECORDS = "files", "import"
+OF_RECORDS = ("size", "budget", "task", "sampler_version")  # what decides results where nobody searches or trains
 
 
 @dataclass(frozen=True)
@@ -143,9 +145,19 @@ def stored_as(density: Density, key_every: int = KEY_EVERY) -> str:
     return f"density={density}" + (f" key_every={key_every}" if density == "witness" else "")
 
 
+@dataclass(frozen=True)
+class ImportConfig(JobConfig):
+    """What `levelproof import` makes: levels, the folder `level_files` of records, are labelled by actions it has."""
+
+    @property
+    def results(self) -> dict[str, Any]:
+        known = super().results
+        return {name: known[name] for name in OF_RECORDS} | {"distribution": FROM_RECORDS}
+
+
 def from_files(results: Mapping[str, Any]) -> bool:
-    """Whether a job with these `JobConfig.results` labels level files: no id makes such a level."""
-    return results.get("distribution") == FROM_FILES
+    """Whether a job with these `JobConfig.results` labels levels that no id makes: level files, or imported ones."""
+    return results.get("distribution") in (FROM_FILES, FROM_RECORDS)
 
 
 def hash_of(results: dict[str, Any]) -> str:

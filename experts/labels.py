@@ -25,6 +25,7 @@ class Source(StrEnum):
     SCOUT = "scout"  # persistent random play before training
     SEARCH = "search"  # exploration from archived states, before training
     NOTHING = "nothing"  # a trivial level's
+    IMPORT = "import"  # of another program's data
 
 
 MADE_BY = {

@@ -11,7 +11,7 @@ file says of contacts is not read; the reference forgets it too when it evaluate
 import json
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -171,29 +171,26 @@ def _fields(world: object, size: Size) -> Fields:
     return fields | {"gravity": np.array([layout.GRAVITY.read(world, "gravity", "env_state")], np.float32)}
 
 
-def _check(level: Level) -> None:
-    """What no entry alone can tell.
-
-    Raises:
-        LevelFileError: the engine cannot have this.
-    """
+def flaws(level: Level) -> Iterator[tuple[Any, str, str]]:
+    """What the engine cannot have, and no entry alone can tell: which things of a kind (thing, lane), the kind, why."""
     model, state, scenery = level.model, level.state, slice(FIXED_POLYGONS)
     moves = (model.inverse_mass != 0) | (model.inverse_inertia != 0) | (state.angular_velocity != 0)
     moves |= np.any(np.asarray(state.velocity), 1)
-    _refuse(moves[scenery], "polygon", "is scenery and may move: its inverse masses and velocities have to be 0")
+    yield moves[scenery], "polygon", "is scenery and may move: its inverse masses and velocities have to be 0"
     flat = model.active[: level.size.polygons] & (model.n_vertices < 3)
-    _refuse(flat, "polygon", "is active and has fewer than 3 vertices")
-    _refuse(model.joint_active & (model.joint_a == model.joint_b), "joint", "joins a body to itself")
+    yield flat, "polygon", "is active and has fewer than 3 vertices"
+    yield model.joint_active & (model.joint_a == model.joint_b), "joint", "joins a body to itself"
     motors = model.joint_active & (level.motor_binding >= MOTOR_BINDINGS)
-    _refuse(motors, "joint", f"has a motor_binding beyond {MOTOR_BINDINGS - 1}")
+    yield motors, "joint", f"has a motor_binding beyond {MOTOR_BINDINGS - 1}"
     thrusters = model.thruster_active & (level.thruster_binding >= THRUSTER_BINDINGS)
-    _refuse(thrusters, "thruster", f"has a thruster_binding beyond {THRUSTER_BINDINGS - 1}")
+    yield thrusters, "thruster", f"has a thruster_binding beyond {THRUSTER_BINDINGS - 1}"
 
 
-def _refuse(bad: Any, kind: str, why: str) -> None:
-    """`bad` things of a kind, (thing, 1)."""
-    if len(found := np.flatnonzero(bad)):
-        raise LevelFileError(f"env_state.{kind}[{found[0]}] {why}")
+def _check(level: Level) -> None:
+    """Raises LevelFileError where the one lane has a flaw."""
+    for bad, kind, why in flaws(level):
+        if len(found := np.flatnonzero(bad)):
+            raise LevelFileError(f"env_state.{kind}[{found[0]}] {why}")
 
 
 def _things(fields: Fields, kind: str, entries: Mapping[str, Entry]) -> list[dict[str, Any]]:

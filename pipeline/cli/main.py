@@ -9,12 +9,25 @@ import sys
 from collections.abc import Sequence
 
 from configs.errors import ConfigError
-from pipeline.cli import card, export, generate, inspect, regenerate, sample, seal, settings, show, status, verify
+from pipeline.cli import (
+    card,
+    export,
+    generate,
+    import_,
+    inspect,
+    regenerate,
+    sample,
+    seal,
+    settings,
+    show,
+    status,
+    verify,
+)
 from pipeline.cli.command import EXITS
 from pipeline.errors import Exit, LevelproofError
 from pipeline.version import __version__
 
-COMMANDS = (generate, regenerate, settings, sample, inspect, show, export, card, status, verify, seal)
+COMMANDS = (generate, regenerate, settings, sample, inspect, show, export, import_, card, status, verify, seal)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     for command in COMMANDS:
         examples = "\n  ".join(["examples:", *command.EXAMPLE.splitlines()])
         added = commands.add_parser(
-            command.__name__.rpartition(".")[2],
+            command.__name__.rpartition(".")[2].rstrip("_"),  # `import` is a word of Python
             help=command.DOES,
             description=f"{command.DOES[0].upper()}{command.DOES[1:]}.",
             epilog=f"{examples}\n{EXITS}",

@@ -22,7 +22,7 @@ ROUND = 1.0  # s that a worker trains between reports; a step that is compiled t
 class WorkUnit:
     """Levels done together and committed together: ids of one multiple of the job's `unit`, or as many from files."""
 
-    level_ids: tuple[int, ...]  # ascending
+    level_ids: tuple[int, ...] | range  # ascending
     origins: tuple[Origin, ...] = field(default=(), compare=False, repr=False)  # of each; empty: ids make them
 
     @property

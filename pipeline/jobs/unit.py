@@ -33,6 +33,7 @@ from pipeline.store.fields import arrays_of, unlike_fields
 from pipeline.store.layout import new_attempt
 from pipeline.store.locks import LockRefused, committing
 from pipeline.store.manifest import begin_fragment, write_fragment
+from pipeline.store.origins import RECORD, Origin
 from pipeline.store.provenance import device, versions
 from pipeline.store.schema import Encoding
 from pipeline.store.shard import write_shard
@@ -97,8 +98,10 @@ def check_witnesses(result: UnitResult, task: TaskParams) -> None:
             raise Failure(f"The witness of level {level_id} does not reach the goal when replayed.")
 
 
-def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> None:
+def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult, command: str = "") -> None:
     """The shard first, under this attempt's own name, then the fragment that names it.
+
+    `command` makes the rows again, where no `generate` or `regenerate` of each does.
 
     Raises:
         OSError: the disk refuses; nothing is committed.
@@ -111,7 +114,7 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
     for row_of_shard, i in enumerate(kept):
         rows[i] |= {"shard": str(paths.shard.relative_to(split)), "row": row_of_shard}
     for row, origin in zip(rows, unit.origins, strict=bool(unit.origins)):
-        row |= {"file": origin.file, "command": f"{again(job)} {shlex.quote(f'level_files={origin.file}')}"}
+        row |= {"file": origin.file, "command": command or _command(job, origin, row["level_id"])}
     for row in rows if result.experts else ():
         if row["level_id"] in result.experts:
             row["experts"] = str(paths.experts.relative_to(split))
@@ -127,6 +130,14 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult) -> N
                 Encoding(job.density, job.key_every, job.task),
             )
         write_fragment(paths, rows, job.hash, job.results, densities=[job.stored])
+
+
+def _command(job: JobConfig, origin: Origin, level_id: int) -> str:
+    """What labels a level again that no id makes: a level file by itself, an imported one by its split."""
+    if not RECORD.fullmatch(origin.file):
+        return f"{again(job)} {shlex.quote(f'level_files={origin.file}')}"
+    _, _, words = again(job).split(maxsplit=2)
+    return f"levelproof regenerate {shlex.quote(f'manifest={origin.split}')} {words} where='level_id = {level_id}'"
 
 
 def shard_arrays(levels: Level, record: Record, kept: list[int]) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from configs.compose import identified
 from configs.convert import typed
-from configs.schema import from_files
+from configs.schema import FROM_RECORDS, from_files
 from experts.config import RECORD_STEPS
 from experts.labels import Label
 from levelgen.pictures.raster import sheet, write_png
@@ -102,7 +102,7 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
 
 def _distribution(config: dict) -> str:
     if from_files(config):
-        return "level files"
+        return "imported" if config["distribution"] == FROM_RECORDS else "level files"
     name, short = identified(typed(Distribution, config["distribution"], "distribution"))
     return f"random, `{name}`" if name else f"random, of a distribution of its own (`{short}`)"
 

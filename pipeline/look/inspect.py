@@ -117,7 +117,9 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     of = facts["distribution"]
     lines = {
         "split": facts["split"],
-        "distribution": f"{of['name'] or 'of its own'} ({of['hash']})" if of else "none, levels are of level files",
+        "distribution": f"{of['name'] or 'of its own'} ({of['hash']})"
+        if of
+        else "none, levels are of level files or imported",
         "levels": f"{facts['levels']} ({labels})",
         "unsolvable": "; ".join(f"{count} {reason}" for reason, count in facts["unsolvable"].items()) or None,
         "experts that diverged": str(facts["diverged"]) if facts["diverged"] else None,

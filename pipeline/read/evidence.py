@@ -27,7 +27,7 @@ from levelgen.task.rules import TaskParams
 from pipeline.errors import Failure
 from pipeline.read.level_files import level_at
 from pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
-from pipeline.store.origins import origin_of
+from pipeline.store.origins import RECORD, origin_of
 from pipeline.store.provenance import device, versions
 from pipeline.store.shard import Shard
 
@@ -142,7 +142,8 @@ class Evidence:
         ours = list(zip(content_hashes(made), signatures(made), strict=True))
         same = np.array([a == b for a, b in zip(rows, ours, strict=True)])
         if self.making.distribution is None:
-            same &= [level_id_for(of) == level_id for (of, _), level_id in zip(ours, self.ids, strict=True)]
+            own = [level_id_for(of) == level_id for (of, _), level_id in zip(ours, self.ids, strict=True)]
+            same &= np.array(own) | [RECORD.fullmatch(file or "") is not None for file in self.of["file"]]
         near = np.array([bool(set(a[1]) & set(b[1])) for a, b in zip(rows, ours, strict=True)])
         self._tell(
             ~np.where(self.same_stack, same, near),

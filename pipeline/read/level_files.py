@@ -13,10 +13,13 @@ from configs.schema import JobConfig
 from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelgen.identity.content import content_hashes, level_id_for
 from levelgen.level import Level, name_of
+from levelgen.task.rules import DEFAULT_RULES
 from pipeline.errors import Failure, UserError
+from pipeline.read.kinetix.folder import open_folder, read_trajectories
+from pipeline.read.kinetix.zarr2 import FormatError
 from pipeline.read.rows import read_row
 from pipeline.store.fields import tree_of
-from pipeline.store.origins import Origin
+from pipeline.store.origins import Origin, place_of
 
 
 class LevelUnseen(Failure):
@@ -38,7 +41,8 @@ def levels_below(folder: Path, job: JobConfig) -> Listing:
     Raises:
         UserError: there is no such folder, or no file in it.
     """
-    paths = [folder] if folder.is_file() else sorted(folder.rglob("*.json"))
+    one = folder.is_file() or place_of(str(folder.absolute()))
+    paths = [folder] if one else sorted(folder.rglob("*.json"))
     if not paths:
         what = "There is no level file in" if folder.is_dir() else "There is no folder of level files at"
         raise UserError(f"{what} {folder}: name a folder that has some, or a level file, with level_files=PATH.")
@@ -63,7 +67,7 @@ def levels_below(folder: Path, job: JobConfig) -> Listing:
 
 def _usable(path: Path, job: JobConfig) -> Origin:
     """Raises LevelFileError where a file has no level, or one that the job cannot have."""
-    file = read_level_file(path)
+    file = _level_in(path)
     size = name_of(file.level.size)
     try:
         replace(job, size=size)
@@ -75,6 +79,24 @@ def _usable(path: Path, job: JobConfig) -> Origin:
             "and label it apart from files with other ones."
         )
     return Origin(content_hashes(file.level)[0], str(path), size)
+
+
+def _level_in(path: Path) -> LevelFile:
+    """Of a level file, or of a record.
+
+    Raises:
+        LevelFileError: there is no level, or one that cannot be used.
+    """
+    if (place := place_of(str(path))) is None:
+        return read_level_file(path)
+    try:
+        folder = open_folder(place.folder)
+        found = read_trajectories(folder.named(place.array), folder.size, place.row, place.row + 1)
+    except FormatError as error:
+        raise LevelFileError(f"Cannot use the level of {path}: {error}.") from None
+    if found.wrong[0]:
+        raise LevelFileError(f"Cannot use the level of {path}: {found.wrong[0]}.")
+    return LevelFile(found.level, DEFAULT_RULES)
 
 
 def _other_rules(file: LevelFile, job: JobConfig) -> list[str]:
@@ -98,11 +120,10 @@ def level_at(origin: Origin) -> Level:
         Failure: its shard is damaged.
     """
     if origin.shard:
-        row = origin._asdict() | {"level_id": level_id_for(origin.content_hash)}
-        arrays = read_row(Path(origin.split), row)
+        arrays = read_row(Path(origin.split), origin._asdict())
         return tree_of(Level, {name: x for name, x in arrays.items() if name.startswith("level/")}, "level/")
     try:
-        level = read_level_file(Path(origin.file)).level
+        level = _level_in(Path(origin.file)).level
     except LevelFileError as error:
         raise LevelUnseen(
             f"{str(error)[:-1]} on {socket.gethostname()}: put it back, into a folder that all machines share."

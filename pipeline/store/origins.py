@@ -1,8 +1,11 @@
-"""Where levels are that no id makes: in a level file, and once they have a witness in a shard.
+"""Where levels are that no id makes: in a level file or a record of an imported folder, and once they have a witness
+in a shard.
 
-Such a level's id is made of its content hash: it has the same random streams wherever its file lies.
+The id of a level file's level is made of its content hash: it has the same random streams wherever its file lies. That
+of a record is its place in the folder.
 """
 
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,23 +16,46 @@ from pipeline.store.manifest import read_manifest
 ASKED = ("content_hash", "file", "size", "shard", "row")  # columns that tell a level's origin
 
 
+RECORD = re.compile(r"(.+)/([^/]+)#(0|[1-9][0-9]{0,11})")
+
+
+class RecordPlace(NamedTuple):
+    """Where an imported record is; as text, the `file` of its row."""
+
+    folder: Path
+    array: str
+    row: int
+
+    def __str__(self) -> str:
+        return f"{self.folder}/{self.array}#{self.row}"
+
+
+def place_of(file: str) -> RecordPlace | None:
+    """The record that a row's `file` names; None: it names a level file."""
+    found = RECORD.fullmatch(file)
+    if not found or not (Path(found[1]) / found[2]).is_dir() or Path(file).exists():
+        return None
+    return RecordPlace(Path(found[1]), found[2], int(found[3]))
+
+
 class Origin(NamedTuple):
     """Where one level is, and what it has to be."""
 
     content_hash: str
-    file: str  # absolute path
+    file: str  # absolute path, or that of a record's `RecordPlace`
     size: str
-    split: str = ""  # absolute path, where a shard has the level
-    shard: str = ""  # path below the split
+    split: str = ""  # absolute path, where a row has the level
+    shard: str = ""  # path below the split; empty: none has it
     row: int = 0
+    level_id: int = 0  # there
 
 
 def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:
     """Of a row of a split's manifest, with the columns ASKED."""
-    found = Origin(row["content_hash"], row["file"] or "", row["size"])
+    found = Origin(row["content_hash"], row["file"] or "", row["size"], str(split.expanduser().absolute()))
     if not row["shard"]:
         return found
-    return found._replace(split=str(split.expanduser().absolute()), shard=row["shard"], row=row["row"])
+    return found._replace(shard=row["shard"], row=row["row"], level_id=row["level_id"])
 
 
 def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
@@ -41,7 +67,7 @@ def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
     """
     rows = read_manifest(split, ASKED, list(level_ids)).table.to_pylist()
     found = {row["level_id"]: origin_of(split, row) for row in rows}
-    gone = [of.file for of in found.values() if not of.shard and not Path(of.file).is_file()]
+    gone = [of.file for of in found.values() if not of.shard and not place_of(of.file) and not Path(of.file).is_file()]
     if gone:
         more = f" and {len(gone) - 1} more" if gone[1:] else ""
         raise UserError(
@@ -58,7 +84,7 @@ def require_same_levels(split: Path, origins: Mapping[int, Origin], done: Collec
         UserError: there is such a level.
         Failure: a fragment is damaged.
     """
-    if not origins or not done:
+    if not origins or not len(done):
         return
     table = read_manifest(split, ["content_hash", "file"], list(done)).table
     for row in table.to_pylist():

@@ -40,7 +40,7 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
                 write_chunk(folder / name_of_array(array), (at + part) // ROWS, made[part : part + ROWS])
         dtype = dtype_of(size_of(rows.column("size")[0].as_py()))
         for first in range(0, count, ARRAY):
-            write_array(folder / name_of_array(first // ARRAY), (min(ARRAY, count - first), RECORD_STEPS), dtype)
+            write_array(folder / name_of_array(first // ARRAY), min(ARRAY, count - first), dtype)
         write_group(folder)
     stored = sum(path.stat().st_size for path in out.rglob("*"))
     print(

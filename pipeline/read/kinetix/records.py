@@ -12,7 +12,18 @@ import numpy as np
 
 from experts.config import RECORD_STEPS
 from experts.witness import Record
-from levelgen.files.kinetix import MANIFOLD, STATE, Fields, fillers, level_to_kinetix, to_kinetix
+from levelgen.files.kinetix import (
+    BODIES,
+    MANIFOLD,
+    MANIFOLDS,
+    MODEL,
+    STATE,
+    TASK,
+    Fields,
+    fillers,
+    level_to_kinetix,
+    to_kinetix,
+)
 from levelgen.level import Level
 from levelgen.task.actions import action_mask
 from physics.buffers import buffers_of
@@ -21,6 +32,15 @@ from physics.types import Size
 T = TypeVar("T")
 
 WORLD = "env_state/"  # before the names of the reference's state
+# Of a state, what a level consists of
+LEVEL_FIELDS = tuple(
+    dict.fromkeys(
+        name.replace("*", body).replace("@", manifold)
+        for name in ("timestep", *MODEL.values(), *STATE.values(), *TASK.values())
+        for body in BODIES
+        for manifold in MANIFOLDS
+    )
+)
 # m, where the reference has joints and thrusters that are not active, at an episode's start. Later such a joint is at
 # 0, and such a thruster where it would be
 UNUSED = {"joint": np.float32(256), "thruster": np.float32(0)}

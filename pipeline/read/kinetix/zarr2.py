@@ -4,16 +4,28 @@ An array is a folder with its description, `.zarray`, and a file for each chunk;
 """
 
 import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numcodecs.blosc import Blosc
 
+from experts.config import RECORD_STEPS
+
 ARRAY, GROUP = ".zarray", ".zgroup"
 ROWS = 16  # trajectories of a chunk
 # A step's 1,487 or more bytes come again nearly alike: blocks have to hold many. As large as the released data
-BLOSC = {"id": "blosc", "cname": "zstd", "clevel": 3, "shuffle": 0, "blocksize": 1 << 18}
+BLOSC = Blosc(cname="zstd", clevel=3, shuffle=Blosc.NOSHUFFLE, blocksize=1 << 18)
+# What is read
+NUMBER = r"[<|][biuf][1248]"  # types of fields
+MOST_TEXT = 2**20  # bytes of a description
+MOST_ROWS = 2**40  # and of other numbers in it
+MOST_BYTES = 2**30  # of a chunk
+BLOSC_HEADER = 16  # bytes, which is what a block may grow by
 
 
 def write_group(path: Path) -> None:
@@ -26,17 +38,17 @@ def write_chunk(path: Path, number: int, values: np.ndarray) -> None:
     chunk = np.zeros((ROWS, *values.shape[1:]), values.dtype)
     chunk[: len(values)] = values
     path.mkdir(exist_ok=True)
-    (path / f"{number}.0").write_bytes(_blosc(BLOSC).encode(chunk.view(np.uint8)))
+    (path / f"{number}.0").write_bytes(BLOSC.encode(chunk.view(np.uint8)))
 
 
-def write_array(path: Path, shape: tuple[int, int], dtype: np.dtype) -> None:
+def write_array(path: Path, rows: int, dtype: np.dtype) -> None:
     """The description of an array whose chunks are written."""
     about = {
         "zarr_format": 2,
-        "shape": shape,
-        "chunks": (ROWS, shape[1]),
+        "shape": (rows, RECORD_STEPS),
+        "chunks": (ROWS, RECORD_STEPS),
         "dtype": [[name, dtype[name].base.str, dtype[name].shape] for name in dtype.names or ()],
-        "compressor": BLOSC,
+        "compressor": BLOSC.get_config(),
         "fill_value": None,
         "order": "C",
         "filters": None,
@@ -44,5 +56,111 @@ def write_array(path: Path, shape: tuple[int, int], dtype: np.dtype) -> None:
     (path / ARRAY).write_text(json.dumps(about))
 
 
-def _blosc(about: dict[str, Any]) -> Blosc:
-    return Blosc(**{name: value for name, value in about.items() if name != "id"})
+class FormatError(ValueError):
+    """A folder has no trajectories that can be read; the message is the end of a sentence."""
+
+
+@dataclass(frozen=True)
+class StoredArray:
+    """An array as its description has it, which is checked; its chunks are when they are read."""
+
+    path: Path
+    rows: int
+    chunks: tuple[int, int]  # trajectories and steps
+    dtype: np.dtype  # each field with its own shape
+    compressor: dict[str, Any] | None
+    suffix: str  # of the names of chunks, for one more axis of length 1
+
+    def read(self, first: int, last: int) -> Iterator[tuple[int, int, np.ndarray]]:
+        """Chunk by chunk what there is of rows `first` to `last - 1`: its first row and step, and (row, step).
+
+        Raises:
+            FormatError: a chunk is missing or damaged, or lies about its size.
+        """
+        rows, steps = self.chunks
+        for i, j in product(range(first // rows, -(-last // rows)), range(-(-RECORD_STEPS // steps))):
+            low, high = max(first - i * rows, 0), min(last - i * rows, rows)
+            yield i * rows + low, j * steps, self._chunk(i, j)[low:high, : RECORD_STEPS - j * steps]
+
+    def _chunk(self, i: int, j: int) -> np.ndarray:
+        path, wanted = self.path / f"{i}.{j}{self.suffix}", self.chunks[0] * self.chunks[1] * self.dtype.itemsize
+        try:
+            if not path.is_file():
+                raise FormatError("is missing")
+            if path.stat().st_size > wanted + BLOSC_HEADER:
+                raise FormatError("is larger than what is in it")
+            raw = path.read_bytes()
+            if self.compressor is not None:
+                sizes = [int.from_bytes(raw[at : at + 4], "little") for at in (4, 12)]  # decoded and as it is
+                if sizes != [wanted, len(raw)]:
+                    raise FormatError(f"is not the {wanted:,} bytes of its array's chunks")
+                raw = BLOSC.decode(raw)
+            return np.frombuffer(raw, self.dtype).reshape(self.chunks)
+        except FormatError as error:
+            raise FormatError(f"its chunk {path} {error}") from None
+        except Exception as error:  # codecs raise many kinds
+            raise FormatError(f"its chunk {path} is damaged ({type(error).__name__})") from None
+
+
+def arrays_in(folder: Path) -> list[StoredArray]:
+    """All arrays of a group, in the order of their names, but for empty ones.
+
+    Raises:
+        FormatError: it is no such group, or an array of it cannot be one of trajectories.
+    """
+    if _description(folder / GROUP).get("zarr_format") != 2:
+        raise FormatError(f"its {GROUP} is not of zarr's format 2")
+    paths = sorted(path.parent for path in folder.glob(f"*/{ARRAY}"))
+    found = [array for array in map(_array, paths) if array.rows]
+    if not found:
+        raise FormatError("it has no trajectories")
+    return found
+
+
+def _array(path: Path) -> StoredArray:
+    about = _description(path / ARRAY)
+    refuse = lambda what: FormatError(f"its array {path.name} {what}")
+    try:
+        shape, chunks, compressor = about["shape"], about["chunks"], about["compressor"]
+        dtype = _dtype(about["dtype"])
+        good = all(type(n) is int and 0 <= n <= MOST_ROWS for n in (*shape, *chunks)) and 0 not in chunks
+        if not good or len(shape) != len(chunks) or list(shape[1:]) not in ([RECORD_STEPS], [RECORD_STEPS, 1]):
+            raise refuse(f"has the shape {str(shape)[:40]}, and it should be (trajectories, {RECORD_STEPS})")
+        if len(shape) == 2:  # the axis that trajectories have too many is the first of every field
+            fields = {name: dtype[name] for name in dtype.names or ()}
+            if any(of.shape[:1] != (1,) for of in fields.values()):
+                raise refuse("has fields without an axis of length 1 before their own")
+            dtype = np.dtype([(name, of.base, of.shape[1:]) for name, of in fields.items()])
+        if chunks[2:] not in ([], [1]) or chunks[0] * chunks[1] * dtype.itemsize > MOST_BYTES:
+            raise refuse(f"has chunks {str(chunks)[:40]} of more than {MOST_BYTES:,} bytes")
+        if compressor is not None and compressor["id"] != "blosc":
+            raise refuse(f"is compressed by {str(compressor['id'])[:20]!r}, and only blosc is read")
+        if about.get("filters") or about["order"] != "C" or about.get("dimension_separator", ".") != ".":
+            raise refuse("has filters, another order than C, or chunks in folders of their own")
+    except FormatError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise refuse(f"has a description that says nothing ({type(error).__name__})") from None
+    return StoredArray(path, shape[0], (chunks[0], chunks[1]), dtype, compressor, ".0" * (len(shape) - 2))
+
+
+def _dtype(fields: Any) -> np.dtype:
+    """Of numbers and flags only: nothing that would have to be unpickled."""
+    parts = []
+    for name, kind, *rest in fields:
+        shape = rest[0] if rest else []
+        if not re.fullmatch(NUMBER, kind) or not all(type(n) is int and 0 <= n <= MOST_ROWS for n in shape):
+            raise FormatError(f"its field {str(name)[:60]} is of type {str(kind)[:20]}, and no number or flag")
+        parts.append((name, kind, tuple(shape)))
+    return np.dtype(parts)
+
+
+def _description(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise FormatError(f"there is no {path.name} in {path.parent}")
+    try:
+        with path.open() as file:
+            about = json.loads(file.read(MOST_TEXT))
+    except (OSError, ValueError, RecursionError) as error:
+        raise FormatError(f"its {path} cannot be read ({type(error).__name__})") from None
+    return about if isinstance(about, dict) else {}

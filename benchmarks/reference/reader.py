@@ -1,0 +1,40 @@
+# pyright: reportMissingImports=false
+"""The reference's reader opens a folder of trajectories, and its renderer draws some. Runs inside its own environment.
+
+    python benchmarks/reference/reader.py OUT.npz FOLDER --size s --rows 4 --steps 0 10 40
+
+OUT has every field of the first batch, of that many trajectories, (trajectory, 256, ...), by the reference's names, and
+`frame` (trajectory, step, 125, 125, 3): what the states of these steps look like.
+"""
+
+import argparse
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from kinetix.data import TrajectoryDatasetManager
+from kinetix.environment import EnvParams, static_env_params_from_size
+from kinetix.render import make_render_pixels
+from world import flatten
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("out")
+    parser.add_argument("folder")
+    parser.add_argument("--size", required=True)
+    parser.add_argument("--rows", type=int, required=True)
+    parser.add_argument("--steps", type=int, nargs="+", required=True)
+    given = parser.parse_args()
+    batch = TrajectoryDatasetManager(given.folder, batch_size=given.rows).load_next_batch()
+    render = jax.jit(make_render_pixels(EnvParams(), static_env_params_from_size(given.size)))
+    shown = jax.tree.map(lambda x: jnp.asarray(x[:, np.array(given.steps)]), batch.env_state)
+    at = lambda i, t: jax.tree.map(lambda x: x[i, t], shown)
+    frames = np.array([[render(at(i, t)) for t in range(len(given.steps))] for i in range(given.rows)])
+    fields = {f"env_state/{name}": values for name, values in flatten(batch.env_state).items()}
+    others = {"action": batch.action, "action_mask": batch.action_mask, "done": batch.done, "mask": batch.mask}
+    np.savez(given.out, frame=frames, **others, **fields)
+
+
+if __name__ == "__main__":
+    main()

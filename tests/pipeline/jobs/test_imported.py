@@ -1,0 +1,210 @@
+"""`levelproof import`: trajectories that the reference wrote become a split on which every command works."""
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import oracle
+from experts.witness import replay, succeeds
+from levelgen.files.level_file import read_level_file
+from levelgen.identity.content import content_hashes
+from pipeline.jobs import imported as module
+from pipeline.look.status import look
+from pipeline.read.rows import read_rows
+from pipeline.read.verify import examine
+from pipeline.store.manifest import read_manifest
+from tests.pipeline.command import assert_refused, here
+from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, ours_of, trajectories_in
+
+ROWS = SOLVED + OTHERS
+NAMES = [*(f"first#{i}" for i in range(ROWS // 2)), *(f"second#{i}" for i in range(ROWS - ROWS // 2))]
+
+
+@pytest.fixture(scope="module")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a copy of the golden trajectories of size s, `theirs`, and the split that was made of it."""
+    folder = tmp_path_factory.mktemp("imported")
+    shutil.copytree(GOLDEN / "s", folder / "theirs")
+    done = here(["import", "theirs", "-o", "data/1M/s"], folder)
+    assert done.returncode == 0, done.stderr
+    assert f"data/1M/s: {ROWS} levels of" in done.stdout
+    assert "% reach the goal here." in done.stdout
+    assert "levelproof inspect data/1M/s" in done.stdout
+    return folder
+
+
+@pytest.fixture
+def folder(once: Path, tmp_path: Path) -> Path:
+    """A copy; its rows name the trajectories of the first."""
+    return Path(shutil.copytree(once, tmp_path / "copy"))
+
+
+def rows_of(split: Path) -> list[dict]:
+    return read_manifest(split).table.to_pylist()
+
+
+def test_every_trajectory_is_a_row_that_says_where_it_was(once: Path) -> None:
+    rows = rows_of(once / "data/1M/s")
+    assert [row["level_id"] for row in rows] == list(range(ROWS))
+    assert [row["file"] for row in rows] == [f"{once}/theirs/{name}" for name in NAMES]
+    level, _ = ours_of(trajectories_in(once / "theirs"))
+    assert [row["content_hash"] for row in rows] == content_hashes(level)
+    assert {(row["size"], row["budget"], row["env_steps"]) for row in rows} == {("s", "1M", 0)}
+
+
+def test_labels_are_what_a_replay_of_the_actions_shows(once: Path) -> None:
+    split = once / "data/1M/s"
+    level, record = ours_of(trajectories_in(once / "theirs"))
+    again = replay(level, record.action)
+    whole = succeeds(np.asarray(again.done), np.asarray(again.goal))
+    rows, table = rows_of(split), read_manifest(split).table
+    assert [row["label"] in ("solved", "trivial") for row in rows][:SOLVED] == whole[:SOLVED].tolist()
+    assert {row["label"] for row in rows} == {"solved", "trivial", "unsolved"}
+    for i, row in enumerate(rows):
+        if row["label"] == "unsolved":
+            assert (row["shard"], row["witness"], row["steps_to_goal"]) == (None, None, None)
+            assert "do not reach the goal" in row["label_reason"]
+            continue
+        kept = read_rows(split, table.slice(i, 1))
+        assert row["witness"] == ("nothing" if row["label"] == "trivial" else "import")
+        if row["label"] == "trivial":
+            assert not kept["record/action"].any()
+        elif whole[i]:
+            np.testing.assert_array_equal(kept["record/action"][..., 0], record.action[..., i])
+        else:
+            assert "first imported episode, again and again" in row["label_reason"]
+            steps = row["steps_to_goal"]
+            np.testing.assert_array_equal(kept["record/action"][:steps, :, 0], record.action[:steps, :, i])
+            np.testing.assert_array_equal(kept["record/action"][steps, :, 0], record.action[0, :, i])
+
+
+def test_every_level_is_looked_at_again(once: Path, folder: Path) -> None:
+    findings = examine(once / "data/1M/s")
+    assert (findings.levels, findings.witnesses, findings.wrong) == (ROWS, findings.same_bits, [])
+    shutil.rmtree(once / "theirs.gone", ignore_errors=True)
+    (once / "theirs").rename(once / "theirs.gone")
+    try:
+        (wrong,) = examine(once / "data/1M/s").wrong  # the unsolved one's world is nowhere else
+    finally:
+        (once / "theirs.gone").rename(once / "theirs")
+    assert "cannot be made again" in wrong
+
+
+def test_commands_work_on_it(once: Path, tmp_path: Path) -> None:
+    split = once / "data/1M/s"
+    rows = rows_of(split)
+    unsolved = next(row for row in rows if row["label"] == "unsolved")
+    assert look(split)["done"] == look(split)["wanted"] == ROWS
+    assert json.loads(here(["inspect", str(split), "--json"], tmp_path).stdout)["levels"] == ROWS
+    assert here(["show", str(split), str(unsolved["level_id"]), "-o", "level.png"], tmp_path).returncode == 0
+    assert here(["export", str(split), str(unsolved["level_id"]), "-o", "level.json"], tmp_path).returncode == 0
+    assert content_hashes(read_level_file(tmp_path / "level.json").level) == [unsolved["content_hash"]]
+    assert here(["export", str(split), "--format", "kinetix", "-o", "k"], tmp_path).returncode == 0
+    assert len(trajectories_in(tmp_path / "k")) == sum(row["label"] == "solved" for row in rows)
+
+
+def test_no_other_job_writes_into_it(folder: Path) -> None:
+    generate = ["generate", "budget=1M", "executor=inline", "levels=1"]
+    assert_refused(here(generate, folder), 2, "distribution was import, now absent", "out=NAME")
+    shutil.copytree(folder / "theirs", folder / "others")
+    (folder / "others/first").rename(folder / "others/third")
+    again = ["import", "others", "-o", "data/1M/s"]
+    assert_refused(here(again, folder), 2, "theirs/first#0", "others/second#0", "one folder makes one split")
+
+
+@pytest.mark.slow
+def test_its_levels_are_labelled_at_another_budget(once: Path, tmp_path: Path) -> None:
+    words = [f"manifest={once / 'data/1M/s'}", "budget=5k", "procedure=label", "executor=inline"]
+    done = here(["regenerate", *words, "where=label != 'solved'"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    before = [row for row in rows_of(once / "data/1M/s") if row["label"] != "solved"]
+    after = rows_of(tmp_path / "data/5k/s")
+    same = ("level_id", "content_hash", "file")
+    assert [[row[name] for name in same] for row in after] == [[row[name] for name in same] for row in before]
+    assert not examine(tmp_path / "data/5k/s").wrong
+    row = after[-1]
+    (tmp_path / "again").mkdir()
+    done = here([*shlex.split(row["command"])[1:], "executor=inline"], tmp_path / "again")
+    assert done.returncode == 0, done.stderr
+    assert rows_of(tmp_path / "again/data/5k/s")[0] | {"shard": row["shard"], "row": row["row"]} == row
+
+
+def test_a_stopped_import_goes_on(once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    committed, commit = [], module.commit
+
+    def once_only(job, split, unit, *rest) -> None:
+        if committed:
+            raise KeyboardInterrupt
+        commit(job, split, unit, *rest)
+        committed.append(unit.name)
+
+    words = ["import", str(once / "theirs"), "-o", "data/1M/s"]
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "commit", once_only)
+        done = here(words, tmp_path)
+    assert done.returncode == 130
+    assert "the same command goes on" in done.stderr
+    assert look(tmp_path / "data/1M/s")["done"] < ROWS == look(tmp_path / "data/1M/s")["wanted"]
+    done = here(words, tmp_path)
+    assert "1 of 2 units are there already" in done.stderr
+    want, got = (rows_of(path / "data/1M/s") for path in (once, tmp_path))
+    same = [name for name in want[0] if name not in ("shard", "command", "learning_curve")]
+    assert [[row[name] for name in same] for row in got] == [[row[name] for name in same] for row in want]
+
+
+def test_what_is_no_level_is_left_out_and_told(once: Path, tmp_path: Path) -> None:
+    """An array of all, uncompressed and with an axis more, of which the reference reads that as well."""
+    made = trajectories_in(once / "theirs")
+    plain = np.dtype([(name, made.dtype[name].base, made.dtype[name].shape[1:]) for name in made.dtype.names or ()])
+    made = made.view(plain).copy()
+    made["action"][1, 200, 0] = 3
+    made["env_state/polygon/position"][2, 0, 4, 0] = np.nan
+    made["env_state/joint/a_index"][3, 0] = 99
+    made["env_state/timestep"][4, 0] = 7
+    path = tmp_path / "odd/array"
+    path.mkdir(parents=True)
+    (path.parent / ".zgroup").write_text('{"zarr_format": 2}')
+    about = {"zarr_format": 2, "shape": [ROWS, 256, 1], "chunks": [ROWS, 256, 1], "compressor": None, "order": "C"}
+    fields = [[name, plain[name].base.str, list(plain[name].shape)] for name in plain.names or ()]
+    (path / ".zarray").write_text(json.dumps(about | {"dtype": fields, "fill_value": None, "filters": None}))
+    (path / "0.0.0").write_bytes(made.tobytes())
+    done = here(["import", "odd", "-o", "data/1M/s"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"{ROWS - 4} levels of" in done.stdout
+    assert "4 were left out." in done.stdout
+    said = [line for line in done.stderr.splitlines() if line.startswith("Left out:")]
+    assert len(said) == module.TOLD
+    assert "odd/array#1, its actions are none of this task." in said[0]
+    assert "#2, its polygon/position has what is no number." in said[1]
+    assert "#3, its model/joint_a has numbers that no such level can have." in said[2]
+    assert [row["level_id"] for row in rows_of(tmp_path / "data/1M/s")] == [0, 5, 6]
+    assert look(tmp_path / "data/1M/s")["wanted"] == ROWS - 4
+    want = [rows_of(once / "data/1M/s")[i]["content_hash"] for i in (0, 5, 6)]
+    assert [row["content_hash"] for row in rows_of(tmp_path / "data/1M/s")] == want
+
+
+def test_a_split_is_named_by_budget_and_size(once: Path, tmp_path: Path) -> None:
+    words = ["import", str(once / "theirs"), "-o"]
+    assert_refused(here([*words, "data/1M/m"], tmp_path), 2, "levels of size s", "-o data/1M/s")
+    assert_refused(here([*words, "data/much/s"], tmp_path), 2, "budget is 'much'", "-o data/1M/s")
+    assert_refused(here(["import", "nothing", "-o", "data/1M/s"], tmp_path), 2, "there is no .zgroup in")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.campaign
+def test_folders_that_the_reference_s_code_wrote(reference: Path, tmp_path: Path) -> None:
+    """Of every size; most of what reaches the goal there does so here."""
+    for size, levels, solved in (("s", 512, 96), ("m", 512, 64), ("l", 128, 8)):
+        file = oracle.sampled_levels(reference, size)
+        words = [tmp_path / size, file, "--size", size, "--levels", levels, "--solved", solved, "--others", 8]
+        oracle.run_script(reference, "trajectories", words, "play levels with the reference")
+        done = here(["import", size, "-o", f"data/1M/{size}"], tmp_path)
+        assert done.returncode == 0, done.stderr
+        rows = rows_of(tmp_path / "data/1M" / size)
+        assert len(rows) == solved + 8
+        assert np.mean([row["label"] in ("solved", "trivial") for row in rows[:solved]]) >= 0.8
+        assert not examine(tmp_path / "data/1M" / size).wrong
