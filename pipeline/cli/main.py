@@ -6,6 +6,7 @@ Imports nothing heavy before it knows the command: `levelproof --help` has to an
 import argparse
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 
 from configs.errors import ConfigError
@@ -33,6 +34,7 @@ COMMANDS = (generate, regenerate, settings, sample, inspect, show, export, impor
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; its exit code."""
     arguments = _parser().parse_args(argv)
+    warnings.showwarning = lambda message, *_: print(f"Warning: {message}", file=sys.stderr)
     try:
         return int(arguments.run(arguments) or Exit.DONE)
     except (LevelproofError, ConfigError) as error:
