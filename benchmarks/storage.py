@@ -67,8 +67,8 @@ def run(given: argparse.Namespace) -> Report:
         notes=[
             "*bytes* per transition, of all files of one shard; *published*: of the reference's 1M splits. *written/s* "
             "and the columns after it: trajectories a second of a core's time, written all at once, and read in random "
-            f"batches of {BATCH} to arrays of {', '.join(FIELDS)}; the files are in the system's cache, and programs are "
-            "compiled before. Key frames of `witness` every 32 steps.",
+            f"batches of {BATCH} to arrays of {', '.join(FIELDS)}; the files are in the system's cache, and programs "
+            "are compiled before. Key frames of `witness` every 32 steps.",
         ],
     )
 
