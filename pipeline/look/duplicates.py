@@ -54,39 +54,43 @@ def compared_of(split: Path, level_ids: np.ndarray) -> pa.Table:
 
 
 def perhaps_alike(split: Path, level_ids: np.ndarray) -> pa.Table:
-    """The same of those of these levels (ascending ids) that share a half of a signature, and of a few by chance.
+    """The same of those of these levels (ascending ids) that share a half of a signature, with numbers for texts.
 
-    Of all that a split has, only numbers are kept to find them.
+    Two of 6 million levels have by chance one number for two contents once in a million splits.
     """
-    numbers = require_manifest(split, ["signature"], each=_numbers_of_halves).table
-    ours = np.isin(numbers["level_id"].to_numpy(), level_ids)
-    shared = np.zeros(len(level_ids), bool)
+    rows = require_manifest(split, COMPARED, each=_in_numbers).table
+    rows = rows.filter(np.isin(rows["level_id"].to_numpy(), level_ids))
+    shared = np.zeros(rows.num_rows, bool)
     for name in HALVES:
-        half = numbers[name].to_numpy()[ours]
-        ordered = np.sort(half)
-        shared |= np.isin(half, ordered[1:][ordered[1:] == ordered[:-1]])
-    return compared_of(split, level_ids[shared])
+        half = rows[name].to_numpy()
+        order = np.argsort(half)
+        same = np.flatnonzero(np.diff(half[order]) == 0)
+        shared[order[same]] = shared[order[same + 1]] = True
+    alike = rows.filter(shared)
+    halves = np.stack([alike[name].to_numpy() for name in HALVES], 1)
+    signature = pa.FixedSizeListArray.from_arrays(pa.array(halves.reshape(-1)), len(HALVES)).cast(pa.list_(pa.int64()))
+    return pa.table({"name": alike["level_id"], "content_hash": alike["content_hash"], "signature": signature})
 
 
-def _numbers_of_halves(rows: pa.Table) -> pa.Table:
-    part = lambda i: pc.list_element(rows["signature"], i)  # pyright: ignore[reportAttributeAccessIssue]
-    return pa.table({"level_id": rows["level_id"], **{name: _numbers(part(i)) for i, name in enumerate(HALVES)}})
+def _in_numbers(rows: pa.Table) -> pa.Table:
+    half = lambda i: pc.list_element(rows["signature"], i)  # pyright: ignore[reportAttributeAccessIssue]
+    halves = {name: _numbers(half(i)) for i, name in enumerate(HALVES)}
+    return pa.table({"level_id": rows["level_id"], "content_hash": _numbers(rows["content_hash"]), **halves})
 
 
 def _numbers(texts: pa.ChunkedArray) -> np.ndarray:
-    """A number for each text, the same for the same text and hardly ever for two."""
-    array = pa.concat_arrays(texts.chunks) if texts.num_chunks else pa.array([], pa.string())
+    """A number of 64 bits for each text, by its bytes."""
+    array = pa.concat_arrays([pa.array([], pa.string()), *texts.chunks])
     widths = pc.binary_length(array).to_numpy()  # pyright: ignore[reportAttributeAccessIssue]
-    if not len(widths) or (widths != widths[0]).any() or widths[0] > 8 * len(FACTORS):
-        return np.fromiter(map(hash, array.to_pylist()), np.int64)
-    width = int(widths[0])
-    padded = np.zeros((len(array), -(-width // 8) * 8), np.uint8)
-    start = array.offset * width  # texts of one width lie there without gaps
-    padded[:, :width] = np.frombuffer(array.buffers()[2], np.uint8)[start : start + padded[:, :width].size].reshape(
-        -1, width
-    )
-    words = padded.view(np.uint64)
-    return (words * FACTORS[: words.shape[1]]).sum(1).view(np.int64)
+    numbers = np.zeros(len(array), np.uint64)
+    for width in np.unique(widths).tolist():  # nearly always there is one
+        mine = np.flatnonzero(widths == width)
+        of_width = array if len(mine) == len(array) else array.take(pa.array(mine))
+        padded = np.zeros((len(mine), -(-width // 8) * 8), np.uint8)
+        padded[:, :width] = np.frombuffer(of_width.buffers()[2], np.uint8, len(mine) * width).reshape(len(mine), width)
+        words = padded.view(np.uint64)
+        numbers[mine] = (words * np.resize(FACTORS, words.shape[1])).sum(1, dtype=np.uint64) + np.uint64(width)
+    return numbers.view(np.int64)
 
 
 def compared_in(source: Path) -> pa.Table:

@@ -18,7 +18,7 @@ from levelgen.task.rules import TaskParams
 from pipeline.errors import UserError
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
-from pipeline.look.duplicates import between, compared_in, told, within
+from pipeline.look.duplicates import _numbers, between, compared_in, told, within
 from pipeline.look.inspect import survey
 from pipeline.store.layout import split_path
 from pipeline.store.manifest import require_manifest
@@ -71,6 +71,14 @@ def test_many_levels_are_compared_at_once() -> None:
     many = table(*((i, contents[i], f"x{contents[i]}", f"y{contents[i]}") for i in range(100_000)))
     found = within(many, 2)
     assert found == {"same": {"levels": 33_333, "pairs": [[2, 1], [5, 4]]}, "near": NONE}
+
+
+def test_texts_have_one_number_each() -> None:
+    texts = ["", "a", "b", "ab", "a\0", "c1:0123456789abcdef", "c1:0123456789abcdee", "n" * 600, "m" + "n" * 599]
+    alone = [_numbers(pa.chunked_array([[text]]))[0] for text in texts]
+    assert len(set(alone)) == len(texts)
+    assert _numbers(pa.chunked_array([texts[:4], texts[4:], texts])).tolist() == [*alone, *alone]
+    assert _numbers(pa.chunked_array([], pa.string())).tolist() == []
 
 
 @pytest.fixture(scope="module")

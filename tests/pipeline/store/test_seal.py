@@ -136,7 +136,9 @@ def killed(split: Path, step: int) -> bool:
 
     def count(event: str, arguments: tuple) -> None:
         changes = event in WRITES or (event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
-        if changes and str(split) in str(arguments[0]) and next(left, None) is None:
+        path = str(arguments[0]) if changes else ""
+        ours = str(split) in path or not path.startswith("/")  # what is in a folder that goes, goes by its name alone
+        if changes and ours and next(left, None) is None:
             os.kill(os.getpid(), signal.SIGKILL)
 
     try:
@@ -172,7 +174,7 @@ def test_a_kill_at_any_step_loses_nothing_and_doubles_nothing(made: Path, tmp_pa
         if not dead:
             break
         deaths += 1
-    assert deaths > 100 / stride, "every change of a file is a step"
+    assert deaths > 150 / stride, "every change of a file is a step"
 
 
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
