@@ -4,8 +4,9 @@ The new data first, then the new fragment, which counts before those that it was
 process that dies in between leaves what `leftovers.clean` removes. Knows nothing of who seals, and when.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -15,7 +16,7 @@ import pyarrow as pa
 
 from configs.schema import Density, stored_as
 from pipeline.store.convert import convert
-from pipeline.store.layout import SHARDS, begun_path, data_path, fragment_of, new_attempt, unit_name
+from pipeline.store.layout import SHARDS, Attempt, begun_path, data_path, fragment_of, new_attempt, unit_name
 from pipeline.store.leftovers import disown, drop
 from pipeline.store.manifest import (
     THREADS,
@@ -96,54 +97,74 @@ def seal(
         OSError: the disk refuses; nothing has changed.
     """
 
+    paths = {piece.path for piece in pieces}
+    parts = _read(paths, moved)
+    table, about = each_once(parts)[0], parts[0][0]
+    shards = {name: data_path(split, name) for name in named_by([of for _, of in parts], "shard")}
+    replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
+    places, between = _places(table, shards), list[Path]()
+    densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(of.densities for of, _ in parts))
+    first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
+    unit, count = unit_name(first, last), 1 if density else len(places)
+    with _attempted(split, unit, max(count, 1), replaced, between) as attempts:
+        if density:
+            places = _converted(places, density, lambda: _another(split, unit, between), converted)
+        merged = dict(zip((attempt.shard for attempt in attempts), places.values(), strict=False))
+        for shard, of in merged.items():
+            merge_shards(shard, of, moved, rows_a_file)
+        disown(replaced)
+        write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities)
+    for path in paths - {attempts[0].fragment}:
+        path.unlink(missing_ok=True)
+    for shard in replaced:
+        drop(shard)
+    return Piece(attempts[0].fragment, table.num_rows, True)
+
+
+def _read(paths: Iterable[Path], moved: Callable[[int], None]) -> list[tuple[Fragment, pa.Table]]:
     def read(path: Path) -> tuple[Fragment, pa.Table]:
         moved(0)
         return read_fragment(path)
 
-    paths = {piece.path for piece in pieces}
     with ThreadPoolExecutor(THREADS) as threads:
-        parts = list(threads.map(read, sorted(paths)))
-    table, _ = each_once(parts)
-    level_ids, rows = (table.column(name).to_pylist() for name in ("level_id", "row"))
-    shards = {name: data_path(split, name) for name in named_by([of for _, of in parts], "shard")}
+        return list(threads.map(read, sorted(paths)))
+
+
+def _places(table: pa.Table, shards: Mapping[str, Path]) -> dict[Encoding, list[Place]]:
+    """Where the trajectories of these rows lie, by how they are stored."""
     encodings = {name: Shard(path).encoding for name, path in shards.items()}
-    places: dict[Encoding, list[Place]] = {}
-    for name, row, level_id in zip(table.column("shard").to_pylist(), rows, level_ids, strict=True):
+    found: dict[Encoding, list[Place]] = {}
+    for name, row, level_id in zip(*(table.column(of).to_pylist() for of in ("shard", "row", "level_id")), strict=True):
         if name:
-            places.setdefault(encodings[name], []).append(Place(shards[name], row, level_id))
-    replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
-    unit, about = unit_name(level_ids[0], level_ids[-1]), parts[0][0]
-    densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(of.densities for of, _ in parts))
-    count = len(places) if density is None else 1
-    attempts = [new_attempt(split, unit) for _ in range(count or 1)]  # nearly always one
-    attempt, between = attempts[0], list[Path]()
+            found.setdefault(encodings[name], []).append(Place(shards[name], row, level_id))
+    return found
+
+
+@contextmanager
+def _attempted(
+    split: Path, unit: str, count: int, replaced: Sequence[Path], between: Sequence[Path]
+) -> Iterator[list[Attempt]]:
+    """Attempts at a sealed unit, a shard each; the fragment is that of the first. If it fails, all is as before.
+
+    Shards `between` are needed meanwhile only, and those that were `replaced` go after the commit.
+    """
+    attempts = [new_attempt(split, unit) for _ in range(count)]
     try:
-        for each in attempts:
-            begin_fragment(each)
-        if density:
-            places = _converted(places, density, lambda: _another(split, unit, between), converted)
-        for each, of in zip(attempts, places.values(), strict=False):
-            merge_shards(each.shard, of, moved, rows_a_file)
-        disown(replaced)
-        merged = {each.shard.name: of for each, of in zip(attempts, places.values(), strict=False)}
-        write_fragment(attempt, _moved(table, merged), about.config_hash, about.config, True, densities)
+        for attempt in attempts:
+            begin_fragment(attempt)
+        yield attempts
     except BaseException:
-        if attempt.begun.exists():  # not committed
-            for each in attempts:
-                drop(each.shard)
-            for mark in [*(each.begun for each in attempts), *map(begun_path, replaced)]:
+        if attempts[0].begun.exists():  # not committed
+            for attempt in attempts:
+                drop(attempt.shard)
+            for mark in [*(attempt.begun for attempt in attempts), *map(begun_path, replaced)]:
                 mark.unlink(missing_ok=True)
         raise
     finally:
         for shard in between:
             drop(shard)
-    for each in attempts[1:]:
-        each.begun.unlink()
-    for path in paths - {attempt.fragment}:
-        path.unlink(missing_ok=True)
-    for shard in replaced:
-        drop(shard)
-    return Piece(attempt.fragment, len(level_ids), True)
+    for attempt in attempts[1:]:
+        attempt.begun.unlink()
 
 
 def _converted(
@@ -173,9 +194,13 @@ def _another(split: Path, unit: str, between: list[Path]) -> Path:
     return attempt.shard
 
 
-def _moved(table: pa.Table, merged: Mapping[str, Sequence[Place]]) -> pa.Table:
+def _moved(table: pa.Table, merged: Mapping[Path, Sequence[Place]]) -> pa.Table:
     """The same rows, with these shards as the places of their levels, one after another."""
-    now = {of.level_id: (f"{SHARDS}/{name}", row) for name, places in merged.items() for row, of in enumerate(places)}
+    now = {
+        of.level_id: (f"{SHARDS}/{shard.name}", row)
+        for shard, places in merged.items()
+        for row, of in enumerate(places)
+    }
     found = [now.get(level_id, (None, None)) for level_id in table.column("level_id").to_pylist()]
     for name, values in zip(("shard", "row"), zip(*found, strict=True), strict=True):
         field = COLUMNS.field(name)

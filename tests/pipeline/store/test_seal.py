@@ -30,6 +30,7 @@ from pipeline.store.leftovers import clean
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.seal import CROWD, Piece, due, plan, seal
 from pipeline.store.shard import Shard
+from tests.pipeline.command import PATIENCE
 from tests.pipeline.made import commit_copy, made_job, made_result, made_split
 
 UNITS = 6  # of two levels each, one of them solved
@@ -129,7 +130,12 @@ WRITES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 def killed(split: Path, step: int) -> bool:
     """Whether who cleans and seals is killed before it has changed the files of a split so many times."""
     if child := os.fork():
-        _, status = os.waitpid(child, 0)
+        status, end = None, time.monotonic() + PATIENCE
+        while status is None:
+            ended, how = os.waitpid(child, os.WNOHANG)
+            status = how if ended else None
+            assert time.monotonic() < end, "it hangs"
+            time.sleep(0.005)
         assert status in (0, signal.SIGKILL), "it failed"
         return status == signal.SIGKILL
     left = iter(range(step))
@@ -156,7 +162,8 @@ def sealed(split: Path, rows: int) -> None:
         seal(split, group, rows_a_file=2)
 
 
-@pytest.mark.parametrize("stride", [31, pytest.param(1, marks=pytest.mark.campaign)])
+@pytest.mark.filterwarnings("ignore:os.fork")
+@pytest.mark.parametrize("stride", [59, pytest.param(1, marks=pytest.mark.campaign)])
 def test_a_kill_at_any_step_loses_nothing_and_doubles_nothing(made: Path, tmp_path: Path, stride: int) -> None:
     expected, split, deaths = whole(made), tmp_path / "split", 0
     for step in itertools.count(0, stride):
@@ -177,7 +184,8 @@ def test_a_kill_at_any_step_loses_nothing_and_doubles_nothing(made: Path, tmp_pa
     assert deaths > 150 / stride, "every change of a file is a step"
 
 
-@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@pytest.mark.filterwarnings("ignore:os.fork")
+@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     steps=st.lists(
         st.one_of(
@@ -186,7 +194,7 @@ def test_a_kill_at_any_step_loses_nothing_and_doubles_nothing(made: Path, tmp_pa
             st.tuples(st.just("kill"), st.integers(0, 150)),
         ),
         min_size=3,
-        max_size=8,
+        max_size=7,
     )
 )
 def test_any_sequence_of_commits_seals_and_kills(made: Path, tmp_path: Path, steps: list[tuple[str, int]]) -> None:
@@ -229,7 +237,7 @@ def test_readers_at_work_go_on(split: Path, made: Path) -> None:
     with ThreadPoolExecutor() as threads:
         readers = [threads.submit(read) for _ in range(2)]
         try:
-            for rows in (2, 3, 5, 9, 100):
+            for rows in (2, 5, 100):
                 sealed(split, rows)
         finally:
             ended.set()
