@@ -1,0 +1,33 @@
+"""Our side of `python -m benchmarks reader`: random batches of a split, every field, one after another for a while."""
+
+import argparse
+import json
+import time
+
+import jax
+import numpy as np
+
+import levelproof
+from benchmarks.reference.batches import WARM, rates
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("split")
+    parser.add_argument("--batch", type=int, required=True)
+    parser.add_argument("--seconds", type=float, required=True)
+    given = parser.parse_args()
+    start = time.perf_counter()
+    data = levelproof.open(given.split)
+    batches = data.batches(given.batch, seed=0, fields=["record", "level"], observation=None, epochs=None)
+    following = lambda: next(batches)
+    following()
+    first = time.perf_counter() - start
+    for _ in range(WARM):
+        following()
+    arrays = lambda batch: [x for x in jax.tree.leaves(batch) if isinstance(x, np.ndarray)]
+    print(json.dumps({"first": first} | rates(following, arrays, given.batch, given.seconds)))
+
+
+if __name__ == "__main__":
+    main()

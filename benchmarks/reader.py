@@ -1,0 +1,115 @@
+"""Trajectories a second of both readers on the same trajectories: random batches, every field, both cores for each.
+
+Ours reads a sealed split, of all its fields (`full`) and of little more than actions (`witness`, simulated again); the
+reference reads what `levelproof export --format kinetix` makes of it. Both read from the page cache.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from benchmarks import oracle
+from benchmarks.reference.batches import WARM
+from benchmarks.report import Report, Table
+from levelgen.level import SIZES
+from pipeline.errors import Failure
+from pipeline.runtime import cache_folder
+from pipeline.store.shard import stored_bytes
+
+BATCH = 64
+BUDGET = "64k"
+LEVELS = {"s": 512, "m": 192, "l": 96}  # that are tried; two thirds get a witness
+DENSITIES = ("full", "witness")
+TARGETS = {"s": 6, "m": 5, "l": 3}  # times the reference's
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
+    parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement (default: 4)")
+
+
+def run(given: argparse.Namespace) -> Report:
+    python = oracle.oracle_python()
+    results = [measured(python, size, given.seconds) for size in given.size]
+    return Report(
+        title="Reading trajectories",
+        results=results,
+        tables=[table(results, "rate", "Trajectories/s"), table(results, "copied", "With every array copied as well")],
+        notes=[
+            f"Random batches of {BATCH} whole trajectories with every field, after {WARM} to warm up; the reference's "
+            "are runs of neighbours in a random order, ours are drawn one by one. Both give arrays (batch, time, ...) "
+            "that are views of what they decoded; for the second table all of them are copied.",
+            f"Targets are {', '.join(f'{times}x for {size}' for size, times in TARGETS.items())}.",
+        ],
+        reference=oracle.versions(python),
+    )
+
+
+def measured(python: Path, size: str, seconds: float) -> dict[str, Any]:
+    """Rates of both on one split."""
+    folders = made(size)
+    words = ["--batch", BATCH, "--seconds", seconds]
+    ours = {of: json.loads(oracle.run_ours("reader", [folders[of], *words])) for of in DENSITIES}
+    theirs = json.loads(
+        oracle.run_script(python, "batches", [folders["kinetix"], *words], "read trajectories with the reference")
+    )
+    stored = {of: sum(map(stored_bytes, (folders[of] / "shards").iterdir())) for of in DENSITIES}
+    return {"size": size, "unit": "trajectories/s", "ours": ours, "reference": theirs, "bytes": stored}
+
+
+def table(results: list[dict[str, Any]], what: str, title: str) -> Table:
+    rows = []
+    for of in results:
+        theirs = of["reference"][what]
+        cells = [f"{of['ours'][density][what]:,.0f}" for density in DENSITIES]
+        ratios = [f"{of['ours'][density][what] / theirs:.1f}x" for density in DENSITIES]
+        rows.append([of["size"], *cells, f"{theirs:,.0f}", *ratios])
+    head = ("size", *(f"ours, {density}" for density in DENSITIES), "reference", *(f"{of}, times" for of in DENSITIES))
+    return Table(head, rows, title)
+
+
+def made(size: str) -> dict[str, Path]:
+    """Folders with the same trajectories: a split of each density, and the reference's; made on first use."""
+    home = cache_folder() / "bench" / "reader"
+    source = home / "generated" / BUDGET / size
+    with oracle.alone(cache_folder() / "bench.lock"):
+        if not source.is_dir():
+            oracle.tell(f"Labelling {LEVELS[size]} levels of size {size} to read (once, one to five minutes) ...")
+            _levelproof(
+                "generate", f"size={size}", f"levels={LEVELS[size]}", f"budget={BUDGET}", f"out={source.parents[1]}"
+            )
+        folders = {of: home / of / size for of in (*DENSITIES, "kinetix")}
+        for density in DENSITIES:
+            if not folders[density].is_dir():
+                unfinished = folders[density].with_name(f"unfinished-{size}")
+                shutil.rmtree(unfinished, ignore_errors=True)
+                shutil.copytree(source, unfinished)
+                _levelproof("seal", unfinished, "--density", density)
+                unfinished.replace(folders[density])
+        if not folders["kinetix"].is_dir():
+            _levelproof(
+                "export",
+                folders["full"],
+                "--format",
+                "kinetix",
+                "--where",
+                "shard IS NOT NULL",
+                "-o",
+                folders["kinetix"],
+            )
+    return folders
+
+
+def _levelproof(*words: object) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "levelproof", *map(str, words)],
+        env=oracle.our_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise Failure(
+            (done.stderr.strip().splitlines() or ["It failed without a message."])[-1].removeprefix("Error: ")
+        )

@@ -1,0 +1,53 @@
+# pyright: reportMissingImports=false
+"""The reference's side of `python -m benchmarks reader`: its own trajectory manager on an exported folder.
+
+It reads 500 batches ahead if nobody takes them. Here somebody always does, so that its queue is empty, its rate is what
+it can sustain, and its memory stays small.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+WARM = 24  # batches before the clock starts
+
+
+def rates(following: Callable[[], Any], arrays: Callable[[Any], list], batch: int, seconds: float) -> dict[str, float]:
+    """Trajectories a second: as they come, and with every array copied to one without gaps."""
+
+    def rate(use: Callable[[Any], object]) -> float:
+        start, count = time.perf_counter(), 0
+        while time.perf_counter() - start < seconds:
+            use(following())
+            count += 1
+        return count * batch / (time.perf_counter() - start)
+
+    copied = lambda found: [np.ascontiguousarray(x) for x in arrays(found)]
+    return {"rate": rate(lambda found: found), "copied": rate(copied)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder")
+    parser.add_argument("--batch", type=int, required=True)
+    parser.add_argument("--seconds", type=float, required=True)
+    given = parser.parse_args()
+
+    import jax
+    from kinetix.data import TrajectoryDatasetManager
+
+    start = time.perf_counter()
+    manager = TrajectoryDatasetManager(given.folder, given.batch, seed=0)
+    manager.load_next_batch()
+    first = time.perf_counter() - start
+    for _ in range(WARM):
+        manager.load_next_batch()
+    print(json.dumps({"first": first} | rates(manager.load_next_batch, jax.tree.leaves, given.batch, given.seconds)))
+
+
+if __name__ == "__main__":
+    main()
