@@ -77,13 +77,8 @@ def read_placed(
         by_shard.setdefault(name, []).append(i)
     shards = at_once(split, lambda name, mine: opened(split, name, sizes[mine[0]]), by_shard, by_shard.values())
     parts = [(shard, [row[i] for i in mine]) for shard, mine in zip(shards, by_shard.values(), strict=True)]
-    order = [i for mine in by_shard.values() for i in mine]
     for (shard, held), mine in zip(parts, by_shard.values(), strict=True):
         known = [shard.level_ids[k] if 0 <= k < len(shard.level_ids) else None for k in held]
         if known != [ids[i] for i in mine]:
             raise Failure(f"The shard {shard.path} has not the levels that the manifest says: verify {split}.")
-    arrays = read_together(parts, fields)
-    if order == sorted(order):
-        return arrays
-    back = np.argsort(order)
-    return {name: x[back] for name, x in arrays.items()}
+    return read_together(parts, fields, places=[*by_shard.values()])

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from itertools import groupby
 from pathlib import Path
+from struct import Struct
 from typing import Any
 
 import google_crc32c
@@ -22,8 +23,7 @@ from pipeline.store.remote import RemoteFile, bytes_of, is_remote
 
 CHECKSUM = 4  # bytes of a CRC-32C
 ENTRY = 16  # bytes of an index for each chunk: where it starts, and how many bytes it has
-BLOSC_HEADER = 16  # bytes; its words of 4 at SIZES are how many bytes a buffer decodes to, and has
-SIZES = 4, 12
+BLOSC_HEADER = Struct("<4xI4xI")  # how many bytes a buffer decodes to, and has
 KINDS = ["bytes", "blosc", "crc32c"]  # of a chunk's codecs
 
 
@@ -45,9 +45,10 @@ class Chunks:
         if self.rows_a_file < 1:
             raise ContentsError(f"its array {name} is not stored as this program stores it")
         self._indices: dict[int, np.ndarray] = {}  # by file: [chunk, (first byte, bytes)]
+        self._paths: dict[int, str] = {}  # by file, of those that were looked at
 
-    def read(self, rows: Sequence[int], out: np.ndarray) -> None:
-        """Decode the chunk of `rows[i]` into `out[i]`, which is C-contiguous.
+    def read(self, rows: Sequence[int], out: np.ndarray, places: Sequence[int]) -> None:
+        """Decode the chunk of `rows[i]` into `out[places[i]]`; `out` is C-contiguous.
 
         Raises:
             ContentsError, OSError, ValueError, RuntimeError: a chunk is missing or damaged.
@@ -59,9 +60,9 @@ class Chunks:
             with closing(self._opened(number)) as file:
                 if number not in self._indices:
                     self._indices[number] = self._index(file)
-                places = self._indices[number][[rows[i] % self.rows_a_file for i in mine]].tolist()
-                for i, stored in zip(mine, file.read(places), strict=True):
-                    self._decode(stored, out[i])
+                index = self._indices[number][[rows[i] % self.rows_a_file for i in mine]]
+                for i, stored in zip(mine, file.read(index.tolist()), strict=True):
+                    self._decode(stored, out[places[i]])
 
     def encoded(self, rows: Iterable[int]) -> Iterator[bytes]:
         """The chunks of these rows as they are stored, each with a checksum that is right.
@@ -80,7 +81,9 @@ class Chunks:
         name = file_name(self.name, number, len(self.shape))
         if is_remote(self.shard):
             return RemoteFile(self.shard / name)
-        return LocalFile(self.shard / name if number in self._indices else ordinary_file(self.shard, name))
+        if number not in self._paths:
+            self._paths[number] = str(ordinary_file(self.shard, name))
+        return LocalFile(self._paths[number])
 
     def _index(self, file: "LocalFile | RemoteFile") -> np.ndarray:
         end, length = file.size, ENTRY * self.rows_a_file + CHECKSUM
@@ -99,8 +102,7 @@ class Chunks:
 
     def _decode(self, stored: bytes, out: np.ndarray) -> None:
         chunk = self._checked(stored)
-        sizes = [int.from_bytes(chunk[at : at + 4], "little") for at in SIZES]
-        if len(chunk) < BLOSC_HEADER or sizes != [out.nbytes, len(chunk)]:
+        if len(chunk) < BLOSC_HEADER.size or BLOSC_HEADER.unpack_from(chunk) != (out.nbytes, len(chunk)):
             raise ContentsError(f"a chunk of its array {self.name} has another size than it should")
         blosc.decompress(chunk, out)
 
@@ -108,7 +110,7 @@ class Chunks:
 class LocalFile:
     """One file of a shard in a folder, open for reading."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str) -> None:
         self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
 
     @property

@@ -5,6 +5,7 @@ Knows nothing of files. Names are paths: `state/position`, `model/joint_anchor_a
 
 import dataclasses
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
@@ -21,13 +22,18 @@ def arrays_of(tree: Any, path: str = "") -> dict[str, np.ndarray]:
 
 def tree_of(cls: type[T], arrays: Mapping[str, np.ndarray], path: str = "") -> T:
     """The inverse of `arrays_of`; the annotations of `cls` say which fields are themselves dataclasses."""
-    hints = get_type_hints(cls)
+    hints = _hints(cls)
     values = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         hint, name = hints[field.name], f"{path}{field.name}"
         nested = isinstance(hint, type) and dataclasses.is_dataclass(hint)
         values[field.name] = tree_of(hint, arrays, f"{name}/") if nested else arrays[name]
     return cls(**values)  # type: ignore[return-value]
+
+
+@cache
+def _hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
 
 
 def same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:

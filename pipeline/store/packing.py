@@ -56,7 +56,8 @@ def unpack(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict
         if field.constant:
             part = part.reshape(len(part), *field.shape)
         else:
-            part = np.moveaxis(part.reshape(len(part), *field.shape, field.steps), -1, 1)
+            part = part.reshape(len(part), *field.shape, field.steps)
+            part = part.transpose(0, -1, *range(1, part.ndim - 1))
         arrays[field.name] = _original(part, field)
     return arrays
 

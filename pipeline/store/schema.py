@@ -3,6 +3,7 @@
 A fragment or shard of another version is refused with a sentence, never guessed at.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, get_args
@@ -141,7 +142,7 @@ class FieldSpec:
 
     @property
     def count(self) -> int:
-        return int(np.prod(self.shape, dtype=int))
+        return math.prod(self.shape)
 
     @property
     def bits(self) -> int:

@@ -158,10 +158,10 @@ class Shard:
         Raises:
             Failure: as `read`.
         """
-        return _read_alike([(self, rows)], table_for(self.size)).unlike
+        return _read_alike([(self, rows)], table_for(self.size), [range(len(rows))]).unlike
 
-    def put(self, rows: Sequence[int], packed: Mapping[str, np.ndarray]) -> None:
-        """Decode the chunks of these rows into packed arrays, row after row.
+    def put(self, rows: Sequence[int], packed: Mapping[str, np.ndarray], places: Sequence[int]) -> None:
+        """Decode the chunks of these rows into packed arrays, each at its place there.
 
         Raises:
             ContentsError, or another of DAMAGE: a chunk is missing or damaged.
@@ -172,15 +172,22 @@ class Shard:
             if name not in self._chunks:
                 shape = (len(self.level_ids), *values.shape[1:])
                 self._chunks[name] = Chunks(self.path, name, shape, values.dtype)
-            self._chunks[name].read(rows, values)
+            self._chunks[name].read(rows, values, places)
+
+
+Part = tuple[Shard, Sequence[int]]  # rows of a shard
 
 
 def read_together(
-    parts: Sequence[tuple[Shard, Sequence[int]]], fields: Iterable[str] | None = None, exactly: bool = False
+    parts: Sequence[Part],
+    fields: Iterable[str] | None = None,
+    exactly: bool = False,
+    places: Sequence[Sequence[int]] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Named arrays of rows of shards of one size, one part after another; level axis FIRST, then time.
+    """Named arrays of rows of shards of one size; level axis FIRST, then time.
 
-    What a shard holds along time is given as a view of the packed arrays, whose time is the last axis.
+    The rows of each part stand at its `places` there; default: one part after another. What a shard holds along time
+    is given as a view of the packed arrays, whose time is the last axis.
 
     Raises:
         Failure: a chunk is missing or damaged, or holds what a level or a record of this size cannot; or, if it has to
@@ -191,56 +198,61 @@ def read_together(
     by_encoding: dict[Encoding, list[int]] = {}
     for i, (shard, _) in enumerate(parts):
         by_encoding.setdefault(shard.encoding, []).append(i)
-    found = [_read_alike([parts[i] for i in alike], table) for alike in by_encoding.values()]
-    for alike, of in zip(by_encoding.values(), found, strict=True):
-        _tell([parts[i] for i in alike], of.unlike, exactly)
-    if len(found) == 1:
-        return found[0].arrays
-    ends = np.cumsum([0] + [len(rows) for _, rows in parts])
-    order = np.concatenate([np.arange(ends[i], ends[i + 1]) for alike in by_encoding.values() for i in alike])
-    back = np.argsort(order)
-    return {name: np.concatenate([of.arrays[name] for of in found])[back] for name in found[0].arrays}
+    places = _one_after_another(parts) if places is None else places
+    if len(by_encoding) == 1:
+        found = _read_alike(parts, table, places)
+        _tell(parts, places, found.unlike, exactly)
+        return found.arrays
+    alone = []
+    for alike in by_encoding.values():
+        mine = [parts[i] for i in alike]
+        alone.append(_read_alike(mine, table, _one_after_another(mine)))
+        _tell(mine, _one_after_another(mine), alone[-1].unlike, exactly)
+    back = np.argsort(np.concatenate([places[i] for alike in by_encoding.values() for i in alike]))
+    return {name: np.concatenate([of.arrays[name] for of in alone])[back] for name in alone[0].arrays}
 
 
-def _read_alike(parts: Sequence[tuple[Shard, Sequence[int]]], table: Sequence[FieldSpec]) -> Restored:
+def _read_alike(parts: Sequence[Part], table: Sequence[FieldSpec], places: Sequence[Sequence[int]]) -> Restored:
     """The same of shards of one encoding, with the first row of each level that is not as it was stored."""
     size, encoding = parts[0][0].size, parts[0][0].encoding
     known = table_for(size, encoding)
     names = needed((field.name for field in table), (field.name for field in known))
     chosen = [field for field in known if field.name in names]
     packed = empty(known, dict.fromkeys(field.array for field in chosen), sum(len(rows) for _, rows in parts))
-    slices = _slices(parts)
 
-    def put(part: tuple[Shard, Sequence[int]], mine: slice) -> None:
+    def put(part: Part, mine: Sequence[int]) -> None:
         with _reading(part[0]):
-            part[0].put(part[1], {name: x[mine] for name, x in packed.items()})
+            part[0].put(part[1], packed, mine)
 
-    at_once(parts[0][0].path, put, parts, slices)
+    at_once(parts[0][0].path, put, parts, places)
     try:
         stored = _named(packed, chosen, size)
     except ValueError:  # one of them holds what it cannot
-        for (shard, _), mine in zip(parts, slices, strict=True):
+        for (shard, _), mine in zip(parts, places, strict=True):
             with _reading(shard):
-                _named({name: x[mine] for name, x in packed.items()}, chosen, size)
+                _named({name: x[np.asarray(mine)] for name, x in packed.items()}, chosen, size)
         raise
+    if names == {field.name for field in table}:  # nothing is left to compute
+        return Restored({field.name: stored[field.name] for field in table}, np.full(sum(map(len, places)), -1))
     found = restored({name: np.moveaxis(x, 0, -1) for name, x in stored.items()}, table, encoding)
     return Restored({name: np.moveaxis(x, -1, 0) for name, x in found.arrays.items()}, found.unlike)
 
 
-def _slices(parts: Sequence[tuple[Shard, Sequence[int]]]) -> list[slice]:
+def _one_after_another(parts: Sequence[Part]) -> list[range]:
     ends = np.cumsum([len(rows) for _, rows in parts]).tolist()
-    return [slice(end - len(rows), end) for end, (_, rows) in zip(ends, parts, strict=True)]
+    return [range(end - len(rows), end) for end, (_, rows) in zip(ends, parts, strict=True)]
 
 
-def _tell(parts: Sequence[tuple[Shard, Sequence[int]]], unlike: np.ndarray, refuse: bool) -> None:
+def _tell(parts: Sequence[Part], places: Sequence[Sequence[int]], unlike: np.ndarray, refuse: bool) -> None:
     """Say it where this machine's states are not those that were stored."""
-    for (shard, rows), mine in zip(parts, _slices(parts), strict=True):
-        if len(wrong := np.flatnonzero(unlike[mine] >= 0)):
+    for (shard, rows), mine in zip(parts, places, strict=True) if (unlike >= 0).any() else ():
+        unlike_here = unlike[np.asarray(mine, int)]
+        if len(wrong := np.flatnonzero(unlike_here >= 0)):
             first = int(wrong[0])
             what = (
                 f"On this machine the engine computes other states than those that were stored of {len(wrong)} of "
                 f"{len(rows)} levels of the shard {shard.path}, of level {shard.level_ids[rows[first]]} from step "
-                f"{unlike[mine][first]} on"
+                f"{unlike_here[first]} on"
             )
             if refuse:
                 raise Failure(f"{what}: read it with a machine and versions such as it was made with.")
