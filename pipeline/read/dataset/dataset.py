@@ -231,8 +231,8 @@ class Dataset:
         rows = np.arange(numbers.size)
         arrays |= {name: x[rows, steps.ravel()] for name, x in arrays.items() if name.startswith("record/")}
         level = replace(tree_of(Level, arrays, "level/"), state=tree_of(State, arrays, "record/state/"))
-        states = EnvState(level, arrays["record/timestep"], arrays["record/last_distance"])
-        return jax.tree.map(lambda x: jnp.asarray(x.reshape((*numbers.shape, *x.shape[1:]))), states)
+        given = level, arrays["record/timestep"], arrays["record/last_distance"]
+        return EnvState(*jax.tree.map(lambda x: jnp.asarray(x.reshape((*numbers.shape, *x.shape[1:]))), given))
 
     @cached_property
     def fingerprint(self) -> str:
