@@ -32,7 +32,7 @@ from pipeline.read.dataset.parts import check_share, in_part
 from pipeline.read.dataset.sources import TrajectorySource
 from pipeline.read.dataset.windows import Windows
 from pipeline.read.levels import rules_of
-from pipeline.read.rows import COLUMNS, moved_rows, read_placed
+from pipeline.read.rows import COLUMNS, moved_rows, read_placed, same_places
 from pipeline.read.select import columns_in, select
 from pipeline.runtime import own_cores
 from pipeline.store.fields import tree_of
@@ -273,7 +273,7 @@ class Dataset:
             if self._manifest is not manifest:
                 return True
             moved = moved_rows(self.split, manifest)
-            same = moved.select(["shard", "row"]).equals(manifest.select(["shard", "row"]))
+            same = same_places(manifest, moved)
             for name in () if same else ("shard", "row"):
                 at = manifest.schema.get_field_index(name)
                 manifest = manifest.set_column(at, name, moved[name].combine_chunks())
