@@ -1,22 +1,40 @@
-"""`levelproof verify`: whether a split is what it says."""
+"""`levelproof verify`: whether a split is what it says, and what is not made again."""
 
 import argparse
 
 from pipeline.cli.command import add_json, add_split
 from pipeline.errors import Exit
 
-DOES = "make every level of a split again, read every shard, replay every witness"
-EXAMPLE = "levelproof verify data/128k/s"
+DOES = "hold every byte of a split against its checksum, make every level again, replay every witness"
+EXAMPLE = """\
+levelproof verify data/128k/s
+levelproof verify data/128k/s --repair"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
-    add_json(parser)
+    how = parser.add_mutually_exclusive_group()
+    add_json(how)
+    how.add_argument(
+        "--repair",
+        nargs="*",
+        metavar="NAME=VALUE",
+        help="make again what is damaged or missing, and nothing else; settings: executor, workers and unit, as for "
+        "generate",
+    )
 
 
 def run(arguments: argparse.Namespace) -> Exit:
-    from pipeline.read.verify import verify
+    from rich.console import Console
+
     from pipeline.store.remote import require_folder
 
     require_folder(arguments.split, "verify it")
-    return verify(arguments.split, arguments.json)
+    if arguments.repair is not None:
+        from pipeline.jobs.repair import repair
+
+        return repair(arguments.split, arguments.repair, Console(stderr=True))
+    from pipeline.read.verify import verify
+    from pipeline.store.remote import require_folder
+
+    return verify(arguments.split, arguments.json, Console(stderr=True))

@@ -32,25 +32,27 @@ def generate(
     console: Console,
     level_ids: Sequence[int] | None = None,
     origins: Mapping[int, Origin] | None = None,
+    repaired: Path | None = None,
 ) -> Exit:
     """Make what is missing of the job's levels, and commit it unit by unit.
 
     `command` is as typed, for the hint of how to go on; `level_ids` are which levels, if not those of the job;
-    `origins` say where they are, if their ids do not make them.
+    `origins` say where they are, if their ids do not make them; `repaired` is the split, where they are made again.
 
     Raises:
         UserError, Failure: see `store.split.writing` and `store.checkpoints.require_same_experts`; or the disk refuses.
         KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; what is committed stays.
     """
     require_same_experts(job)
-    with writing(job, partial(say, console)) as (split, manifest):
+    with writing(job, partial(say, console), repaired) as (split, manifest):
         asked = origins or (job.level_ids if level_ids is None else level_ids)
         wanted = ascending(np.fromiter(asked, np.int64, len(asked)))
         is_done = np.isin(manifest.level_ids, wanted)
         done = manifest.level_ids[is_done]
         require_same_levels(split, origins or {}, done)
         queue = UnitQueue(deque(plan_units(wanted, done, job.levels_per_unit, origins)))
-        note_job(split, job, command, runs(wanted))
+        if not repaired:
+            note_job(split, job, command, runs(wanted))
         if queue.waiting:
             solved = manifest.counts(is_done).get(Label.SOLVED, 0)
             board = Board(Tally(len(wanted), len(done), solved), console)

@@ -3,8 +3,9 @@
 Worked out for many levels at once, whatever shards they lie in.
 """
 
+import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,31 +26,21 @@ from levelgen.sampling.sampler import Distribution, sample_levels
 from levelgen.sampling.scenery import empty_level
 from levelgen.task.rules import TaskParams
 from pipeline.errors import Failure
+from pipeline.read.findings import Findings
 from pipeline.read.level_files import level_at
 from pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
 from pipeline.store.origins import RECORD, origin_of
 from pipeline.store.provenance import device, versions
-from pipeline.store.shard import Shard
+from pipeline.store.shard import EngineDiffers, Shard
 
 COLUMNS = (
     "label", "label_reason", "failed_by_noop", "content_hash", "signature", "file", "size", "steps_to_goal", "shard",
-    "row",
+    "row", "experts", "budget",
     "versions", "device",
 )  # fmt: skip
 
 Mask = Bool[np.ndarray, " level"]
 Lanes = Int[np.ndarray, " lane"]  # indices of some of the levels
-
-
-@dataclass
-class Findings:
-    """What was looked at, and what is wrong: at most one sentence for each level and each shard."""
-
-    levels: int = 0
-    shards: int = 0
-    witnesses: int = 0
-    same_bits: int = 0  # of the witnesses: replayed bit for bit
-    wrong: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -99,7 +90,8 @@ class Evidence:
         """Note what is wrong with these of the lanes' levels, those that have a sentence left out."""
         where, ids = np.asarray(where, bool), self.ids[lanes]
         new = np.flatnonzero(where & ~self.told[lanes])
-        self.findings.wrong += [f"Level {ids[i]} {what(int(i))}." for i in new]
+        for i in new:
+            self.findings.tell(f"Level {ids[i]} {what(int(i))}.", [int(ids[i])])
         self.told[lanes] |= where
 
     def _claims(self) -> Mask:
@@ -171,10 +163,11 @@ class Evidence:
         differs, steps = unlike_fields(record, again), steps_to_goal(done)
         labels, claimed = (np.array(self.of[name], object)[lanes] for name in ("label", "steps_to_goal"))
         self.findings.witnesses += len(lanes)
-        self.findings.same_bits += len(lanes) - len(differs)
-        unlike = np.isin(np.arange(len(lanes)), list(differs))
+        unlike, other = np.isin(np.arange(len(lanes)), list(differs)), self._restored_otherwise(lanes)
+        self.findings.same_bits += int((~unlike & ~other).sum())
         tell = partial(self._tell, lanes=lanes)
         tell(unlike & self.same_stack[lanes], lambda i: f"has a witness that does not replay: its {differs[i]} differs")
+        tell(other & self.same_stack[lanes], lambda _: "has other states than its shard's checksums and key frames say")
         tell(~succeeds(done, again.goal), lambda _: "has a witness that does not reach the goal when replayed")
         busy = record.action.any((0, 1))
         tell(busy & (labels == Label.TRIVIAL), lambda _: "is trivial, and its witness does something")
@@ -189,17 +182,43 @@ class Evidence:
             by_shard.setdefault(self.of["shard"][i], []).append(int(i))
         found, parts = [], []
         for name, mine in by_shard.items():
-            if (shard := self.shards[name]) is None:  # seen to be damaged before
-                continue
-            try:
-                parts.append(shard.read([self.of["row"][i] for i in mine], fields))
-                found += mine
-            except Failure as failure:
-                self.findings.wrong.append(str(failure))
-                self.shards[name] = None
-                self.told |= [other == name for other in self.of["shard"]]
+            shard = self.shards[name]
+            assert shard, "levels of one that is unusable have no claim to it"
+            for lanes_read, arrays in self._readable(name, shard, mine, fields):
+                found += lanes_read
+                parts.append(arrays)
         names = parts[0] if parts else {}
         return np.array(found, int), {name: np.concatenate([part[name] for part in parts], -1) for name in names}
+
+    def _restored_otherwise(self, lanes: Lanes) -> Mask:
+        """Of which levels this machine computes other states than those that were not stored."""
+        wrong = np.zeros(len(lanes), bool)
+        names = np.array(self.of["shard"], object)[lanes]
+        for name in dict.fromkeys(names):
+            shard = self.shards[name]
+            if shard and shard.encoding.density != "full":
+                wrong[names == name] = shard.unlike([self.of["row"][i] for i in lanes[names == name]]) >= 0
+        return wrong
+
+    def _readable(
+        self, name: str, shard: Shard, lanes: list[int], fields: Iterable[str] | None
+    ) -> list[tuple[list[int], dict[str, np.ndarray]]]:
+        """Levels of one shard and what it holds of them: all at once, or one by one where it is damaged."""
+        read = lambda of: shard.read([self.of["row"][i] for i in of], fields)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", EngineDiffers)  # is told level by level
+            try:
+                found = [(lanes, read(lanes))]
+            except Failure:
+                self.findings.unlike.add(name)
+                found = []
+                for i in lanes:
+                    try:
+                        found.append(([i], read([i])))
+                    except Failure as failure:
+                        self.findings.tell(str(failure), [int(self.ids[i])])
+                        self.told[i] = True
+        return found
 
     def _worlds(self, lanes: Lanes, stored: Level, levels: Level) -> None:
         """Compare the worlds in shards with those that ids make, and put them in their place."""

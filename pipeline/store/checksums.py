@@ -11,26 +11,25 @@ from pathlib import Path
 
 MARK = b"levelproof.sha256:"  # before a fragment's own digest
 OWN = len(MARK) + hashlib.sha256().digest_size
+BLOCK = 2**20  # bytes read at once
 TAIL = 8  # bytes at the end of parquet: how long its footer is, and PAR1
 
 
-def digest_of(path: Path) -> str:
-    """SHA-256 of a file; of a folder, that of what `sha256sum` prints of all files below it, in the order of paths.
+def digests_of(path: Path) -> dict[str, str]:
+    """SHA-256 of all files below a folder, by their paths there; of a file, its own without a path.
 
-    Links are not followed: they, and whatever is no ordinary file, give another digest than any file.
+    Links are not followed: they, and whatever else is no ordinary file, have what no file has.
 
     Raises:
         OSError: it cannot be read.
     """
     if not stat.S_ISDIR(path.lstat().st_mode):
-        return _digest_of_file(path)
-    below = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
-    names = sorted(os.fsencode(file.relative_to(path)) for file in below)
-    lines = (_digest_of_file(path / os.fsdecode(name)).encode() + b"  " + name + b"\n" for name in names)
-    return hashlib.sha256(b"".join(lines)).hexdigest()
+        return {"": _digest(path)}
+    below = sorted(Path(folder, name) for folder, _, names in os.walk(path) for name in names)
+    return {file.relative_to(path).as_posix(): _digest(file) for file in below}
 
 
-def _digest_of_file(path: Path) -> str:
+def _digest(path: Path) -> str:
     if not stat.S_ISREG(path.lstat().st_mode):
         return "no file"
     with path.open("rb") as file:
@@ -39,7 +38,7 @@ def _digest_of_file(path: Path) -> str:
 
 def with_own(data: bytes) -> bytes:
     """A parquet file with its own digest in it."""
-    footer = _footer(data)
+    footer = _footer(data, len(data))
     return data[:footer] + MARK + hashlib.sha256(data).digest() + data[footer:]
 
 
@@ -49,12 +48,20 @@ def has_own(path: Path) -> bool:
     Raises:
         OSError: it cannot be read.
     """
-    data = path.read_bytes()
-    end = _footer(data)
-    start = max(0, end - OWN)
-    return data[start:end] == MARK + hashlib.sha256(data[:start] + data[end:]).digest()
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - TAIL))
+        start = max(0, _footer(file.read(), size) - OWN)
+        rest = hashlib.sha256()
+        file.seek(0)
+        for first in range(0, start, BLOCK):
+            rest.update(file.read(min(BLOCK, start - first)))
+        own = file.read(OWN)
+        while block := file.read(BLOCK):
+            rest.update(block)
+    return own == MARK + rest.digest()
 
 
-def _footer(data: bytes) -> int:
-    """Where the footer of parquet begins, as its end says; 0 where that cannot be."""
-    return max(0, len(data) - TAIL - int.from_bytes(data[-TAIL : 4 - TAIL], "little"))
+def _footer(end: bytes, size: int) -> int:
+    """Where the footer of a parquet file of so many bytes begins, as its end says; 0 where that cannot be."""
+    return max(0, size - TAIL - int.from_bytes(end[-TAIL:][:4], "little"))

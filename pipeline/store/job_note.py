@@ -72,6 +72,15 @@ def read_note(split: Path) -> JobNote:
     return JobNote(command, runs, config if known else None, text == _text(said))
 
 
+def sound_note(split: Path) -> JobNote | None:
+    """The note of a split as it was written; None where it is damaged or missing."""
+    try:
+        note = read_note(split)
+    except (FileNotFoundError, NoteError):
+        return None
+    return note if note.intact else None
+
+
 def _text(note: dict[str, Any]) -> str:
     """The whole file: one line, its digest last."""
     digest = hashlib.sha256(json.dumps(note).encode()).hexdigest()

@@ -4,6 +4,7 @@ import os
 import re
 import secrets
 from collections.abc import Callable
+from os import DirEntry
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,6 +53,17 @@ def new_attempt(split: Path, unit: str) -> Attempt:
         split / SHARDS / f"{name}.zarr",
         split / EXPERTS / f"{name}.npz",
     )
+
+
+def unit_ids(data: Path) -> tuple[int, int]:
+    """The lowest and the highest level id of the unit that made this shard or these experts, by their name."""
+    first, last, _ = attempt_of(data).split("-")
+    return int(first), int(last)
+
+
+def data_paths(split: Path) -> list[Path]:
+    """All shards and experts of a split, whoever names them."""
+    return [*entries(split, SHARDS, DATA, DirEntry.is_dir), *entries(split, EXPERTS, DATA, DirEntry.is_file)]
 
 
 def attempt_of(path: Path) -> str:

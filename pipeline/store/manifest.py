@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from configs.convert import flat
 from configs.schema import KEYS_EVERY, Density, hash_of, stored_as
 from pipeline.errors import Failure, UserError
-from pipeline.store.checksums import digest_of, with_own
+from pipeline.store.checksums import digests_of, with_own
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
 from pipeline.store.remote import bytes_of, is_remote, mended
@@ -54,7 +54,7 @@ class Fragment:
     path: Path
     config_hash: str
     config: dict[str, Any]  # the settings that decide results
-    digests: dict[str, str]  # of the shards and checkpoints that its rows name
+    digests: dict[str, dict[str, str]]  # of the files of each shard and checkpoint that its rows name
     rows: int
     sealed: bool
     densities: frozenset[str]  # how its shards were to be stored (`configs.schema.stored_as`)
@@ -104,10 +104,10 @@ def write_fragment(
     flush_entry(attempt.fragment.parent)  # the new name itself
 
 
-def _digests(split: Path, table: pa.Table) -> dict[str, str]:
-    """Of the shards and checkpoints that these rows name, as they are on the disk now."""
+def _digests(split: Path, table: pa.Table) -> dict[str, dict[str, str]]:
+    """Of the files of the shards and checkpoints that these rows name, as they are on the disk now."""
     names = sorted(name for column in DATA_COLUMNS for name in table.column(column).unique().to_pylist() if name)
-    return {name: digest_of(split / name) for name in names if (split / name).exists()}
+    return {name: digests_of(split / name) for name in names if (split / name).exists()}
 
 
 def fragment_paths(split: Path) -> list[Path]:
@@ -164,7 +164,7 @@ def read_fragment(
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:
         raise Failure(
             f"The fragment {path} is damaged ({type(error).__name__}): "
-            + mended(path, "delete it and run the same `levelproof generate` again to remake its levels.")
+            + mended(path, f"run `levelproof verify {path.parent.parent} --repair` to make its levels again.")
         ) from error
     return fragment, table
 

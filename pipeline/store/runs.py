@@ -39,6 +39,17 @@ def without(runs: Iterable[Sequence[int]], level_ids: np.ndarray) -> list[tuple[
     return left
 
 
+def merged(*of: Iterable[Sequence[int]]) -> list[tuple[int, int]]:
+    """Runs of all the numbers in these runs, ascending."""
+    together: list[tuple[int, int]] = []
+    for first, last in sorted((first, last) for runs in of for first, last in runs):
+        if together and first <= together[-1][1] + 1:
+            together[-1] = together[-1][0], max(together[-1][1], last)
+        else:
+            together.append((first, last))
+    return together
+
+
 def told_levels(runs: Sequence[Sequence[int]]) -> str:
     """For people: `levels 0 to 31, 96 to 127`."""
     of = [f"{first} to {last}" if last > first else f"{first}" for first, last in runs]

@@ -24,7 +24,7 @@ VERSION_KEY = b"levelproof.manifest_version"
 HASH_KEY = b"levelproof.config_hash"
 CONFIG_KEY = b"levelproof.config"  # the settings that decide results, as JSON
 DENSITIES_KEY = b"levelproof.densities"  # how its shards were to be stored, as JSON; see `configs.schema.stored_as`
-DIGESTS_KEY = b"levelproof.sha256"  # of every shard and checkpoint that its rows name, by its name, as JSON
+DIGESTS_KEY = b"levelproof.sha256"  # of the files of each shard and checkpoint that its rows name, as JSON
 SEALED_KEY = b"levelproof.sealed"  # there: fragments of several units were merged into this one
 
 COLUMNS = pa.schema(

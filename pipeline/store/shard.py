@@ -32,7 +32,7 @@ from pipeline.store.contents import (
 from pipeline.store.density import Restored, kept, needed, restored
 from pipeline.store.disk import flush
 from pipeline.store.fields import same_bits
-from pipeline.store.layout import data_path, fragment_of
+from pipeline.store.layout import data_path
 from pipeline.store.packing import empty, pack, unpack
 from pipeline.store.remote import at_once, is_remote, mended, stored_in
 from pipeline.store.schema import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
@@ -278,9 +278,7 @@ def damaged(shard: Path, error: Exception) -> Failure:
     reason = str(error) if isinstance(error, ContentsError) else type(error).__name__
     return Failure(
         f"The shard {shard} is missing or damaged ({reason}): "
-        + mended(
-            shard, f"delete {fragment_of(shard)} and run the same `levelproof generate` again to remake its levels."
-        )
+        + mended(shard, f"run `levelproof verify {shard.parent.parent} --repair` to make its levels again.")
     )
 
 

@@ -15,15 +15,15 @@ from pipeline.store.remote import require_folder
 
 
 @contextmanager
-def writing(job: JobConfig, say: Callable[[str], None]) -> Iterator[tuple[Path, Manifest]]:
-    """The job's split, locked, cleaned, and of this configuration; with what is committed.
+def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = None) -> Iterator[tuple[Path, Manifest]]:
+    """The job's split, locked, cleaned, and of this configuration; with what is committed. It may lie elsewhere.
 
     Raises:
         UserError: it cannot be written or locked, is being written, or was made with another configuration or
             density.
         Failure: a fragment is damaged.
     """
-    split = split_path(job.out, job.budget, job.size)
+    split = split or split_path(job.out, job.budget, job.size)
     with taken(split, say) as manifest:
         if manifest.config_hash not in (None, job.hash):
             changes = told(differences(manifest.config or {}, job.results))
@@ -48,13 +48,24 @@ def taken(split: Path, say: Callable[[str], None]) -> Iterator[Manifest]:
         UserError: it cannot be written or locked, or is being written.
         Failure: a fragment is damaged.
     """
+    with locked(split):
+        yield clean(split, say)
+
+
+@contextmanager
+def locked(split: Path) -> Iterator[None]:
+    """The split for this process alone to write to.
+
+    Raises:
+        UserError: it cannot be written or locked, or is being written.
+    """
     require_folder(split, "write to it")
     _make_writable(split)
     _require_own_folders(split)
     with only_writer(split):
         with committing(split):
             pass  # as workers do: a file system that refuses their lock is named before anything trains
-        yield clean(split, say)
+        yield
 
 
 def _make_writable(split: Path) -> None:

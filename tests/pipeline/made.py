@@ -15,11 +15,12 @@ import numpy as np
 
 from configs.compose import compose_job
 from configs.schema import JobConfig
+from experts.before import decide
 from experts.config import RECORD_STEPS
-from experts.labels import Label, Source, Verdict
+from experts.labels import WITNESSED, Label, Source, Verdict
 from experts.steps import EnvSteps
 from experts.train import UnitResult
-from experts.witness import Record, replay, succeeds
+from experts.witness import Record, replay, steps_to_goal, succeeds, take
 from levelgen.level import ACTIONS, SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from physics.pairs import pairs_of
@@ -28,6 +29,7 @@ from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
 from pipeline.store.contents import highest
 from pipeline.store.fields import arrays_of, tree_of
+from pipeline.store.job_note import note_job
 from pipeline.store.layout import split_path
 from pipeline.store.manifest import fragment_paths
 
@@ -132,12 +134,39 @@ def played_split(folder: Path, held: int = 16) -> Path:
     verdicts = [made_verdict(Label.SOLVED if good else Label.UNSOLVED) for good in solved]
     path = split_path(job.out, job.budget, job.size)
     path.mkdir(parents=True)
+    note_job(path, job, ["levelproof", "generate"], [(0, PLAYED - 1)])
     commit(
         job,
         path,
         WorkUnit(tuple(int(i) for i in ids)),
         UnitResult(ids.astype(np.int64), levels, record, verdicts, SPENT),
     )
+    return path
+
+
+def honest_split(folder: Path, unit: int, units: int) -> Path:
+    """A split without training in which everything is true: random actions solve what they solve."""
+    job, ids = made_job(str(folder), "size=s"), np.arange(unit * units)
+    levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
+    before, failed = decide(levels, job.task)
+    action = np.repeat(np.random.default_rng(0).integers(0, 2, (16, 6, len(ids))), 16, axis=0).astype(np.int32)
+    action[..., [verdict is not None for verdict in before]] = 0
+    record = replay(levels, action, job.task)
+    solved, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
+    verdicts = [
+        known or made_verdict(Label.SOLVED if solved[i] else Label.UNSOLVED, failed_by_noop=bool(failed[i]))
+        for i, known in enumerate(before)
+    ]
+    path = split_path(job.out, job.budget, job.size)
+    path.mkdir(parents=True)
+    note_job(path, job, ["levelproof", "generate"], [(0, len(ids) - 1)])
+    for lanes in ids.reshape(units, unit):
+        told = [
+            dataclasses.replace(verdicts[i], steps_to_goal=int(steps[i]) if verdicts[i].label in WITNESSED else None)
+            for i in lanes
+        ]
+        result = UnitResult(lanes, take(levels, lanes), take(record, lanes), told, SPENT)
+        commit(job, path, WorkUnit(tuple(lanes.tolist())), result)
     return path
 
 
@@ -150,6 +179,7 @@ def made_split(folder: Path, units: Sequence[Sequence[Label]], *words: str) -> P
         ids = list(range(first, first + len(labels)))
         commit(job, path, WorkUnit(tuple(ids)), made_result(ids, list(labels)))
         first += len(labels)
+    note_job(path, job, ["levelproof", "generate"], [(0, first - 1)])
     return path
 
 

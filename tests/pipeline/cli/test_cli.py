@@ -134,7 +134,7 @@ def test_another_configuration_names_what_differs(made: Path) -> None:
 def test_a_damaged_fragment_is_named(split: Path, command: list[str]) -> None:
     fragment_paths(split)[1].write_bytes(b"PAR1 and then nothing")
     done = here(command, split.parents[2])
-    assert_refused(done, 1, "000000000001-000000000001.parquet is damaged", "delete it")
+    assert_refused(done, 1, "000000000001-000000000001.parquet is damaged", "verify data/5k/s --repair")
 
 
 @pytest.mark.campaign
@@ -212,7 +212,7 @@ def test_show_draws_a_witness(made: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(tmp_path: Path) -> None:
     """A limit on the size of files stands in for a full disk: both refuse in the middle of a write."""
-    limit = 2_000  # bytes; experts, which come first, are longer
+    limit = 8_000  # bytes; the note of the job is shorter, experts, which come next, are longer
     command = ["generate", "levels=4", "unit=4", "budget=5k", "keep_experts=true", "executor=inline"]
 
     def limited() -> None:

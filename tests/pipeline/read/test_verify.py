@@ -1,33 +1,26 @@
 """Forged splits: each lie is found, by levels made again, labels worked out again, and witnesses replayed."""
 
-import dataclasses
 import itertools
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from experts.before import decide
 from experts.labels import WITNESSED, Label
-from experts.train import UnitResult
-from experts.witness import replay, steps_to_goal, succeeds, take
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
+from experts.witness import replay
 from pipeline.read import evidence
 from pipeline.read.verify import examine
-from pipeline.store.layout import split_path
+from pipeline.store.checksums import digests_of, with_own
 from pipeline.store.manifest import fragment_paths, read_manifest
+from pipeline.store.schema import DIGESTS_KEY
 from pipeline.store.shard import Shard, write_shard
-from tests.pipeline.made import SPENT, made_job, made_verdict
+from tests.pipeline.made import honest_split
 
 pytestmark = pytest.mark.slow
 UNIT, UNITS = 8, 6
@@ -37,27 +30,7 @@ Row = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A split of several small shards without training: random actions solve what they solve."""
-    job, ids = made_job(str(tmp_path_factory.mktemp("data")), "size=s"), np.arange(UNIT * UNITS)
-    levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
-    before, failed = decide(levels, job.task)
-    action = np.repeat(np.random.default_rng(0).integers(0, 2, (16, 6, len(ids))), 16, axis=0).astype(np.int32)
-    action[..., [verdict is not None for verdict in before]] = 0
-    record = replay(levels, action, job.task)
-    solved, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
-    verdicts = [
-        known or made_verdict(Label.SOLVED if solved[i] else Label.UNSOLVED, failed_by_noop=bool(failed[i]))
-        for i, known in enumerate(before)
-    ]
-    path = split_path(job.out, job.budget, job.size)
-    path.mkdir(parents=True)
-    for lanes in ids.reshape(UNITS, UNIT):
-        told = [
-            dataclasses.replace(verdicts[i], steps_to_goal=int(steps[i]) if verdicts[i].label in WITNESSED else None)
-            for i in lanes
-        ]
-        result = UnitResult(lanes, take(levels, lanes), take(record, lanes), told, SPENT)
-        commit(job, path, WorkUnit(tuple(lanes.tolist())), result)
+    path = honest_split(tmp_path_factory.mktemp("data"), UNIT, UNITS)
     assert set(read_manifest(path, ["label"]).labels) == set(Label)
     return path
 
@@ -67,15 +40,20 @@ def split(honest: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(honest, tmp_path / "s"))
 
 
-def forge(split: Path, change: Callable[[Row], None], level_ids: list[int] | None = None) -> None:
-    """Change rows, and write their fragments as they were written."""
+def forge(split: Path, change: Callable[[Row], None] = lambda row: None, level_ids: list[int] | None = None) -> None:
+    """Change rows, and write their fragments with every checksum, as if all were right."""
     for path in fragment_paths(split):
         table = pq.read_table(path)
         rows = table.to_pylist()
         for row in rows:
             if level_ids is None or row["level_id"] in level_ids:
                 change(row)
-        pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), path, write_page_checksum=True)
+        names = {row["shard"] for row in rows if row["shard"] and (split / row["shard"]).exists()}
+        digests = {DIGESTS_KEY: json.dumps({name: digests_of(split / name) for name in names})}
+        whole = pa.BufferOutputStream()
+        forged = pa.Table.from_pylist(rows, schema=table.schema.with_metadata(table.schema.metadata | digests))
+        pq.write_table(forged, whole, write_page_checksum=True)
+        path.write_bytes(with_own(whole.getvalue().to_pybytes()))
 
 
 def of_label(split: Path, *labels: Label) -> list[Row]:
@@ -96,6 +74,7 @@ def exchange_worlds(split: Path, a: Row, b: Row) -> None:
     arrays = shard.read(order)
     shutil.rmtree(path)
     write_shard(path, shard.level_ids, arrays)
+    forge(split)
 
 
 def of_another_stack(row: Row) -> None:
@@ -103,7 +82,7 @@ def of_another_stack(row: Row) -> None:
 
 
 def assert_told(split: Path, *sentences: str) -> None:
-    wrong = examine(split).wrong
+    wrong = examine(split).sentences
     assert len(wrong) == len(sentences), wrong
     for sentence, told in zip(sentences, sorted(wrong), strict=True):
         assert sentence in told
@@ -115,7 +94,7 @@ def test_an_honest_split_has_nothing_wrong(honest: Path, monkeypatch: pytest.Mon
     counted = lambda level, action, rules: counts.append(action.shape[-1]) or replay(level, action, rules)
     monkeypatch.setattr(evidence, "replay", counted)
     found = examine(honest)
-    assert found.wrong == []
+    assert found.sentences == []
     assert (found.levels, found.shards) == (UNIT * UNITS, len(read_manifest(honest).shards))
     assert found.witnesses == found.same_bits == len(of_label(honest, *WITNESSED))
     assert counts == [found.witnesses]
@@ -198,6 +177,7 @@ def test_a_record_that_differs_in_one_bit(split: Path) -> None:
     arrays["record/reward"].view(np.uint32)[7, row["row"]] ^= 1
     shutil.rmtree(shard.path)
     write_shard(shard.path, shard.level_ids, arrays)
+    forge(split)
     assert_told(split, f"Level {row['level_id']} has a witness that does not replay: its reward differs.")
     forge(split, of_another_stack)
     assert_told(split)
@@ -210,12 +190,13 @@ def test_a_hostile_shard_is_one_sentence_and_the_others_are_looked_at(split: Pat
     arrays["level/model/joint_a"][:] = 200
     shutil.rmtree(shard.path)
     write_shard(shard.path, shard.level_ids, arrays)
+    forge(split)
     found = examine(split)
-    (sentence,) = found.wrong
+    (sentence,) = found.sentences
     assert "its field level/model/joint_a has numbers that size s cannot have" in sentence
     assert 0 < found.witnesses == len(of_label(split, *WITNESSED)) - len(shard.level_ids)
     for name in ("/etc", "../../elsewhere", row["shard"]):
         if name == row["shard"]:
             shutil.rmtree(split / "shards")
         forge(split, lambda row, name=name: row.update(shard=name), [row["level_id"]])
-        assert all(sentence.startswith(("The manifest of ", "The shard ")) for sentence in examine(split).wrong)
+        assert all(sentence.startswith(("The manifest of ", "The shard ")) for sentence in examine(split).sentences)

@@ -223,7 +223,9 @@ def test_a_group_that_is_none(shard: Path, text: str) -> None:
 
 def test_another_size_than_its_row_says(shard: Path) -> None:
     assert open_shard(shard.parents[1], NAME, "s").size == Shard(shard).size
-    with pytest.raises(Failure, match=r"has levels of size s, and its row says m\): delete .*\.parquet and run"):
+    with pytest.raises(
+        Failure, match=r"has levels of size s, and its row says m\): run `levelproof verify .* --repair`"
+    ):
         open_shard(shard.parents[1], NAME, "m")
 
 

@@ -130,7 +130,7 @@ def test_any_damaged_byte_of_a_fragment_is_seen_or_harmless(tmp_path: Path, job:
 def test_a_fragment_that_is_none_is_named(tmp_path: Path, job: JobConfig, content: bytes) -> None:
     path = commit(tmp_path, job, [0])
     path.write_bytes(content)
-    with pytest.raises(Failure, match=r"is damaged .* delete it and run the same `levelproof generate` again"):
+    with pytest.raises(Failure, match=r"is damaged .* run `levelproof verify .* --repair` to make its levels again"):
         read_manifest(tmp_path)
 
 

@@ -1,0 +1,38 @@
+"""What people see while something long is looked at: a bar on a terminal, a line now and then elsewhere. On stderr."""
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+LINE_EVERY = 30.0  # s between plain lines
+
+
+class Pace:
+    """Counts what is done of a total."""
+
+    def __init__(self, what: str, total: int, console: Console | None) -> None:
+        self._what, self._console, self._line_at = what, console, time.monotonic()
+        self._quiet = console is None or not console.is_terminal
+        columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeRemainingColumn()
+        self._bar = Progress(*columns, console=console, transient=True, disable=self._quiet)
+        self._task = self._bar.add_task("", total=max(total, 1))
+
+    def __enter__(self) -> "Pace":
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._bar.stop()
+
+    def advance(self, count: int) -> None:
+        """So many more are done."""
+        self._bar.advance(self._task, count)
+        (task,) = self._bar.tasks
+        text = f"{task.completed:,.0f}/{task.total:,.0f} {self._what} · {task.speed or 0:,.0f}/s"
+        self._bar.update(self._task, description=text)
+        if self._quiet and self._console and time.monotonic() - self._line_at >= LINE_EVERY:
+            self._line_at = time.monotonic()
+            left = f" · about {task.time_remaining:,.0f} s left" if task.time_remaining else ""
+            self._console.print(text + left, highlight=False, markup=False, soft_wrap=True)

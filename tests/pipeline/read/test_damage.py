@@ -1,0 +1,182 @@
+"""Damage of every kind is found, wherever in a split it is, and named with the levels that it hits."""
+
+import random
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pipeline.jobs.seal import seal_split
+from pipeline.read.findings import Findings
+from pipeline.read.verify import examine
+from pipeline.store.layout import JOB
+from pipeline.store.manifest import fragment_paths, read_fragment
+from tests.pipeline.made import honest_split
+
+pytestmark = pytest.mark.slow
+FLIPS = 1000
+
+
+@pytest.fixture(scope="module")
+def unsealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return honest_split(tmp_path_factory.mktemp("unsealed"), 4, 6)
+
+
+@pytest.fixture(scope="module")
+def mixed(unsealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four units in two sealed fragments, and two units that came later."""
+    split, later = tmp_path_factory.mktemp("mixed") / "s", tmp_path_factory.mktemp("later")
+    shutil.copytree(unsealed, split)
+    kept = fragment_paths(split)[4:]
+    for path in kept:
+        path.rename(later / path.name)
+    seal_split(split, 8, Console(quiet=True))
+    for path in kept:
+        (later / path.name).rename(path)
+    assert len(fragment_paths(split)) == 4
+    return split
+
+
+def files_of(split: Path) -> dict[Path, set[int]]:
+    """All that is committed, and the levels that each file is there for."""
+    files: dict[Path, set[int]] = {split / JOB: set()}
+    for fragment in fragment_paths(split):
+        rows = read_fragment(fragment, ["level_id", "shard", "experts"])[1].to_pylist()
+        files[fragment] = {row["level_id"] for row in rows}
+        for row in rows:
+            for name in filter(None, (row["shard"], row["experts"])):
+                for file in [split / name, *(split / name).rglob("*")]:
+                    if file.is_file():
+                        files.setdefault(file, set()).add(row["level_id"])
+    return files
+
+
+def flip(file: Path, random: random.Random) -> None:
+    content = bytearray(file.read_bytes())
+    content[random.randrange(len(content))] ^= random.randrange(1, 256)
+    file.write_bytes(content)
+
+
+def hit(found: Findings) -> set[int]:
+    return {level_id for level_ids in found.wrong.values() for level_id in level_ids}
+
+
+def assert_named(found: Findings, split: Path, file: Path, levels: set[int]) -> None:
+    """Nothing but this file is damaged: all of its levels are named, or of its trajectories some."""
+    assert found.sentences
+    if file.name == JOB:
+        assert f"The file {file} is" in found.sentences[0]
+    named = hit(found)
+    if "c" in file.relative_to(split).parts:
+        assert named
+        assert named <= levels
+    else:
+        assert named == levels
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Callable[[Path], Path]:
+    return lambda split: Path(shutil.copytree(split, tmp_path / "s"))
+
+
+@pytest.mark.parametrize("kind", ["unsealed", "mixed"])
+def test_flips_in_many_files_at_once(kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest) -> None:
+    """One in each of ten; what is hit is what they hold, and what they do not is looked at nevertheless."""
+    split, chance = copied(request.getfixturevalue(kind)), random.Random(0)
+    assert not examine(split).wrong
+    files = files_of(split)
+    chosen = chance.sample(sorted(files.keys() - {split / JOB}), 9)
+    for file in [*chosen, split / JOB]:
+        flip(file, chance)
+    found = examine(split)
+    assert any(f"{split / JOB}" in sentence for sentence in found.sentences)
+    named, all_of_them = hit(found), set[int]().union(*(files[file] for file in chosen))
+    assert named <= all_of_them
+    for file in chosen:
+        assert named & files[file], file
+        assert "c" in file.relative_to(split).parts or files[file] <= named, file
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["unsealed", "mixed"])
+def test_each_of_a_thousand_flips(kind: str, request: pytest.FixtureRequest) -> None:
+    split, chance = request.getfixturevalue(kind), random.Random(1)
+    files = files_of(split)
+    for _ in range(FLIPS // 2):
+        file = chance.choice(sorted(files))
+        before = file.read_bytes()
+        try:
+            flip(file, chance)
+            assert_named(examine(split), split, file, files[file])
+        finally:
+            file.write_bytes(before)
+    assert not examine(split).wrong
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["unsealed", "mixed"])
+def test_each_file_cut_off_lengthened_or_gone(kind: str, request: pytest.FixtureRequest) -> None:
+    split, chance = request.getfixturevalue(kind), random.Random(2)
+    for file, levels in sorted(files_of(split).items()):
+        before = file.read_bytes()
+        for after in (before[: chance.randrange(len(before))], before[:-1], before + b"\0", b"", None):
+            if after is None:
+                file.unlink()
+            else:
+                file.write_bytes(after)
+            found = examine(split)
+            file.write_bytes(before)
+            if file.suffix == ".parquet" and after is None:
+                assert found.missing
+                assert "no fragment has them" in " ".join(found.sentences)
+            else:
+                assert_named(found, split, file, levels)
+
+
+def exchange(a: Path, b: Path) -> None:
+    other = a.with_name("other")
+    a.rename(other)
+    b.rename(a)
+    other.rename(b)
+
+
+@pytest.mark.parametrize("kind", ["unsealed", "mixed"])
+def test_what_is_exchanged(kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest) -> None:
+    """Two shards, two fragments, two files of chunks; and a file that was not there."""
+    split = copied(request.getfixturevalue(kind))
+    fragments, shards = fragment_paths(split), sorted((split / "shards").iterdir())
+    files = files_of(split)
+    chunks = [shards[1] / "dyn32/c/0/0/0", shards[2] / "dyn32/c/0/0/0"]
+    for a, b in (shards[:2], fragments[:2], chunks):
+        exchange(a, b)
+        found = examine(split)
+        exchange(a, b)
+        levels = set[int]().union(*(of for file, of in files.items() if {a, b} & {file, *file.parents}))
+        assert hit(found) == levels, (a, b)
+    (shards[0] / "more").touch()
+    assert examine(split).sentences == [
+        f"The file {shards[0]}/more is not what was committed ({_hits(files[shards[0] / 'zarr.json'])})."
+    ]
+
+
+def _hits(levels: set[int]) -> str:
+    from pipeline.read.findings import _levels
+
+    return _levels(levels)
+
+
+def test_what_is_missing(copied: Callable[[Path], Path], unsealed: Path) -> None:
+    split = copied(unsealed)
+    files = files_of(split)
+    first, second = fragment_paths(split)[:2]
+    first.unlink()
+    shard = next(path for path in sorted((split / "shards").iterdir()) if path.name.startswith(second.stem))
+    levels = files[shard / "zarr.json"]
+    shutil.rmtree(shard)
+    found = examine(split)
+    assert found.missing == [] or set(range(*found.missing[0])) <= files[first]
+    assert hit(found) | {i for a, b in found.missing for i in range(a, b + 1)} == files[first] | levels
+    (split / JOB).unlink()
+    assert any("nobody knows which levels" in sentence for sentence in examine(split).sentences)
