@@ -35,6 +35,5 @@ def run(arguments: argparse.Namespace) -> Exit:
 
         return repair(arguments.split, arguments.repair, Console(stderr=True))
     from pipeline.read.verify import verify
-    from pipeline.store.remote import require_folder
 
     return verify(arguments.split, arguments.json, Console(stderr=True))

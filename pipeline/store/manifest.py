@@ -155,7 +155,9 @@ def read_fragment(
             )
             if not file.schema_arrow.equals(schema_of(COLUMNS.names, compact)) or true_hash != fragment.config_hash:
                 raise ValueError("its footer has other columns or another configuration than were written")
-            groups = [i for i in range(about.num_row_groups) if _may_have(about.row_group(i), level_ids)]
+            groups = list(range(about.num_row_groups))
+            if level_ids is not None and groups[1:]:  # of damaged statistics Arrow aborts: not read without need
+                groups = [i for i in groups if _may_have(about.row_group(i), level_ids)]
             table = file.read_row_groups(groups, None if columns is None else list(columns), use_threads=False)
     except FileNotFoundError:
         raise
@@ -169,12 +171,10 @@ def read_fragment(
     return fragment, table
 
 
-def _may_have(group: pq.RowGroupMetaData, level_ids: np.ndarray | None) -> bool:
+def _may_have(group: pq.RowGroupMetaData, level_ids: np.ndarray) -> bool:
     """Whether any of these levels (ascending ids) may be in a group of rows."""
     ids = group.column(COLUMNS.names.index("level_id")).statistics
-    if level_ids is None or ids is None or not ids.has_min_max:
-        return True
-    return _any_within(level_ids, ids.min, ids.max)
+    return ids is None or not ids.has_min_max or _any_within(level_ids, ids.min, ids.max)
 
 
 def _any_within(ordered: np.ndarray, first: int, last: int) -> bool:
