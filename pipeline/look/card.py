@@ -96,6 +96,7 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
         budget=table.column("budget")[0].as_py(),
         distribution=_distribution(config),
         config_hash=manifest.config_hash or "",
+        stored_as=", ".join(sorted(set[str]().union(*(of.densities for of in manifest.counting)))),
         made_with=_made_with(table),
     )
 

@@ -57,6 +57,7 @@ class SplitFacts:
     budget: str
     distribution: str  # in words
     config_hash: str
+    stored_as: str  # densities, in the words of settings
     made_with: Sequence[str]  # each stack of versions and device
 
     @property
@@ -131,7 +132,8 @@ is another task.
 the engine, and reached the goal. `levelproof verify` does it again on your machine.
 - **All that was tried is here.** The manifests have a row for each of {tried} levels, unsolved ones too, with what \
 was tried, learning curves and costs; `trivial` and `unsolvable` ones are told apart, each with its reason.
-- **The whole state is stored**, at every step: draw it, observe it in any way, and start an environment from it."""
+- **The whole world at every step**, stored or computed again by the engine, the same bits: draw it, observe it in any \
+way, and start an environment from it."""
 
 
 def _sizes(splits: Sequence[SplitFacts]) -> str:
@@ -186,20 +188,20 @@ def _format(wishes: Wishes) -> str:
 
 - `manifest/*.parquet`: a row for every level that was tried. `label` and `label_reason`, `steps_to_goal`, success \
 rates, what it cost, `shard` and `row` of its data, and the command that makes the row again.
-- `shards/*.zarr`: zarr v3. A record of {RECORD_STEPS} steps for each level with a witness: world, contacts, action, \
-reward, end and goal, with a restart of the level after every end. One trajectory is one compressed chunk with a \
-checksum.
+- `shards/*.zarr`: zarr v3. A record of {RECORD_STEPS} steps for each level with a witness, with a restart of the \
+level after every end; how much of it is stored is the split's density, and reading gives world, contacts, action, \
+reward, end and goal whatever that is. One trajectory is one compressed chunk with a checksum.
 - `{PREVIEW}/*.parquet`: a sample of the levels with pictures, which the viewer shows.
 
-Columns and fields with their units: {_link("docs/storage.md", wishes.code, "/blob/main/docs/storage.md")}."""
+Columns and fields: {_link("docs/storage.md", wishes.code, "/blob/main/docs/storage.md")} and \
+{_link("docs/shards.md", wishes.code, "/blob/main/docs/shards.md")}."""
 
 
 def _making(splits: Sequence[SplitFacts], wishes: Wishes) -> str:
-    rows = ["| split | budget | levels are | configuration | made with |", "|---|---|---|---|---|"]
+    rows = ["| split | budget | levels are | configuration | stored as | made with |", "|---" * 6 + "|"]
     for of in splits:
-        rows.append(
-            f"| `{of.path}` | {of.budget} | {of.distribution} | `{of.config_hash}` | {'; '.join(of.made_with)} |"
-        )
+        stored, stacks = f"`{of.stored_as}`", "; ".join(of.made_with)
+        rows.append(f"| `{of.path}` | {of.budget} | {of.distribution} | `{of.config_hash}` | {stored} | {stacks} |")
     first = splits[0]
     return (
         "## How it was made\n\nEvery level got an expert of its own, trained with PPO for at most the budget's steps, "

@@ -56,10 +56,13 @@ def _level_fields(size: Size) -> list[FieldSpec]:
 
 
 def _nested(values: np.ndarray) -> pa.Array:
-    """(level, ...) as one entry a level, of lists within lists."""
+    """(level, ...) as one entry a level, of lists within lists.
+
+    Not of fixed-size lists: pyarrow 26 dies of a segmentation fault where rows of those, in chunks, are filtered.
+    """
     column = pa.array(np.ascontiguousarray(values).reshape(-1))
     for length in reversed(values.shape[1:]):
-        column = pa.FixedSizeListArray.from_arrays(column, length)
+        column = pa.ListArray.from_arrays(np.arange(0, len(column) + 1, length, dtype=np.int32), column)
     return column
 
 

@@ -70,13 +70,14 @@ def _groups(manifest: Manifest, rows: pa.Table) -> Iterator[pa.Table]:
 def with_worlds(manifest: Manifest, rows: pa.Table) -> pa.Table:
     """These rows of a manifest, with their levels' columns beside them, but for those that come out otherwise here."""
     level = levels_of(manifest, rows)
-    for name, column in columns_for(level).items():
-        rows = rows.append_column(name, column)
     same = np.ones(rows.num_rows, bool)
     made = np.flatnonzero(rows.column("shard").is_null())
     hashes = rows.column("content_hash").to_pylist()
     same[made] = [ours == hashes[i] for i, ours in zip(made, content_hashes(take(level, made)), strict=True)]
-    return rows.filter(pa.array(same))
+    rows = rows.filter(pa.array(same))
+    for name, column in columns_for(take(level, np.flatnonzero(same))).items():
+        rows = rows.append_column(name, column)
+    return rows
 
 
 def _write(path: Path, groups: Iterator[pa.Table], metadata: dict[bytes, bytes]) -> int:

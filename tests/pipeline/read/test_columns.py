@@ -44,6 +44,15 @@ def test_rows_may_be_chosen_and_put_in_order() -> None:
         assert same_bits(values[..., [3, 4, 1]], chosen[name]).all(), name
 
 
+def test_rows_in_many_chunks_are_filtered() -> None:
+    """As of a file with many row groups."""
+    level = made_level("m", 40)
+    chunks = pa.concat_tables([table_of(level, "m").slice(first, 8) for first in range(0, 40, 8)])
+    even = arrays_of(levels_from(chunks.filter(pa.array([i % 2 == 0 for i in range(40)]))))
+    for name, values in arrays_of(level).items():
+        assert same_bits(values[..., ::2], even[name]).all(), name
+
+
 def test_what_has_no_levels_is_refused() -> None:
     table = table_of(made_level("s"), "s")
     other = lambda name, column: table.set_column(table.schema.get_field_index(name), name, column)
