@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pipeline.read.dataset.dataset import Dataset as Dataset
     from pipeline.read.dataset.dataset import open as open
     from pipeline.store.manifest import read_manifest as read_manifest
+    from pipeline.store.shard import EngineDiffers as EngineDiffers
     from pipeline.store.shard import Shard as Shard
     from pipeline.version import __version__ as __version__
 
@@ -34,6 +35,7 @@ HOME = {
     "Batch": "pipeline.read.dataset.batch",
     "Dataset": "pipeline.read.dataset.dataset",
     "SIZES": "levelgen.level",
+    "EngineDiffers": "pipeline.store.shard",
     "Distribution": "levelgen.sampling.distribution",
     "Level": "levelgen.level",
     "LevelFile": "levelgen.files.level_file",
