@@ -57,8 +57,9 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
     manifest, shown = require_manifest(split, [*READ, *columns_in(where)], compact=True), max(rows, 0)
     chosen = select(manifest.table, where)
     labels, reasons = _counts(chosen, "label"), _counts(chosen, "label_reason")
+    told = chosen.select(["label_reason", "steps_to_goal", "steps_to_first_success", "env_steps"])
     solved, unsolved, unsolvable = (
-        chosen.filter(pc.equal(chosen["label"], label.value))  # pyright: ignore[reportAttributeAccessIssue]
+        told.filter(pc.equal(chosen["label"], label.value))  # pyright: ignore[reportAttributeAccessIssue]
         for label in (Label.SOLVED, Label.UNSOLVED, Label.UNSOLVABLE)
     )
     tried, ids = solved.num_rows + unsolved.num_rows, chosen["level_id"].to_numpy()
