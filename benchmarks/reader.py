@@ -24,6 +24,11 @@ BATCH = 64
 BUDGET = "64k"
 LEVELS = {"s": 512, "m": 192, "l": 96}  # that are tried; two thirds get a witness
 DENSITIES = ("full", "witness")
+TABLES = {
+    "rate": "Trajectories/s",
+    "copied": "Trajectories/s, with every array copied as well",
+    "core_rate": "Trajectories a second of a core",
+}
 TARGETS = {"s": 6, "m": 5, "l": 3}  # times the reference's
 
 
@@ -38,7 +43,7 @@ def run(given: argparse.Namespace) -> Report:
     return Report(
         title="Reading trajectories",
         results=results,
-        tables=[table(results, "rate", "Trajectories/s"), table(results, "copied", "With every array copied as well")],
+        tables=[table(results, what, title) for what, title in TABLES.items()],
         notes=[
             f"Random batches of {BATCH} whole trajectories with every field, after {WARM} to warm up; the reference's "
             "are runs of neighbours in a random order, ours are drawn one by one. Both give arrays (batch, time, ...) "

@@ -17,17 +17,19 @@ WARM = 24  # batches before the clock starts
 
 
 def rates(following: Callable[[], Any], arrays: Callable[[Any], list], batch: int, seconds: float) -> dict[str, float]:
-    """Trajectories a second: as they come, and with every array copied to one without gaps."""
+    """Trajectories a second and, as `core_...`, a second of a core: as they come, and with every array copied."""
 
-    def rate(use: Callable[[Any], object]) -> float:
-        start, count = time.perf_counter(), 0
+    def rate(use: Callable[[Any], object]) -> tuple[float, float]:
+        start, used, count = time.perf_counter(), time.process_time(), 0
         while time.perf_counter() - start < seconds:
             use(following())
-            count += 1
-        return count * batch / (time.perf_counter() - start)
+            count += batch
+        return count / (time.perf_counter() - start), count / (time.process_time() - used)
 
-    copied = lambda found: [np.ascontiguousarray(x) for x in arrays(found)]
-    return {"rate": rate(lambda found: found), "copied": rate(copied)}
+    (plain, of_core), (copied, copied_of_core) = (
+        rate(use) for use in (lambda found: found, lambda found: [np.ascontiguousarray(x) for x in arrays(found)])
+    )
+    return {"rate": plain, "core_rate": of_core, "copied": copied, "core_copied": copied_of_core}
 
 
 def main() -> None:

@@ -130,6 +130,7 @@ class Dataset:
         windows, kind, chosen = Windows.of(length), kind_of(observation), named(fields, self.size)
         numbers = np.asarray(numbers, np.int64)
         starts = np.broadcast_to(np.asarray(first, np.int64), numbers.shape)
+        _require_steps(starts)
         needed = [*chosen, *ALWAYS, *named(["level", *(["record/state"] if kind else [])], self.size)]
         arrays = windows.cut(self._arrays(numbers, needed), starts)
         level, mask = tree_of(Level, arrays, "level/"), windows.mask(starts)
@@ -224,8 +225,7 @@ class Dataset:
         the stack that made it.
         """
         numbers, steps = np.broadcast_arrays(np.asarray(number, np.int64), np.asarray(step, np.int64))
-        if numbers.size and not (0 <= steps.min() <= steps.max() < RECORD_STEPS):
-            raise UserError(f"There is no step {steps.max()} in a record: give 0 to {RECORD_STEPS - 1}.")
+        _require_steps(steps)
         fields = named(["level", "record/state", "record/timestep", "record/last_distance"], self.size)
         arrays = self._arrays(numbers.ravel(), fields)
         rows = np.arange(numbers.size)
@@ -257,8 +257,8 @@ class Dataset:
 
     def _arrays(self, numbers: Int[np.ndarray, " batch"], fields: Sequence[str]) -> dict[str, np.ndarray]:
         """Named arrays of trajectories, level axis first; looked for again where a seal has moved them."""
-        if numbers.size and not (0 <= numbers.min() <= numbers.max() < len(self)):
-            raise UserError(f"There is no trajectory {numbers.max()}: {self.split} has {len(self)} of these.")
+        if not numbers.size or numbers.min() < 0 or numbers.max() >= len(self):
+            raise UserError(f"There are no trajectories {numbers.tolist()}: give some from 0 to {len(self) - 1}.")
         while True:
             manifest = self._manifest
             try:
@@ -279,6 +279,11 @@ class Dataset:
                 manifest = manifest.set_column(at, name, moved[name].combine_chunks())
             self._manifest = manifest
             return not same
+
+
+def _require_steps(steps: np.ndarray) -> None:
+    if ((steps < 0) | (steps >= RECORD_STEPS)).any():
+        raise UserError(f"There are no steps {steps.tolist()} in a record: give some from 0 to {RECORD_STEPS - 1}.")
 
 
 def _opened_again(opened_with: tuple, fingerprint: str) -> Dataset:

@@ -41,7 +41,7 @@ class Windows(NamedTuple):
 
     def cut(self, arrays: Mapping[str, np.ndarray], first: Int[np.ndarray, " item"]) -> dict[str, np.ndarray]:
         """The windows of whole records [item, time, ...]; what does not change along time is left as it is."""
-        if self.length == RECORD_STEPS:
+        if self.length == RECORD_STEPS and not first.any():
             return dict(arrays)
         steps = np.minimum(first[:, None] + np.arange(self.length), RECORD_STEPS - 1)
         rows = np.arange(len(first))[:, None]

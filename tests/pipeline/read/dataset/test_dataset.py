@@ -71,6 +71,9 @@ def test_windows_are_parts_of_trajectories(data: Dataset) -> None:
     assert_same(cut.state.position[0, :6], whole.state.position[0, 250:])
     assert_same(cut.state.position[1], whole.state.position[1, 4:14])
     assert cut.mask.sum(1).tolist() == [6, 10]
+    late = data.read([3], first=200, fields=["record/state"], observation=None)
+    assert_same(late.state.position[0, :56], whole.state.position[0, 200:])
+    assert late.mask.sum() == 56
 
 
 def test_an_observation_is_that_of_the_environment(data: Dataset) -> None:
@@ -190,7 +193,11 @@ def test_what_cannot_be_opened_is_a_sentence(split: Path, tmp_path: Path) -> Non
         open(split, validation=2)
     with pytest.raises(UserError, match="trajectories is in the part validation: open with another validation="):
         open(split, validation=0).batches(8, part="validation")
-    with pytest.raises(UserError, match="There is no trajectory 999"):
-        open(split).read([999])
-    with pytest.raises(UserError, match="There is no step 256 in a record"):
-        open(split).state(0, 256)
+    for numbers in ([999], [-1, 0], []):
+        with pytest.raises(UserError, match="There are no trajectories"):
+            open(split).read(numbers)
+    for step in (256, -1):
+        with pytest.raises(UserError, match=f"There are no steps {step} in a record"):
+            open(split).state(0, step)
+        with pytest.raises(UserError, match=rf"There are no steps \[{step}\] in a record"):
+            open(split).read([0], first=step)
