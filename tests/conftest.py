@@ -18,8 +18,14 @@ from pipeline.runtime import CACHE_VARIABLE, prepare_jax
 
 ROOT = Path(__file__).parent.parent
 DEMANDED = "LEVELPROOF_TEST_ORACLE"
-MOST_MAPS = 20_000
-FIRST, BESIDE = ROOT / "tests/pipeline/jobs/test_unit.py", ROOT / "tests/physics"
+MOST_MAPS = 40_000
+# Tests that one process runs, one after another, because they trace and load the same programs. Those of jobs come
+# first: they compile what all commands and workers load afterwards; physics, beside them, uses none of that.
+TOGETHER = {
+    "jobs": ("tests/pipeline/jobs", "tests/pipeline/cli", "tests/test_manifests", "tests/benchmarks/test_handmade"),
+    "experts": ("tests/experts",),
+}
+FIRST, BESIDE = "jobs", "tests/physics/"
 DESELECTED = pytest.StashKey[int]()
 
 os.environ.setdefault(CACHE_VARIABLE, str(ROOT / ".pytest_cache" / "levelproof"))
@@ -55,14 +61,21 @@ def reference() -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What runs the reference is a campaign: golden states stand for it in the other tests.
 
-    The first file compiles the programs of experts that all commands and workers load afterwards; physics, beside it,
-    uses none of them. Then files with slow tests, so that no process is left alone with one of them at the end.
+    Groups of files with many slow tests come first, so that no process is left alone with one of them at the end.
     """
     for item in items:
         if "reference" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.campaign)
-    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: (item.path != FIRST, BESIDE not in item.path.parents, -slow[item.path]))
+        item.add_marker(pytest.mark.xdist_group(group_of(item)))
+    slow = Counter(group_of(item) for item in items if item.get_closest_marker("slow"))
+    beside = lambda group: not group.startswith(BESIDE)
+    items.sort(key=lambda item: ((group := group_of(item)) != FIRST, beside(group), -slow[group]))
+
+
+def group_of(item: pytest.Item) -> str:
+    """What runs in one process: a file, or the group that it belongs to."""
+    name = item.path.relative_to(ROOT).as_posix()
+    return next((group for group, paths in TOGETHER.items() if name.startswith(paths)), name)
 
 
 def pytest_deselected(items: list[pytest.Item]) -> None:

@@ -41,7 +41,7 @@ def new_archive(start: Reached, config: SearchConfig) -> Archive:
     """Archives with nothing but the levels' starts [level, 1, ...]."""
     count, entries = len(start.steps), config.entries
     widen = lambda x: jnp.pad(x, [(0, 0), (0, entries - 1)] + [(0, 0)] * (x.ndim - 2))
-    width, entry = jnp.full(count, config.width), jax.tree.map(widen, start)
+    width, entry = jnp.full(count, config.width, jnp.float32), jax.tree.map(widen, start)
     used = jnp.broadcast_to(jnp.arange(entries) == 0, (count, entries))
     ones = jnp.ones(count, jnp.int32)
     return Archive(entry, used, keys_of(entry.feature, width), jnp.zeros((count, entries), jnp.int32), width, ones)

@@ -14,7 +14,7 @@ from configs.compose import compose_job
 from configs.errors import ConfigError
 from levelgen.files.level_file import LevelFile, read_level_file, write_level_file
 from levelgen.identity.content import content_hashes, level_id_for
-from levelgen.level import SIZES
+from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import TaskParams
 from pipeline.jobs.schedule import WorkUnit, plan_units
@@ -25,16 +25,24 @@ from pipeline.read.level_files import LevelUnseen, level_at, levels_below
 from pipeline.read.verify import examine
 from pipeline.store.manifest import read_manifest
 from pipeline.store.origins import Origin
+from tests.experts.search.worlds import switchback
 from tests.pipeline.command import assert_refused, here, run
 
 WORDS = ["procedure=label", "budget=5k", "executor=inline"]
 IDS = TRIVIAL, UNSOLVABLE = 1, 16  # of size s: the first gets a shard, the second does not
 
 
-def write(folder: Path, level_id: int, name: str, size: str = "s", rules: TaskParams | None = None) -> Path:
+def still() -> Level:
+    """Of another size, and nothing acts in it: next to no program is compiled for that size."""
+    level = switchback()
+    level.model.thruster_active[...] = False
+    return level
+
+
+def write(folder: Path, level_id: int, name: str, rules: TaskParams | None = None) -> Path:
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
-    level = jax.tree.map(np.asarray, sample_levels([level_id], SIZES[size]))
+    level = jax.tree.map(np.asarray, sample_levels([level_id], SIZES["s"]))
     write_level_file(LevelFile(level, rules or TaskParams()), path)
     return path
 
@@ -51,7 +59,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write(folder / "mine", TRIVIAL, "a.json")
     write(folder / "mine", TRIVIAL, "deeper/copy.json")
     write(folder / "mine", UNSOLVABLE, "deeper/b c.json")
-    write(folder / "mine", 0, "m.json", "m")
+    write_level_file(LevelFile(still(), TaskParams()), folder / "mine/larger.json")
     write(folder / "mine", 1, "rules.json", rules=replace(TaskParams(), frame_skip=4))
     (folder / "mine/bad.json").write_text("{")
     done = here(["generate", "level_files=mine", *WORDS], folder)
@@ -74,7 +82,7 @@ def folder(once: Path, tmp_path: Path) -> Path:
 def test_rows_are_named_by_file_and_content(once: Path) -> None:
     rows = rows_of(once / "data/5k/s")
     assert {name: row["label"] for name, row in rows.items()} == {"a.json": "trivial", "b c.json": "unsolvable"}
-    assert rows_of(once / "data/5k/m").keys() == {"m.json"}
+    assert rows_of(once / "data/5k/6-2-1-2").keys() == {"larger.json"}
     for row in rows.values():
         assert row["content_hash"] == content_hashes(read_level_file(Path(row["file"])).level)[0]
         assert row["level_id"] == level_id_for(row["content_hash"])

@@ -1,4 +1,4 @@
-"""Runs on real Ray workers, undisturbed and killed in every way: afterwards the split is the same."""
+"""Runs on real Ray workers, undisturbed and killed in every way: afterwards the split is that of one without Ray."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ import pytest
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard
-from tests.pipeline.command import PATIENCE, ROOT, descendants, heed_ctrl_c, here, run, start, status, title, until
+from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, run, start, status, title, until
 
 LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
 COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
@@ -24,8 +24,9 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without Ray."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    done = run(COMMAND, folder)
+    done = here([*COMMAND, "executor=inline"], folder)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     return folder / SPLIT
@@ -60,16 +61,18 @@ def assert_all_gone(pids: set[int]) -> None:
         time.sleep(0.1)
 
 
-def test_an_undisturbed_run_is_whole_and_leaves_no_process(undisturbed: Path) -> None:
+def test_an_undisturbed_run_is_whole(undisturbed: Path) -> None:
     manifest = read_manifest(undisturbed)
     assert manifest.level_ids.tolist() == list(range(LEVELS))
     assert "solved" in manifest.labels
     assert not (undisturbed / "quarantine").exists()
 
 
-def test_without_ray_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
-    done = here([*COMMAND, "executor=inline"], tmp_path)
+@pytest.mark.campaign
+def test_with_a_worker_for_each_core_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
+    done = run(COMMAND, tmp_path)
     assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
     assert_same_content(tmp_path / SPLIT, undisturbed)
 
 
@@ -94,33 +97,27 @@ def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path) -> N
     assert_same_content(tmp_path / SPLIT, undisturbed)
 
 
-def test_kill_9_of_a_worker(undisturbed: Path, tmp_path: Path) -> None:
-    process = start([*COMMAND, ALONE], tmp_path)
-    found: list[int] = []
-    until(lambda: found.extend(workers(process)) or found, process)
-    os.kill(found[0], signal.SIGKILL)
-    _, err = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, err
-    assert "trying again" in err
-    assert "Traceback" not in err
-    assert_same_content(tmp_path / SPLIT, undisturbed)
-    assert not (tmp_path / SPLIT / "quarantine").exists()
-
-
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.campaign), signal.SIGTERM])
-def test_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
+def test_kill_9_of_a_worker_then_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
+    """Another worker takes what the dead one had, and is at work when the run is stopped."""
     process = start([*COMMAND, ALONE], tmp_path, preexec_fn=heed_ctrl_c)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    (worker,) = workers(process)
+    os.kill(worker, signal.SIGKILL)
+    before = len(fragment_paths(tmp_path / SPLIT))
+    until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before, process)
     family = descendants(process.pid)
     os.killpg(process.pid, number)  # as a terminal does
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
+    assert "trying again" in err
     assert "Stopped: " in err
     assert "Traceback" not in err
     assert_all_gone(family)
     done = here([*COMMAND, "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert_same_content(tmp_path / SPLIT, undisturbed)
+    assert not (tmp_path / SPLIT / "quarantine").exists()
 
 
 def test_the_command_itself_does_not_start_jax(tmp_path: Path) -> None:
