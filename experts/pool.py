@@ -22,12 +22,11 @@ from experts.procedure import Procedure
 from experts.queue import GROUP, empty_queue, enter, next_indices
 from experts.slots import Begun, LevelQueue, Mode, Report, Slots, empty_slots
 from experts.stop import rules_of
-from experts.witness import take
+from experts.witness import at_once, take
 from levelgen.level import Level
 from levelgen.task.rules import TaskParams
 
-LANES_IN_CACHE = 128  # their physics and one minibatch fit the cache of a core
-LANES_ON_ACCELERATOR = 32_768
+IN_CACHE = 128  # lanes: their physics and one minibatch fit the cache of a core
 QUEUED_PER_SLOT = 4  # levels: one that stays long keeps none from coming that could have a slot
 T = TypeVar("T")
 NOTHING_BEGUN: Mapping[int, Kept] = MappingProxyType({})
@@ -188,10 +187,7 @@ class Pool:
 
 def slot_count(config: ExpertConfig) -> int:
     """How many experts train side by side in one program."""
-    if config.slots:
-        return config.slots
-    lanes = LANES_IN_CACHE if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR
-    return max(1, lanes // config.environments)
+    return config.slots or at_once(config.environments, IN_CACHE)
 
 
 def capacity_of(config: ExpertConfig) -> int:

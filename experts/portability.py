@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from experts.config import RECORD_STEPS
 from experts.judge import Witness
 from experts.rollout import repeat
-from experts.witness import blocks, take
+from experts.witness import at_once, blocks, take
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task import rules as task
@@ -24,8 +24,7 @@ from levelgen.task.rules import TaskParams
 from physics.types import State
 
 LATE = 16  # env steps by which a replay may reach the goal later than the candidate
-CANDIDATES_IN_CACHE = 4  # side by side, each in as many lanes as it has replays
-CANDIDATES_ON_ACCELERATOR = 512
+IN_CACHE = 128  # lanes, of candidates side by side
 
 
 def choose(
@@ -73,9 +72,8 @@ def survival(
         replays: of each witness: their starts are the same for all witnesses of a level.
         rules: of the task.
     """
-    side_by_side = CANDIDATES_IN_CACHE if jax.default_backend() == "cpu" else CANDIDATES_ON_ACCELERATOR
     shares = []
-    for some in blocks(len(witnesses), side_by_side):
+    for some in blocks(len(witnesses), at_once(replays, IN_CACHE)):
         action = np.stack([witnesses[i].action for i in some], -1).astype(np.int8)
         steps = np.array([witnesses[i].steps for i in some], np.int32)
         shares.append(jax.device_get(_survival(take(levels, some), level_ids[some], action, steps, replays, rules)))

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from functools import partial
-from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,6 @@ from experts.witness import take
 from levelgen.level import Level
 
 GROUP = 16  # levels that enter at once
-NO_EXPERTS: Mapping[int, Begun] = MappingProxyType({})
 
 
 def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig) -> LevelQueue:
@@ -44,7 +42,7 @@ def enter(
     level_ids: Int[np.ndarray, " level"],
     success: Success,
     config: ExpertConfig,
-    begun: Mapping[int, Begun] = NO_EXPERTS,
+    begun: Mapping[int, Begun],
 ) -> LevelQueue:
     """The queue (used up) with more levels: some, at most GROUP.
 

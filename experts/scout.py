@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int, Key
 from experts.config import RECORD_STEPS, ScoutConfig
 from experts.rollout import repeat
 from experts.success import Success, no_success
-from experts.witness import blocks, take
+from experts.witness import at_once, blocks, take
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task import rules as task
@@ -24,8 +24,7 @@ from levelgen.task.rules import TaskParams
 EPISODES = 64  # lanes of a level
 STEPS_PER_ROUND = EPISODES * RECORD_STEPS
 REDRAWN = (0.02, 0.05, 0.1, 0.3)  # chance that an entry of the action is drawn anew; of a quarter of the lanes each
-LEVELS_IN_CACHE = 4  # side by side: their physics fits the cache of a core
-LEVELS_ON_ACCELERATOR = 512
+IN_CACHE = 256  # lanes: their physics fits the cache of a core
 
 
 class Scouted(NamedTuple):
@@ -47,11 +46,10 @@ def scout(levels: Level, level_ids: Int[np.ndarray, " level"], config: ScoutConf
     count = len(level_ids)
     action, length = no_success(count)
     env_steps = np.zeros(count, np.int64)
-    side_by_side = LEVELS_IN_CACHE if jax.default_backend() == "cpu" else LEVELS_ON_ACCELERATOR
     for number in range(config.rounds):
         left = np.flatnonzero(length == 0)
         env_steps[left] += STEPS_PER_ROUND
-        for block in blocks(len(left), side_by_side):
+        for block in blocks(len(left), at_once(EPISODES, IN_CACHE)):
             some = left[block]
             found = play(take(levels, some), level_ids[some], np.int32(number), rules)
             action[some], length[some] = jax.device_get(found)

@@ -24,7 +24,8 @@ from physics.buffers import zeros_of
 from physics.types import Manifold, State
 from physics.vector import select, unvec, vec
 
-LANES = 64
+LANES = 64  # of a block of replays
+LANES_ON_ACCELERATOR = 32_768  # that keep it busy
 
 T = TypeVar("T")
 
@@ -78,6 +79,11 @@ def blocks(count: int, size: int = LANES) -> Iterator[np.ndarray]:
     """Numbers of each block of so many; the last one is filled up with its last number: one program serves all."""
     for first in range(0, count, size):
         yield np.minimum(np.arange(first, first + size), count - 1)
+
+
+def at_once(lanes: int, in_cache: int) -> int:
+    """How many things of so many lanes each go through a program side by side; `in_cache` lanes fit a core's cache."""
+    return max(1, (in_cache if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR) // lanes)
 
 
 def take(tree: T, lanes: np.ndarray) -> T:

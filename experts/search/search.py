@@ -14,12 +14,11 @@ from experts.search.config import SearchConfig
 from experts.search.explore import Search, begin, explore, successes, under_way
 from experts.search.shorten import shorten
 from experts.success import Success
-from experts.witness import blocks, take
+from experts.witness import at_once, blocks, take
 from levelgen.level import Level
 from levelgen.task.rules import TaskParams
 
-LANES_IN_CACHE = 256  # their physics and archives fit the cache of a core
-LANES_ON_ACCELERATOR = 32_768
+IN_CACHE = 256  # lanes: their physics and archives fit the cache of a core
 ONE = np.zeros(1, np.int32)
 
 
@@ -102,18 +101,9 @@ class Searching:
         self.env_steps = int(self._result.env_steps.sum()) + int(np.asarray(seen.env_steps)[going].sum())
 
 
-def search(levels: Level, level_ids: Int[np.ndarray, " level"], config: SearchConfig, rules: TaskParams) -> Searched:
-    """Search every level until it has a success or has had its env steps. Arguments as of `Searching`."""
-    searching = Searching(levels, level_ids, config, rules)
-    while searching.step():
-        pass
-    return searching.result()
-
-
 def side_by_side(config: SearchConfig) -> int:
     """How many levels are searched in one program."""
-    lanes = LANES_IN_CACHE if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR
-    return max(1, lanes // config.lanes)
+    return at_once(config.lanes, IN_CACHE)
 
 
 @partial(jax.jit, static_argnames="config")

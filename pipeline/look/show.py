@@ -4,24 +4,22 @@ import shutil
 import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
 
-from experts.witness import steps_to_goal, succeeds
+from experts.config import RECORD_STEPS
+from experts.witness import Record, replay, steps_to_goal, succeeds
 from levelgen.level import ACTIONS, Level, name_of
 from levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
 from levelgen.pictures.scene import scene_of
 from levelgen.pictures.shapes import Scene
 from levelgen.pictures.svg import svg_of
 from levelgen.pictures.words import Caption
-from levelgen.task.rules import StepResult, TaskParams, TaskState, advance, has_nan, reset
+from levelgen.task.rules import TaskParams
 from physics.types import State
 from pipeline.errors import Failure, UserError
 from pipeline.read.levels import find_level, is_level_file, level_file, level_of, rules_of, writing_to
@@ -32,8 +30,7 @@ from pipeline.store.manifest import Manifest, require_manifest
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures a second
 LAST_SECONDS = 1.5  # how long a film rests on its last picture
-MOST_STEPS = 256  # env steps of doing nothing that are shown
-MOST_FRAMES = 2048  # and physics steps, whatever a level file's rules say
+MOST_FRAME_SKIP = 8  # with which doing nothing is played: a level file's rules may have any
 SHOWN_SECONDS = (0.02, 2.0)  # shortest and longest of a picture; rules may have any time step
 SHEET = (3, 2)  # columns and rows of a still
 
@@ -115,66 +112,62 @@ def recorded_film(
     if not succeeds(done, goal):
         raise Failure("The record of this level does not reach the goal: run `levelproof verify` on its split.")
     steps = int(steps_to_goal(done))
-    second = rules.frame_skip * rules.physics.dt  # of an env step
-    shown = [*range(0, steps, every), steps]
-    scenes = []
-    for step in shown:
-        last = min(step, steps - 1)
-        state = jax.tree.map(lambda x, last=last: x[last], states)
-        state = state if step < steps else _touch(state, rules)
-        caption = Caption(_title(row), f"{step * second:.1f} s", "goal reached" if step == steps else "")
-        scenes.append(scene_of(level, state, action=action[last], caption=caption))
-    seconds = [second * (after - step) for step, after in pairwise(shown)] + [LAST_SECONDS]
-    told = f"solved in {steps} step{'s' if steps > 1 else ''} ({steps * second:.1f} s)"
+    scenes, seconds = _episode(level, states, action, (steps, GOAL), rules, Caption(_title(row)), every)
+    told = f"solved in {steps} step{'s' if steps > 1 else ''} ({_length(steps, rules)})"
     return Film(scenes, seconds, f"level {row['level_id']} of size {row['size']}, {told}")
 
 
 def _without_witness(level: Level, rules: TaskParams, caption: Caption, told: str, plays: bool) -> Film:
     """What doing nothing does, or the initial world."""
-    if not plays:
+    if not plays or rules.frame_skip > MOST_FRAME_SKIP:
         scene = scene_of(level, level.state, caption=replace(caption, clock="0.0 s"))
         return Film([scene], [LAST_SECONDS], f"{told}, so this is its initial world")
-    every = STEPS_A_PICTURE * rules.frame_skip
-    states, end = do_nothing(level, rules)
-    shown, nothing = [*range(0, len(states) - 1, every), len(states) - 1], np.zeros(ACTIONS, np.int32)
-    scenes = []
-    for frame in shown:
-        now = replace(caption, clock=f"doing nothing · {frame * rules.physics.dt:.1f} s")
-        if end and frame == shown[-1]:
-            now = replace(now, outcome=end, good=end == GOAL)
-        scenes.append(scene_of(level, states[frame], action=nothing, caption=now))
-    shortest, longest = SHOWN_SECONDS
-    times = [min(max(rules.physics.dt * (after - frame), shortest), longest) for frame, after in pairwise(shown)]
-    length = f"{shown[-1] * rules.physics.dt:.1f} s"
+    record, end = do_nothing(level, rules)
+    caption = replace(caption, clock="doing nothing · ")
+    scenes, seconds = _episode(level, record.state, record.action[..., 0], end, rules, caption, STEPS_A_PICTURE)
+    length, end = _length(end[0], rules), end[1]
     told = f"{told}, so this is what doing nothing does ({f'{end} after' if end else 'the first'} {length})"
-    return Film(scenes, [*times, LAST_SECONDS], told)
+    return Film(scenes, seconds, told)
 
 
+End = tuple[int, str]  # length of a first episode, env steps, and what it ends with; "": it goes on
 GOAL, FAIL, LATE, BROKEN = "goal reached", "touched red", "time is up", "world breaks down"
 
 
-def do_nothing(level: Level, rules: TaskParams) -> tuple[list[State], str]:
-    """The worlds before and after each physics step of the first episode, and how it ends; "" if it lasts longer."""
+def do_nothing(level: Level, rules: TaskParams) -> tuple[Record, End]:
+    """The record of doing nothing."""
     prepare_jax()
-    frames = min(MOST_STEPS * rules.frame_skip, MOST_FRAMES)
-    limit = min(rules.max_timesteps * rules.frame_skip, MOST_FRAMES + 1)
-    frame = replace(rules, frame_skip=1, max_timesteps=limit, dense_reward_scale=0.0)
-    now = reset(level)
-    states = [now.state]
-    for _ in range(frames):
-        now, outcome, broken = _idle_frame(level, now, frame)
-        if broken[0]:
-            return states, BROKEN
-        states.append(now.state)
-        if outcome.done[0]:
-            return states, GOAL if outcome.goal[0] else FAIL if outcome.reward[0] < 0 else LATE
-    return states, ""
+    record = replay(level, np.zeros((RECORD_STEPS, ACTIONS, 1)), replace(rules, dense_reward_scale=0.0))
+    if not record.done.any():
+        return record, (RECORD_STEPS, "")
+    steps = int(steps_to_goal(record.done)[0])
+    if record.goal[steps - 1, 0]:
+        return record, (steps, GOAL)
+    failed = record.reward[steps - 1, 0] < 0
+    return record, (steps, FAIL if failed else LATE if steps == rules.max_timesteps else BROKEN)
 
 
-@partial(jax.jit, static_argnames="frame")
-def _idle_frame(level: Level, now: TaskState, frame: TaskParams) -> tuple[TaskState, StepResult, Bool[Array, " lane"]]:
-    after, outcome = advance(level, now, jnp.zeros((ACTIONS, 1), jnp.int32), frame)
-    return after, outcome, has_nan(after.state)
+def _episode(
+    level: Level, states: State, action: np.ndarray, end: End, rules: TaskParams, caption: Caption, every: int
+) -> tuple[list[Scene], list[float]]:
+    """A scene every so many env steps of a record's first episode, and one of its end; and the time of each."""
+    steps, outcome = end
+    shown, scenes = [*range(0, steps, every), steps], []
+    for step in shown:
+        last = min(step, steps - 1)
+        state = jax.tree.map(lambda x, last=last: x[last], states)
+        now = replace(caption, clock=caption.clock + _length(step, rules))
+        if step == steps:
+            state = _touch(state, rules)
+            now = replace(now, outcome=outcome, good=outcome == GOAL) if outcome else now
+        scenes.append(scene_of(level, state, action=action[last], caption=now))
+    (shortest, longest), second = SHOWN_SECONDS, rules.frame_skip * rules.physics.dt
+    seconds = [min(max(second * (after - step), shortest), longest) for step, after in pairwise(shown)]
+    return scenes, [*seconds, LAST_SECONDS]
+
+
+def _length(steps: int, rules: TaskParams) -> str:
+    return f"{steps * rules.frame_skip * rules.physics.dt:.1f} s"
 
 
 def write_sheet(film: Film, path: Path) -> None:

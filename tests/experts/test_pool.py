@@ -103,7 +103,7 @@ def test_entries_of_a_queue_go_round(levels: Level) -> None:
     for at in (range(12), range(12, 24), range(24, 36)):
         some, ids = part(levels, at)
         assert next_indices(queue, len(ids)) == [i % capacity for i in at]
-        queue = enter(queue, some, ids, no_success(len(ids)), CONFIG)
+        queue = enter(queue, some, ids, no_success(len(ids)), CONFIG, {})
     assert int(queue.come) == 36 > capacity
     expected = [*IDS[capacity:], *IDS[36 - capacity : capacity]]
     np.testing.assert_array_equal(queue.level_ids, expected)

@@ -16,6 +16,7 @@ from levelgen.sampling.distribution import Distribution
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, IDS, WHOLE, untouched
+from tests.experts.test_slots import same
 
 UPDATES = 24
 BUDGET = UPDATES * CONFIG.steps_per_update + 100
@@ -34,10 +35,6 @@ def reports() -> list[tuple[int, float, int]]:
 @pytest.fixture(scope="module")
 def result(levels: Level, reports) -> UnitResult:
     return label(levels, IDS, BUDGET, untouched(WHOLE), tell=lambda *now: reports.append(now))
-
-
-def same(a, b) -> None:
-    jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 def test_verdicts(result: UnitResult) -> None:

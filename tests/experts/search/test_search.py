@@ -16,14 +16,14 @@ from experts.scout import STEPS_PER_ROUND
 from experts.search.config import SearchConfig
 from experts.search.explore import Search, begin, draw, explore
 from experts.search.play import arena, fresh_walk, play
-from experts.search.search import Searched, search, side_by_side
+from experts.search.search import Searched, Searching, side_by_side
 from experts.search.shorten import shorten
 from experts.steps import EnvSteps
 from experts.success import Success
 from experts.witness import replay, take
 from levelgen.identity.keys import GENERATOR
 from levelgen.level import Level
-from levelgen.task.rules import DEFAULT_RULES
+from levelgen.task.rules import DEFAULT_RULES, TaskParams
 from tests.experts.search.worlds import broken, switchback, valley
 from tests.experts.search.worlds import side_by_side as together
 
@@ -33,6 +33,14 @@ SWITCHBACK, VALLEY, BROKEN = range(3)
 KINDS = np.array([SWITCHBACK, VALLEY, BROKEN, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY])
 IDS = np.arange(700, 700 + len(KINDS), dtype=np.int32)
 SOLVABLE = np.flatnonzero(KINDS != BROKEN)
+
+
+def search(levels: Level, level_ids: np.ndarray, config: SearchConfig, rules: TaskParams) -> Searched:
+    """Every level until it has a success or has had its env steps."""
+    searching = Searching(levels, level_ids, config, rules)
+    while searching.step():
+        pass
+    return searching.result()
 
 
 @cache
@@ -98,7 +106,8 @@ def test_another_id_is_another_search() -> None:
 def test_no_chance_twice() -> None:
     """Rounds and levels draw their own."""
     keys = begun().key
-    drawn = [draw(keys[level], jnp.int32(env_steps), CONFIG) for level in (0, 1) for env_steps in (0, ROUND)]
+    deal = jax.jit(draw, static_argnums=2)
+    drawn = [deal(keys[level], jnp.int32(env_steps), CONFIG) for level in (0, 1) for env_steps in (0, ROUND)]
     for numbers in zip(*drawn, strict=True):
         assert len({np.asarray(x).tobytes() for x in numbers}) == len(drawn)
 

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from experts.config import RECORD_STEPS
 from experts.witness import succeeds
+from levelgen.files.level_file import LevelFile, write_level_file
 from levelgen.level import SIZES
 from levelgen.pictures.raster import draw, rasterised
 from levelgen.proofs import examine
@@ -19,7 +21,7 @@ from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import TaskParams, advance, reset
 from pipeline.errors import Failure, UserError
 from pipeline.look import show as show_module
-from pipeline.look.show import MOST_FRAMES, MOST_STEPS, do_nothing, show, witness_film
+from pipeline.look.show import do_nothing, film_of, show, witness_film
 from pipeline.read.levels import find_level
 from pipeline.store.manifest import require_manifest
 from tests.pipeline.made import PLAYED, made_job, played_split
@@ -73,46 +75,43 @@ def test_an_unsolved_level_shows_its_beginning_and_says_so(split, tmp_path, caps
 
 
 def test_an_unsolved_level_plays_doing_nothing_and_says_so(split, tmp_path, capsys) -> None:
-    show(split, level_with(split, "unsolved"), tmp_path / "level.gif")
+    show(split, level_with(split, "unsolved"), tmp_path / "level.svg")
     assert "there is no witness, so this is what doing nothing does (" in capsys.readouterr().out
-    with Image.open(tmp_path / "level.gif") as picture:
-        assert picture.n_frames > 10  # type: ignore[attr-defined]
+    assert (tmp_path / "level.svg").read_text().count("doing nothing · ") > 10
 
 
 class TestDoingNothing:
     RULES = TaskParams()
 
     def test_it_is_the_tasks_episode(self) -> None:
-        """Physics step by physics step, to the same ends."""
         levels = sample_levels(jnp.arange(16), SIZES["s"])
         act = jax.jit(lambda now: advance(levels, now, jnp.zeros((6, 16), jnp.int32), self.RULES))
         after, ends = reset(levels), {}
         for number in range(1, 257):
             after, outcome = act(after)
             for lane in np.flatnonzero(outcome.done):
-                ends.setdefault(int(lane), (number, bool(outcome.goal[lane]), float(outcome.reward[lane])))
+                ends.setdefault(int(lane), (number, bool(outcome.goal[lane])))
         kinds = set()
         for lane in range(16):
             one = jax.tree.map(lambda x, lane=lane: x[..., lane : lane + 1], levels)
-            states, end = do_nothing(one, self.RULES)
-            steps, goal, _ = ends[lane]
-            assert -(-(len(states) - 1) // 2) == steps
-            assert (end == "goal reached") == goal
+            steps, end = do_nothing(one, self.RULES)[1]
+            assert (steps, end == "goal reached") == ends[lane]
             kinds.add(end)
         assert kinds == {"goal reached", "touched red", "time is up"}
 
-    def test_no_rules_make_it_long(self) -> None:
-        level = sample_levels(jnp.array([ends_late()]), SIZES["s"])
+    def test_no_rules_make_it_long(self, tmp_path: Path) -> None:
+        level = jax.tree.map(np.asarray, sample_levels(jnp.array([ends_late()]), SIZES["s"]))
         for rules in (TaskParams(frame_skip=10**6, max_timesteps=10**6), TaskParams(max_timesteps=10**6)):
-            states, end = do_nothing(level, rules)
-            assert len(states) == 1 + min(MOST_FRAMES, MOST_STEPS * rules.frame_skip)
-            assert end == ""
+            write_level_file(LevelFile(level, rules), tmp_path / "level.json")
+            film = film_of(tmp_path / "level.json", None)
+            assert len(film.scenes) <= RECORD_STEPS
+            assert ("so this is its initial world" in film.told) == (rules.frame_skip > 2)
+        assert "what doing nothing does (the first 8.5 s)" in film.told
 
     def test_a_world_that_breaks_down_ends(self) -> None:
         level = sample_levels(jnp.array([ends_late()]), SIZES["s"])
         model = replace(level.model, gravity=level.model.gravity * np.nan)
-        states, end = do_nothing(replace(level, model=model), self.RULES)
-        assert (len(states), end) == (1, "world breaks down")
+        assert do_nothing(replace(level, model=model), self.RULES)[1] == (1, "world breaks down")
 
 
 def ends_late() -> int:
