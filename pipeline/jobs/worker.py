@@ -30,7 +30,8 @@ class Worker:
         outcomes = [outcome for unit in units if unit not in self._runs and (outcome := self._begin(unit))]
         while self._runs and not outcomes and time.monotonic() < until:
             outcomes = self._step()
-        plain = {unit: tuple(run.totals()) for unit, run in self._runs.items()}  # read without JAX
+        now = {unit: run.totals() for unit, run in self._runs.items()}
+        plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}  # read without JAX
         wants = max(0, self._pool.wants - sum(run.searching for run in self._runs.values()))
         return Round(outcomes, plain, wants)
 

@@ -123,10 +123,10 @@ def _without_witness(level: Level, rules: TaskParams, caption: Caption, told: st
         scene = scene_of(level, level.state, caption=replace(caption, clock="0.0 s"))
         return Film([scene], [LAST_SECONDS], f"{told}, so this is its initial world")
     record, end = do_nothing(level, rules)
-    caption = replace(caption, clock="doing nothing · ")
-    scenes, seconds = _episode(level, record.state, record.action[..., 0], end, rules, caption, STEPS_A_PICTURE)
-    length, end = _length(end[0], rules), end[1]
-    told = f"{told}, so this is what doing nothing does ({f'{end} after' if end else 'the first'} {length})"
+    action, caption = np.asarray(record.action)[..., 0], replace(caption, clock="doing nothing · ")
+    scenes, seconds = _episode(level, record.state, action, end, rules, caption, STEPS_A_PICTURE)
+    how = f"{end[1]} after" if end[1] else "the first"
+    told = f"{told}, so this is what doing nothing does ({how} {_length(end[0], rules)})"
     return Film(scenes, seconds, told)
 
 
