@@ -69,7 +69,7 @@ def test_a_mapped_step_is_the_tasks_step(levels: Level, keys, actions) -> None:
         np.testing.assert_array_equal(reward[step], outcome.reward)
         np.testing.assert_array_equal(done[step], outcome.done)
     assert_same(lanes_last(state.now), world)
-    np.testing.assert_allclose(seen[-1].T, symbolic_flat(levels, world.state), rtol=1e-6)
+    np.testing.assert_allclose(seen[-1].T, jax.jit(symbolic_flat)(levels, world.state), rtol=1e-6)
 
 
 @pytest.mark.campaign
@@ -154,8 +154,12 @@ def test_an_end_resets(levels: Level, keys) -> None:
 def test_parameters_are_those_of_make_where_none_are_given(levels: Level, made) -> None:
     env, params = made
     assert_same(env.reset(jax.random.key(1)), env.reset(jax.random.key(1), params))
-    first = EnvParams(jax.tree.map(lambda x: x[..., :1], env.levels))
-    assert_same(env.reset(jax.random.key(1), first)[1], EnvState.start(lane(levels, 0)))
+
+
+@pytest.mark.campaign
+def test_of_one_level_it_is_always_that_one(levels: Level, made) -> None:
+    first = EnvParams(jax.tree.map(lambda x: x[..., :1], made[0].levels))
+    assert_same(made[0].reset(jax.random.key(1), first)[1], EnvState.start(lane(levels, 0)))
 
 
 MORE = (ObservationType.PIXELS, ObservationType.SYMBOLIC_ENTITY)
@@ -179,13 +183,23 @@ def test_observations_are_in_their_space(levels: Level, observation_type: str) -
 
 
 @pytest.mark.parametrize("action_type", list(ActionType))
-def test_actions_of_their_space_are_taken(levels: Level, keys, action_type: str) -> None:
+def test_actions_of_their_space(levels: Level, keys, action_type: str) -> None:
     env, params = make(levels, action_type)
     space = env.action_space(params)
     action = jax.vmap(space.sample)(keys)
     assert jax.vmap(space.contains)(action).all()
     kind = {"discrete": Discrete, "multi_discrete": MultiDiscrete, "continuous": Box}[action_type]
     assert isinstance(space, kind)
+
+
+STEPPED = (ActionType.MULTI_DISCRETE, ActionType.CONTINUOUS)  # in tests of other things
+TYPES = [pytest.param(kind, marks=pytest.mark.campaign if kind in STEPPED else ()) for kind in ActionType]
+
+
+@pytest.mark.parametrize("action_type", TYPES)
+def test_actions_are_taken(levels: Level, keys, action_type: str) -> None:
+    env, params = make(levels, action_type)
+    action = jax.vmap(env.action_space(params).sample)(keys)
     _, state, _, _, _ = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, starts(levels), action, params)
     assert np.isfinite(state.now.state.position).all()
 
