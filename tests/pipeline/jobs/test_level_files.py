@@ -172,7 +172,7 @@ def test_questions_are_answered(once: Path, tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
     done = here(["card", str(split), "-o", "../README.md"], split)
     assert done.returncode == 0, done.stderr
-    assert "| level files |" in (once / "data/README.md").read_text()
+    assert "| level files |" in (once / "data/5k/README.md").read_text()
     done = here(["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels")], tmp_path)
     assert done.stdout.startswith(f"{tmp_path / 'levels'}: 2 levels. "), done.stderr
 
