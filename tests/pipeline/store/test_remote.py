@@ -304,6 +304,34 @@ def test_a_server_that_lies_about_sizes_is_one_sentence() -> None:
         read_manifest(Path(f"{server.url}/s"))
 
 
+@pytest.mark.campaign
+def test_processes_share_a_cache_and_may_be_killed(bucket: Bucket, split: Path) -> None:
+    code = (
+        "import sys, hashlib\nfrom pathlib import Path\nfrom pipeline.read.rows import read_rows\n"
+        "from pipeline.store.manifest import read_manifest\nsplit = Path(sys.argv[1])\n"
+        "table = read_manifest(split).table\nprint('at work', flush=True)\n"
+        "found = read_rows(split, table.filter(table['shard'].is_valid()))\n"
+        "print(hashlib.sha256(b''.join(found[name].tobytes() for name in sorted(found))).hexdigest())"
+    )
+
+    def begin(there: Path | str) -> subprocess.Popen[str]:
+        words = [sys.executable, "-c", code, str(there)]
+        return subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+
+    true = begin(split).communicate()[0]
+    bucket.server.spoil(5)
+    for delay in (0.0, 0.02, 0.05, 0.1):
+        processes = [begin("s3://bucket/data/s") for _ in range(3)]
+        stdout = processes[0].stdout
+        assert stdout
+        assert stdout.readline() == "at work\n"
+        time.sleep(delay)
+        processes[0].kill()
+        processes[0].communicate()
+        assert [process.communicate()[0] for process in processes[1:]] == [true, true]
+    assert begin("s3://bucket/data/s").communicate()[0] == true
+
+
 def test_a_split_on_a_web_server(split: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(split, tmp_path / "www" / "s"))
     with serving(files_of(tmp_path / "www")) as server:
