@@ -52,7 +52,7 @@ def open(
     """The trajectories of a split, for training.
 
     Args:
-        path: of the split, such as `data/1M/s`.
+        path: of the split, such as `data/1M/s`, or its URL (docs/remote.md).
         where: an SQL condition on the manifest's columns, such as `label = 'solved' AND steps_to_goal < 64`.
         columns: of the manifest, to have in `Dataset.manifest` beside those that are always read.
         validation: share of all levels that is kept for `part="validation"`.

@@ -15,6 +15,7 @@ from pipeline.read.rows import read_rows
 from pipeline.read.select import SOLVED, witnessed
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
+from pipeline.store.remote import as_typed
 
 BLOCK = 4 * ROWS  # trajectories in memory at a time
 ARRAY = 64 * ROWS  # trajectories of an array: the reference shuffles arrays, and what they have
@@ -44,7 +45,8 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
         write_group(folder)
     stored = sum(path.stat().st_size for path in out.rglob("*"))
     print(
-        f"{out}: {count} trajectories of {split}, {stored / (count * RECORD_STEPS):.0f} bytes per transition.\n"
+        f"{out}: {count} trajectories of {as_typed(split)}, "
+        f"{stored / (count * RECORD_STEPS):.0f} bytes per transition.\n"
         f'Next:  kinetix.data.TrajectoryDatasetManager("{out}", batch_size=64)'
     )
 
