@@ -16,12 +16,14 @@ from experts.config import RECORD_STEPS
 from experts.witness import Record
 from levelgen.identity.keys import MAX_LEVEL_ID
 from levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
+from levelgen.sampling.scenery import empty_level
 from levelgen.task.actions import CHOICES
 from physics.buffers import buffers_of
 from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
-from pipeline.store.density import kept
+from pipeline.store.density import KEY, kept
 from pipeline.store.fields import arrays_of
-from pipeline.store.schema import Encoding, FieldSpec, field_table
+from pipeline.store.packing import pack
+from pipeline.store.schema import FLAT, Encoding, FieldSpec, field_table
 
 COUNTED = (  # fields with one entry for each thing of a kind, in the order of Size
     "level/model/n_vertices",
@@ -46,6 +48,25 @@ def table_for(size: Size, encoding: Encoding = FULL) -> tuple[FieldSpec, ...]:
     for name in ("record/state/", "record/manifold/"):  # of the engine, which knows one moment only
         record |= {of: np.stack([x] * RECORD_STEPS) for of, x in record.items() if of.startswith(name)}
     return tuple(field_table(kept(level | record, encoding), encoding.density))
+
+
+def size_of_levels(arrays: Mapping[str, np.ndarray]) -> Size:
+    """The size of levels with these fields."""
+    return Size(*(arrays[name].shape[0] for name in COUNTED))
+
+
+@cache
+def blank_row(size: Size, encoding: Encoding) -> np.ndarray:
+    """A row of FLAT for the empty level: its fields, its state in every key frame, and zeros elsewhere.
+
+    Of rows it is stored where they differ from it (exclusive or): nearly all levels have the same scenery.
+    """
+    empty, arrays = arrays_of(empty_level(size, 1), "level/"), {}
+    table = table_for(size, encoding)
+    for field in table:
+        start = empty.get(field.name.replace(KEY, "level/", 1), np.zeros((*field.shape, 1), field.dtype))
+        arrays[field.name] = start if field.constant else np.repeat(start[None], field.steps, 0)
+    return pack(arrays, table)[FLAT][0]
 
 
 def encoding_in(attributes: Mapping[str, Any]) -> Encoding:

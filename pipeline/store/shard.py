@@ -23,10 +23,12 @@ from pipeline.store.chunks import Chunks, read_whole
 from pipeline.store.contents import (
     FULL,
     ContentsError,
+    blank_row,
     check_level_ids,
     check_numbers,
     encoding_in,
     size_in,
+    size_of_levels,
     table_for,
 )
 from pipeline.store.density import Restored, kept, needed, restored
@@ -75,6 +77,8 @@ def write_shard(
     with zarr.config.set({"json_indent": None}):  # of a small shard, half would be blanks
         group = zarr.create_group(path, attributes=attributes)
         for name, values in pack(stored, table).items():
+            if name == FLAT:
+                values ^= blank_row(size_of_levels(stored), encoding)
             blosc = BloscCodec(cname="zstd", typesize=values.dtype.itemsize, **PRESSED.get(name, PRESSED[None]))
             group.create_array(
                 name,
@@ -225,6 +229,8 @@ def _read_alike(parts: Sequence[Part], table: Sequence[FieldSpec], places: Seque
             part[0].put(part[1], packed, mine)
 
     at_once(parts[0][0].path, put, parts, places)
+    if FLAT in packed:
+        packed[FLAT] ^= blank_row(size, encoding)
     try:
         stored = _named(packed, chosen, size)
     except ValueError:  # one of them holds what it cannot

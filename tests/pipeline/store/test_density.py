@@ -34,7 +34,7 @@ from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
 from pipeline.read.rows import read_rows
 from pipeline.store import convert, density, seal
-from pipeline.store.contents import table_for
+from pipeline.store.contents import blank_row, table_for
 from pipeline.store.density import CHECKSUM, key_rows, task_states
 from pipeline.store.fields import arrays_of, same_bits, tree_of
 from pipeline.store.layout import split_path
@@ -86,10 +86,12 @@ def changed(shard: Shard, change: Callable[[dict[str, np.ndarray]], None]) -> Sh
     table = table_for(shard.size, shard.encoding)
     group = zarr.open_group(shard.path, mode="r+")
     packed = {name: np.asarray(group[name][:]) for name in shard.arrays}  # type: ignore[index]
+    mask = {"witness": blank_row(shard.size, shard.encoding)} if "witness" in packed else {}
+    packed |= {name: packed[name] ^ mask[name] for name in mask}
     stored = {name: np.moveaxis(x, 0, -1).copy() for name, x in unpack(packed, table).items()}
     change(stored)
     for name, values in pack(stored, table).items():
-        group[name][:] = values  # type: ignore[index]
+        group[name][:] = values ^ mask.get(name, values.dtype.type(0))  # type: ignore[index]
     return Shard(shard.path)
 
 
