@@ -53,6 +53,7 @@ def test_a_forked_process_reads_but_makes_no_observations(data: Dataset) -> None
 @pytest.mark.parametrize("workers", [0, 2])
 def test_grain_shuffles_and_batches_it(data: Dataset, workers: int) -> None:
     grain = pytest.importorskip("grain")
+    pytest.importorskip("absl.flags").FLAGS.mark_as_parsed()  # grain's workers look at them
     source = data.grain(part="train", length=64, observation=None)
     loader = grain.DataLoader(
         data_source=source,
