@@ -34,7 +34,7 @@ def committed(split: Path, first: int) -> None:
 def dead(split: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """An attempt that died between its shard and its fragment; its name."""
 
-    def die(*_: object) -> None:
+    def die(*_: object, **__: object) -> None:
         raise MemoryError
 
     with monkeypatch.context() as patched:
