@@ -17,7 +17,7 @@ from pipeline.store.locks import only_writer
 from pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import ROOT, TINY, assert_refused, here, run
 
-COMMANDS = [command.__name__.rpartition(".")[2] for command in main.COMMANDS]
+COMMANDS = [command.__name__.rpartition(".")[2].rstrip("_") for command in main.COMMANDS]
 
 
 @pytest.fixture(scope="module")
