@@ -5,6 +5,7 @@ that everything comes back, and read through the engine where it has to compute.
 """
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
@@ -68,7 +69,8 @@ def run(given: argparse.Namespace) -> Report:
             "*bytes* per transition, of all files of one shard; *published*: of the reference's 1M splits. *written/s* "
             "and the columns after it: trajectories a second of a core's time, written all at once, and read in random "
             f"batches of {BATCH} to arrays of {', '.join(FIELDS)}; the files are in the system's cache, and programs "
-            "are compiled before. Key frames of `witness` every 32 steps.",
+            "are compiled before. Key frames of `witness` every 32 steps. Load of the machine meanwhile, with this: "
+            f"{os.getloadavg()[1]:.1f}; what others do slows this down.",
         ],
     )
 
