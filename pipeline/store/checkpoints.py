@@ -3,6 +3,7 @@
 import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from zipfile import ZIP_STORED, ZipFile
 
 import jax
 import numpy as np
@@ -52,9 +53,12 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
     like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), no_success(1), job.expert), level)
     like = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
     try:
-        with np.load(path) as file:  # whole files only: each array has a checksum; never what is pickled
+        _require_plain(path)
+        with np.load(path, allow_pickle=False) as file:  # whole files only: each array has a checksum
             arrays = {name: file[name] for name in file.files}
         level_ids, curves = arrays.pop("level_id"), arrays.pop("curve")
+        if (level_ids.dtype, level_ids.ndim, curves.ndim, len(curves)) != (np.int64, 1, 2, len(level_ids)):
+            raise ValueError("its level ids or curves are none")
         for name, one in arrays_of(like, "begun/").items():
             if (arrays[name].shape, arrays[name].dtype) != ((len(level_ids), *one.shape[1:]), one.dtype):
                 raise ValueError(f"{name} has another shape or type")
@@ -69,6 +73,16 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
         begun = jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves])
         experts[level_id] = Kept(begun, curves[i, : int(begun.training.course.updates)].tolist())
     return experts
+
+
+def _require_plain(path: Path) -> None:
+    """Raises ValueError where a file is no archive as `save_experts` writes it: not packed, no larger than it is."""
+    if not path.is_file():
+        raise ValueError("it is no file" if path.exists() else "it is not there")
+    with ZipFile(path) as archive:
+        parts = archive.infolist()
+    if any(part.compress_type != ZIP_STORED for part in parts) or sum(p.file_size for p in parts) > path.stat().st_size:
+        raise ValueError("it is packed, and experts are not")
 
 
 def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:

@@ -21,6 +21,7 @@ from numcodecs import blosc  # pyright: ignore[reportAttributeAccessIssue]
 from pipeline.store.contents import ContentsError
 from pipeline.store.remote import RemoteFile, bytes_of, is_remote
 
+MOST_METADATA = 2**24  # bytes of a zarr.json; a level takes up to 12
 CHECKSUM = 4  # bytes of a CRC-32C
 ENTRY = 16  # bytes of an index for each chunk: where it starts, and how many bytes it has
 BLOSC_HEADER = Struct("<4xI4xI")  # how many bytes a buffer decodes to, and has
@@ -42,8 +43,9 @@ class Chunks:
         if [about[key] for key in ("node_type", "shape", "data_type")] != ["array", [*shape], str(dtype)]:
             raise ContentsError(f"its array {name} has not the shape and type that its fields need")
         self.rows_a_file = _rows_a_file(about, shape)
-        if self.rows_a_file < 1:
+        if not 1 <= self.rows_a_file <= max(1, shape[0]):
             raise ContentsError(f"its array {name} is not stored as this program stores it")
+        self._most = int(np.prod(shape[1:])) * dtype.itemsize + BLOSC_HEADER.size + CHECKSUM  # bytes of a chunk
         self._indices: dict[int, np.ndarray] = {}  # by file: [chunk, (first byte, bytes)]
         self._paths: dict[int, str] = {}  # by file, of those that were looked at
 
@@ -91,7 +93,8 @@ class Chunks:
             raise ContentsError(f"a file of its array {self.name} is cut off")
         (stored,) = file.read([(end - length, length)])
         index = np.frombuffer(self._checked(stored), "<u8").reshape(-1, 2)
-        return np.where(index.max(1, keepdims=True) > end, 0, index)  # what lies outside is as if it had no byte
+        lies = (index > (end, self._most)).any(1, keepdims=True)  # outside of the file, or about how much is read
+        return np.where(lies, 0, index)  # as if there were no byte
 
     def _checked(self, data: bytes) -> bytes:
         """Without the CRC-32C at their end."""
@@ -131,7 +134,12 @@ def read_whole(shard: Path, name: str) -> bytes:
     Raises:
         ContentsError, OSError: it is no ordinary file, or cannot be read.
     """
-    return bytes_of(shard / name) if is_remote(shard) else ordinary_file(shard, name).read_bytes()
+    if is_remote(shard):
+        return bytes_of(shard / name)
+    path = ordinary_file(shard, name)
+    if path.stat().st_size > MOST_METADATA:
+        raise ContentsError(f"its {name} is larger than that of any shard")
+    return path.read_bytes()
 
 
 def file_name(array: str, number: int, axes: int) -> str:

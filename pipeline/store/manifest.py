@@ -42,6 +42,9 @@ DENSITIES = {stored_as(density, every) for density in get_args(Density) for ever
 SHOWN = 6  # differing settings that an error lists
 THREADS = 8  # fragments read at once: a shared folder takes its time for each
 ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
+CAREFULLY = {"page_checksum_verification": True, "thrift_string_size_limit": 2**26}
+MOST_ROWS = 10_000_000  # of a fragment
+MOST_FIXED, MOST_A_ROW = 2**26, 2**14  # bytes in memory of a fragment, and of each of its rows: a hundred times theirs
 ROUNDS = 20  # looks at a split that is sealed meanwhile; each takes a moment, and sealing a fragment takes seconds
 Each = Callable[[pa.Table], pa.Table]
 DATA_COLUMNS = ("shard", "experts")  # name what lies beside the manifest
@@ -132,7 +135,8 @@ def read_fragment(
     try:
         dictionaries = REPETITIVE if compact else None
         source = pa.BufferReader(bytes_of(path)) if is_remote(path) else path
-        with pq.ParquetFile(source, page_checksum_verification=True, read_dictionary=dictionaries) as file:
+        with pq.ParquetFile(source, read_dictionary=dictionaries, **CAREFULLY) as file:
+            _require_modest(file.metadata)
             metadata = file.schema_arrow.metadata or {}
             version = metadata.get(VERSION_KEY, b"?").decode()
             if version != str(MANIFEST_VERSION):
@@ -142,6 +146,8 @@ def read_fragment(
                 )
             config, true_hash = _config_in(metadata[CONFIG_KEY])
             digests, about = json.loads(metadata.get(DIGESTS_KEY, b"{}")), file.metadata
+            if not isinstance(digests, dict) or not all(isinstance(files, dict) for files in digests.values()):
+                raise ValueError("its digests are none")
             fragment = Fragment(
                 path,
                 metadata[HASH_KEY].decode(),
@@ -163,12 +169,21 @@ def read_fragment(
         raise
     except PermissionError:
         raise Failure(f"The fragment {path} cannot be read: check its permissions.") from None
-    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+    except (OSError, pa.ArrowException, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise Failure(
             f"The fragment {path} is damaged ({type(error).__name__}): "
             + mended(path, f"run `levelproof verify {path.parent.parent} --repair` to make its levels again.")
         ) from error
     return fragment, table
+
+
+def _require_modest(about: pq.FileMetaData) -> None:
+    """Raises ValueError where a small file would become large: pages of nothing are packed ten thousandfold."""
+    groups = [about.row_group(i) for i in range(about.num_row_groups)]
+    if about.num_rows > MOST_ROWS or len(groups) > MOST_ROWS // ROW_GROUP + about.num_rows:
+        raise ValueError("it has more rows than any fragment")
+    if sum(group.total_byte_size for group in groups) > MOST_FIXED + MOST_A_ROW * about.num_rows:
+        raise ValueError("its rows would take more memory than those of any fragment")
 
 
 def _may_have(group: pq.RowGroupMetaData, level_ids: np.ndarray) -> bool:

@@ -14,7 +14,7 @@ import google_crc32c
 import numpy as np
 
 from pipeline.errors import Failure
-from pipeline.store.chunks import CHECKSUM, Chunks, file_name, ordinary_file
+from pipeline.store.chunks import CHECKSUM, Chunks, file_name, read_whole
 from pipeline.store.contents import ContentsError
 from pipeline.store.disk import flush
 from pipeline.store.shard import DAMAGE, Shard, damaged, stored_bytes
@@ -105,7 +105,7 @@ def _opened(paths: Iterable[Path]) -> tuple[dict[str, Any], dict[Path, _Source]]
 
 
 def _document(shard: Path, name: str) -> dict[str, Any]:
-    return json.loads(ordinary_file(shard, f"{name}/zarr.json" if name else "zarr.json").read_bytes())
+    return json.loads(read_whole(shard, f"{name}/zarr.json" if name else "zarr.json"))
 
 
 def _rows_a_file(sources: dict[Path, _Source]) -> int:

@@ -3,19 +3,23 @@
 import random
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from pipeline.jobs import repair as repairing
 from pipeline.jobs.seal import seal_split
 from pipeline.read.verify import examine
+from pipeline.store import mend
 from pipeline.store.fields import same_bits
-from pipeline.store.layout import JOB
-from pipeline.store.manifest import fragment_paths, read_manifest
+from pipeline.store.layout import JOB, new_attempt
+from pipeline.store.manifest import begin_fragment, fragment_paths, read_fragment, read_manifest, write_fragment
 from pipeline.store.shard import Shard
-from tests.pipeline.command import here
+from tests.pipeline.command import assert_refused, here
 from tests.pipeline.read.test_damage import files_of, flip
 
 pytestmark = pytest.mark.slow
@@ -96,3 +100,90 @@ def test_several_damages_are_repaired_together(whole: Path, copied: Callable[[Pa
     assert untouched(split, third) == kept
     assert_as_before(split, whole)
     assert "nothing" not in repaired(split)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["whole", "sealed"])
+def test_each_kind_of_file_is_repaired(
+    kind: str, whole: Path, copied: Callable[[Path], Path], request: pytest.FixtureRequest
+) -> None:
+    """One after another: a flip in every file of the first fragment's data, and in it; then each of them gone."""
+    split, chance = copied(request.getfixturevalue(kind)), random.Random(3)
+    for kinds in ("zarr.json", "c", "npz", "parquet", "json", "gone"):
+        last = fragment_paths(split)[-1]
+        kept = untouched(split, last)
+        files = [file for file, levels in files_of(split).items() if levels & files_of(split)[fragment_paths(split)[0]]]
+        chosen = [file for file in files if kinds in (file.name, file.suffix[1:], *file.relative_to(split).parts)]
+        if kinds == "json":
+            chosen = [split / JOB]
+        for file in chosen or [fragment_paths(split)[0]]:
+            if kinds == "gone":
+                file.unlink()
+            else:
+                flip(file, chance)
+        repaired(split)
+        assert untouched(split, last) == kept
+        assert_as_before(split, whole)
+
+
+class Killed(BaseException):
+    """The process dies here."""
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["whole", "sealed"])
+def test_a_repair_that_is_killed_goes_on(
+    kind: str, whole: Path, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before and after everything that it does to the disk."""
+    original, chance = request.getfixturevalue(kind), random.Random(4)
+    steps = [(repairing, name) for name in ("note_job", "take_out", "taken", "generate")]
+    steps += [(mend, name) for name in ("begin_fragment", "merge_shards", "disown", "write_fragment")]
+    for number, (module, name) in enumerate(steps):
+        for after in (False, True):
+            split = Path(shutil.copytree(original, tmp_path / f"{number}-{after}"))
+            first = fragment_paths(split)[0]
+            shards = [path for path in (split / "shards").iterdir() if path.name.startswith(first.stem)]
+            flip(shards[0] / "dyn32/c/0/0/0", chance)
+            fragment_paths(split)[-1].write_bytes(b"PAR1")
+            done = getattr(module, name)
+
+            def die(*words: Any, done: Any = done, after: bool = after, **named: Any) -> None:
+                if after:
+                    done(*words, **named)
+                raise Killed
+
+            with monkeypatch.context() as patched:
+                patched.setattr(module, name, die)
+                with suppress(Killed):  # where a damage takes this step
+                    repaired(split)
+            repaired(split)
+            assert_as_before(split, whole)
+
+
+@pytest.mark.campaign
+def test_what_cannot_be_made_again_is_told_and_stays(copied: Callable[[Path], Path], whole: Path) -> None:
+    """Of another stack."""
+    split = copied(whole)
+    (path, *_) = fragment_paths(split)
+    fragment, rows = read_fragment(path)
+    column = rows.schema.get_field_index("device")
+    rows = rows.set_column(column, rows.schema.field(column), [["cpu: of another kind"] * rows.num_rows])
+    attempt = new_attempt(split, path.stem)
+    begin_fragment(attempt)
+    write_fragment(attempt, rows, fragment.config_hash, fragment.config)
+    names = [name for name in rows.column("shard").to_pylist() if name]
+    (split / names[0] / "dyn32/c/0/0/0").write_bytes(b"")
+    before = sorted((file, file.stat().st_mtime_ns) for file in split.rglob("*") if file.name != JOB and file.is_file())
+    done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
+    assert done.returncode == 1
+    assert "Not made again: level" in done.stdout
+    assert "it was made on another stack, of cpu: of another kind" in done.stdout
+    after = sorted((file, file.stat().st_mtime_ns) for file in split.rglob("*") if file.name != JOB and file.is_file())
+    assert after == before
+
+
+@pytest.mark.parametrize("word", ["size=m", "budget=1M", "out=x", "nonsense"])
+def test_settings_of_a_split_cannot_be_changed_by_a_repair(word: str, tmp_path: Path) -> None:
+    done = here(["verify", str(tmp_path), "--repair", word], tmp_path)
+    assert_refused(done, 2, "A repair has the settings of its split", "executor, workers, unit")

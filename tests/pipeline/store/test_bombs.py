@@ -1,0 +1,109 @@
+"""Small files that would become large, and files that never end: one sentence each, in little memory."""
+
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from experts.labels import Label
+from pipeline.errors import Failure
+from pipeline.store.checkpoints import load_experts
+from pipeline.store.manifest import fragment_paths, read_fragment
+from pipeline.store.shard import Shard
+from tests.pipeline.made import made_job, made_split
+
+MOST = 2**27  # bytes
+
+
+def refused(kind: str, path: Path) -> str:
+    """What is said of it, before much memory is taken."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(Failure) as raised:
+            read_fragment(path) if kind == "fragment" else Shard(path).read()
+        assert tracemalloc.get_traced_memory()[1] + pa.total_allocated_bytes() < MOST
+    finally:
+        tracemalloc.stop()
+    return str(raised.value)
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    return made_split(tmp_path, [[Label.SOLVED, Label.SOLVED]])
+
+
+def test_a_small_fragment_with_gigabytes_in_it(split: Path) -> None:
+    """Texts of 2 MB, each the same byte again and again."""
+    (path,) = fragment_paths(split)
+    table = pq.read_table(path)
+    rows = pa.concat_tables([table] * 100)
+    at = rows.schema.get_field_index("label_reason")
+    text = pa.array([f"{i:03d}" + "x" * 2_000_000 for i in range(10)] * 20)
+    rows = rows.set_column(at, rows.schema.field(at), text)
+    pq.write_table(rows, path, compression="zstd", use_dictionary=False, write_page_checksum=True)
+    assert path.stat().st_size < 2_000_000
+    assert "is damaged (ValueError)" in refused("fragment", path)
+
+
+def test_metadata_of_a_gigabyte(split: Path) -> None:
+    (shard,) = (split / "shards").iterdir()
+    for name in ("dyn32/zarr.json", "zarr.json"):
+        with (shard / name).open("r+b") as file:
+            file.truncate(2**30)
+        assert f"its {name} is larger than that of any shard" in refused("shard", shard)
+
+
+def test_experts_that_are_packed_pickled_or_a_folder(tmp_path: Path) -> None:
+    job, path = made_job(), tmp_path / "experts.npz"
+    np.savez_compressed(path, level_id=np.zeros(10**7, np.int64))
+    assert path.stat().st_size < 10**6
+    with pytest.raises(Failure, match="it is packed, and experts are not"):
+        load_experts(path, job)
+    np.savez(path, level_id=np.array([{}], object), curve=np.zeros((1, 1)))
+    with pytest.raises(Failure, match="cannot be read"):
+        load_experts(path, job)
+    with zipfile.ZipFile(path, "w") as archive:
+        header = b"{'descr': '<i8', 'fortran_order': False, 'shape': (10000000000000,), }"
+        archive.writestr("level_id.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    with pytest.raises(Failure, match="cannot be read"):
+        load_experts(path, job)
+    path.unlink()
+    path.mkdir()  # as Orbax keeps checkpoints
+    (path / "_METADATA").write_text("{}")
+    with pytest.raises(Failure, match="it is no file"):
+        load_experts(path, job)
+
+
+def test_level_ids_of_experts_that_are_none(tmp_path: Path) -> None:
+    for level_ids, curves in ((7, [[0.0]]), ([0.5], [[0.0]]), ([1], [0.0]), ([1, 2], [[0.0]])):
+        np.savez(tmp_path / "experts.npz", level_id=np.array(level_ids), curve=np.array(curves))
+        with pytest.raises(Failure, match="its level ids or curves are none"):
+            load_experts(tmp_path / "experts.npz", made_job())
+
+
+@pytest.mark.parametrize("text", [b"[[]]", b'{"a": 7}', b"[" * 100_000, b"7"])
+def test_digests_that_are_none(split: Path, text: bytes) -> None:
+    (path,) = fragment_paths(split)
+    table = pq.read_table(path)
+    pq.write_table(table.replace_schema_metadata(table.schema.metadata | {b"levelproof.sha256": text}), path)
+    with pytest.raises(Failure, match="is damaged"):
+        read_fragment(path)
+
+
+def test_an_index_that_lies_about_a_chunk(split: Path) -> None:
+    """A file with a hole of a terabyte, of which a chunk claims to be all."""
+    from google_crc32c import value
+
+    (shard,) = (split / "shards").iterdir()
+    file = shard / "dyn32/c/0/0/0"
+    index = np.array([[0, 2**40], [0, 2**40]], "<u8").tobytes()
+    with file.open("r+b") as out:
+        out.truncate(2**40)
+        out.seek(0, 2)
+        out.write(index + value(index).to_bytes(4, "little"))
+    assert "missing or not those that were written" in refused("shard", shard)
+    assert Shard(shard).level_ids == [0, 1]
