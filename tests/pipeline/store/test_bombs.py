@@ -21,11 +21,12 @@ MOST = 2**27  # bytes
 
 def refused(kind: str, path: Path) -> str:
     """What is said of it, before much memory is taken."""
+    before = pa.total_allocated_bytes()
     tracemalloc.start()
     try:
         with pytest.raises(Failure) as raised:
             read_fragment(path) if kind == "fragment" else Shard(path).read()
-        assert tracemalloc.get_traced_memory()[1] + pa.total_allocated_bytes() < MOST
+        assert tracemalloc.get_traced_memory()[1] + pa.total_allocated_bytes() - before < MOST
     finally:
         tracemalloc.stop()
     return str(raised.value)
@@ -81,7 +82,7 @@ def test_experts_that_are_packed_pickled_or_a_folder(tmp_path: Path) -> None:
 def test_level_ids_of_experts_that_are_none(tmp_path: Path) -> None:
     for level_ids, curves in ((7, [[0.0]]), ([0.5], [[0.0]]), ([1], [0.0]), ([1, 2], [[0.0]])):
         np.savez(tmp_path / "experts.npz", level_id=np.array(level_ids), curve=np.array(curves))
-        with pytest.raises(Failure, match="its level ids or curves are none"):
+        with pytest.raises(Failure, match="cannot be read"):
             load_experts(tmp_path / "experts.npz", made_job())
 
 
