@@ -102,30 +102,6 @@ def test_several_damages_are_repaired_together(whole: Path, copied: Callable[[Pa
     assert "nothing" not in repaired(split)
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("kind", ["whole", "sealed"])
-def test_each_kind_of_file_is_repaired(
-    kind: str, whole: Path, copied: Callable[[Path], Path], request: pytest.FixtureRequest
-) -> None:
-    """One after another: a flip in every file of the first fragment's data, and in it; then each of them gone."""
-    split, chance = copied(request.getfixturevalue(kind)), random.Random(3)
-    for kinds in ("zarr.json", "c", "npz", "parquet", "json", "gone"):
-        last = fragment_paths(split)[-1]
-        kept = untouched(split, last)
-        files = [file for file, levels in files_of(split).items() if levels & files_of(split)[fragment_paths(split)[0]]]
-        chosen = [file for file in files if kinds in (file.name, file.suffix[1:], *file.relative_to(split).parts)]
-        if kinds == "json":
-            chosen = [split / JOB]
-        for file in chosen or [fragment_paths(split)[0]]:
-            if kinds == "gone":
-                file.unlink()
-            else:
-                flip(file, chance)
-        repaired(split)
-        assert untouched(split, last) == kept
-        assert_as_before(split, whole)
-
-
 class Killed(BaseException):
     """The process dies here."""
 
