@@ -24,6 +24,7 @@ from experts.labels import Label
 from experts.pool import Pool
 from experts.portability import survival
 from experts.procedure import Procedure
+from experts.train import TrainingRun
 from experts.witness import take
 from levelgen.files.level_file import LevelFile, write_level_file
 from levelgen.level import SIZES, Level

@@ -24,9 +24,9 @@ from experts.before import decide
 from experts.config import ScoutConfig
 from experts.scout import STEPS_PER_ROUND, scout
 from experts.search.config import SearchConfig
-from experts.search.search import search
+from experts.search.search import Searched, Searching
 from experts.witness import take
-from levelgen.level import SIZES
+from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
 from pipeline.runtime import cache_folder, own_cores, prepare_jax
@@ -89,7 +89,7 @@ def searched(size: str, first: int, count: int, env_steps: int) -> Int[np.ndarra
     config = SearchConfig(env_steps=env_steps, trials=1)  # how short a success is does not matter here
     for start in range(0, len(open_levels), TOGETHER):
         if wanted := [i for i in open_levels[start : start + TOGETHER] if int(ids[i]) not in known]:
-            come = search(take(levels, np.array(wanted)), ids[wanted], config, DEFAULT_RULES)
+            come = search(take(levels, np.array(wanted)), ids[wanted], config)
             new = {
                 int(ids[i]): int(n) if length else -1
                 for i, n, length in zip(wanted, come.env_steps, come.success.length, strict=True)
@@ -103,6 +103,14 @@ def searched(size: str, first: int, count: int, env_steps: int) -> Int[np.ndarra
         if steps[at] < 0 and (n := known[int(ids[i])]) >= 0:
             steps[at] = scouts + n
     return steps
+
+
+def search(levels: Level, level_ids: Int[np.ndarray, " level"], config: SearchConfig) -> Searched:
+    """Search every level until it has a success or has had its env steps."""
+    searching = Searching(levels, level_ids, config, DEFAULT_RULES)
+    while searching.step():
+        pass
+    return searching.result()
 
 
 def read(log: Path) -> dict[int, int]:

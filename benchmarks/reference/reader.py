@@ -33,7 +33,7 @@ def main():
     frames = np.array([[render(at(i, t)) for t in range(len(given.steps))] for i in range(given.rows)])
     fields = {f"env_state/{name}": values for name, values in flatten(batch.env_state).items()}
     others = {"action": batch.action, "action_mask": batch.action_mask, "done": batch.done, "mask": batch.mask}
-    np.savez(given.out, frame=frames, **others, **fields)
+    np.savez(given.out, **{"frame": frames, **others, **fields})  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ THRUSTER_BINDINGS entries for thrusters (0 off, 1 on). Environments take two oth
 actuator at a time) and continuous. Facts: `kinetix.environment.utils` 3.0.2.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -68,4 +70,5 @@ def action_mask(level: Level) -> Bool[Array, "6 lane"]:
     live = [(free & (level.motor_binding == k)).any(0) for k in range(MOTOR_BINDINGS)]
     live += [(model.thruster_active & (level.thruster_binding == k)).any(0) for k in range(THRUSTER_BINDINGS)]
     assert len(live) == ACTIONS
-    return (np if isinstance(free, np.ndarray) else jnp).stack(live)  # who reads data need not start JAX
+    stack: Any = np.stack if isinstance(free, np.ndarray) else jnp.stack  # who reads data need not start JAX
+    return stack(live)
