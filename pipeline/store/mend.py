@@ -1,7 +1,8 @@
 """What is damaged taken out of a split, and nothing that is sound: the rows that are lost leave their fragments.
 
 Each fragment is written again in one step, or removed where it has no sound row. What no row names afterwards goes
-with the next cleaning. A process that dies in between leaves a split of which less is taken out.
+with the next cleaning. A process that dies in between leaves a split of which less is taken out: where a fragment has
+another name than before, the one that it takes the place of counts until it is gone, for it has more rows.
 """
 
 from collections.abc import Collection
@@ -12,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import Failure
-from pipeline.store.layout import data_path, data_paths, ids_of, new_attempt, unit_ids
+from pipeline.store.layout import data_path, data_paths, ids_of, new_attempt, unit_ids, unit_name
 from pipeline.store.leftovers import disown
 from pipeline.store.manifest import (
     DATA_COLUMNS,
@@ -55,15 +56,20 @@ def _mend(split: Path, path: Path, lost: np.ndarray, unlike: frozenset[str]) -> 
     stale = named_by([rows], "shard") & unlike
     if rows.num_rows == before.num_rows and not stale:
         return
-    attempts = [new_attempt(split, path.stem) for _ in stale or [path]]
-    for attempt in attempts if rows.num_rows else ():
+    ids = rows.column("level_id").to_pylist()
+    # The name that its rows give it: its old one may be that of the unit in which lost levels are made again
+    unit = unit_name(ids[0], ids[-1]) if ids else path.stem
+    attempts = [new_attempt(split, unit) for _ in stale or [path]]
+    for attempt in attempts if ids else ():
         begin_fragment(attempt)
     for name, attempt in zip(sorted(stale), attempts, strict=False):
         rows = _moved(split, rows, name, attempt.shard)
-    _disown_named(split, _names(before) - _names(rows))
-    if rows.num_rows:
+    theirs = {path, attempts[-1].fragment} & {*fragment_paths(split)}  # two: somebody died between the two below
+    named = {name for of in theirs for name in _names(read_fragment(of, DATA_COLUMNS)[1])}
+    _disown_named(split, named - _names(rows))
+    if ids:
         write_fragment(attempts[-1], rows, fragment.config_hash, fragment.config, fragment.sealed, fragment.densities)
-    else:
+    if not ids or attempts[-1].fragment != path:
         path.unlink()
 
 

@@ -61,7 +61,8 @@ def content(split: Path) -> tuple[str, dict[int, dict[str, np.ndarray]]]:
     return repr([{k: bool(v) if k in places else v for k, v in (row | {"row": 0}).items()} for row in rows]), fields
 
 
-def assert_as_before(split: Path, before: Path) -> None:
+def assert_as_before(split: Path, before: Path, deleted: bool = False) -> None:
+    """Data of a fragment that somebody deleted stays, as always."""
     (rows, fields), (rows_before, fields_before) = content(split), content(before)
     assert rows == rows_before
     assert fields.keys() == fields_before.keys()
@@ -69,8 +70,9 @@ def assert_as_before(split: Path, before: Path) -> None:
         assert all(same_bits(x, fields_before[level_id][name]).all() for name, x in arrays.items())
     assert not examine(split).wrong
     named = read_manifest(split).named
-    assert {f"shards/{path.name}" for path in (split / "shards").iterdir()} == named["shard"]
-    assert {f"experts/{path.name}" for path in (split / "experts").iterdir()} == named["experts"]
+    for folder, column in ("shards", "shard"), ("experts", "experts"):
+        there = {f"{folder}/{path.name}" for path in (split / folder).iterdir()}
+        assert there == named[column] or (deleted and there > named[column])
 
 
 def repaired(split: Path) -> str:
@@ -100,6 +102,30 @@ def test_several_damages_are_repaired_together(whole: Path, copied: Callable[[Pa
     assert untouched(split, third) == kept
     assert_as_before(split, whole)
     assert "nothing" not in repaired(split)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["whole", "sealed"])
+def test_each_kind_of_file_is_repaired(
+    kind: str, whole: Path, copied: Callable[[Path], Path], request: pytest.FixtureRequest
+) -> None:
+    """One after another: a flip in every file of the first fragment's data, and in it; then each of them gone."""
+    split, chance = copied(request.getfixturevalue(kind)), random.Random(3)
+    for kinds in ("zarr.json", "c", "npz", "parquet", "json", "gone"):
+        last = fragment_paths(split)[-1]
+        kept = untouched(split, last)
+        files = [file for file, levels in files_of(split).items() if levels & files_of(split)[fragment_paths(split)[0]]]
+        chosen = [file for file in files if kinds in (file.name, file.suffix[1:], *file.relative_to(split).parts)]
+        if kinds == "json":
+            chosen = [split / JOB]
+        for file in chosen or [fragment_paths(split)[0]]:
+            if kinds == "gone":
+                file.unlink()
+            else:
+                flip(file, chance)
+        repaired(split)
+        assert untouched(split, last) == kept
+        assert_as_before(split, whole, deleted=kinds == "gone")
 
 
 class Killed(BaseException):
