@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from configs.convert import flat
 from configs.schema import KEYS_EVERY, Density, hash_of, stored_as
 from pipeline.errors import Failure, UserError
+from pipeline.store.bounds import CAREFULLY, require_modest
 from pipeline.store.checksums import digests_of, with_own
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
@@ -42,9 +43,6 @@ DENSITIES = {stored_as(density, every) for density in get_args(Density) for ever
 SHOWN = 6  # differing settings that an error lists
 THREADS = 8  # fragments read at once: a shared folder takes its time for each
 ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
-CAREFULLY = {"page_checksum_verification": True, "thrift_string_size_limit": 2**26}
-MOST_ROWS = 10_000_000  # of a fragment
-MOST_FIXED, MOST_A_ROW = 2**26, 2**14  # bytes in memory of a fragment, and of each of its rows: a hundred times theirs
 ROUNDS = 20  # looks at a split that is sealed meanwhile; each takes a moment, and sealing a fragment takes seconds
 Each = Callable[[pa.Table], pa.Table]
 DATA_COLUMNS = ("shard", "experts")  # name what lies beside the manifest
@@ -82,8 +80,7 @@ def write_fragment(
     sealed: bool = False,
     densities: Iterable[str] = FULL,
 ) -> None:
-    """Commit a unit, or many that are sealed: write their manifest rows to the attempt's fragment, durably and in one
-    step.
+    """Commit a unit, or many that are sealed: write their rows to the attempt's fragment, durably and in one step.
 
     Raises:
         OSError: the disk refuses; no fragment is there then, or the one that was there before.
@@ -136,7 +133,7 @@ def read_fragment(
         dictionaries = REPETITIVE if compact else None
         source = pa.BufferReader(bytes_of(path)) if is_remote(path) else path
         with pq.ParquetFile(source, read_dictionary=dictionaries, **CAREFULLY) as file:
-            _require_modest(file.metadata)
+            require_modest(file.metadata)
             metadata = file.schema_arrow.metadata or {}
             version = metadata.get(VERSION_KEY, b"?").decode()
             if version != str(MANIFEST_VERSION):
@@ -175,15 +172,6 @@ def read_fragment(
             + mended(path, f"run `levelproof verify {path.parent.parent} --repair` to make its levels again.")
         ) from error
     return fragment, table
-
-
-def _require_modest(about: pq.FileMetaData) -> None:
-    """Raises ValueError where a small file would become large: pages of nothing are packed ten thousandfold."""
-    groups = [about.row_group(i) for i in range(about.num_row_groups)]
-    if about.num_rows > MOST_ROWS or len(groups) > MOST_ROWS // ROW_GROUP + about.num_rows:
-        raise ValueError("it has more rows than any fragment")
-    if sum(group.total_byte_size for group in groups) > MOST_FIXED + MOST_A_ROW * about.num_rows:
-        raise ValueError("its rows would take more memory than those of any fragment")
 
 
 def _may_have(group: pq.RowGroupMetaData, level_ids: np.ndarray) -> bool:

@@ -116,7 +116,7 @@ def test_a_rows_command_makes_it_again(once: Path, tmp_path: Path) -> None:
 def test_every_level_is_made_again_and_looked_at(once: Path, folder: Path) -> None:
     split = folder / "data/5k/s"
     findings = examine(split)
-    assert (findings.levels, findings.witnesses, findings.wrong) == (2, 1, [])
+    assert (findings.levels, findings.witnesses, findings.sentences) == (2, 1, [])
     (shard,) = (split / "shards").iterdir()
     chunk = next(path for path in shard.rglob("lvl32/c/*/*") if path.is_file())
     raw = bytearray(chunk.read_bytes())
