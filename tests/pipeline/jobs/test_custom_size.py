@@ -49,7 +49,7 @@ def test_every_question_is_answered(made: Path, capsys: pytest.CaptureFixture[st
     assert (facts["wanted"], facts["done"]) == (4, 4)
     findings = examine(split)
     assert findings.witnesses > 0
-    assert findings.wrong == []
+    assert findings.sentences == []
     rows = {row["shard"] is not None: row["level_id"] for row in read_manifest(split).table.to_pylist()}
     assert rows.keys() == {True, False}
     for level_id in rows.values():

@@ -84,7 +84,7 @@ def test_labels_are_what_a_replay_of_the_actions_shows(once: Path) -> None:
 
 def test_every_level_is_looked_at_again(once: Path, folder: Path) -> None:
     findings = examine(once / "data/1M/s")
-    assert (findings.levels, findings.witnesses, findings.wrong) == (ROWS, findings.same_bits, [])
+    assert (findings.levels, findings.witnesses, findings.sentences) == (ROWS, findings.same_bits, [])
     shutil.rmtree(once / "theirs.gone", ignore_errors=True)
     (once / "theirs").rename(once / "theirs.gone")
     try:
