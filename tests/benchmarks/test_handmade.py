@@ -4,6 +4,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 
 from benchmarks.handmade import KINDS, labelled, totals
 from configs.compose import compose_job
@@ -16,6 +17,7 @@ from pipeline.read.level_files import levels_below
 TRIVIAL, UNSOLVABLE = 1, 16
 
 
+@pytest.mark.campaign
 def test_each_level_has_its_row_and_each_size_its_sum(tmp_path: Path) -> None:
     for name, level_id in {"falls": TRIVIAL, "hopeless": UNSOLVABLE}.items():
         level = jax.tree.map(np.asarray, sample_levels([level_id], SIZES["s"]))

@@ -127,7 +127,7 @@ class TestInput:
         assert main(words) == Exit.INPUT
         assert re.search(r"--\w+ is -?\d: it has to be at least 1\.$", capsys.readouterr().err)
 
-    @pytest.mark.parametrize("words", [[], ["storage"], ["physics", "--size", "xl"], ["physics", "--lanes", "many"]])
+    @pytest.mark.parametrize("words", [[], ["nothing"], ["physics", "--size", "xl"], ["physics", "--lanes", "many"]])
     def test_unknown_words(self, words) -> None:
         with pytest.raises(SystemExit) as error:
             main(words)

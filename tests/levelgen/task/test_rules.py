@@ -242,7 +242,7 @@ def test_red_wins_over_blue() -> None:
     [
         ({"frame_skip": 0}, "frame_skip is 0"),
         ({"max_timesteps": 0}, "max_timesteps"),
-        ({"dense_reward_scale": -1.0}, "negative"),
+        ({"dense_reward_scale": -1.0}, "dense_reward_scale is -1.0"),
     ],
 )
 def test_impossible_rules_are_refused(change: dict, words: str) -> None:
