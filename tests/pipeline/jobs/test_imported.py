@@ -197,9 +197,9 @@ def test_a_split_is_named_by_budget_and_size(once: Path, tmp_path: Path) -> None
 
 @pytest.mark.campaign
 def test_folders_that_the_reference_s_code_wrote(reference: Path, tmp_path: Path) -> None:
-    """Of every size; most of what reaches the goal there does so here."""
+    """The smallest and the largest size; most of what reaches the goal there does so here."""
     reached: list[bool] = []
-    for size, levels, solved in (("s", 256, 48), ("m", 256, 32), ("l", 64, 4)):
+    for size, levels, solved in (("s", 128, 24), ("l", 64, 4)):
         file = oracle.sampled_levels(reference, size)
         words = [tmp_path / size, file, "--size", size, "--levels", levels, "--solved", solved, "--others", 4]
         oracle.run_script(reference, "trajectories", words, "play levels with the reference")
