@@ -29,6 +29,7 @@ from pipeline.errors import Failure, UserError
 from pipeline.jobs.progress import Board
 from pipeline.jobs.schedule import ROUND, Assignment, Round, Settle, UnitOutcome, UnitQueue, WorkUnit
 from pipeline.runtime import cores_for, interruptible, own_cores, prepare_jax
+from pipeline.store.remote import absolute, as_typed
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s after which people see progress, whether a worker has reported or not
@@ -113,7 +114,7 @@ def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Bo
         Failure: no worker can start.
     """
     with connected():
-        crew = Crew(_seen_from_elsewhere(job), split.absolute(), len(queue.waiting), board)
+        crew = Crew(_seen_from_elsewhere(job), absolute(split), len(queue.waiting), board)
         while True:
             crew.follow_cluster()
             crew.start_workers(len(queue.waiting))
@@ -126,8 +127,8 @@ def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Bo
 
 def _seen_from_elsewhere(job: JobConfig) -> JobConfig:
     """The job as a worker in another folder has to read it: no path is relative."""
-    absolute = lambda path: path and str(Path(path).expanduser().absolute())
-    return replace(job, out=absolute(job.out), continue_from=absolute(job.continue_from))
+    known = lambda path: path and as_typed(absolute(Path(path)))
+    return replace(job, out=known(job.out), continue_from=known(job.continue_from))
 
 
 class Crew:

@@ -107,18 +107,18 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult, comm
         OSError: the disk refuses; nothing is committed.
     """
     kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label in WITNESSED]
-    paths = new_attempt(split, unit.name)
     rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
     for row, content, signature in zip(rows, content_hashes(result.levels), signatures(result.levels), strict=True):
         row |= {"content_hash": content, "signature": signature}
-    for row_of_shard, i in enumerate(kept):
-        rows[i] |= {"shard": str(paths.shard.relative_to(split)), "row": row_of_shard}
     for row, origin in zip(rows, unit.origins, strict=bool(unit.origins)):
         row |= {"file": origin.file, "command": command or _command(job, origin, row["level_id"])}
-    for row in rows if result.experts else ():
-        if row["level_id"] in result.experts:
-            row["experts"] = str(paths.experts.relative_to(split))
-    with committing(split):
+    with committing(split) as folder:
+        paths = new_attempt(folder, unit.name)
+        for row_of_shard, i in enumerate(kept):
+            rows[i] |= {"shard": str(paths.shard.relative_to(folder)), "row": row_of_shard}
+        for row in rows if result.experts else ():
+            if row["level_id"] in result.experts:
+                row["experts"] = str(paths.experts.relative_to(folder))
         begin_fragment(paths)
         if result.experts:
             save_experts(paths.experts, result.experts)

@@ -38,11 +38,11 @@ def only_writer(split: Path) -> Iterator[None]:
 
 
 @contextmanager
-def committing(split: Path) -> Iterator[None]:
-    """Held while a unit writes its shard and its fragment; many units may at once."""
+def committing(split: Path) -> Iterator[Path]:
+    """Held while a unit writes its shard and its fragment, to the folder that it gives; many units may at once."""
     with (split / COMMIT_LOCK).open("a+") as file:
         _take(file, fcntl.LOCK_SH)
-        yield
+        yield split
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from pipeline.errors import UserError
 from pipeline.store.manifest import read_manifest
+from pipeline.store.remote import absolute, as_typed
 
 ASKED = ("content_hash", "file", "size", "shard", "row")  # columns that tell a level's origin
 
@@ -52,7 +53,7 @@ class Origin(NamedTuple):
 
 def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:
     """Of a row of a split's manifest, with the columns ASKED."""
-    found = Origin(row["content_hash"], row["file"] or "", row["size"], str(split.expanduser().absolute()))
+    found = Origin(row["content_hash"], row["file"] or "", row["size"], as_typed(absolute(split)))
     if not row["shard"]:
         return found
     return found._replace(shard=row["shard"], row=row["row"], level_id=row["level_id"])

@@ -73,6 +73,11 @@ def as_typed(path: Path) -> str:
     return "//".join([path.parts[0], "/".join(path.parts[1:])]) if is_remote(path) else str(path)
 
 
+def absolute(path: Path) -> Path:
+    """A path as processes in other folders know it; of a URL, itself."""
+    return path if is_remote(path) else path.expanduser().absolute()
+
+
 def require_folder(split: Path, what: str) -> None:
     """For what cannot be done from afar.
 
