@@ -1,22 +1,30 @@
-"""Draws docs/solved.png: solved levels of a split, each at the moment its witness reaches the goal.
+"""Draws docs/solved.webp: solved levels of a split, playing their witnesses until all have reached the goal.
 
-levelproof generate size=l levels=24 budget=64k
-python docs/make_solved.py data/64k/l 0 4 5 11 19 20
+levelproof generate size=l levels=96 budget=64k
+python docs/make_solved.py data/64k/l 66 32 76 88 83 89
 """
 
 import sys
 from pathlib import Path
 
-from levelgen.pictures.raster import rasterised, sheet, write_png
+from levelgen.pictures.raster import rasterised, sheet
 from pipeline.look.show import film_of
 
 COLUMNS = 3
 PIXELS = 260  # width of one level's picture
+REST = 1.5  # seconds that the film shows the end
+FILM = Path(__file__).with_name("solved.webp")
 
 
 def main(split: Path, level_ids: list[int]) -> None:
-    last = [rasterised(film_of(split, level_id).scenes[-1], PIXELS) for level_id in level_ids]
-    write_png(sheet(last, COLUMNS), Path(__file__).parent / "solved.png")
+    films = [film_of(split, level_id) for level_id in level_ids]
+    pictures = [[rasterised(scene, PIXELS) for scene in film.scenes] for film in films]
+    frames = [
+        sheet([of[min(moment, len(of) - 1)] for of in pictures], COLUMNS) for moment in range(max(map(len, pictures)))
+    ]
+    shown = [round(1000 * films[0].seconds[0])] * len(frames)
+    shown[-1] = round(1000 * REST)
+    frames[0].save(FILM, save_all=True, append_images=frames[1:], duration=shown, loop=0, quality=30, method=6)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,15 @@
 """Every Python block of the README and the docs runs as it stands, and imports of ours the one door."""
 
 import ast
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+import levelproof
 from pipeline.read.export import export
 from pipeline.read.parquet import export_parquet
 from pipeline.store.manifest import read_manifest
@@ -49,3 +53,14 @@ def test_a_page_imports_of_ours_the_door_alone(page: Path) -> None:
     modules = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
     modules += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
     assert not {module.partition(".")[0] for module in modules} & INSIDE
+
+
+def test_the_docs_are_a_site_without_a_broken_link(tmp_path: Path) -> None:
+    words = ["-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    page = (tmp_path / "api.html").read_text()
+    assert all(f'id="levelproof.{name}"' in page for name in levelproof.__all__ if name != "__version__")
+    asked = {link for html in tmp_path.rglob("*.html") for link in re.findall(r'src="(https?:[^"]+)', html.read_text())}
+    assert not asked, "the site asks other hosts for something"

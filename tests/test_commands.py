@@ -1,0 +1,68 @@
+"""Every `levelproof` command that the README and the docs show does what it says, on a smaller scale."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.pipeline.command import here, run
+
+pytestmark = pytest.mark.campaign
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+LEVELS = 8  # in place of as many as a page says
+BUDGETS = {"64k": "2k", "128k": "3k", "256k": "4k", "1M": "5k"}  # what a page says, and what runs, folders as well
+JOBS = ("generate", "regenerate")
+ELSEWHERE = ("://", "HEAD:", "me/levels")  # on other hosts: those commands are tested with servers, in tests/pipeline
+NOBODY = "No level", "no trajectories"  # of so few fits a condition
+
+
+def smaller(line: str) -> list[str]:
+    """The words of a command, with budgets and levels that take seconds."""
+    for said, small in BUDGETS.items():
+        line = re.sub(rf"\b{said}\b", small, line)
+    words = [re.sub(r"^levels=.*", f"levels={LEVELS}", word) for word in shlex.split(line, comments=True)[1:]]
+    asks = words[0] == "generate" and not any(word.startswith(("levels=", "level_files=", "-")) for word in words)
+    return words + asks * [f"levels={LEVELS}"]
+
+
+def commands(page: Path) -> list[list[str]]:
+    lines = re.findall(r"^    (?:pip install \S+ && )?(levelproof .*)", page.read_text(), re.MULTILINE)
+    return [smaller(line) for line in lines if not any(word in line for word in ELSEWHERE)]
+
+
+def typed(words: list[str], folder: Path) -> None:
+    """In a process of its own what starts workers, in this one what only reads."""
+    done = (run if words[0] in JOBS or "--repair" in words else here)(words, folder)
+    nobody = done.returncode == 2 and any(word in done.stderr for word in NOBODY)
+    assert done.returncode == 0 or nobody, f"levelproof {shlex.join(words)}: {done.stdout[-500:]}{done.stderr[-1500:]}"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What pages take for granted: splits, level files, and a folder of the reference's."""
+    folder = tmp_path_factory.mktemp("docs")
+    for size, budget in (("s", "3k"), ("s", "4k"), ("s", "5k"), ("m", "4k"), ("m", "5k")):
+        typed(["generate", f"size={size}", f"budget={budget}", f"levels={LEVELS}"], folder)
+    typed(["export", "data/3k/s", "7", "-o", "level.json"], folder)
+    for name in ("mine", "handmade"):
+        (folder / name).mkdir()
+        shutil.copy(folder / "level.json", folder / name)
+    everything = ["--where", "shard IS NOT NULL"]
+    typed(["export", "data/5k/s", "--format", "kinetix", *everything, "-o", "kinetix/5k/s"], folder)
+    return folder
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+def test_a_page_s_commands_run_in_their_order(page: Path, made: Path, tmp_path: Path) -> None:
+    for words in commands(page):
+        for name in re.findall(r"data/\w+/\w+|kinetix/\w+/\w+|level\.json|\bmine\b|\bhandmade\b", " ".join(words)):
+            makes = words[0] == "import" and f"-o {name}" in " ".join(words)
+            if (made / name).exists() and not (tmp_path / name).exists() and not makes:
+                copy = shutil.copytree if (made / name).is_dir() else shutil.copy
+                (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+                copy(made / name, tmp_path / name)
+        typed(words, tmp_path)
