@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
 from benchmarks import oracle
 from pipeline.errors import Failure
@@ -66,16 +67,25 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "reference" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.campaign)
-        item.add_marker(pytest.mark.xdist_group(group_of(item)))
-    slow = Counter(group_of(item) for item in items if item.get_closest_marker("slow"))
+    slow = Counter(group_of(item.nodeid) for item in items if item.get_closest_marker("slow"))
     beside = lambda group: not group.startswith(BESIDE)
-    items.sort(key=lambda item: ((group := group_of(item)) != FIRST, beside(group), -slow[group]))
+    items.sort(key=lambda item: ((group := group_of(item.nodeid)) != FIRST, beside(group), -slow[group]))
 
 
-def group_of(item: pytest.Item) -> str:
+def group_of(nodeid: str) -> str:
     """What runs in one process: a file, or the group that it belongs to."""
-    name = item.path.relative_to(ROOT).as_posix()
-    return next((group for group, paths in TOGETHER.items() if name.startswith(paths)), name)
+    return next((group for group, paths in TOGETHER.items() if nodeid.startswith(paths)), nodeid.partition("::")[0])
+
+
+class Groups(LoadScopeScheduling):
+    """Hands out groups. (xdist's own `--dist=loadgroup` writes them into ids that pytest 9.2 no longer reads.)"""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return group_of(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Groups:
+    return Groups(config, log)
 
 
 def pytest_deselected(items: list[pytest.Item]) -> None:
