@@ -83,7 +83,7 @@ def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
             return [primitives.convert(b, operands[0], str(params["new_dtype"]))]
         case "broadcast_in_dim":
             return [primitives.broadcast_in_dim(b, operands[0], params["shape"], params["broadcast_dimensions"])]
-        case "reshape" | "squeeze" | "expand_dims":
+        case "reshape" | "squeeze":
             return [primitives.reshape(operands[0], out.shape)]
         case "slice":
             return [_slice(operands[0], params)]
@@ -91,7 +91,7 @@ def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
             return [_join(b, np.concatenate, operands, params["dimension"])]
         case "stack":
             return [_join(b, np.stack, operands, params["axis"])]
-        case "reduce_or" | "reduce_and" | "reduce_max" | "reduce_min" | "reduce_sum":
+        case "reduce_or" | "reduce_and" | "reduce_max" | "reduce_min":
             return [primitives.reduction(b, name, operands[0], params["axes"], str(out.dtype))]
         case "iota":
             return [primitives.iota(params["shape"], params["dimension"], str(params["dtype"]))]
@@ -280,5 +280,4 @@ CONTROL: dict[str, Callable[[ir.IRBuilder, core.JaxprEqn, list], list[Value]]] =
     "cond": _cond,
     "jit": _call("jaxpr"),
     "closed_call": _call("call_jaxpr"),
-    "custom_jvp_call": _call("call_jaxpr"),
 }

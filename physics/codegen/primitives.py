@@ -15,21 +15,18 @@ FLOAT, INT, BOOL = "float32", "int32", "bool"
 COMPARE = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 
 
-def _intrinsic(b: ir.IRBuilder, name: str, result: ir.Type, *xs: Operand) -> Operand:
-    """An LLVM intrinsic, by its full name."""
-    function = b.module.globals.get(f"llvm.{name}")
-    if function is None:
-        function = ir.Function(b.module, ir.FunctionType(result, [x.type for x in xs]), f"llvm.{name}")
-    return b.call(function, xs)
-
-
-def _lanes_in_name(x: Operand) -> str:
-    return f"v{LANES}" if isinstance(x.type, ir.VectorType) else ""
-
-
 def _call(name: str) -> Emit:
     """An LLVM intrinsic from floats to a float."""
-    return lambda b, *xs: _intrinsic(b, f"{name}.{_lanes_in_name(xs[0])}f32", xs[0].type, *xs)
+
+    def emit(b, *xs):
+        kind = xs[0].type
+        whole = f"llvm.{name}.{f'v{LANES}' if isinstance(kind, ir.VectorType) else ''}f32"
+        function = b.module.globals.get(whole)
+        if function is None:
+            function = ir.Function(b.module, ir.FunctionType(kind, [x.type for x in xs]), whole)
+        return b.call(function, xs)
+
+    return emit
 
 
 def _number(x: Operand, number: float) -> ir.Constant:
@@ -64,10 +61,6 @@ def _sign(b, x):
     return b.select(b.fcmp_unordered("==", x, _number(x, 0.0)), x, _call("copysign")(b, _number(x, 1.0), x))
 
 
-def _clamp_int(b, low, x, high):
-    return _extreme_int("<")(b, _extreme_int(">")(b, x, low), high)
-
-
 def _select(b, which, x, y):
     return b.select(which, y, x)
 
@@ -95,7 +88,6 @@ ELEMENTWISE: dict[str, dict[str, Emit]] = {
     "or": _bits("or_"),
     "not": _bits("not_"),
     "select_n": dict.fromkeys((FLOAT, INT, BOOL), _select),
-    "clamp": {INT: _clamp_int},  # `lax.switch` does it to its index
     **{name: _compare(order) for name, order in COMPARE.items()},
 }
 
@@ -128,22 +120,17 @@ def with_lanes(b: ir.IRBuilder, x: Value) -> Value:
 
 
 def convert(b: ir.IRBuilder, x: Value, dtype: str) -> Value:
+    """Exactly, or to the nearest float."""
     if x.dtype == dtype:
         return x
+    if dtype == FLOAT:
+        emit = b.uitofp if x.dtype == BOOL else b.sitofp
+    elif dtype == INT and x.dtype == BOOL:
+        emit = b.zext
+    else:
+        raise NotImplementedError(f"a kernel cannot convert {x.dtype} to {dtype}")
     to = llvm_type(dtype, x.lanes)
-
-    def one(v):
-        if dtype == BOOL:
-            zero = constant(0, x.dtype, x.lanes)
-            return b.fcmp_unordered("!=", v, zero) if x.dtype == FLOAT else b.icmp_signed("!=", v, zero)
-        if dtype == FLOAT:
-            return b.uitofp(v, to) if x.dtype == BOOL else b.sitofp(v, to)
-        if x.dtype == BOOL:
-            return b.zext(v, to)
-        kind = _lanes_in_name(v)  # the nearest integer there is; 0 for NaN
-        return _intrinsic(b, f"fptosi.sat.{kind}i32.{kind}f32", to, v)
-
-    return Value(array(x.rows.shape, lambda at: one(x.rows[at])), dtype, x.lanes)
+    return Value(array(x.rows.shape, lambda at: emit(x.rows[at], to)), dtype, x.lanes)
 
 
 def broadcast_in_dim(b: ir.IRBuilder, x: Value, shape: tuple[int, ...], dimensions: tuple[int, ...]) -> Value:
@@ -169,8 +156,8 @@ def reshape(x: Value, shape: tuple[int, ...]) -> Value:
 
 
 def reduction(b: ir.IRBuilder, name: str, x: Value, axes: tuple[int, ...], dtype: str) -> Value:
-    """or, and, max, min, sum over rows, over lanes, or over both."""
-    emit = {"reduce_or": "or", "reduce_and": "and", "reduce_max": "max", "reduce_min": "min", "reduce_sum": "add"}[name]
+    """or, and, max, min over rows, over lanes, or over both."""
+    emit = name.removeprefix("reduce_")
     over_lanes = x.lanes and x.rows.ndim in axes
     along = tuple(axis for axis in axes if axis < x.rows.ndim)
     kept = [axis for axis in range(x.rows.ndim) if axis not in along]

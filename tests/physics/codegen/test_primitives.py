@@ -5,7 +5,6 @@ and min choose between two zeros; and numbers below 1.2e-38, which XLA's threads
 which operations that only choose (max, min, sign) may hand on as they are.
 """
 
-import functools
 from collections.abc import Callable
 
 import jax
@@ -85,14 +84,12 @@ INTEGER = {
     "mul": lambda x, y, _: x * y,
     "max": lambda x, y, _: jnp.maximum(x, y),
     "min": lambda x, y, _: jnp.minimum(x, y),
-    "clamp": lambda x, y, z: lax.clamp(y, x, z),
     "neg": lambda x, *_: -x,
     "square": lambda x, *_: jnp.square(x),
     "and": lambda x, y, _: x & y,
     "or": lambda x, y, _: x | y,
     "not": lambda x, *_: ~x,
     "select_n": lambda x, y, z: lax.select_n(x < y, y, z),
-    "reduce_sum": lambda *xs: jnp.stack(xs).sum(0),
     "reduce_max": lambda *xs: jnp.stack(xs).max(0),
     "reduce_min": lambda *xs: jnp.stack(xs).min(0),
     "reduce_and": lambda *xs: lax.reduce_and(jnp.stack(xs), (0,)),
@@ -154,35 +151,12 @@ class TestNumbers:
     def test_integers(self, x) -> None:
         self.check_integers(x)
 
-    def test_a_sum_adds_in_order(self) -> None:
-        kernel = Kernel(lambda x, out: out.__setitem__(0, x[...].sum(0)), [Buffer((5,))], [Buffer((1,))])
-        x = np.random.default_rng(1).normal(size=(5, 4 * LANES)).astype(np.float32)
-        self.check(kernel, x)
-
 
 class TestConversions:
-    @staticmethod
-    @functools.cache
-    def kernel(of: str, to: str) -> Kernel:
-        return table({"convert": lambda x, *_: x.astype(to)}, of, to)
-
-    @pytest.mark.parametrize("to", ["float32", "int32", "bool"])
-    def test_floats(self, to: str) -> None:
-        """Beyond the integers there is the last of them, and 0 for NaN."""
-        edges = np.float32([2**31 - 128, 2**31, -(2**31), -(2**31) - 256, 1e10, 0.99, -0.99, 1.5])
-        x = every_pair(np.concatenate([AWKWARD, edges, -edges]))
-        TestNumbers.check(self.kernel("float32", to), x)
-
-    @pytest.mark.parametrize("to", ["float32", "int32", "bool"])
-    @pytest.mark.parametrize("of", ["int32", "bool"])
-    def test_integers_and_bools(self, of: str, to: str) -> None:
+    @pytest.mark.parametrize(("of", "to"), [("int32", "float32"), ("bool", "float32"), ("bool", "int32")])
+    def test_are_exact_or_to_the_nearest_float(self, of: str, to: str) -> None:
         x = every_pair(AWKWARD_INTS)
-        TestNumbers.check(self.kernel(of, to), x if of == "int32" else x > 0)
-
-    @some
-    @given(rows(floats, np.float32))
-    def test_any_float_to_an_integer(self, x) -> None:
-        TestNumbers.check(self.kernel("float32", "int32"), x)
+        TestNumbers.check(table({"convert": lambda x, *_: x.astype(to)}, of, to), x if of == "int32" else x > 0)
 
 
 def shape_cases() -> dict[str, Callable]:
@@ -200,7 +174,7 @@ def shape_cases() -> dict[str, Callable]:
         "numbers of rows": lambda x, n: lax.broadcasted_iota(jnp.int32, (3, LANES), 0) + n[0],
         "numbers of columns": lambda x, n: lax.broadcasted_iota(jnp.int32, (3, LANES), 1) + n[0],
         "reshape": lambda x, n: x.reshape(2, 3, LANES) + x.reshape(3, 2, LANES)[:2, :1],
-        "squeeze and expand": lambda x, n: jnp.expand_dims(x[2:3].squeeze(0), (0, 1)),
+        "squeeze": lambda x, n: x[2:3].squeeze(0)[None, None],
         "slice": lambda x, n: x[1:6:2] - x[:3],
         "concatenate": lambda x, n: jnp.concatenate([x[:2], n.astype(jnp.float32), jnp.zeros((1, LANES))]),
         "stack": lambda x, n: jnp.stack([x, -x], axis=1),
@@ -216,7 +190,6 @@ def shape_cases() -> dict[str, Callable]:
         "smallest bool over lanes": lambda x, n: jnp.where((x[0] > 0.5).min(), x, 0.0),
         "select by a number": lambda x, n: jnp.where(jnp.bool_(True), x, -x),
         "a function": lambda x, n: jax.jit(lambda x, k: jnp.where(x > 0, x, k))(x, weights[2]),
-        "a function with its own rule": lambda x, n: jax.nn.relu(x),
     }
 
 
