@@ -5,8 +5,9 @@ leave empty. A result depends on nothing but its level, so sharing changes none.
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import groupby
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
@@ -81,8 +82,9 @@ class Pool:
         self._slots: Slots | None = None  # these two are there once the first levels have come
         self._queue: LevelQueue | None = None
         self._taken = 0  # levels that left the queue, ever
-        self._at: dict[int, tuple[Submission, int]] = {}  # by index in the queue: levels that have not left their slots
-        self._coming: deque[tuple[Submission, range]] = deque()  # levels that wait for room in the queue
+        # By index in the queue, in the order in which they came: levels that have not left their slots
+        self._at: dict[int, tuple[Submission, int]] = {}
+        self._coming: deque[tuple[Submission, Sequence[int]]] = deque()  # levels that wait for room in the queue
         self._submissions: list[Submission] = []  # not finished
 
     def submit(
@@ -126,12 +128,37 @@ class Pool:
         waiting = come - self._taken + sum(len(some) for _, some in self._coming)
         return max(0, slot_count(self.config) - waiting)
 
+    def waiting(self, submission: Submission) -> list[int]:
+        """Indices of its levels that have had no slot, ascending."""
+        coming = (i for of, some in self._coming for i in some if of is submission)
+        return [*(i for _, (of, i) in self._queued() if of is submission), *coming]
+
+    def withdraw(self, submission: Submission, indices: Collection[int]) -> None:
+        """Take levels out that have had no slot."""
+        queued = self._queued()
+        for index, _ in queued:
+            del self._at[index]
+        if self._queue is not None:
+            self._queue = self._queue._replace(come=np.int32(self._taken))
+        levels = [level for _, level in queued] + [(of, i) for of, some in self._coming for i in some]
+        left = [(of, i) for of, i in levels if of is not submission or i not in indices]
+        self._coming = deque()
+        for _, same in groupby(left, lambda level: id(level[0])):
+            of, some = zip(*same, strict=True)
+            self._coming.extend((of[0], some[i : i + GROUP]) for i in range(0, len(some), GROUP))
+        submission.under_way.difference_update(indices)
+
     def totals(self, submission: Submission) -> Totals:
         """How far the levels of a submission are."""
         parts = sum(len(submission.curves[i]) for i in submission.under_way) / self.updates
         steps = submission.trained_rollouts * self.config.steps_per_update
         decided = len(submission.curves) - len(submission.under_way)
         return Totals(steps, decided + parts, submission.solved)
+
+    def _queued(self) -> list[tuple[int, tuple[Submission, int]]]:
+        """Levels in the queue that have had no slot, in order, with their indices there."""
+        count = int(self._queue.come) - self._taken if self._queue else 0
+        return list(self._at.items())[len(self._at) - count :]
 
     def _advance(self) -> None:
         """A rollout in every slot, and the account of it."""
@@ -155,7 +182,7 @@ class Pool:
             indices = next_indices(self._queue, len(some))
             if not self._at.keys().isdisjoint(indices):
                 return
-            begun = {i - some.start: submission.begun[i].begun for i in some if i in submission.begun}
+            begun = {row: submission.begun[i].begun for row, i in enumerate(some) if i in submission.begun}
             at = np.array(some)
             success = jax.tree.map(lambda x, at=at: x[at], submission.found.success)
             levels, level_ids = take(submission.levels, at), submission.level_ids[at]

@@ -1,6 +1,6 @@
 """From levels to verdicts: they are decided without an expert, or scouted, trained and judged."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -58,6 +58,7 @@ class TrainingRun:
         self.left = np.array([i for i, verdict in enumerate(self.before.verdicts) if verdict is None], int)
         self.looking = Looking(*self._some(self.left), pool.procedure, pool.rules)
         self.submission: Submission | None = None  # of those that an expert is asked for
+        self._gone: set[int] = set()  # ids of levels that others label
         self.look()
 
     def look(self) -> None:
@@ -75,33 +76,58 @@ class TrainingRun:
         """Levels that will come to the pool."""
         return 0 if self.submission else len(self.left)
 
+    @property
+    def unbegun(self) -> list[int]:
+        """Ids of levels that wait for an expert."""
+        return self.submission.level_ids[self.pool.waiting(self.submission)].tolist() if self.submission else []
+
+    @property
+    def undecided(self) -> list[int]:
+        """Ids of levels that wait for an expert or have one; of all, while there is anything left to search."""
+        of = self.submission
+        return (of.level_ids[sorted(of.under_way)] if of else self.level_ids).tolist()
+
+    def leave_out(self, level_ids: Collection[int]) -> None:
+        """Have others label some of these levels: any that are `unbegun`, or all that are `undecided` at the end."""
+        self._gone.update(level_ids)
+        if self.submission:
+            indices = np.flatnonzero(np.isin(self.submission.level_ids, list(level_ids)))
+            self.pool.withdraw(self.submission, indices.tolist())
+
     def totals(self) -> Totals:
         """How far all levels are, those that need no expert included."""
         looked = self.looking.env_steps
         if self.submission is None:
             return Totals(looked, len(self.level_ids) - len(self.left), 0)
         now, waiting = self.pool.totals(self.submission), len(self.submission.level_ids)
-        return now._replace(env_steps=now.env_steps + looked, levels=len(self.level_ids) - waiting + now.levels)
+        others = len(self.level_ids) - waiting - len(self._gone)
+        return now._replace(env_steps=now.env_steps + looked, levels=others + now.levels)
 
     def finish(self) -> UnitResult:
-        """Choose witnesses and give verdicts, once the submission has finished."""
-        (before, failed), left, found, submission = self.before, self.left, self.looking.found, self.submission
+        """Choose witnesses and give verdicts, once the submission has finished; of all levels that are not left out."""
+        found, submission = self.looking.found, self.submission
         assert submission is not None
         config, rules = self.pool.config, self.pool.rules
+        kept = np.flatnonzero(~np.isin(self.level_ids, list(self._gone)))
+        levels, level_ids = self._some(kept)
+        before, failed = [self.before.verdicts[i] for i in kept], self.before.failed_by_noop[kept]
+        asked = np.flatnonzero(np.isin(self.left, kept))  # of those that came to the submission
+        left = np.searchsorted(kept, self.left[asked])
         trained = submission.trained(config) if len(submission.level_ids) else as_found(found)
-        actions = np.zeros((RECORD_STEPS, ACTIONS, len(self.level_ids)), np.int32)  # doing nothing, if none are found
+        trained = [trained[i] for i in asked]
+        actions = np.zeros((RECORD_STEPS, ACTIONS, len(kept)), np.int32)  # doing nothing, if none are found
         candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
         for i, of in zip(left, trained, strict=True):
             candidates[i] = of.candidates
-        chosen = choose(self.levels, self.level_ids, candidates, config.replays, rules)
+        chosen = choose(levels, level_ids, candidates, config.replays, rules)
         for i, witness in enumerate(chosen):
             if witness is not None:
                 actions[..., i] = witness.action
-        record = replay(self.levels, actions, rules)
+        record = replay(levels, actions, rules)
         witnesses = [chosen[i] for i in left]
         judged = judge(trained, witnesses, take(record, left), self.pool.updates, config, failed[left])
         verdicts = {
-            int(i): with_looks(verdict, found, at) for at, (i, verdict) in enumerate(zip(left, judged, strict=True))
+            i: with_looks(verdict, found, at) for i, verdict, at in zip(left.tolist(), judged, asked, strict=True)
         }
         shares = [None if witness is None else witness.portability for witness in chosen]
         known = [
@@ -110,9 +136,9 @@ class TrainingRun:
         ]
         witnessed = np.array([verdict.label in WITNESSED for verdict in known])
         record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
-        ended = zip(self.level_ids[left].tolist(), trained, strict=True)
+        ended = zip(level_ids[left].tolist(), trained, strict=True)
         experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
-        return UnitResult(self.level_ids, self.levels, record, known, spent_on(known, submission, config), experts)
+        return UnitResult(level_ids, levels, record, known, spent_on(known, submission, config), experts)
 
     def _some(self, indices: Int[np.ndarray, " index"]) -> tuple[Level, Int[np.ndarray, " index"]]:
         return take(self.levels, indices), self.level_ids[indices]

@@ -5,7 +5,10 @@ Called before JAX starts its backend; changes nothing after that.
 
 import os
 import signal
+import socket
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +26,11 @@ XLA_FLAGS = (
 )
 # NPROC and PJRT_NPROC size XLA's pool; the others are those of numpy's libraries.
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+GRACE = 20.0  # s that workers have, when a job is to end, to commit what they can
+LAST = 28.0  # s after which it has ended; batch systems kill after 30
+INTERRUPTED = 130  # exit code, as shells have it
+CLAIMING = 2.0  # s of trying to get a core
+CLAIMS: list[socket.socket] = []  # of this process
 MIN_COMPILE_SECONDS = 0.2  # what compiles faster is not worth a file
 
 
@@ -66,18 +74,56 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+@contextmanager
+def stoppable() -> Iterator[threading.Event]:
+    """Whether SIGTERM or Ctrl-C asked for the end. Asked twice, it comes at once; and after `LAST` s, come what may:
+    what is compiled hears of no signal."""
+    asked = threading.Event()
+    clock = threading.Timer(LAST, os._exit, [INTERRUPTED])
+    clock.daemon = True
+
+    def stop(*_: object) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+        clock.start()
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield asked
+    finally:
+        clock.cancel()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def own_cores() -> list[int]:
     """The CPU cores that this process may keep busy: a container's quota may be smaller than their number."""
     return _allowed_cores()[: cpu_count()]
 
 
-def cores_for(workers: int) -> list[int | None]:
-    """The core that each worker stays on, for at most so many workers.
+def own_core(neighbours: int) -> int | None:
+    """A core that this process has to itself among all workers of this machine, until it ends.
 
-    None leaves that to the system, where not every core has a worker: two runs side by side would choose the same.
+    None leaves the core to the system: `neighbours`, the workers that this machine is to have, this one included, are
+    fewer than the cores that they may use, or a container's quota is smaller than those; then others are on them, too.
     """
-    cores = own_cores()[:workers]
-    return [*cores] if cores == _allowed_cores() else [None] * len(cores)
+    cores = _allowed_cores()
+    if sys.platform != "linux" or neighbours < len(cores) or len(own_cores()) < len(cores):
+        return None
+    end = time.monotonic() + CLAIMING
+    while time.monotonic() < end:
+        for core in cores:
+            claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            try:
+                claim.bind(f"\0levelproof on core {core}")  # a name and no file: the system frees it with the process
+            except OSError:
+                claim.close()
+                continue
+            CLAIMS.append(claim)
+            return core
+        time.sleep(CLAIMING / 10)  # a worker that died before this one may be on its way out
+    return None
 
 
 def _allowed_cores() -> list[int]:

@@ -95,7 +95,7 @@ def train_all(
     scratch: Path,
 ) -> None:
     """The wanted levels that are not there, in processes; a unit's lines when it is done."""
-    units = plan_units(wanted, there, UNIT)
+    units = list(plan_units(wanted, there, UNIT))
     cores = own_cores()
     if not 0 <= jobs <= len(cores):
         raise UserError(f"--jobs is {jobs}: this process may use {len(cores)} cores; give at most that many.")

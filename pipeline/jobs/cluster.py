@@ -7,11 +7,14 @@ import io
 import logging
 import os
 import re
+import signal
 import socket
+import threading
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,55 +26,70 @@ os.environ |= {
 
 import ray
 from ray.exceptions import ActorDiedError, RayError
+from ray.util.metrics import Gauge
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from configs.schema import JobConfig
 from pipeline.errors import Failure, UserError
-from pipeline.jobs.progress import Board
-from pipeline.jobs.schedule import ROUND, Assignment, Round, Settle, UnitOutcome, UnitQueue, WorkUnit
-from pipeline.runtime import cores_for, interruptible, own_cores, prepare_jax
+from pipeline.jobs.likeness import Program, program_of, unlike
+from pipeline.jobs.progress import STOPPING, Board, Tally, duration
+from pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, Settle, UnitOutcome, levels_text
+from pipeline.runtime import GRACE, own_core, own_cores, prepare_jax, stoppable
 from pipeline.store.remote import absolute, as_typed
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s after which people see progress, whether a worker has reported or not
 REACH = 5.0  # s in which a cluster has to answer
-RESCAN = 5.0  # s between looks at how many workers a cluster has room for
+RESCAN = 5.0  # s between looks at which machines a cluster has
 PATIENCE = 60.0  # s without any worker after which people are told why
-STARTS = 3  # workers in a row that do not start, after which no further one is tried with these resources
+STARTS = 3  # times in a row that a worker does not start, after which its place is given up
+REPORTS = 100.0  # a second that the driver takes: of more workers each reports less often
+MOST_SILENT = 1800.0  # s without a word after which a worker is given up; a large program compiles for minutes
 
 
 class WorkerActor:
     """A worker in a process of its own. Calls are short (see `schedule.ROUND`), so that one thread suffices."""
 
-    def __init__(self, job: JobConfig, split: Path, core: int | None) -> None:
-        prepare_jax(core)
+    def begin(self, program: Program, job: JobConfig, split: Path, neighbours: int) -> str:
+        """Get ready; why not, where another program runs here. `neighbours` as in `runtime.own_core`."""
+        if refusal := unlike(program, job):
+            return refusal
+        prepare_jax(own_core(neighbours))
         from pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
-        self._worker = Worker(job, split)
+        self._worker, self._at_work = Worker(job, split), False
+        self._before = signal.signal(signal.SIGTERM, self._asked_to_go)
+        return ""
 
-    def work(self, units: list[WorkUnit]) -> Round:
-        return self._worker.work(units, ROUND)
+    def work(self, order: Order, seconds: float) -> Round:
+        self._at_work = True
+        try:
+            return self._worker.work(order, seconds)
+        finally:
+            self._at_work = False
+
+    def leave(self) -> Round:
+        return self._worker.leave()
+
+    def _asked_to_go(self, number: int, frame: Any) -> None:
+        """SIGTERM: with units under way, leave after the step that is under way; else at once."""
+        self._worker.stopping = True
+        if not self._at_work and callable(self._before):
+            self._before(number, frame)
 
 
-@dataclass
+@dataclass(eq=False)
 class WorkerHandle:
-    """A worker as the driver sees it: what it occupies, what it does, and whether there is one now."""
+    """A worker as the driver sees it: where it is, and whether there is one now."""
 
-    job: JobConfig
-    split: Path
-    core: int | None  # that it stays on; None: the system or the cluster chooses
-    gpus: int
+    node: str  # Ray's id of its machine
+    host: str
+    neighbours: int  # as in `runtime.own_core`
     actor: Any = None
-    answer: Any = None  # reference to the coming Round; its first says that it has started
-    up: bool = False  # it has started
+    answer: Any = None  # reference to what it will answer: to `begin`, then to `work`
+    up: bool = False  # it has begun
     failed_starts: int = 0  # in a row
     why: str = ""  # of the last of them
-    assignment: Assignment = field(default_factory=Assignment)
-
-    def start(self) -> None:
-        """Ask for a worker. It gets no unit before it answers: a cluster may have no room for it now, or ever."""
-        options = {"num_cpus": 1, "num_gpus": self.gpus, "max_restarts": 0}
-        self.actor = ray.remote(WorkerActor).options(**options).remote(self.job, self.split, self.core)
-        self.answer = self.actor.work.remote([])  # nothing yet: that it is there
 
     @property
     def starting(self) -> bool:
@@ -82,20 +100,18 @@ class WorkerHandle:
         """Whether it can be told of units now."""
         return self.up and self.answer is None
 
-    def report(self) -> Round:
-        """What it has answered; a worker that died leaves its resources to a new one."""
-        over, self.answer = self.answer, None
-        try:
-            round: Round = ray.get(over)  # pyright: ignore[reportAssignmentType] - one reference, one value
-        except RayError as error:
-            if not self.up:
-                self.failed_starts, self.why = self.failed_starts + 1, _told(error)
-            self.actor, self.up = None, False
-            return Round(self.assignment.lose(f"{error}\n\n{_told(error)}"), {}, 0)
-        if self.up:
-            self.assignment.account(round)
-        self.up, self.failed_starts = True, 0
-        return round
+    def start(self, name: str, gpus: int, *begin: Any) -> None:
+        """Ask for a worker. It gets no unit before it answers: its machine may have no room for it now, or ever."""
+        here = NodeAffinitySchedulingStrategy(self.node, soft=False)
+        options = {"num_cpus": 1, "num_gpus": gpus, "max_restarts": 0, "scheduling_strategy": here}
+        self.actor = ray.remote(WorkerActor).options(name=f"{name} on {self.host}", **options).remote()
+        self.answer = self.actor.begin.remote(*begin, self.neighbours)
+
+    def end(self) -> None:
+        """It dies, if it is not dead; its place is free for another."""
+        if self.actor is not None:
+            ray.kill(self.actor)
+        self.actor, self.answer, self.up = None, None, False
 
 
 def _told(error: RayError) -> str:
@@ -106,23 +122,26 @@ def _told(error: RayError) -> str:
     return f"The worker died: {lines[0].rstrip('.')}"
 
 
-def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Board) -> None:
-    """Work on the queue until it is empty.
+def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board) -> None:
+    """Work until nothing is left to do.
 
     Raises:
         UserError: the cluster of RAY_ADDRESS cannot be reached.
         Failure: no worker can start.
+        KeyboardInterrupt: somebody asked for the end; what could be kept is committed.
     """
-    with connected():
-        crew = Crew(_seen_from_elsewhere(job), absolute(split), len(queue.waiting), board)
-        while True:
+    with connected() as stop:
+        crew = Crew(_seen_from_elsewhere(job), absolute(split), scheduler, board)
+        while not scheduler.over:
             crew.follow_cluster()
-            crew.start_workers(len(queue.waiting))
-            crew.assign(queue)
-            if not (crew.busy or queue.waiting):
-                return
+            crew.start_workers()
+            crew.order()
             settle(crew.wait())
             board.refresh()
+            if stop.is_set():
+                board.say(STOPPING)
+                settle(crew.leave())
+                raise KeyboardInterrupt
 
 
 def _seen_from_elsewhere(job: JobConfig) -> JobConfig:
@@ -132,71 +151,138 @@ def _seen_from_elsewhere(job: JobConfig) -> JobConfig:
 
 
 class Crew:
-    """All workers of a job."""
+    """All workers of a job: a place for each core or GPU of each machine."""
 
-    def __init__(self, job: JobConfig, split: Path, units: int, board: Board) -> None:
-        self._job, self._split, self._board = job, split, board
-        self._most = min(job.workers or units, units)
+    def __init__(self, job: JobConfig, split: Path, scheduler: Scheduler, board: Board) -> None:
+        self._job, self._split, self._scheduler, self._board = job, split, scheduler, board
+        units = -(-scheduler.waiting // job.levels_per_unit)
+        self._most = max(1, min(job.workers or units, units))
         self._gpus = _on_gpus()
-        self._handles = list(map(self._handle, _room(self._gpus, self._most)))
-        self._given_up = 0  # workers that cannot start
-        self._rescan_at = time.monotonic() + RESCAN
+        self._handles: list[WorkerHandle] = []
+        self._refused: set[str] = set()  # machines
+        self._given_up: Counter[str] = Counter()  # workers that cannot start, by machine
+        self._started = 0
+        self._meters = Meters(split) if _existing() else None
+        self._rescan_at = 0.0
         self._notice_at = time.monotonic() + PATIENCE
 
-    def _handle(self, core: int | None) -> WorkerHandle:
-        return WorkerHandle(self._job, self._split, core, int(self._gpus))
-
-    @property
-    def busy(self) -> bool:
-        return any(handle.assignment.units for handle in self._handles)
-
     def follow_cluster(self) -> None:
-        """As many workers as a cluster has room for now; one on this machine has always the same."""
-        if not _existing() or time.monotonic() < self._rescan_at:
+        """As many workers as the machines have room for now; one on this machine alone has always the same."""
+        if time.monotonic() < self._rescan_at:
             return
-        self._rescan_at = time.monotonic() + RESCAN
-        room = _room(self._gpus, self._most)
-        surplus = len(self._handles) + self._given_up - len(room)
-        self._handles += map(self._handle, room[: max(0, -surplus)])
-        gone = [handle for handle in self._handles if not handle.up]
-        for handle in gone[: max(0, min(surplus, len(self._handles) - 1))]:
-            if handle.actor is not None:
-                ray.kill(handle.actor)
-            self._handles.remove(handle)
+        self._rescan_at = time.monotonic() + RESCAN if _existing() else float("inf")
+        if self._meters:
+            self._meters.show(self._board.tally)
+        room = _room(self._gpus, self._most, self._refused)
+        for handle in [handle for handle in self._handles if not handle.up]:
+            if sum(of.node == handle.node for of in self._handles) > len(room.get(handle.node, ())):
+                handle.end()
+                self._handles.remove(handle)
+        for node, places in room.items():
+            there = sum(handle.node == node for handle in self._handles) + self._given_up[node]
+            self._handles += places[there:]
+        del self._handles[self._most :]
 
-    def start_workers(self, waiting: int) -> None:
-        """Where there is none, and more units wait than workers are starting."""
+    def start_workers(self) -> None:
+        """Where there is none, and more levels wait than workers are starting."""
         starting = sum(handle.starting for handle in self._handles)
         without = [handle for handle in self._handles if handle.actor is None]
-        for handle in without[: max(0, waiting - starting)]:
-            handle.start()
+        for handle in without[: max(0, self._scheduler.waiting - starting)]:
+            self._started += 1
+            name = f"levelproof {self._job.budget}/{self._job.size} worker {self._started}"
+            handle.start(name, int(self._gpus), program_of(self._job), self._job, self._split)
 
-    def assign(self, queue: UnitQueue) -> None:
-        """Give units to the workers that have reported, and let them go on. Each gets one before any gets two."""
-        free = [handle for handle in self._handles if handle.free]
-        starting = sum(handle.starting for handle in self._handles)
-        while any(
-            handle.assignment.take(queue)
-            for handle in free
-            if not handle.assignment.units or len(queue.waiting) > starting
-        ):
-            pass
-        for handle in free:
-            if handle.assignment.units:
-                handle.answer = handle.actor.work.remote(handle.assignment.units)
+    def order(self) -> None:
+        """Give units to the workers that have reported, and let them go on."""
+        self._scheduler.share()
+        seconds = max(ROUND, len(self._handles) / REPORTS)
+        for handle in self._handles:
+            if handle.free:
+                order = self._scheduler.order(handle, time.monotonic())
+                if self._scheduler.workers[handle].units:
+                    handle.answer = handle.actor.work.remote(order, seconds)
 
     def wait(self) -> list[UnitOutcome]:
         """Outcomes of the rounds that are over, if any ends in a moment."""
         asked = {handle.answer: handle for handle in self._handles if handle.answer is not None}
-        self._notice_silence(any(handle.up for handle in asked.values()))
+        self._notice_silence(any(handle.up for handle in self._handles))
+        if not asked:
+            time.sleep(POLL)
+            return []
         ray.wait([*asked], timeout=POLL)  # for the first
-        outcomes: list[UnitOutcome] = []
-        for reference in ray.wait([*asked], num_returns=len(asked), timeout=0)[0]:
-            round = asked[reference].report()
-            outcomes += round.outcomes
-            self._board.tally.running.update(round.totals)
+        ready, _ = ray.wait([*asked], num_returns=len(asked), timeout=0)
+        outcomes = [outcome for reference in ready for outcome in self._hear(asked[reference])]
+        for handle in self._scheduler.silent(time.monotonic() - MOST_SILENT):
+            outcomes += self._lose(handle, f"The worker on {handle.host} was silent for {duration(MOST_SILENT)}")
         self._give_up()
         return outcomes
+
+    def leave(self) -> list[UnitOutcome]:
+        """Outcomes of what all workers could still commit, within GRACE."""
+        outcomes: list[UnitOutcome] = []
+        end = time.monotonic() + GRACE
+        last = {handle.actor.leave.remote(): handle for handle in self._handles if handle.up}
+        while last and (left := end - time.monotonic()) > 0:
+            ready, _ = ray.wait([*last], timeout=left)
+            for reference in ready:
+                handle = last.pop(reference)
+                outcomes += self._hear(handle) if handle.answer is not None else []
+                if handle.up:
+                    handle.answer = reference
+                    outcomes += self._hear(handle)
+        return outcomes
+
+    def _hear(self, handle: WorkerHandle) -> Sequence[UnitOutcome]:
+        """What a worker has answered; where one died or left, another takes its place."""
+        over, handle.answer = handle.answer, None
+        try:
+            answer: Any = ray.get(over)
+        except RayError as error:
+            return self._lose(handle, f"{error}\n\n{_told(error)}", _told(error))
+        if not handle.up:
+            if answer:
+                self._refuse(handle, answer)
+                return []
+            handle.up, handle.failed_starts = True, 0
+            self._scheduler.join(handle, time.monotonic())
+            return []
+        round: Round = answer
+        self._scheduler.report(handle, round, time.monotonic())
+        self._board.tally.follow(round)
+        if round.leaves:
+            self._scheduler.leave(handle)
+            handle.end()
+        return round.outcomes
+
+    def _lose(self, handle: WorkerHandle, reason: str, told: str = "") -> Sequence[UnitOutcome]:
+        """A worker died. Where its machine did, that is no fault of its units."""
+        was_up, gone = handle.up, handle.node not in _machines()
+        handle.end()
+        if gone:
+            self._rescan_at = 0.0
+        elif not was_up:
+            handle.failed_starts, handle.why = handle.failed_starts + 1, told
+        if was_up and gone:
+            units = self._scheduler.workers[handle].units
+            self._board.say(f"{handle.host} is gone; others go on with {levels_text(units) if units else 'its work'}.")
+            self._board.tally.forget(units)
+            self._scheduler.leave(handle)
+        return self._scheduler.lost(handle, reason) if was_up and not gone else []
+
+    def _refuse(self, handle: WorkerHandle, why: str) -> None:
+        """No worker on this machine, which has another program.
+
+        Raises:
+            Failure: there are no others.
+        """
+        handle.end()
+        self._refused.add(handle.node)
+        for other in [other for other in self._handles if other.node == handle.node]:
+            other.end()
+            self._handles.remove(other)
+        if not self._handles:
+            raise Failure(why)
+        self._board.say(f"{why.rstrip('.')}; its workers are left out.")
 
     def _give_up(self) -> None:
         """Leave out workers that do not start.
@@ -209,7 +295,7 @@ class Crew:
             if not usable:
                 raise Failure(f"No worker can start ({handle.why}): executor=inline may tell more.")
             if handle not in usable:
-                self._given_up += 1
+                self._given_up[handle.node] += 1
                 self._board.say(f"A worker cannot start ({handle.why}): it is given up, {len(usable)} left.")
         self._handles = usable
 
@@ -222,9 +308,23 @@ class Crew:
             self._notice_at = float("inf")
 
 
+class Meters:
+    """A job's progress, as Prometheus gets it from Ray."""
+
+    def __init__(self, split: Path) -> None:
+        self._split = {"split": "/".join(split.parts[-2:])}
+        about = {"levels": "levels committed", "solved": "of them solved", "env_steps": "env steps of this run"}
+        self._gauges = {name: Gauge(f"levelproof_{name}", what, ("split",)) for name, what in about.items()}
+
+    def show(self, tally: Tally) -> None:
+        for name, value in {"levels": tally.done, "solved": tally.solved, "env_steps": tally.steps}.items():
+            self._gauges[name].set(value, self._split)
+
+
 @contextmanager
-def connected() -> Iterator[None]:
-    """The cluster of RAY_ADDRESS, or one on this machine that lives as long as this block and this process.
+def connected() -> Iterator[threading.Event]:
+    """The cluster of RAY_ADDRESS, or one on this machine that lives as long as this block and this process; and whether
+    somebody asked for the end.
 
     Raises:
         UserError: there is none at RAY_ADDRESS.
@@ -240,11 +340,11 @@ def connected() -> Iterator[None]:
             ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
         except ConnectionError as error:
             raise _no_cluster(str(error).strip().splitlines()[0]) from error
-        try:
-            with interruptible():  # only now: Ray sets a handler of its own when it starts
-                yield
-        finally:
-            ray.shutdown()
+        with stoppable() as stop:  # only now: Ray sets a handler of its own when it starts
+            try:
+                yield stop
+            finally:
+                ray.shutdown()
 
 
 def _require_reachable(address: str) -> None:
@@ -279,12 +379,20 @@ def _on_gpus() -> bool:
     return ray.get(ray.remote(num_gpus=1, max_calls=1)(_jax_sees_a_gpu).remote())
 
 
-def _room(gpus: bool, most: int) -> list[int | None]:
-    """The core of each worker for which there is room now: one for each GPU or core, and at most so many."""
-    if not (gpus or _existing()):
-        return cores_for(most)
-    room = ray.cluster_resources().get("GPU" if gpus else "CPU", 0)  # which cores a cluster has is its to know
-    return [None] * min(max(int(room), 1), most)  # one that waits: more machines may join
+def _room(gpus: bool, most: int, refused: Collection[str]) -> dict[str, list[WorkerHandle]]:
+    """A place for each worker that there is room for now, at most so many, by machine: one for each GPU or core."""
+    nodes = {name: node for name, node in _machines().items() if name not in refused}
+    count = {name: int(node["Resources"].get("GPU" if gpus else "CPU", 0)) for name, node in nodes.items()}
+    neighbours = {name: number if sum(count.values()) <= most and not gpus else 0 for name, number in count.items()}
+    place = lambda node: WorkerHandle(node, nodes[node]["NodeManagerHostname"], neighbours[node])
+    turns = sorted((turn, name) for name, number in count.items() for turn in range(number))  # one on each, then more
+    taken = Counter(name for _, name in turns[:most])
+    return {name: [place(name) for _ in range(number)] for name, number in taken.items()}
+
+
+def _machines() -> dict[str, dict[str, Any]]:
+    """The machines that the cluster has now, by Ray's ids."""
+    return {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}
 
 
 def _jax_sees_a_gpu() -> bool:

@@ -1,7 +1,6 @@
 """The job of `levelproof generate`: what is left to do, done by workers or in this process, and said to the user."""
 
 import shlex
-from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,7 @@ from experts.labels import Label
 from experts.steps import EnvSteps
 from pipeline.errors import Exit, Failure
 from pipeline.jobs.progress import Board, Tally, say
-from pipeline.jobs.schedule import UnitOutcome, UnitQueue, WorkUnit, levels_text, plan_units
+from pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, plan_units
 from pipeline.jobs.seal import Sealer, sealing
 from pipeline.store.checkpoints import require_same_experts
 from pipeline.store.job_note import note_job
@@ -50,17 +49,18 @@ def generate(
         is_done = np.isin(manifest.level_ids, wanted)
         done = manifest.level_ids[is_done]
         require_same_levels(split, origins or {}, done)
-        queue = UnitQueue(deque(plan_units(wanted, done, job.levels_per_unit, origins)))
+        units = plan_units(wanted, done, job.levels_per_unit, origins)
+        scheduler = Scheduler(units, len(wanted) - len(done), job.levels_per_unit)
         if not repaired:
             note_job(split, job, command, runs(wanted))
-        if queue.waiting:
+        if scheduler.waiting:
             solved = manifest.counts(is_done).get(Label.SOLVED, 0)
             board = Board(Tally(len(wanted), len(done), solved), console)
             there = f", {len(done)} are there already" if len(done) else ""
             board.say(f"{len(wanted)} levels of size {job.size}, {job.budget} env steps each, into {split}{there}")
             try:
-                with board.shown(), sealing(split, manifest.counting, queue.waiting, board.say) as sealer:
-                    _work(job, split, queue, board, sealer)
+                with board.shown(), sealing(split, manifest.counting, board.say) as sealer:
+                    _work(job, split, scheduler, board, sealer)
             except KeyboardInterrupt:
                 board.say(
                     f"Stopped: {board.tally.done} of {len(wanted)} levels are committed; the same command goes on."
@@ -71,11 +71,11 @@ def generate(
         else:
             print(f"Nothing to do: all {len(wanted)} levels are there.")
             spent = ""
-        _closing(split, manifest, wanted, queue, spent)
-    return Exit.QUARANTINED if queue.quarantined else Exit.DONE
+        _closing(split, manifest, wanted, scheduler.quarantined, spent)
+    return Exit.QUARANTINED if scheduler.quarantined else Exit.DONE
 
 
-def _work(job: JobConfig, split: Path, queue: UnitQueue, board: Board, sealer: Sealer) -> None:
+def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, sealer: Sealer) -> None:
     def settle(outcomes: Sequence[UnitOutcome]) -> None:
         """Account for attempts that ended together."""
         failed: dict[tuple[str, bool], list[WorkUnit]] = {}  # by cause, and whether they are given up
@@ -84,26 +84,26 @@ def _work(job: JobConfig, split: Path, queue: UnitQueue, board: Board, sealer: S
             board.ended(unit, outcome.summary)
             if outcome.fatal:
                 raise Failure(outcome.fatal)
-            sealer.ended(unit, committed=outcome.summary is not None)
             note = quarantine_path(split, unit.name)
             if outcome.summary:
+                sealer.committed(unit)
                 note.unlink(missing_ok=True)
                 continue
-            last = queue.failed(unit)
+            last = scheduler.failed(unit)
             failed.setdefault((outcome.reason.strip().splitlines()[-1], last), []).append(unit)
             if last:
                 note.parent.mkdir(exist_ok=True)
-                note.write_text(f"Failed {queue.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n")
+                note.write_text(f"Failed {scheduler.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n")
         for (cause, last), units in failed.items():
             board.say(f"{levels_text(units).capitalize()} failed ({cause}): {'given up' if last else 'trying again'}.")
         if outcomes:
-            sealer.look()
+            sealer.look(scheduler.first)
 
     if job.executor == "inline":
         from pipeline.jobs.inline import run
     else:
         from pipeline.jobs.cluster import run
-    run(job, split, queue, settle, board)
+    run(job, split, scheduler, settle, board)
 
 
 def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
@@ -122,7 +122,7 @@ def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
     return f"{sum(spent):,} env steps: {told}."
 
 
-def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, queue: UnitQueue, spent: str) -> None:
+def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, given_up: list[WorkUnit], spent: str) -> None:
     """Where it is, what came of it, and what to type next. On stdout."""
     labels, folder = manifest.counts(np.isin(manifest.level_ids, wanted)), shlex.quote(str(split))
     total = sum(labels.values())
@@ -130,7 +130,7 @@ def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, queue: UnitQue
     print(f"{split}: {total} levels, {counts}." if total else f"{split}: nothing is committed.")
     if spent:
         print(spent)
-    for unit in queue.quarantined:
+    for unit in given_up:
         print(f"Given up: {levels_text([unit])}, for the reason in {quarantine_path(split, unit.name)}")
     if total:
         print(f"Next:  levelproof inspect {folder}")

@@ -72,13 +72,13 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
         say(console, f"{found.rows} trajectories of size {job.size} into {split}{there}")
         out_of: Counter[str] = Counter()
         shown = track(left, "units of trajectories", console=console, transient=True, disable=not console.is_terminal)
-        units = [part.unit for part in left]
+        firsts = [*(part.unit.level_ids[0] for part in left[1:]), None]  # of what is to come after each
         try:
-            with interruptible(), sealing(split, manifest.counting, units, partial(say, console)) as sealer:
-                for part in shown:
+            with interruptible(), sealing(split, manifest.counting, partial(say, console)) as sealer:
+                for part, first in zip(shown, firsts, strict=False):
                     out_of.update(_import(job, split, found, part, shlex.join(command), console, sum(out_of.values())))
-                    sealer.ended(part.unit, committed=True)
-                    sealer.look()
+                    sealer.committed(part.unit)
+                    sealer.look(first)
         except KeyboardInterrupt:
             say(console, "Stopped: what is committed stays, and the same command goes on.")
             raise

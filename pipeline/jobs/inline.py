@@ -1,27 +1,33 @@
 """The executor without Ray: one worker in this process, for debugging."""
 
+import time
 from pathlib import Path
 
 from configs.schema import JobConfig
-from pipeline.jobs.progress import Board
-from pipeline.jobs.schedule import ROUND, Assignment, Settle, UnitQueue
-from pipeline.runtime import interruptible, prepare_jax
+from pipeline.jobs.progress import STOPPING, Board
+from pipeline.jobs.schedule import ROUND, Scheduler, Settle
+from pipeline.runtime import prepare_jax, stoppable
+
+HERE = "this process"
 
 
-def run(job: JobConfig, split: Path, queue: UnitQueue, settle: Settle, board: Board) -> None:
-    """Work on the queue until it is empty."""
+def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board) -> None:
+    """Work until nothing is left to do."""
     prepare_jax()
     from pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
-    with interruptible():
-        worker, assignment = Worker(job, split), Assignment()
-        while True:
-            while assignment.take(queue):
-                pass
-            if not assignment.units:
-                return
+    with stoppable() as stop:
+        worker = Worker(job, split)
+        scheduler.join(HERE, time.monotonic())
+        while not scheduler.over:
+            if stop.is_set():
+                board.say(STOPPING)
+                worker.stopping = True
+            order = scheduler.order(HERE, time.monotonic())
             board.refresh()
-            round = worker.work(assignment.units, ROUND)
-            assignment.account(round)
-            board.tally.running.update(round.totals)
+            round = worker.work(order, ROUND)
+            scheduler.report(HERE, round, time.monotonic())
+            board.tally.follow(round)
             settle(round.outcomes)
+            if round.leaves:
+                raise KeyboardInterrupt

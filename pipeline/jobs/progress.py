@@ -1,7 +1,7 @@
 """What people see while a job runs: a bar on a terminal, plain lines elsewhere. On stderr. Knows nothing of workers."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
@@ -9,10 +9,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from experts.steps import EnvSteps
-from pipeline.jobs.schedule import Summary, WorkUnit
+from pipeline.jobs.schedule import Round, Summary, WorkUnit
 
 LINE_EVERY = 30.0  # s between plain lines
 LINE_AFTER = 2.0  # s between one and the next commit that is told; the last commit always is
+STOPPING = "Stopping: what is decided is committed first; Ctrl-C ends it at once."
 PACE_OVER = 60.0  # s over which env steps/s and the time left are estimated
 
 
@@ -25,6 +26,16 @@ class Tally:
     solved: int
     running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
     spent: EnvSteps = field(default_factory=EnvSteps)  # on this run's committed units
+
+    def follow(self, round: Round) -> None:
+        """A worker reports. Units that ended are told to `ended`, too."""
+        self.forget(cut.unit for cut in round.cuts)
+        self.running.update(round.totals)
+
+    def forget(self, units: Iterable[WorkUnit]) -> None:
+        """Units are no longer under way."""
+        for unit in units:
+            self.running.pop(unit, None)
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
         """A unit was committed, or an attempt at it failed (`None`)."""

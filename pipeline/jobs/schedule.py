@@ -1,9 +1,14 @@
-"""What is left to do: work units, who has them, their attempts and their quarantine. Knows nothing of files."""
+"""What is left to do: work units, their attempts and their quarantine; and who gets which, in `Scheduler`.
+
+Knows nothing of files, of Ray, or of the time.
+"""
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from heapq import nlargest
+from itertools import chain, groupby
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +21,8 @@ from pipeline.store.runs import runs, told_levels
 # fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.
 COMPANY = (64, 8, 1)
 ROUND = 1.0  # s that a worker trains between reports; a step that is compiled takes longer
+PARTS = 8  # of a unit, below which it is not cut where there are too few for all workers
+LEAST_SHARE = 2  # levels that a worker has not begun, below which it is not asked to share them
 
 
 @dataclass(frozen=True)
@@ -29,25 +36,42 @@ class WorkUnit:
     def name(self) -> str:
         return unit_name(self.level_ids[0], self.level_ids[-1])
 
+    def only(self, level_ids: Collection[int]) -> "WorkUnit | None":
+        """Its levels that are among these; None: there are none."""
+        at = [i for i, level_id in enumerate(self.level_ids) if level_id in level_ids]
+        ids, origins = (tuple(of[i] for i in at if of) for of in (self.level_ids, self.origins))
+        return WorkUnit(ids, origins) if ids else None
+
 
 def plan_units(
     wanted: Collection[int] | np.ndarray,
     done: Collection[int] | np.ndarray,
     unit: int,
     origins: Mapping[int, Origin] | None = None,
-) -> list[WorkUnit]:
-    """Units that cover what is wanted (ascending) and not done, ascending.
+) -> Iterator[WorkUnit]:
+    """Units that cover what is wanted (ascending) and not done, ascending; made as they are asked for.
 
     A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same ids. Ids of levels
     with origins lie far apart: of those a unit has as many as it may.
     """
     there = np.fromiter(wanted, np.int64, len(wanted))
     left = there[~np.isin(there, np.fromiter(done, np.int64, len(done)))]
-    numbers = (np.arange(len(left)) if origins else left) // unit
-    firsts = np.flatnonzero(np.diff(numbers, prepend=-1)).tolist()
-    ids, of = left.tolist(), origins or {}
-    parts = [tuple(ids[first:end]) for first, end in pairwise([*firsts, len(ids)])]
-    return [WorkUnit(part, tuple(of[i] for i in part if i in of)) for part in parts]
+    if origins is None:
+        return _by_multiple(runs(left), unit)
+    parts = (left[i : i + unit].tolist() for i in range(0, len(left), unit))
+    return (WorkUnit(tuple(part), tuple(origins[i] for i in part)) for part in parts)
+
+
+def _by_multiple(runs: Iterable[tuple[int, int]], unit: int) -> Iterator[WorkUnit]:
+    """Units of these runs of ids. Ids that follow one another are a range, however many they are."""
+    pieces = (
+        range(max(first, number * unit), min(last, number * unit + unit - 1) + 1)
+        for first, last in runs
+        for number in range(first // unit, last // unit + 1)
+    )
+    for _, of in groupby(pieces, lambda piece: piece[0] // unit):
+        some = list(of)
+        yield WorkUnit(tuple(chain(*some)) if some[1:] else some[0])
 
 
 @dataclass(frozen=True)
@@ -72,6 +96,14 @@ class UnitOutcome:
 Settle = Callable[[Sequence[UnitOutcome]], None]  # takes note of attempts that ended together
 
 
+class Cut(NamedTuple):
+    """A unit of which a worker has given levels back."""
+
+    unit: WorkUnit  # as it was
+    kept: WorkUnit | None  # what the worker goes on with
+    back: WorkUnit | None  # what is to be done by others
+
+
 @dataclass(frozen=True)
 class Round:
     """What a worker reports of some time at work."""
@@ -79,63 +111,161 @@ class Round:
     outcomes: list[UnitOutcome]  # of the units that ended
     totals: dict[WorkUnit, tuple[int, float, int]]  # of the others: env steps, levels, solved levels so far
     wants: int  # levels more for which it has room
+    spare: int = 0  # levels that it has not begun
+    cuts: list[Cut] = field(default_factory=list)  # what it has given back
+    leaves: bool = False  # it goes, with all that it could keep committed
 
 
-@dataclass
-class UnitQueue:
-    """Units waiting, each with the attempts it has had."""
+@dataclass(frozen=True)
+class Order:
+    """What a worker is told."""
 
-    waiting: deque[WorkUnit]
-    attempts: dict[WorkUnit, int] = field(default_factory=dict)
-    quarantined: list[WorkUnit] = field(default_factory=list)
-
-    def take(self, running: Collection[WorkUnit] = ()) -> WorkUnit | None:
-        """The next unit for a worker that has these; None when none may join them (see `COMPANY`)."""
-        failures = {self.attempts.get(unit, 0) for unit in running}  # one number at most
-        if failures and len(running) >= COMPANY[max(failures)]:
-            return None  # without a look at all that wait: workers ask several times a second
-        for unit in self.waiting:
-            if not failures or self.attempts.get(unit, 0) in failures:
-                self.waiting.remove(unit)
-                return unit
-        return None
-
-    def failed(self, unit: WorkUnit) -> bool:
-        """Note a failed attempt; the unit waits again, or True when it is now quarantined."""
-        self.attempts[unit] = self.attempts.get(unit, 0) + 1
-        if self.attempts[unit] < len(COMPANY):
-            self.waiting.append(unit)
-            return False
-        self.quarantined.append(unit)
-        return True
+    units: list[WorkUnit]  # to begin with
+    give: int = 0  # levels to give back, of those that it has not begun
 
 
 @dataclass
 class Assignment:
-    """The units that one worker has."""
+    """What one worker has."""
 
-    units: list[WorkUnit] = field(default_factory=list)
+    units: dict[WorkUnit, None] = field(default_factory=dict)  # in the order in which it got them
     wants: int = 1  # levels more for which it has room
+    spare: int = 0  # levels that it has not begun, as it last said
+    asked: int = 0  # levels to give back
+    heard: float = 0.0  # s, when it was last told something, or reported
 
-    def take(self, queue: UnitQueue) -> bool:
-        """Another unit from the queue, if there is room for one and one may join these."""
-        unit = queue.take(self.units) if self.wants > 0 or not self.units else None
-        if unit is None:
-            return False
-        self.units.append(unit)
-        self.wants -= len(unit.level_ids)
-        return True
 
-    def account(self, round: Round) -> None:
-        """Follow the worker's report."""
-        ended = {outcome.unit for outcome in round.outcomes}
-        self.units = [unit for unit in self.units if unit not in ended]
-        self.wants = round.wants
+class Scheduler:
+    """Which worker gets which units. It is told who joins, what each reports, who is lost, and the time.
 
-    def lose(self, reason: str) -> list[UnitOutcome]:
-        """The worker died, and its units failed."""
-        units, self.units, self.wants = self.units, [], 1
-        return [UnitOutcome(unit, reason=reason) for unit in units]
+    A worker has units while it has room for their levels, so what waits on the driver is not what waits on workers.
+    Towards the end units are cut to a worker's share of what is left, and who has nothing gets what others have not
+    begun. A level's result does not depend on its unit, so neither changes any.
+
+    Its memory and time depend on how many workers there are and how many units have failed, not on how many wait.
+    """
+
+    def __init__(self, units: Iterable[WorkUnit], levels: int, unit: int = 1) -> None:
+        """Of units, ascending, that have so many levels together; whole ones have `unit`."""
+        self._fresh = iter(units)
+        self._next = next(self._fresh, None)
+        self._again: list[deque[WorkUnit]] = [deque() for _ in COMPANY]  # by failed attempts; first: parts of units
+        self.waiting, self._smallest = levels, max(1, unit // PARTS)  # levels
+        self.attempts: dict[WorkUnit, int] = {}  # that failed
+        self.quarantined: list[WorkUnit] = []
+        self.workers: dict[Hashable, Assignment] = {}
+        self._idle: set[Hashable] = set()  # workers without units
+
+    @property
+    def over(self) -> bool:
+        """Whether nobody has or will get anything."""
+        return not self.waiting and len(self._idle) == len(self.workers)
+
+    @property
+    def first(self) -> int | None:
+        """The lowest level id of the units that are yet to end for the first time; None: there is none."""
+        under_way = (unit for of in self.workers.values() for unit in of.units if unit not in self.attempts)
+        units = chain(under_way, self._again[0], [self._next] if self._next else [])
+        return min((unit.level_ids[0] for unit in units), default=None)
+
+    def join(self, worker: Hashable, now: float) -> None:
+        """A worker is there, and has nothing."""
+        self.workers[worker] = Assignment(heard=now)
+        self._idle.add(worker)
+
+    def order(self, worker: Hashable, now: float) -> Order:
+        """What to tell a worker that has nothing more to report."""
+        mine, new = self.workers[worker], []
+        mine.heard = now
+        while unit := self._take(mine):
+            mine.units[unit] = None
+            mine.wants -= len(unit.level_ids)
+            self._idle.discard(worker)
+            new.append(unit)
+        return Order(new, mine.asked)
+
+    def report(self, worker: Hashable, round: Round, now: float) -> None:
+        """What a worker has done of what it has. Its failures are told to `failed` by whom they concern, too."""
+        mine = self.workers[worker]
+        for unit, kept, back in round.cuts:
+            del mine.units[unit]
+            mine.units |= {kept: None} if kept else {}
+            self.attempts |= {part: self.attempts[unit] for part in (kept, back) if part and unit in self.attempts}
+            self._put_back(back)
+        for outcome in round.outcomes:
+            del mine.units[outcome.unit]
+        mine.wants, mine.spare, mine.asked, mine.heard = round.wants, round.spare, 0, now
+        if not mine.units:
+            self._idle.add(worker)
+
+    def leave(self, worker: Hashable) -> None:
+        """A worker goes that could say so; others do what it still has."""
+        for unit in self._remove(worker):
+            self._put_back(unit)
+
+    def lost(self, worker: Hashable, reason: str) -> list[UnitOutcome]:
+        """A worker died, and its units failed."""
+        return [UnitOutcome(unit, reason=reason) for unit in self._remove(worker)]
+
+    def failed(self, unit: WorkUnit) -> bool:
+        """Note a failed attempt; the unit waits again, or True when it is now quarantined."""
+        self.attempts[unit] = attempts = self.attempts.get(unit, 0) + 1
+        if attempts == len(COMPANY):
+            self.quarantined.append(unit)
+            return True
+        self._put_back(unit)
+        return False
+
+    def share(self) -> None:
+        """Have workers asked to give levels back, half of what each has not begun, where others have nothing."""
+        if self.waiting or not self._idle:
+            return
+        untried = lambda of: self.attempts.keys().isdisjoint(of.units)
+        can = (of for of in self.workers.values() if of.spare >= LEAST_SHARE and untried(of))
+        for of in nlargest(len(self._idle), can, key=lambda of: of.spare):
+            of.asked = -(-of.spare // 2)
+
+    def silent(self, since: float) -> list[Hashable]:
+        """Workers that have units and have not been heard of since then."""
+        return [worker for worker, of in self.workers.items() if of.units and of.heard < since]
+
+    def _take(self, mine: Assignment) -> WorkUnit | None:
+        """The next unit for a worker; None when it wants none, others have none, or none may join what it has."""
+        if mine.units and (mine.wants <= 0 or self._idle):
+            return None
+        failures = {self.attempts.get(unit, 0) for unit in mine.units}  # one number at most
+        if failures and len(mine.units) >= COMPANY[max(failures)]:
+            return None
+        for attempts in failures or range(len(COMPANY)):
+            if self._again[attempts]:
+                return self._part(self._again[attempts].popleft())
+            if not attempts and self._next:
+                unit, self._next = self._next, next(self._fresh, None)
+                return self._part(unit)
+        return None
+
+    def _part(self, unit: WorkUnit) -> WorkUnit:
+        """The unit, or its beginning: a worker's share of all that waits. What has failed stays whole."""
+        count = size = len(unit.level_ids)
+        self.waiting -= count
+        if unit in self.attempts:
+            return unit
+        while size > self._smallest and size * len(self.workers) > self.waiting + count:
+            size = -(-size // 2)
+        part, rest = (unit.only(ids) for ids in (unit.level_ids[:size], unit.level_ids[size:]))
+        if rest:
+            self._again[0].appendleft(rest)
+            self.waiting += count - size
+        return part if rest else unit
+
+    def _put_back(self, unit: WorkUnit | None) -> None:
+        if unit:
+            self._again[self.attempts.get(unit, 0)].append(unit)
+            self.waiting += len(unit.level_ids)
+
+    def _remove(self, worker: Hashable) -> list[WorkUnit]:
+        self._idle.discard(worker)
+        return list(self.workers.pop(worker).units)
 
 
 def levels_text(units: Iterable[WorkUnit]) -> str:

@@ -2,7 +2,6 @@
 
 import shlex
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -79,11 +78,9 @@ class _Stopped(Exception):
 
 
 @contextmanager
-def sealing(
-    split: Path, fragments: Iterable[Fragment], units: Iterable[WorkUnit], tell: Callable[[str], None]
-) -> Iterator["Sealer"]:
+def sealing(split: Path, fragments: Iterable[Fragment], tell: Callable[[str], None]) -> Iterator["Sealer"]:
     """A `Sealer` beside a job. In the end it seals all that there is enough of; where the job fails, it stops."""
-    sealer = Sealer(split, fragments, units, tell)
+    sealer = Sealer(split, fragments, tell)
     try:
         yield sealer
         sealer.finish()
@@ -97,43 +94,35 @@ class Sealer:
     What goes wrong is told once and ends the sealing, never the job.
     """
 
-    def __init__(
-        self, split: Path, fragments: Iterable[Fragment], units: Iterable[WorkUnit], tell: Callable[[str], None]
-    ) -> None:
-        """Of a split with these fragments, to which these units, ascending, are to come."""
+    def __init__(self, split: Path, fragments: Iterable[Fragment], tell: Callable[[str], None]) -> None:
+        """Of a split with these fragments."""
         self._split, self._tell = split, tell
         self._pieces = {fragment.path: Piece.of(fragment) for fragment in fragments}
-        self._coming, self._ended = deque(units), set[str]()  # names
         self._thread, self._stop = ThreadPoolExecutor(1), threading.Event()
         self._at_work: tuple[list[Piece], Future[Piece]] | None = None
         self._broken = False
 
-    def ended(self, unit: WorkUnit, committed: bool) -> None:
-        """A unit was committed, or an attempt at it failed: then what lies around it is not kept waiting."""
-        self._ended.add(unit.name)
-        if committed:
-            path = fragment_path(self._split, unit.name)
-            self._pieces[path] = Piece(path, len(unit.level_ids), False)
+    def committed(self, unit: WorkUnit) -> None:
+        path = fragment_path(self._split, unit.name)
+        self._pieces[path] = Piece(path, len(unit.level_ids), False)
 
-    def look(self) -> None:
-        """Take note of what was sealed, and begin with the next if there is enough of it before the units to come."""
+    def look(self, first: int | None) -> None:
+        """Take note of what was sealed, and begin with the next if there is enough of it before the units to come:
+        the lowest of their level ids is `first`; None: none is waited for."""
         if self._at_work and not self._at_work[1].done():
             return
         self._take_note()
-        while self._coming and self._coming[0].name in self._ended:
-            self._ended.remove(self._coming.popleft().name)
-        first = self._coming[0].level_ids[0] if self._coming else None
         end = None if first is None else fragment_path(self._split, unit_name(first, first))
         group = store.due((piece for piece in self._pieces.values() if end is None or piece.path < end), store.ROWS)
         if group and not self._broken:
             self._at_work = group, self._thread.submit(seal, self._split, group, self._go_on)
 
     def finish(self) -> None:
-        """Seal all that there is enough of."""
-        self.look()
+        """Seal all that there is enough of; nothing is to come."""
+        self.look(None)
         while self._at_work:
             self._at_work[1].exception()  # waits
-            self.look()
+            self.look(None)
 
     def stop(self) -> None:
         """End at once; what is half sealed goes."""

@@ -4,12 +4,12 @@ The same in this process and in a Ray worker. Knows nothing of either.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from configs.schema import JobConfig
 from experts.train import TrainingRun
-from pipeline.jobs.schedule import Round, UnitOutcome, WorkUnit
+from pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
 from pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
 
 
@@ -20,20 +20,48 @@ class Worker:
         self._job, self._split = job, split
         self._pool = pool_for(job)
         self._runs: dict[WorkUnit, TrainingRun] = {}
+        self.stopping = False  # set by whoever wants it to leave soon
 
-    def work(self, units: Sequence[WorkUnit], seconds: float) -> Round:
-        """Begin those of these units that are not under way, then train for so many seconds, or until one ends.
+    def work(self, order: Order, seconds: float) -> Round:
+        """Give levels back and begin units as ordered, then train for so many seconds, or until a unit ends.
 
         A failure of one unit is that unit's outcome. One of the step that all share is the outcome of each.
         """
         until = time.monotonic() + seconds
-        outcomes = [outcome for unit in units if unit not in self._runs and (outcome := self._begin(unit))]
-        while self._runs and not outcomes and time.monotonic() < until:
+        cuts = self._give(order.give)
+        outcomes = [outcome for unit in order.units if (outcome := self._begin(unit))]
+        while self._runs and not outcomes and not self.stopping and time.monotonic() < until:
             outcomes = self._step()
+        if self.stopping:
+            return self.leave(outcomes, cuts)
         now = {unit: run.totals() for unit, run in self._runs.items()}
         plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}  # read without JAX
         wants = max(0, self._pool.wants - sum(run.searching for run in self._runs.values()))
-        return Round(outcomes, plain, wants)
+        return Round(outcomes, plain, wants, sum(len(run.unbegun) for run in self._runs.values()), cuts)
+
+    def leave(self, outcomes: Sequence[UnitOutcome] = (), cuts: Sequence[Cut] = ()) -> Round:
+        """Commit what is decided of the units under way; they are cut for it."""
+        last = [self._cut(unit, run.undecided) for unit, run in list(self._runs.items())]
+        ended = [self._finish(unit) for unit in list(self._runs)]
+        return Round([*outcomes, *ended], {}, 0, cuts=[*cuts, *last], leaves=True)
+
+    def _give(self, levels: int) -> list[Cut]:
+        """Give back so many levels that have not begun, if there are, of the latest units first."""
+        cuts = []
+        for unit, run in reversed(self._runs.items()):
+            some = run.unbegun[-levels:] if levels > 0 else []
+            levels -= len(some)
+            cuts += [(unit, some)] if some else []
+        return [self._cut(unit, some) for unit, some in cuts]
+
+    def _cut(self, unit: WorkUnit, level_ids: Collection[int]) -> Cut:
+        """Go on without these levels of a unit."""
+        run = self._runs.pop(unit)
+        run.leave_out(level_ids)
+        kept, back = unit.only(set(unit.level_ids).difference(level_ids)), unit.only(level_ids)
+        if kept:
+            self._runs[kept] = run
+        return Cut(unit, kept, back)
 
     def _begin(self, unit: WorkUnit) -> UnitOutcome | None:
         try:

@@ -73,6 +73,25 @@ def test_levels_that_come_later_take_the_slots_that_are_empty(levels: Level) -> 
     assert first.idle_rollouts == 1  # of the first rollout alone
 
 
+def test_levels_that_wait_are_taken_out_and_change_no_other(levels: Level, alone: list[Trained]) -> None:
+    """From the queue, and from before it; another pool gives them what they would have got here."""
+    pool, other = new_pool(), new_pool()
+    first, second = pool.submit(*part(levels, range(30))), pool.submit(*part(levels, range(30, 36)))
+    for _ in range(3):
+        pool.step()
+    assert pool.waiting(first)[-1] == 29
+    assert pool.waiting(second) == list(range(6))
+    gone = pool.waiting(first)[3:]
+    pool.withdraw(first, gone)
+    assert not set(gone) & set(pool.waiting(first))
+    later = other.submit(take(levels, np.array(gone)), IDS[gone])
+    finished(pool, first, second)
+    finished(other, later)
+    trained = dict(zip(gone, later.trained(CONFIG), strict=True))
+    trained = dict(enumerate(first.trained(CONFIG))) | trained | dict(enumerate(second.trained(CONFIG), 30))
+    same([trained[i] for i in range(36)], alone)
+
+
 def test_totals_grow_to_the_whole(levels: Level) -> None:
     pool = new_pool()
     submission, seen = pool.submit(*part(levels, range(5))), []

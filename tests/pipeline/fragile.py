@@ -10,7 +10,8 @@ from pathlib import Path
 from configs.schema import JobConfig
 from pipeline.cli import main as cli
 from pipeline.jobs import cluster
-from pipeline.jobs.schedule import Round, WorkUnit
+from pipeline.jobs.likeness import Program
+from pipeline.jobs.schedule import Order, Round
 
 
 class Fragile(cluster.WorkerActor):
@@ -18,15 +19,15 @@ class Fragile(cluster.WorkerActor):
 
     deadly = int(sys.argv[1])
 
-    def __init__(self, job: JobConfig, split: Path, core: int | None) -> None:
+    def begin(self, program: Program, job: JobConfig, split: Path, neighbours: int) -> str:
         if self.deadly < 0:
             os._exit(1)
-        super().__init__(job, split, core)
+        return super().begin(program, job, split, neighbours)
 
-    def work(self, units: list[WorkUnit]) -> Round:
-        if any(self.deadly in unit.level_ids for unit in units):
+    def work(self, order: Order, seconds: float) -> Round:
+        if any(self.deadly in unit.level_ids for unit in order.units):
             os._exit(1)  # and with it die the units that it has from earlier rounds
-        return super().work(units)
+        return super().work(order, seconds)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def test_xla_has_one_thread_to_compute(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform != "linux" or len(own_cores()) < 2, reason="looks at /proc; needs a second core")
 def test_runs_with_fewer_workers_than_cores_do_not_meet_on_one(tmp_path: Path) -> None:
     program = (
-        "from pipeline.runtime import cores_for, prepare_jax; prepare_jax(cores_for(1)[0]); "
+        "from pipeline.runtime import own_core, prepare_jax; prepare_jax(own_core(1)); "
         "import os; print(*os.sched_getaffinity(0))"
     )
     one, two = (set(python(program, tmp_path).split()) for _ in range(2))
@@ -87,5 +87,33 @@ def test_workers_are_as_many_as_the_quota_of_a_container_keeps_busy(
     monkeypatch.setattr(runtime, "cpu_count", lambda: quota)
     assert len(own_cores()) == quota
     pinned = quota == 64  # under a quota, neighbours of other containers would be on the same cores
-    assert runtime.cores_for(1000) == (list(range(64)) if pinned else [None] * quota)
-    assert runtime.cores_for(2) == [None] * min(2, quota)
+    assert (runtime.own_core(64) is not None) == pinned
+    assert runtime.own_core(63) is None
+    while runtime.CLAIMS:
+        runtime.CLAIMS.pop().close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no other system can")
+def test_every_worker_of_a_machine_has_its_own_core(tmp_path: Path) -> None:
+    """Of a mask that leaves some out; what a worker had is free when it has died."""
+    program = (
+        "import sys; from pipeline import runtime; runtime._allowed_cores = lambda: [5, 7]; "
+        "runtime.cpu_count = lambda: 64; print(runtime.own_core(2), flush=True); sys.stdin.read()"
+    )
+    start = lambda: subprocess.Popen(
+        [sys.executable, "-c", program],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with start() as one, start() as two, start() as three:
+        told = sorted(each.stdout.readline().strip() for each in (one, two, three) if each.stdout)
+        assert told == ["5", "7", "None"]
+        one.kill()
+        two.kill()
+        three.kill()
+    with start() as again:
+        assert again.stdout
+        assert again.stdout.readline().strip() == "5"
+        again.kill()

@@ -204,7 +204,7 @@ def test_two_levels_with_one_id_are_told_apart(folder: Path, tmp_path: Path, mon
 
 def test_units_take_levels_with_origins_as_they_come() -> None:
     origins = {i: Origin(f"c1:{i}", f"{i}.json", "s") for i in range(0, 1000, 100)}
-    units = plan_units(sorted(origins), {300}, 4, origins)
+    units = list(plan_units(sorted(origins), {300}, 4, origins))
     assert [len(unit.level_ids) for unit in units] == [4, 4, 1]
     assert all([of.file for of in unit.origins] == [f"{i}.json" for i in unit.level_ids] for unit in units)
 

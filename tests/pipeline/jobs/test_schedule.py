@@ -1,17 +1,17 @@
 """What is left to do: everything wanted and not done, once; attempts and quarantine."""
 
-from collections import deque
-from collections.abc import Collection
+import tracemalloc
+from collections.abc import Collection, Iterable
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.jobs.schedule import (
     COMPANY,
-    Assignment,
+    Cut,
     Round,
+    Scheduler,
     UnitOutcome,
-    UnitQueue,
     WorkUnit,
     levels_text,
     plan_units,
@@ -23,7 +23,7 @@ def test_units_cover_what_is_left_once_and_never_cross_a_multiple(
     first: int, count: int, done: set[int], unit: int
 ) -> None:
     wanted = range(first, first + count)
-    units = plan_units(wanted, done, unit)
+    units = list(plan_units(wanted, done, unit))
     planned = [level_id for work in units for level_id in work.level_ids]
     assert planned == sorted(set(wanted) - done)
     for work in units:
@@ -40,87 +40,138 @@ def test_jobs_that_start_elsewhere_cut_at_the_same_places(count: int, unit: int,
 @given(st.integers(1, 60), st.integers(1, 20), st.sets(st.integers(0, 59)))
 def test_names_of_what_is_left_are_new(count: int, unit: int, committed: set[int]) -> None:
     """A fragment holds the first and the last level of its name, so what is left never takes a name that is there."""
-    units = plan_units(range(count), set(), unit)
+    units = list(plan_units(range(count), set(), unit))
     kept = [work for i, work in enumerate(units) if i in committed]
     done = {level_id for work in kept for level_id in work.level_ids}
     assert not {work.name for work in kept} & {work.name for work in plan_units(range(count), done, unit)}
 
 
-def drain(queue: UnitQueue, workers: int, kills: Collection[int]) -> tuple[list[int], int]:
+def scheduler_of(levels: int, unit: int, workers: int = 0) -> Scheduler:
+    scheduler = Scheduler(plan_units(range(levels), set(), unit), levels, unit)
+    for worker in range(workers):
+        scheduler.join(worker, 0.0)
+    return scheduler
+
+
+def finished(units: Iterable[WorkUnit], wants: int = 1000) -> Round:
+    return Round([UnitOutcome(unit) for unit in units], {}, wants)
+
+
+def drain(scheduler: Scheduler, workers: int, kills: Collection[int]) -> tuple[list[int], int]:
     """Levels that got done, and how many workers died, where some levels kill the worker that has them."""
     done, deaths = [], 0
-    assignments = [Assignment(wants=1000) for _ in range(workers)]
-    while True:
-        for assignment in assignments:
-            while assignment.take(queue):
-                pass
-        if not any(assignment.units for assignment in assignments):
-            return sorted(done), deaths
-        for assignment in assignments:
-            running = assignment.units
+    while not scheduler.over:
+        for worker in range(workers):
+            if worker not in scheduler.workers:
+                scheduler.join(worker, 0.0)
+            scheduler.order(worker, 0.0)
+        for worker in range(workers):
+            running = list(scheduler.workers[worker].units)
             if any(level_id in kills for unit in running for level_id in unit.level_ids):
                 deaths += 1
-                for outcome in assignment.lose("died"):
-                    queue.failed(outcome.unit)
+                for outcome in scheduler.lost(worker, "died"):
+                    scheduler.failed(outcome.unit)
             else:
                 done += [level_id for unit in running for level_id in unit.level_ids]
-                assignment.account(Round([UnitOutcome(unit) for unit in running], {}, wants=1000))
+                scheduler.report(worker, finished(running), 0.0)
+    return sorted(done), deaths
 
 
 @given(st.integers(1, 400), st.integers(1, 3), st.integers(1, 4), st.sets(st.integers(0, 400), max_size=5))
 def test_units_that_kill_their_worker_are_given_up_and_no_other(
     levels: int, unit: int, workers: int, kills: set[int]
 ) -> None:
-    queue = UnitQueue(deque(plan_units(range(levels), set(), unit)))
-    done, deaths = drain(queue, workers, kills)
-    given_up = {level_id for unit in queue.quarantined for level_id in unit.level_ids}
-    assert all(kills.intersection(unit.level_ids) for unit in queue.quarantined)
+    scheduler = scheduler_of(levels, unit)
+    done, deaths = drain(scheduler, workers, kills)
+    given_up = {level_id for unit in scheduler.quarantined for level_id in unit.level_ids}
+    assert all(kills.intersection(unit.level_ids) for unit in scheduler.quarantined)
     assert kills & set(range(levels)) <= given_up
     assert sorted([*done, *given_up]) == list(range(levels))
-    assert deaths <= len(COMPANY) * len(queue.quarantined)
+    assert deaths <= len(COMPANY) * len(scheduler.quarantined)
 
 
-def test_company() -> None:
-    queue = UnitQueue(deque(plan_units(range(100), set(), 1)))
-    running = [unit for _ in range(COMPANY[0]) if (unit := queue.take([]))]
-    assert queue.take(running) is None
-    fresh = queue.take(running[1:])
-    assert fresh is not None
-    for unit in running:
-        assert not queue.failed(unit)
-    assert fresh not in queue.attempts
-    assert queue.take([fresh]) not in running  # what has failed joins only what has failed as often
-    assert queue.take([running[0]]) == running[0]
-    assert queue.take(running[: COMPANY[1]]) is None
+def test_a_unit_that_failed_has_less_company_each_time() -> None:
+    scheduler = scheduler_of(100, 1, workers=1)
+    scheduler.report(0, finished([]), 0.0)
+    for attempt, most in enumerate(COMPANY):
+        while True:  # those that have failed less come first, and none of them joins one that has failed more
+            units = scheduler.order(0, 0.0).units
+            (attempts,) = {scheduler.attempts.get(unit, 0) for unit in units}
+            if attempts == attempt:
+                break
+            scheduler.report(0, finished(units), 0.0)
+        assert len(units) == most
+        for outcome in scheduler.lost(0, "died"):
+            assert scheduler.failed(outcome.unit) == (most == COMPANY[-1])
+        scheduler.join(0, 0.0)
+        scheduler.report(0, finished([]), 0.0)
+    assert len(scheduler.quarantined) == COMPANY[-1]
 
 
 def test_a_worker_gets_units_while_it_has_room() -> None:
-    queue, assignment = UnitQueue(deque(plan_units(range(12), set(), 4))), Assignment()
-    assert assignment.take(queue)  # however little room there is
-    assert not assignment.take(queue)
-    (first,) = assignment.units
-    assignment.account(Round([], {first: (0, 0.0, 0)}, wants=2))
-    assert assignment.take(queue)
-    assert not assignment.take(queue)
-    first, second = assignment.units
-    assignment.account(Round([UnitOutcome(first)], {}, wants=0))
-    assert assignment.units == [second]
-    assert [outcome.unit for outcome in assignment.lose("died")] == [second]
-    assert assignment.take(queue)  # the next worker with these resources begins anew
+    scheduler = scheduler_of(12, 4, workers=1)
+    (first,) = scheduler.order(0, 0.0).units  # however little room there is
+    assert not scheduler.order(0, 0.0).units
+    scheduler.report(0, Round([], {first: (0, 0.0, 0)}, wants=2), 0.0)
+    (second,) = scheduler.order(0, 0.0).units
+    scheduler.report(0, Round([UnitOutcome(first)], {}, wants=0), 0.0)
+    assert not scheduler.order(0, 0.0).units
+    assert [outcome.unit for outcome in scheduler.lost(0, "died")] == [second]
+    scheduler.join(0, 0.0)
+    assert scheduler.order(0, 0.0).units  # the next worker in its place begins anew
 
 
-def test_a_unit_that_fails_waits_behind_the_others_until_it_is_given_up() -> None:
-    queue = UnitQueue(deque(plan_units(range(4), set(), 2)))
-    bad = queue.take()
-    assert bad is not None
-    assert not queue.failed(bad)
-    good = queue.take()
-    assert good != bad
-    for attempt in range(2, len(COMPANY) + 1):
-        assert queue.take() == bad
-        assert queue.failed(bad) == (attempt == len(COMPANY))
-    assert queue.quarantined == [bad]
-    assert queue.take() is None
+def test_towards_the_end_units_are_cut_to_a_worker_s_share() -> None:
+    scheduler = scheduler_of(160, 32, workers=2)
+    sizes = []
+    while not scheduler.over:
+        for worker in range(2):
+            units = scheduler.order(worker, 0.0).units
+            sizes += [len(unit.level_ids) for unit in units]
+            scheduler.report(worker, finished(scheduler.workers[worker].units, wants=1), 0.0)
+    assert sizes == [32, 32, 32, 32, 16, 8, 4, 4]
+    assert scheduler_of(160, 32, workers=1).order(0, 0.0).units[0].level_ids == range(32)
+
+
+def test_what_a_worker_has_not_begun_goes_to_one_that_has_nothing() -> None:
+    scheduler = scheduler_of(32, 32, workers=1)
+    (unit,) = scheduler.order(0, 0.0).units
+    scheduler.report(0, Round([], {unit: (0, 0.0, 0)}, wants=0, spare=24), 0.0)
+    scheduler.share()
+    assert scheduler.order(0, 0.0).give == 0, "nobody has nothing"
+    scheduler.join("idle", 0.0)
+    assert scheduler.order("idle", 0.0).units == []
+    scheduler.share()
+    assert scheduler.order(0, 0.0).give == 12
+    kept, back = unit.only(range(20)), unit.only(range(20, 32))
+    scheduler.report(0, Round([], {}, wants=100, spare=12, cuts=[Cut(unit, kept, back)]), 0.0)
+    assert not scheduler.order(0, 0.0).units, "it is not for the one that gave it back"
+    (part,) = scheduler.order("idle", 0.0).units
+    assert part.level_ids == (20, 21, 22, 23, 24, 25)  # a half; the other is for whoever is the first to want it
+    assert [*scheduler.workers[0].units] == [kept]
+
+
+def test_a_worker_that_leaves_is_no_failure_and_one_that_is_silent_is_known() -> None:
+    scheduler = scheduler_of(8, 4, workers=2)
+    first, second = (scheduler.order(worker, 1.0).units[0] for worker in (0, 1))
+    assert scheduler.silent(1.0) == []
+    scheduler.report(1, Round([], {second: (0, 0.0, 0)}, 0), 5.0)
+    assert scheduler.silent(4.0) == [0]
+    scheduler.leave(0)
+    assert not scheduler.attempts
+    assert scheduler.first == 0
+    scheduler.report(1, finished([second]), 6.0)
+    assert {i for unit in scheduler.order(1, 6.0).units for i in unit.level_ids} >= set(first.level_ids)
+
+
+def test_the_driver_does_not_grow_with_what_waits() -> None:
+    """A million levels, of which none is there before it is asked for."""
+    tracemalloc.start()
+    scheduler = Scheduler(plan_units(range(2**20), [], 32), 2**20, 32)
+    before = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert before < 2**20 // 8, "bytes"
+    assert scheduler.waiting == 2**20
 
 
 def test_levels_are_told_in_runs() -> None:

@@ -1,7 +1,7 @@
 """Sealing beside a job: what is done is merged while units come, in what order ever, and trouble never ends the job."""
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import pytest
@@ -13,7 +13,7 @@ from pipeline.store import seal as store
 from pipeline.store.manifest import read_manifest
 from tests.pipeline.made import commit_copy, made_split
 
-Make = Callable[[Sealer, WorkUnit], None]
+Make = Callable[[Sealer, WorkUnit, Collection[WorkUnit]], None]
 UNITS = [WorkUnit((level_id,)) for level_id in range(12)]
 
 
@@ -36,10 +36,10 @@ def split(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 def make(source: Path, split: Path) -> Make:
     """As a worker and a driver do."""
 
-    def committed(sealer: Sealer, unit: WorkUnit) -> None:
+    def committed(sealer: Sealer, unit: WorkUnit, coming: Collection[WorkUnit]) -> None:
         commit_copy(source, unit.level_ids[0], split)
-        sealer.ended(unit, committed=True)
-        sealer.look()
+        sealer.committed(unit)
+        sealer.look(min((of.level_ids[0] for of in coming), default=None))
 
     return committed
 
@@ -48,10 +48,10 @@ def test_units_are_sealed_while_others_come(split: Path, make: Make) -> None:
     said: list[str] = []
     coming = UNITS[2:]
     random.Random(0).shuffle(coming)
-    with sealing(split, read_manifest(split, []).fragments, UNITS[2:], said.append) as sealer:
-        for unit in coming:
-            make(sealer, unit)
-            there = {0, 1} | {of.level_ids[0] for of in coming[: coming.index(unit) + 1]}
+    with sealing(split, read_manifest(split, []).fragments, said.append) as sealer:
+        for i, unit in enumerate(coming):
+            make(sealer, unit, coming[i + 1 :])
+            there = {0, 1} | {of.level_ids[0] for of in coming[: i + 1]}
             assert set(read_manifest(split, []).level_ids.tolist()) == there
     fragments = read_manifest(split).fragments
     assert [(fragment.rows, fragment.sealed) for fragment in fragments] == [(3, True)] * 4
@@ -59,15 +59,15 @@ def test_units_are_sealed_while_others_come(split: Path, make: Make) -> None:
 
 
 def test_a_unit_that_failed_is_not_waited_for_and_one_that_comes_is(split: Path, make: Make) -> None:
-    with sealing(split, read_manifest(split, []).fragments, UNITS[2:8], print) as sealer:
+    with sealing(split, read_manifest(split, []).fragments, print) as sealer:
         for unit in UNITS[3:6]:
-            make(sealer, unit)
-        sealer.finish()
+            make(sealer, unit, UNITS[2:3])
+        sealer.look(2)
         assert not any(fragment.sealed for fragment in read_manifest(split).fragments), "level 2 may come"
-        sealer.ended(UNITS[2], committed=False)
+        sealer.look(None)  # it has failed
         sealer.finish()
         assert [fragment.rows for fragment in read_manifest(split).fragments] == [3, 1, 1]
-        make(sealer, UNITS[2])
+        make(sealer, UNITS[2], [])
     assert read_manifest(split).level_ids.tolist() == [0, 1, 2, 3, 4, 5]
 
 
@@ -75,9 +75,9 @@ def test_trouble_is_told_once_and_never_ends_the_job(split: Path, make: Make) ->
     said: list[str] = []
     shard = next((split / "shards").iterdir())
     (shard / "act/c/0/0/0").write_bytes(b"x")
-    with sealing(split, read_manifest(split, []).fragments, UNITS[2:], said.append) as sealer:
-        for unit in UNITS[2:]:
-            make(sealer, unit)
+    with sealing(split, read_manifest(split, []).fragments, said.append) as sealer:
+        for i in range(2, len(UNITS)):
+            make(sealer, UNITS[i], UNITS[i + 1 :])
     (sentence,) = said
     assert sentence.startswith(f"Not sealed (The shard {shard} is missing or damaged")
     assert sentence.endswith(f"`levelproof seal {split}` seals it when this has ended.")
@@ -86,9 +86,9 @@ def test_trouble_is_told_once_and_never_ends_the_job(split: Path, make: Make) ->
 
 def test_a_job_that_fails_leaves_no_half_sealed_fragment(split: Path, make: Make) -> None:
     def interrupted() -> None:
-        with sealing(split, read_manifest(split, []).fragments, UNITS[2:], print) as sealer:
-            for unit in UNITS[2:8]:
-                make(sealer, unit)
+        with sealing(split, read_manifest(split, []).fragments, print) as sealer:
+            for i in range(2, 8):
+                make(sealer, UNITS[i], UNITS[i + 1 :])
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

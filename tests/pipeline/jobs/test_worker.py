@@ -1,6 +1,7 @@
 """A worker's loop on real units: what it commits, what it reports, and whom a failure reaches."""
 
 import errno
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,11 @@ import pytest
 
 from configs.schema import JobConfig
 from experts import pool as pool_module
+from experts.config import ScoutConfig
 from experts.labels import WITNESSED
+from experts.search.config import SearchConfig
 from pipeline.jobs import worker as worker_module
-from pipeline.jobs.schedule import Round, UnitOutcome, WorkUnit
+from pipeline.jobs.schedule import Order, Round, UnitOutcome, WorkUnit
 from pipeline.jobs.worker import Worker
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import read_manifest
@@ -30,12 +33,12 @@ def job() -> JobConfig:
 def outcomes(worker: Worker, units: list[WorkUnit]) -> dict[WorkUnit, UnitOutcome]:
     """Of these units, all given at once."""
     found: dict[WorkUnit, UnitOutcome] = {}
-    round = worker.work(units, 0.1)
+    round = worker.work(Order(units), 0.1)
     while True:
         found |= {outcome.unit: outcome for outcome in round.outcomes}
         if not round.totals:
             return found
-        round = worker.work([], 0.1)
+        round = worker.work(Order([]), 0.1)
 
 
 def failing(work: Any, error: Exception, unit: WorkUnit | None = None, after: int = 0) -> Any:
@@ -53,9 +56,9 @@ def failing(work: Any, error: Exception, unit: WorkUnit | None = None, after: in
 
 def test_units_are_committed_with_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
     worker = Worker(job, tmp_path)
-    rounds = [worker.work(UNITS, 0.0)]
+    rounds = [worker.work(Order(UNITS), 0.0)]
     while rounds[-1].totals:
-        rounds.append(worker.work([], 0.1))
+        rounds.append(worker.work(Order([]), 0.1))
     ended = [outcome for round in rounds for outcome in round.outcomes]
     assert {outcome.unit for outcome in ended} == set(UNITS)
     summaries = [outcome.summary for outcome in ended if outcome.summary]
@@ -74,7 +77,7 @@ def test_units_are_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
     for unit in UNITS:
         totals = [round.totals[unit] for round in rounds if unit in round.totals]
         assert totals == sorted(totals)
-    assert [round.wants for round in rounds[-1:]] == [Worker(job, tmp_path).work([], 0.0).wants]
+    assert [round.wants for round in rounds[-1:]] == [Worker(job, tmp_path).work(Order([]), 0.0).wants]
 
 
 def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: JobConfig) -> None:
@@ -89,6 +92,37 @@ def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: J
             a = Shard(tmp_path / "beside" / one["shard"]).read([one["row"]])
             b = Shard(tmp_path / "alone" / two["shard"]).read([two["row"]])
             assert all(same_bits(values, b[name]).all() for name, values in a.items())
+
+
+def test_levels_given_back_and_levels_left_undecided_are_made_by_another_to_the_same_bits(
+    tmp_path: Path, job: JobConfig
+) -> None:
+    job = replace(job, scout=ScoutConfig(0), search=SearchConfig(env_steps=0))
+    unit = WorkUnit(range(16))
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "alone").mkdir()
+    outcomes(Worker(job, tmp_path / "alone"), [unit])
+    worker, other = Worker(job, tmp_path / "cut"), Worker(job, tmp_path / "cut")
+    round = worker.work(Order([unit]), 0.0)
+    while not round.spare:
+        round = worker.work(Order([]), 0.0)
+    round = worker.work(Order([], give=round.spare - 1), 0.0)
+    ((before, kept, back),) = round.cuts
+    assert (before, round.spare) == (unit, 1)
+    assert kept
+    assert back
+    assert sorted([*kept.level_ids, *back.level_ids]) == list(unit.level_ids)
+    while sum(of[1] for of in round.totals.values()) < len(kept.level_ids) - 1:
+        round = worker.work(Order([]), 0.0)
+    worker.stopping = True
+    round = worker.work(Order([]), 60.0)
+    assert round.leaves
+    assert not [outcome.reason for outcome in round.outcomes if outcome.reason]
+    ((_, done, rest),) = round.cuts
+    assert read_manifest(tmp_path / "cut").level_ids.tolist() == list(done.level_ids if done else ())
+    outcomes(other, [part for part in (back, rest) if part])
+    one, two = (read_manifest(tmp_path / name).table.to_pylist() for name in ("alone", "cut"))
+    assert repr([row | {"shard": "", "row": 0} for row in one]) == repr([row | {"shard": "", "row": 0} for row in two])
 
 
 @pytest.mark.parametrize("phase", ["begin_unit", "finish_unit"])
@@ -127,6 +161,6 @@ def test_a_step_that_fails_fails_all_that_share_it_and_no_later_one(
 
 
 def test_a_worker_without_units_has_nothing_to_report(tmp_path: Path, job: JobConfig) -> None:
-    nothing = Worker(job, tmp_path).work([], 60.0)
+    nothing = Worker(job, tmp_path).work(Order([]), 60.0)
     assert nothing == Round([], {}, nothing.wants)
     assert nothing.wants > 0
