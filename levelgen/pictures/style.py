@@ -22,6 +22,14 @@ INK: Colour = (38, 44, 52)
 PAPER: Colour = (255, 255, 255)
 MUTED: Colour = (128, 135, 144)
 FIXED_PLAIN: Colour = (98, 105, 115)
+LIGHT: dict[str, Colour] = {"sky": SKY, "grid": GRID, "ink": INK, "paper": PAPER, "muted": (104, 111, 121)}  # of pages
+DARK: dict[str, Colour] = {  # of pages that are read in the dark; roles and bindings keep their colours
+    "sky": (30, 33, 39),
+    "grid": (42, 46, 53),
+    "ink": (226, 229, 233),
+    "paper": (19, 21, 25),
+    "muted": (150, 157, 166),
+}
 ROLE_COLOUR: dict[Role, Colour] = {
     Role.PLAIN: (168, 175, 184),
     Role.GREEN: (62, 176, 92),

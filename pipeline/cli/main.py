@@ -13,6 +13,7 @@ from configs.errors import ConfigError
 from pipeline.cli import (
     card,
     export,
+    gallery,
     generate,
     import_,
     inspect,
@@ -28,7 +29,7 @@ from pipeline.cli.command import EXITS
 from pipeline.errors import Exit, LevelproofError
 from pipeline.version import __version__
 
-COMMANDS = (generate, regenerate, settings, sample, inspect, show, export, import_, card, status, verify, seal)
+COMMANDS = (generate, regenerate, settings, sample, inspect, show, gallery, export, import_, card, status, verify, seal)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,21 +10,27 @@ from pipeline.errors import UserError
 
 
 @contextmanager
-def new_folder(out: Path) -> Iterator[Path]:
+def new_folder(out: Path, replaces: Callable[[Path], bool] = lambda _: False) -> Iterator[Path]:
     """Where to write what shall be in `out`: a folder beside it, under a hidden name until all of it is there.
 
-    What an exception ends is removed; a killed process leaves the hidden folder, and never `out`.
+    What an exception ends is removed; a killed process leaves the hidden folder, and `out` as it was. A folder that is
+    there makes way for the new one if `replaces` says that it may.
 
     Raises:
-        UserError: `out` is there already, or cannot be written.
+        UserError: `out` is there and stays, or cannot be written.
     """
-    if out.exists() or out.is_symlink():
+    there = out.is_symlink() or out.exists()
+    if there and (out.is_symlink() or not out.is_dir() or not replaces(out)):
         raise UserError(f"There is something at {out} already: name a new folder with -o, or remove that one.")
-    unfinished = out.with_name(f".{out.name}.{os.getpid()}")
+    out = out.absolute()  # `gallery/` and `.` have names
+    unfinished, replaced = (out.with_name(f".{out.name}.{os.getpid()}{end}") for end in ("", ".old"))
     try:
         unfinished.mkdir(parents=True)
         yield unfinished
+        if there:
+            out.rename(replaced)
         unfinished.rename(out)
+        shutil.rmtree(replaced, ignore_errors=True)
     except OSError as error:
         raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another folder with -o.") from None
     finally:

@@ -1,0 +1,224 @@
+"""How a gallery of many levels feels in a browser: how soon it shows, how smoothly it scrolls, what it keeps.
+
+Chromium without a window and without a GPU, the site opened from the disk. The split is made for this: sampled levels
+under random actions, of which some reach the goal.
+"""
+
+import argparse
+import shutil
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks.browser import browser
+from benchmarks.report import Report, Table
+from configs.compose import compose_job
+from configs.numbers import parse_count
+from experts.config import RECORD_STEPS
+from experts.labels import Label, Source, Verdict
+from experts.steps import EnvSteps
+from experts.train import UnitResult
+from experts.witness import replay, steps_to_goal, succeeds
+from levelgen.level import ACTIONS, size_of
+from levelgen.sampling.sampler import sample_levels
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.jobs.unit import commit
+from pipeline.look.gallery.gallery import ABOUT, gallery
+from pipeline.runtime import prepare_jax
+from pipeline.store.layout import split_path
+
+UNIT = 1000  # levels that are made at once
+HELD = 16  # env steps that an action is held
+SCROLLS = 5.0  # s
+PACE = 40  # px a frame
+FIRST, FRAMES, GROWS = 2.0, 50.0, 1.1  # the aims: s, frames/s, times the memory
+JUMPS = 150
+VIEW = {"width": 1280, "height": 900}
+# Scrolls for some milliseconds; the milliseconds between its frames
+SCROLLING = """async ([length, pace]) => {
+    const gaps = [];
+    let before = await new Promise(requestAnimationFrame);
+    const end = before + length;
+    while (before < end) {
+        scrollBy(0, pace);
+        const now = await new Promise(requestAnimationFrame);
+        gaps.push(now - before);
+        before = now;
+    }
+    return gaps;
+}"""
+# Jumps over the whole page and waits for what is drawn there
+JUMPING = """async (jumps) => {
+    for (let i = 0; i <= jumps; i++) {
+        scrollTo(0, (document.body.scrollHeight - innerHeight) * i / jumps);
+        for (let frame = 0; frame < 12; frame++) await new Promise(requestAnimationFrame);
+    }
+}"""
+# Brushes a histogram as a pointer does, and sorts; milliseconds of each
+CHOOSING = """async () => {
+    const svg = document.querySelector(".histogram svg");
+    const { left, top, width } = svg.getBoundingClientRect();
+    const at = (type, part) =>
+        svg.dispatchEvent(new PointerEvent(type, { pointerId: 1, clientX: left + part * width, clientY: top }));
+    svg.setPointerCapture = () => {};
+    at("pointerdown", 0.1);
+    const took = [];
+    for (let part = 0.15; part < 0.9; part += 0.05) {
+        const before = performance.now();
+        at("pointermove", part);
+        took.push(performance.now() - before);
+    }
+    at("pointerup", 0.9);
+    document.getElementById("clear").click();
+    const before = performance.now();
+    const sort = document.getElementById("sort");
+    sort.value = "env_steps";
+    sort.dispatchEvent(new Event("change"));
+    return [Math.max(...took), performance.now() - before];
+}"""
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--levels", nargs="+", default=["10k", "100k"], help="of each gallery (default: 10k 100k)")
+    parser.add_argument("--size", default="s", help="of the levels (default: s)")
+    parser.add_argument("--folder", type=Path, help="keep the galleries in this folder, or use those that are there")
+
+
+def run(given: argparse.Namespace) -> Report:
+    folder = given.folder or Path(tempfile.mkdtemp(prefix="levelproof-"))
+    try:
+        sites = {count: made_gallery(folder, given.size, parse_count(count, "levels")) for count in given.levels}
+        with browser() as chromium:
+            results = [{"levels": count, **measured(chromium, *site)} for count, site in sites.items()]
+    finally:
+        if not given.folder:
+            shutil.rmtree(folder)
+    slow = [of["levels"] for of in results if not fits(of)]
+    return Report(
+        title="Galleries of many levels",
+        results=results,
+        tables=[
+            Table(("", *(f"{of['levels']} levels of {given.size}" for of in results)), [*rows(results)]),
+        ],
+        notes=[
+            f"Chromium without a window or a GPU, {VIEW['width']} by {VIEW['height']} px, the site on the disk. "
+            "The first levels are drawn when all cells of the first screen are. It scrolls "
+            f"{PACE} px a frame for {SCROLLS:.0f} s, over levels that have to be loaded. Memory is JavaScript's after "
+            "a garbage collection: with all columns, after jumps over the whole page, and after as many again. "
+            f"The aim is {FIRST:.0f} s to the first levels, {FRAMES:.0f} frames/s, and memory that these last jumps "
+            f"let grow by less than {GROWS - 1:.0%}.",
+        ],
+        fault=f"{', '.join(slow)} levels: slower than the aim." if slow else "",
+    )
+
+
+def fits(of: Mapping[str, Any]) -> bool:
+    return of["first"] < FIRST and of["frames"] > FRAMES and of["memory_again"] < GROWS * of["memory_after"]
+
+
+def rows(results: list[dict[str, Any]]) -> list[list[str]]:
+    lines = {
+        "seconds to write": ("written", "{:.0f}"),
+        "megabytes": ("megabytes", "{:.0f}"),
+        "seconds to the first levels drawn": ("first", "{:.2f}"),
+        "seconds to all columns": ("columns", "{:.2f}"),
+        "frames/s while scrolling": ("frames", "{:.0f}"),
+        "ms between frames, 99%": ("frame_99", "{:.0f}"),
+        "ms to brush a histogram, the slowest": ("brush", "{:.0f}"),
+        "ms to sort": ("sort", "{:.0f}"),
+        "memory, MB": ("memory", "{:.1f}"),
+        "memory after the whole page, MB": ("memory_after", "{:.1f}"),
+        "memory after the whole page twice, MB": ("memory_again", "{:.1f}"),
+    }
+    told = lambda of, name, form: "-" if of[name] is None else form.format(of[name])
+    return [[words, *(told(of, *line) for of in results)] for words, line in lines.items()]
+
+
+def measured(chromium: Any, site: Path, written: float | None) -> dict[str, Any]:
+    """What a browser takes for one gallery."""
+    context = chromium.new_context(viewport=VIEW)
+    page = context.new_page()
+    page.goto((site / "index.html").as_uri())
+    marks = [_mark(page, name) for name in ("levels are drawn", "all columns are there")]
+    memory = _memory(context, page)
+    gaps = np.array(page.evaluate(SCROLLING, [1000 * SCROLLS, PACE]))
+    after = [_after_jumps(context, page) for _ in range(2)]
+    brush, sort = page.evaluate(CHOOSING)
+    context.close()
+    return {
+        "written": written,
+        "megabytes": sum(path.stat().st_size for path in site.rglob("*") if path.is_file()) / 1e6,
+        "first": marks[0],
+        "columns": marks[1],
+        "frames": 1000 * len(gaps) / gaps.sum(),
+        "frame_99": float(np.quantile(gaps, 0.99)),
+        "brush": brush,
+        "sort": sort,
+        "memory": memory,
+        "memory_after": after[0],
+        "memory_again": after[1],
+    }
+
+
+def _mark(page: Any, name: str) -> float:
+    """Seconds from the navigation to what the page notes."""
+    found = f"performance.getEntriesByName('{name}')"
+    page.wait_for_function(f"{found}.length > 0")
+    return page.evaluate(f"{found}[0].startTime") / 1000
+
+
+def _after_jumps(context: Any, page: Any) -> float:
+    """Memory after jumps over the whole page and back, MB."""
+    page.evaluate(JUMPING, JUMPS)
+    page.evaluate("scrollTo(0, 0)")
+    page.wait_for_timeout(500)
+    return _memory(context, page)
+
+
+def _memory(context: Any, page: Any) -> float:
+    """Of JavaScript, MB."""
+    session = context.new_cdp_session(page)
+    session.send("HeapProfiler.collectGarbage")
+    used = session.send("Runtime.getHeapUsage")["usedSize"] / 1e6
+    session.detach()
+    return used
+
+
+def made_gallery(folder: Path, size: str, levels: int) -> tuple[Path, float | None]:
+    """A gallery of so many levels, and the seconds it took to write; None: it was there."""
+    site = folder / f"gallery-{size}-{levels}"
+    if (site / ABOUT).is_file():
+        return site, None
+    split = made_split(folder / str(levels), size, levels)
+    start = time.perf_counter()
+    gallery(split, site, None, levels)
+    return site, time.perf_counter() - start
+
+
+def made_split(folder: Path, size: str, levels: int) -> Path:
+    """A split of levels under random actions: what reaches the goal is solved."""
+    prepare_jax()
+    job, rng = compose_job([f"out={folder}", f"size={size}", f"levels={levels}"]), np.random.default_rng(0)
+    split = split_path(job.out, job.budget, job.size)
+    split.mkdir(parents=True)
+    for first in range(0, levels, UNIT):
+        ids = np.arange(first, min(first + UNIT, levels))
+        level = jax.tree.map(np.asarray, sample_levels(ids, size_of(size), job.distribution))
+        choices = rng.integers(0, 2, (RECORD_STEPS // HELD, ACTIONS, len(ids)))
+        record = replay(level, np.repeat(choices, HELD, axis=0), job.task)
+        solved, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
+        verdicts = [
+            Verdict(
+                Label.SOLVED, "random actions", False, Source.SCOUT, steps_to_goal=int(steps[i]), env_steps=int(spent)
+            )
+            if solved[i]
+            else Verdict(Label.UNSOLVED, "random actions", False, success_rate=0.0, env_steps=int(spent))
+            for i, spent in enumerate(rng.integers(0, 2**18, len(ids)))
+        ]
+        commit(job, split, WorkUnit(tuple(ids.tolist())), UnitResult(ids, level, record, verdicts, EnvSteps()))
+    return split

@@ -1,0 +1,153 @@
+"""Writes a split as a site that browsers open from the disk: pages that are the same for every split, and data.
+
+Data are scripts that hand over a value, because pages from the disk may load scripts and nothing else:
+`data/about.js` what the split is, `data/columns/` pages of the manifest, `data/worlds/` the initial worlds of BLOCK
+levels each, `data/levels/` a file a level with its row and what its witness does.
+"""
+
+import json
+import math
+import shutil
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from experts.witness import steps_to_goal, succeeds
+from levelgen.level import Level
+from levelgen.pictures.palette import palette_css
+from pipeline.errors import Failure, UserError
+from pipeline.look.gallery.columns import NOTHING, PAGE, columns_of, page_of
+from pipeline.look.gallery.worlds import drawn_bodies, states_of, text_of, world_of
+from pipeline.look.things import THINGS, things_of
+from pipeline.read.created import new_folder
+from pipeline.read.levels import levels_of, rules_of
+from pipeline.read.rows import read_rows
+from pipeline.read.select import columns_in, select
+from pipeline.store.manifest import Manifest, require_manifest
+from pipeline.store.remote import as_typed
+
+SITE = Path(__file__).parent / "site"
+ABOUT = Path("data") / "about.js"  # what makes a folder a gallery
+BLOCK = 64  # levels whose worlds are a file, and whose records are in memory at once
+FOLDER = 1000  # levels whose files are in one folder
+DIGITS = 6  # of numbers in a level's file
+STATES = ("position", "rotation", "velocity", "angular_velocity")
+MOVED = (*(f"record/state/{name}" for name in STATES), "record/action", "record/done", "record/goal")
+
+
+def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
+    """Write the site, and say where it is and how to open it.
+
+    Raises:
+        UserError: no split, no level in it that fits, a folder at `out` that is no gallery, or one that cannot be
+            written.
+        Failure: the split is damaged.
+    """
+    manifest, found = _chosen(split, where, most)
+    count, console = manifest.table.num_rows, Console(stderr=True)
+    with new_folder(out, replaces=lambda folder: (folder / ABOUT).is_file()) as folder:
+        shutil.copytree(SITE, folder, dirs_exist_ok=True)
+        (folder / "palette.css").write_text(palette_css(), encoding="utf-8")
+        blocks = track(
+            range(0, count, BLOCK), "levels", console=console, transient=True, disable=not console.is_terminal
+        )
+        counted = [_write_block(folder, manifest, first) for first in blocks]
+        things = {name: np.concatenate([of[name] for of in counted]) for name in THINGS}
+        about, values = columns_of(manifest.table, things)
+        for page in range(math.ceil(count / PAGE)):
+            _write(folder, f"columns/{page}", page_of(values, page))
+        _write(folder, "about", _about(manifest, found, where, about))
+        size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    some = f"{count:,} levels" if count == found else f"{count:,} of {found:,} levels, spread evenly over their ids,"
+    print(f"{out / 'index.html'}: {some} of {split}, {size / 1e6:,.1f} MB. Open it in a browser, or:")
+    print(f"{Path(sys.executable).name} -m webbrowser {out / 'index.html'}")
+
+
+def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
+    """The rows to show, and how many there are that fit."""
+    if most < 1:
+        raise UserError(f"levels is {most}: a gallery has at least one.")
+    everything = require_manifest(split, columns_in(where), compact=True)
+    ids = select(everything.table, where).column("level_id").to_numpy()
+    if not len(ids):
+        raise UserError(f"No level of {split} fits {where}: choose others with --where.")
+    chosen = ids[np.unique(np.linspace(0, len(ids) - 1, min(most, len(ids))).round().astype(int))]
+    return require_manifest(split, level_ids=chosen), len(ids)
+
+
+def _write_block(folder: Path, manifest: Manifest, first: int) -> dict[str, np.ndarray]:
+    """The worlds of BLOCK levels, and the file of each; how many things they have."""
+    rows = manifest.table.slice(first, BLOCK)
+    stored = rows.column("shard").is_valid().to_numpy()
+    levels = jax.tree.map(np.asarray, levels_of(manifest, rows))
+    worlds = [jax.tree.map(lambda x, lane=lane: x[..., lane], levels) for lane in range(rows.num_rows)]
+    _write(folder, f"worlds/{first // BLOCK}", [world_of(level) for level in worlds])
+    moved = read_rows(manifest.split, rows.filter(stored), MOVED) if stored.any() else {}
+    rules, lane = rules_of(manifest), 0
+    between = (rules.frame_skip - 1) * rules.physics.dt
+    for number, row in enumerate(rows.to_pylist()):
+        told: dict[str, Any] = {"row": _plain(row)}
+        if stored[number]:
+            told |= _witness(worlds[number], {name: x[..., lane] for name, x in moved.items()}, between, row)
+            lane += 1
+        _write(folder, f"levels/{(first + number) // FOLDER}/{row['level_id']}", told)
+    return things_of(levels)
+
+
+def _witness(level: Level, moved: Mapping[str, np.ndarray], between: float, row: Mapping[str, Any]) -> dict[str, str]:
+    """The first episode of a record: bodies that can move, before each step and when the goal is reached; actions.
+
+    Records keep states before steps. The last of a step's physics steps looks for contacts after the others have moved
+    the bodies, `between` seconds later.
+    """
+    done, goal, position, rotation, velocity, spin = (
+        moved[f"record/{name}"] for name in ("done", "goal", *(f"state/{name}" for name in STATES))
+    )
+    if not succeeds(done[:, None], goal[:, None])[0]:
+        raise Failure(f"The record of level {row['level_id']} does not reach the goal: run `levelproof verify`.")
+    steps, (bodies, still) = int(steps_to_goal(done[:, None])[0]), drawn_bodies(level)
+    follow = lambda x, v: np.concatenate([x[:steps], x[steps - 1 : steps] + between * v[steps - 1 : steps]])
+    states = states_of(follow(position, velocity), follow(rotation, spin), bodies[still:])
+    return {"states": states, "actions": text_of(moved["record/action"][:steps].astype(np.uint8))}
+
+
+def _about(manifest: Manifest, found: int, where: str | None, columns: list[dict[str, Any]]) -> dict[str, Any]:
+    rules = rules_of(manifest)
+    return {
+        "split": as_typed(manifest.split),
+        "levels": manifest.table.num_rows,
+        "found": found,
+        "where": where,
+        "config_hash": manifest.config_hash,
+        "step_seconds": rules.frame_skip * rules.physics.dt,
+        "page": PAGE,
+        "block": BLOCK,
+        "folder": FOLDER,
+        "nothing": NOTHING,
+        "columns": columns,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """A row as JSON can have it, its fractions in DIGITS digits."""
+    if isinstance(value, dict):
+        return {name: _plain(of) for name, of in value.items()}
+    if isinstance(value, list):
+        return [_plain(of) for of in value]
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+    return value
+
+
+def _write(folder: Path, name: str, value: Any) -> None:
+    """A value as a script that hands it over."""
+    path = folder / "data" / f"{name}.js"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    path.write_text(f"levelproof.arrived({json.dumps(name)},{text});\n", encoding="utf-8")

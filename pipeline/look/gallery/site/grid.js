@@ -1,0 +1,200 @@
+// The grid of drawn levels: only the cells that are on the screen are there, however many levels are chosen.
+"use strict";
+
+(function () {
+  const { made, drawWorld, shown } = window.levelproof;
+  const NARROWEST = 150; // px, of a cell
+  const CAPTION = 34; // px below its picture
+  const BEYOND = 1; // rows above and below the screen that are drawn ahead
+  const BUDGET = 6; // ms of drawing a frame
+  const LOADS = 6; // blocks of worlds that are loaded at once
+
+  class Grid {
+    constructor(element, columns, worlds, hrefOf) {
+      Object.assign(this, { element, columns, worlds, hrefOf });
+      this.rows = new Uint32Array(0);
+      this.cells = new Map(); // place in the grid: cell
+      this.free = [];
+      this.current = 0; // the place that the keyboard is at
+      this.queue = []; // cells to draw
+      this.loading = 0;
+      this.detail = "steps_to_goal"; // the column that captions tell
+      this.colours = levelproof.coloursOf();
+      this.asked = false;
+      const later = () => this.later();
+      addEventListener("scroll", later, { passive: true });
+      new ResizeObserver(later).observe(element);
+      element.addEventListener("keydown", (event) => this.key(event));
+      element.addEventListener("focusin", (event) => {
+        const cell = event.target.closest(".cell");
+        if (cell) this.move(cell.place, false);
+      });
+    }
+
+    show(rows, detail) {
+      Object.assign(this, { rows, detail, current: 0 });
+      for (const cell of this.cells.values()) this.release(cell);
+      this.cells.clear();
+      this.element.querySelector(".nothing")?.remove();
+      if (!rows.length) this.element.append(made("p", { class: "nothing" }, "No level is like that: clear a filter."));
+      this.layout();
+    }
+
+    recolour() {
+      this.colours = levelproof.coloursOf();
+      for (const cell of this.cells.values()) this.want(cell);
+    }
+
+    later() {
+      if (this.asked) return;
+      this.asked = true;
+      requestAnimationFrame(() => {
+        this.asked = false;
+        this.layout();
+      });
+    }
+
+    layout() {
+      const width = this.element.clientWidth;
+      if (!width) return;
+      const across = Math.max(2, Math.floor(width / NARROWEST / (width > 900 ? 1.15 : 1)));
+      const [wide, tall] = [width / across, width / across + CAPTION];
+      if (wide !== this.wide) {
+        for (const cell of this.cells.values()) this.release(cell);
+        this.cells.clear();
+      }
+      Object.assign(this, { across, wide, tall });
+      this.element.style.height = this.rows.length ? `${Math.ceil(this.rows.length / across) * tall}px` : "";
+      const above = -this.element.getBoundingClientRect().top;
+      const first = Math.max(0, (Math.floor(above / tall) - BEYOND) * across);
+      const last = Math.min(this.rows.length, (Math.ceil((above + innerHeight) / tall) + BEYOND) * across);
+      for (const [place, cell] of this.cells) {
+        if (place < first || place >= last) {
+          if (cell.element.contains(document.activeElement)) continue; // the keyboard keeps its place
+          this.release(cell);
+          this.cells.delete(place);
+        }
+      }
+      for (let place = first; place < last; place++) {
+        if (!this.cells.has(place)) this.cells.set(place, this.fill(this.free.pop() || this.cell(), place));
+      }
+      this.draw();
+    }
+
+    cell() {
+      const canvas = made("canvas", { "aria-hidden": "true" });
+      const [dot, name, detail] = [made("i", { class: "dot" }), made("span"), made("span")];
+      const link = made("a", {}, canvas, made("p", { "aria-hidden": "true" }, dot, name, detail));
+      const element = made("div", { class: "cell", role: "listitem" }, link);
+      const cell = { element, link, canvas, dot, name, detail };
+      element.place = 0;
+      this.element.append(element);
+      return cell;
+    }
+
+    release(cell) {
+      cell.row = undefined;
+      cell.element.hidden = true;
+      this.free.push(cell);
+    }
+
+    fill(cell, place) {
+      const row = this.rows[place];
+      const id = this.columns.values.level_id[row];
+      const label = this.columns.word("label", row);
+      const value = this.columns.values[this.detail][row];
+      const detail = Number.isNaN(value) ? "" : `${shown(value)} ${{ steps_to_goal: "steps", level_id: "" }[this.detail] ?? ""}`;
+      cell.row = row;
+      cell.element.place = place;
+      cell.element.hidden = false;
+      cell.element.style.width = `${this.wide}px`;
+      cell.element.style.height = `${this.tall}px`;
+      cell.element.style.transform = `translate(${(place % this.across) * this.wide}px, ${Math.floor(place / this.across) * this.tall}px)`;
+      cell.element.setAttribute("aria-posinset", place + 1);
+      cell.element.setAttribute("aria-setsize", this.rows.length);
+      cell.link.href = this.hrefOf(row);
+      cell.link.tabIndex = place === this.current ? 0 : -1;
+      const steps = this.columns.values.steps_to_goal[row];
+      cell.link.setAttribute("aria-label", `Level ${id}, ${label}${Number.isNaN(steps) ? "" : `, ${steps} steps to the goal`}`);
+      cell.dot.dataset.label = label;
+      cell.name.textContent = id;
+      cell.detail.textContent = this.detail === "level_id" || !detail ? label : detail;
+      const pixels = Math.round((this.wide - 8) * Math.min(2, devicePixelRatio));
+      if (cell.canvas.width !== pixels) cell.canvas.width = cell.canvas.height = pixels;
+      else {
+        const context = cell.canvas.getContext("2d");
+        context.setTransform(1, 0, 0, 1, 0, 0);
+        context.clearRect(0, 0, pixels, pixels);
+      }
+      this.want(cell);
+      return cell;
+    }
+
+    want(cell) {
+      this.queue.push({ cell, row: cell.row });
+      this.later();
+    }
+
+    // Draws what is wanted and still on the screen, as long as a frame has time.
+    draw() {
+      const until = performance.now() + BUDGET;
+      const left = [];
+      for (const wanted of this.queue) {
+        const { cell, row } = wanted;
+        if (cell.row !== row) continue;
+        const world = performance.now() < until ? this.worlds.now(row) : null;
+        if (world) drawWorld(cell.canvas, world, this.colours);
+        else left.push(wanted);
+      }
+      if (this.queue.length && !left.length && !this.painted) {
+        this.painted = true;
+        performance.mark("levels are drawn");
+      }
+      this.queue = left;
+      for (const { row } of left) this.load(row);
+      if (left.some(({ row }) => this.worlds.has(row))) this.later();
+    }
+
+    load(row) {
+      if (this.loading >= LOADS || this.worlds.has(row)) return;
+      this.loading++;
+      const block = (of) => Math.floor(of / this.columns.about.block);
+      this.worlds.get(row).catch((error) => {
+        levelproof.tell(error.message);
+        this.queue = this.queue.filter((wanted) => block(wanted.row) !== block(row));
+      }).finally(() => {
+        this.loading--;
+        this.later();
+      });
+    }
+
+    move(place, focuses = true) {
+      const before = this.cells.get(this.current);
+      if (before) before.link.tabIndex = -1;
+      this.current = Math.min(this.rows.length - 1, Math.max(0, place));
+      if (focuses) {
+        const top = Math.floor(this.current / this.across) * this.tall + this.element.getBoundingClientRect().top;
+        if (top < 0) scrollBy(0, top - 8);
+        else if (top + this.tall > innerHeight) scrollBy(0, top + this.tall - innerHeight + 8);
+        this.layout();
+      }
+      const cell = this.cells.get(this.current);
+      if (!cell) return;
+      cell.link.tabIndex = 0;
+      if (focuses) cell.link.focus({ preventScroll: true });
+    }
+
+    key(event) {
+      const screen = this.across * Math.max(1, Math.floor(innerHeight / this.tall));
+      const steps = {
+        ArrowLeft: -1, ArrowRight: 1, ArrowUp: -this.across, ArrowDown: this.across, PageUp: -screen, PageDown: screen,
+        Home: -this.rows.length, End: this.rows.length,
+      };
+      if (!(event.key in steps) || event.ctrlKey || event.metaKey || event.altKey) return;
+      event.preventDefault();
+      this.move(this.current + steps[event.key]);
+    }
+  }
+
+  Object.assign(window.levelproof, { Grid });
+})();

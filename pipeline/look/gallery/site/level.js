@@ -1,0 +1,202 @@
+// The page of one level: its witness played from its states, how it was learned, why it has its label.
+"use strict";
+
+(function () {
+  const { load, made, spoken, shown, statesOf, between, bytesOf, liveEntries, entryName, drawWorld } = window.levelproof;
+  const ENTRIES = 6; // of an action
+  const REST = 0.8; // s that the last picture stays before the witness begins again
+  const PIXELS = 1200; // most, of the canvas
+  const at = (id) => document.getElementById(id);
+
+  class LevelPage {
+    constructor(columns, worlds) {
+      Object.assign(this, { columns, worlds, row: null, film: null, playing: false });
+      this.colours = levelproof.coloursOf();
+      at("play").addEventListener("click", () => this.play(!this.playing));
+      at("step-back").addEventListener("click", () => this.seek(Math.ceil(this.time) - 1));
+      at("step-on").addEventListener("click", () => this.seek(Math.floor(this.time) + 1));
+      at("scrub").addEventListener("input", () => this.seek(Number(at("scrub").value)));
+      at("trails").addEventListener("change", () => this.draw());
+      at("copy").addEventListener("click", () => this.copy());
+      addEventListener("keydown", (event) => this.key(event));
+      new ResizeObserver(() => this.fit()).observe(at("stage"));
+    }
+
+    // Shows the level of a row; null: none, nothing plays on.
+    async open(row) {
+      this.play(false);
+      Object.assign(this, { row, film: null, world: null });
+      if (row === null) return;
+      const id = this.columns.values.level_id[row];
+      const [world, told] = await Promise.all([this.worlds.get(row), load(`levels/${Math.floor(row / this.columns.about.folder)}/${id}`)]);
+      if (this.row !== row) return; // another one was opened meanwhile
+      this.world = world;
+      if (told.states) {
+        const actions = bytesOf(told.actions);
+        const steps = actions.length / ENTRIES;
+        const action = (step) => actions.subarray(ENTRIES * step, ENTRIES * (step + 1));
+        this.film = { steps, action, states: statesOf(world, told.states, steps + 1) };
+        this.now = new Float32Array(world.start.length);
+      }
+      this.time = 0;
+      this.tell(told.row);
+      this.fit();
+      if (this.film && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.play(true);
+    }
+
+    tell(row) {
+      const badge = made("span", { class: "badge" }, made("i", { class: "dot", "data-label": row.label }), row.label);
+      at("title").replaceChildren(`Level ${row.level_id}`, badge);
+      document.title = `Level ${row.level_id} · levelproof gallery`;
+      const reason = row.label_reason;
+      at("reason").textContent = `${reason[0].toUpperCase()}${reason.slice(1)}.`;
+      at("command").textContent = row.command;
+      at("controls").hidden = !this.film;
+      at("scrub").max = this.film ? this.film.steps : 0;
+      this.keys = liveEntries(this.world).map((entry) => {
+        const element = made("span", { class: "key", style: `--colour: var(--binding-${entry})` });
+        return { entry, element, motor: entry < 4 };
+      });
+      at("keys").replaceChildren(...this.keys.map((key) => key.element));
+      this.learning(row.learning_curve);
+      const value = (of) => {
+        if (of === null) return "–";
+        if (typeof of === "number") return shown(of);
+        if (typeof of === "boolean") return of ? "yes" : "no";
+        return Array.isArray(of) ? of.join(" ") : typeof of === "object" ? Object.entries(of).map(([name, x]) => `${name} ${x}`).join(", ") : of;
+      };
+      const told = Object.entries(row).filter(([name]) => !["label_reason", "command", "learning_curve"].includes(name));
+      at("row").replaceChildren(...told.flatMap(([name, of]) => [made("dt", {}, spoken(name)), made("dd", {}, name === "level_id" ? String(of) : value(of))]));
+      const known = this.film ? `its witness reaches the goal in ${this.film.steps} steps` : "there is no witness, so this is its initial world";
+      at("stage").setAttribute("aria-label", `Level ${row.level_id}, ${row.label}: ${known}. ${described(this.world)}`);
+    }
+
+    // Success rate of training per update; where no episode ended there is none.
+    learning(rates) {
+      const known = rates.map((rate, update) => [update, rate]).filter(([, rate]) => rate !== null);
+      at("learning").hidden = !known.length;
+      if (!known.length) return;
+      const [left, right, top, bottom] = [30, 314, 8, 102];
+      const x = (update) => left + ((right - left) * update) / Math.max(1, rates.length - 1);
+      const y = (rate) => bottom - (bottom - top) * rate;
+      const text = (words, place, anchor) => made("text", { svg: true, ...place, "text-anchor": anchor }, words);
+      const grid = [0, 0.5, 1].flatMap((rate) => [
+        made("line", { svg: true, x1: left, x2: right, y1: y(rate), y2: y(rate) }),
+        text(`${100 * rate}%`, { x: left - 5, y: y(rate) + 3 }, "end"),
+      ]);
+      const path = known.map(([update, rate], i) => `${i ? "L" : "M"}${x(update).toFixed(1)} ${y(rate).toFixed(1)}`).join("");
+      const dots = known.length > 60 ? [] : known.map(([update, rate]) => made("circle", { svg: true, cx: x(update), cy: y(rate), r: 2 }));
+      at("curve").replaceChildren(...grid, made("path", { svg: true, d: path }), ...dots,
+        text("update 1", { x: left, y: 115 }, "start"), text(String(rates.length), { x: right, y: 115 }, "end"));
+      const last = known[known.length - 1][1];
+      const words = `Share of training episodes that reached the goal, in each of ${rates.length} updates`;
+      at("curve").setAttribute("aria-label", `${words}: from ${Math.round(100 * known[0][1])}% to ${Math.round(100 * last)}%`);
+      at("learning-caption").textContent = `${words}.`;
+    }
+
+    recolour() {
+      this.colours = levelproof.coloursOf();
+      this.draw();
+    }
+
+    fit() {
+      const canvas = at("stage");
+      const pixels = Math.min(PIXELS, Math.round(canvas.clientWidth * devicePixelRatio));
+      if (!pixels) return;
+      if (canvas.width !== pixels) canvas.width = canvas.height = pixels;
+      this.draw();
+    }
+
+    seek(time) {
+      if (!this.film) return;
+      this.play(false);
+      this.time = Math.min(this.film.steps, Math.max(0, time));
+      this.draw();
+    }
+
+    play(playing) {
+      this.playing = playing && Boolean(this.film);
+      at("play").textContent = this.playing ? "Pause" : "Play";
+      if (!this.playing) return;
+      if (this.time >= this.film.steps) this.time = 0;
+      let before = performance.now();
+      const film = this.film;
+      const frame = (now) => {
+        if (!this.playing || this.film !== film) return;
+        const steps = ((now - before) / 1000 / this.columns.about.step_seconds) * Number(at("speed").value);
+        before = now;
+        this.time += Math.max(0, steps);
+        if (this.time > film.steps + REST / this.columns.about.step_seconds) this.time = 0;
+        this.draw();
+        requestAnimationFrame(frame);
+      };
+      requestAnimationFrame(frame);
+    }
+
+    draw() {
+      if (!this.world || !at("stage").clientWidth) return;
+      if (!this.film) {
+        drawWorld(at("stage"), this.world, this.colours);
+        return;
+      }
+      const { steps, states, action } = this.film;
+      const time = Math.min(this.time, steps);
+      const step = Math.min(Math.floor(time), steps - 1);
+      const places = between(states[step], states[step + 1], time - step, this.now);
+      const acting = action(step);
+      const trails = at("trails").checked ? { states, until: Math.floor(time) } : null;
+      drawWorld(at("stage"), this.world, this.colours, { places, action: acting, trails });
+      at("scrub").value = Math.floor(time);
+      const clock = `step ${Math.floor(time)} of ${steps} · ${(time * this.columns.about.step_seconds).toFixed(1)} s`;
+      if (at("clock").textContent !== clock) at("clock").textContent = clock;
+      for (const { entry, element, motor } of this.keys) {
+        const words = `${entryName(entry)} ${["off", motor ? "forward" : "on", "back"][acting[entry]]}`;
+        if (element.textContent !== words) {
+          element.textContent = words;
+          element.classList.toggle("lit", acting[entry] !== 0);
+        }
+      }
+    }
+
+    async copy() {
+      const words = at("command").textContent;
+      try {
+        await navigator.clipboard.writeText(words);
+      } catch {
+        getSelection().selectAllChildren(at("command")); // a page from the disk may not be let
+        document.execCommand("copy");
+      }
+      at("copy").textContent = "Copied";
+      setTimeout(() => { at("copy").textContent = "Copy"; }, 1500);
+    }
+
+    key(event) {
+      if (this.row === null || event.ctrlKey || event.metaKey || event.altKey) return;
+      if (/^(INPUT|SELECT|BUTTON|A)$/.test(event.target.tagName) && event.key !== "Escape") return;
+      const deeds = {
+        " ": () => this.play(!this.playing),
+        ArrowLeft: () => this.seek(Math.ceil(this.time) - 1),
+        ArrowRight: () => this.seek(Math.floor(this.time) + 1),
+        Home: () => this.seek(0),
+        End: () => this.film && this.seek(this.film.steps),
+        Escape: () => at("back").click(),
+        n: () => at("next").click(),
+        p: () => at("previous").click(),
+      };
+      if (!deeds[event.key]) return;
+      event.preventDefault();
+      deeds[event.key]();
+    }
+  }
+
+  // A world in words, for who does not see it.
+  function described(world) {
+    const bodies = world.bodies.slice(4);
+    const count = (words, of) => (of ? [`${of} ${words}${of > 1 ? "s" : ""}`] : []);
+    const roles = ["green", "blue", "red", "plain"].flatMap((role) =>
+      count(`${role} body`, bodies.filter((body) => body.role === role).length).map((words) => words.replace("bodys", "bodies")));
+    return [...roles, ...count("joint", world.joints.length), ...count("thruster", world.thrusters.length)].join(", ");
+  }
+
+  Object.assign(window.levelproof, { LevelPage });
+})();

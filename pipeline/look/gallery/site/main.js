@@ -1,0 +1,157 @@
+// Brings the parts together. What is shown is in the address: `#level=7`, or conditions and an order, as in
+// `#label=solved&steps_to_goal=3..40&sort=-env_steps`.
+"use strict";
+
+(async function () {
+  const { load, Columns, Worlds, Choice, Panel, Grid, LevelPage, made, spoken } = window.levelproof;
+  const at = (id) => document.getElementById(id);
+  let columns, worlds, choice, panel, grid, page, rows, scrolled = 0, overview = "";
+
+  // Says that something is wrong; "": nothing is.
+  levelproof.tell = (problem) => { at("problem").textContent = problem; };
+
+  const hrefOf = (row) => `#level=${columns.values.level_id[row]}`;
+
+  function wordsOf(name) {
+    return columns.about.columns.find((column) => column.name === name)?.words;
+  }
+
+  // What is chosen, as the address has it.
+  function addressOf() {
+    const parts = [...choice.conditions].map(([name, condition]) => {
+      const value = condition instanceof Set ? [...condition].map((place) => wordsOf(name)[place]) : [condition.join("..")];
+      return `${name}=${value.map(encodeURIComponent).join(",")}`;
+    });
+    const [name, direction] = choice.sortedBy;
+    if (name !== "level_id" || direction < 0) parts.push(`sort=${direction < 0 ? "-" : ""}${name}`);
+    return `#${parts.join("&")}`;
+  }
+
+  // The opposite: words and columns that are none are passed over.
+  function choose(address) {
+    choice.clear();
+    choice.sort("level_id", 1);
+    for (const part of address.slice(1).split("&").filter(Boolean)) {
+      const [name, value = ""] = part.split("=");
+      if (name === "sort" && columns.values[value.replace("-", "")]) choice.sort(value.replace("-", ""), value[0] === "-" ? -1 : 1);
+      const words = wordsOf(name);
+      if (words) {
+        const places = value.split(",").map((word) => words.indexOf(decodeURIComponent(word))).filter((place) => place >= 0);
+        if (places.length) choice.set(name, new Set(places));
+      } else if (columns.values[name]) {
+        const [low, high] = value.split("..").map(Number);
+        if (low <= high) choice.set(name, [low, high]);
+      }
+    }
+  }
+
+  function look() {
+    rows = choice.rows();
+    const [name, direction] = choice.sortedBy;
+    const { levels, found } = columns.about;
+    const some = rows.length === columns.rows ? "" : `${rows.length.toLocaleString("en")} of `;
+    const all = columns.rows < levels ? `${columns.rows.toLocaleString("en")} levels, more to come` : `${levels.toLocaleString("en")} levels`;
+    at("count").textContent = some + all + (found > levels ? ` (spread evenly over ${found.toLocaleString("en")})` : "");
+    at("clear").hidden = !choice.conditions.size;
+    at("sort").value = name;
+    at("direction").textContent = direction < 0 ? "↓" : "↑";
+    at("direction").setAttribute("aria-pressed", String(direction < 0));
+    panel.look();
+    grid.show(rows, name === "level_id" ? "steps_to_goal" : name);
+  }
+
+  function changed() {
+    overview = addressOf();
+    history.replaceState(null, "", overview);
+    look();
+  }
+
+  // Shows what the address says.
+  function follow() {
+    const address = location.hash || "#";
+    const id = address.match(/^#level=(-?\d+)$/);
+    levelproof.tell("");
+    if (!id) {
+      page.open(null);
+      [at("overview").hidden, at("level").hidden] = [false, true];
+      document.title = `${columns.about.split} · levelproof gallery`;
+      if (address !== overview) {
+        overview = address;
+        choose(address);
+        look();
+      } else grid.layout();
+      scrollTo(0, scrolled);
+      return;
+    }
+    const row = columns.numbers.get(Number(id[1]));
+    if (row === undefined) {
+      if (columns.rows < columns.about.levels) return; // it may be on a page to come
+      history.replaceState(null, "", overview || "#");
+      follow();
+      levelproof.tell(`There is no level ${id[1]} in this gallery.`);
+      return;
+    }
+    if (!at("overview").hidden) scrolled = scrollY;
+    [at("overview").hidden, at("level").hidden] = [true, false];
+    at("back").href = overview || "#";
+    const place = rows ? rows.indexOf(row) : -1;
+    for (const [name, other] of [["previous", place - 1], ["next", place < 0 ? -1 : place + 1]]) {
+      if (rows && rows[other] !== undefined) at(name).href = hrefOf(rows[other]);
+      else at(name).removeAttribute("href");
+    }
+    scrollTo(0, 0);
+    page.open(row).then(() => at("level").focus({ preventScroll: true }), (error) => levelproof.tell(error.message));
+  }
+
+  function listen() {
+    addEventListener("hashchange", follow);
+    at("clear").addEventListener("click", () => { choice.clear(); changed(); });
+    at("sort").addEventListener("change", () => { choice.sort(at("sort").value, choice.sortedBy[1]); changed(); });
+    at("direction").addEventListener("click", () => { choice.sort(choice.sortedBy[0], -choice.sortedBy[1]); changed(); });
+    document.querySelector(".skip").addEventListener("click", (event) => {
+      event.preventDefault();
+      (at("level").hidden ? at("levels") : at("level")).focus();
+    });
+    at("search").addEventListener("submit", (event) => {
+      event.preventDefault();
+      const id = at("level-id").value.trim();
+      if (/^-?\d+$/.test(id) && columns.numbers.has(Number(id))) location.hash = `level=${Number(id)}`;
+      else levelproof.tell(id ? `There is no level ${id} in this gallery.` : "Type the id of a level.");
+    });
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+      grid.recolour();
+      page.recolour();
+    });
+  }
+
+  try {
+    const about = await load("about");
+    [columns, worlds] = [new Columns(about), new Worlds(about)];
+    choice = new Choice(columns);
+    panel = new Panel(columns, choice, changed);
+    grid = new Grid(at("levels"), columns, worlds, hrefOf);
+    page = new LevelPage(columns, worlds);
+    at("split").textContent = about.split;
+    at("facts").textContent = [`configuration ${about.config_hash}`, ...(about.where ? [`where ${about.where}`] : [])].join(" · ");
+    const sorts = about.columns.filter((column) => !column.words).map((column) => column.name);
+    at("sort").append(...sorts.map((name) => made("option", { value: name }, name === "level_id" ? "level id" : spoken(name))));
+    if (innerWidth <= 820) at("panel").open = false;
+    listen();
+    for (let number = 0; columns.rows < about.levels; number++) {
+      columns.add(await load(`columns/${number}`));
+      choice.grown();
+      panel.grown();
+      if (number === 0) {
+        if (!/^#level=/.test(location.hash)) [overview, at("overview").hidden] = [location.hash || "#", false];
+        choose(overview);
+      }
+      look();
+      if (number === 0 || (at("overview").hidden && at("level").hidden)) follow();
+    }
+    if (at("overview").hidden && at("level").hidden) follow();
+    performance.mark("all columns are there");
+  } catch (error) {
+    levelproof.tell(`${error.message}: write the gallery again with levelproof gallery.`);
+    throw error;
+  }
+})();

@@ -1,0 +1,196 @@
+// The filters beside the grid: words as buttons, numbers as histograms that are brushed. Each tells the choice what is
+// wanted and is told to look again.
+"use strict";
+
+(function () {
+  const { binsOf } = window.levelproof;
+  const FIRST = ["steps_to_goal", "env_steps", "success_rate", "portability", "bodies", "joints", "motors", "thrusters"];
+  const [FEW, SHORT] = [8, 24]; // words that are buttons, and their letters; more are a list
+  const [WIDE, HIGH] = [320, 46]; // of a histogram's drawing
+  const SVG = "http://www.w3.org/2000/svg";
+
+  function made(tag, attributes = {}, ...inside) {
+    const element = attributes.svg ? document.createElementNS(SVG, tag) : document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) {
+      if (name === "svg" || value === undefined) continue;
+      if (typeof value === "function") element.addEventListener(name, value);
+      else element.setAttribute(name, value);
+    }
+    element.append(...inside);
+    return element;
+  }
+
+  const spoken = (name) => name.replaceAll("_", " ");
+
+  function shown(value) {
+    if (Number.isInteger(value)) return value.toLocaleString("en");
+    return Number(value.toPrecision(3)).toString();
+  }
+
+  class Words {
+    constructor(column, choice, changed) {
+      Object.assign(this, { column, choice, changed });
+      const heading = made("h3", {}, spoken(column.name));
+      if (column.words.length <= FEW && column.words.every((word) => word.length <= SHORT)) {
+        this.buttons = column.words.map((word, place) =>
+          made("button", { type: "button", "aria-pressed": "false", click: () => this.toggle(place) },
+            ...(column.name === "label" ? [made("i", { class: "dot", "data-label": word })] : []), word, made("span")));
+        this.element = made("div", { class: "filter", role: "group", "aria-label": spoken(column.name) }, heading,
+          made("div", { class: "chips" }, ...this.buttons));
+      } else {
+        this.select = made("select", { "aria-label": spoken(column.name), change: () => this.pick() },
+          made("option", { value: "" }, "any"),
+          ...column.words.map((word, place) => made("option", { value: place }, word)));
+        this.element = made("div", { class: "filter" }, heading, this.select);
+      }
+    }
+
+    toggle(place) {
+      const chosen = new Set(this.choice.conditions.get(this.column.name) || []);
+      if (!chosen.delete(place)) chosen.add(place);
+      this.choice.set(this.column.name, chosen.size ? chosen : null);
+      this.changed();
+    }
+
+    pick() {
+      this.choice.set(this.column.name, this.select.value === "" ? null : new Set([Number(this.select.value)]));
+      this.changed();
+    }
+
+    look() {
+      const chosen = this.choice.conditions.get(this.column.name);
+      if (this.select) {
+        this.select.value = chosen ? String([...chosen][0]) : "";
+        return;
+      }
+      const counts = this.choice.counts(this.column.name, this.column.words.length);
+      this.buttons.forEach((button, place) => {
+        button.setAttribute("aria-pressed", String(Boolean(chosen && chosen.has(place))));
+        button.lastChild.textContent = counts[place].toLocaleString("en");
+      });
+    }
+  }
+
+  class Histogram {
+    constructor(name, choice, changed) {
+      Object.assign(this, { name, choice, changed, bins: null });
+      const path = (of) => made("path", { svg: true, class: of });
+      [this.all, this.chosen] = [path("all"), path("chosen")];
+      this.brush = made("rect", { svg: true, class: "brush", y: 0, height: HIGH });
+      this.drawing = made("svg", {
+        svg: true, viewBox: `0 0 ${WIDE} ${HIGH}`, preserveAspectRatio: "none", role: "img",
+        pointerdown: (event) => this.begin(event), pointermove: (event) => this.drag(event), pointerup: () => this.end(),
+      }, this.all, this.brush, this.chosen);
+      this.clear = made("button", { type: "button", "aria-label": `Clear ${spoken(name)}`, click: () => this.choose(null) }, "clear");
+      this.inputs = ["at least", "at most"].map((words) =>
+        made("input", { type: "number", step: "any", "aria-label": `${spoken(name)}, ${words}`, change: () => this.typed() }));
+      this.element = made("div", { class: "filter histogram" }, made("h3", {}, spoken(name), this.clear), this.drawing,
+        made("div", { class: "ends" }, ...this.inputs));
+    }
+
+    // The bin under a pointer.
+    binAt(event) {
+      const { left, width } = this.drawing.getBoundingClientRect();
+      const bin = Math.floor(((event.clientX - left) / width) * this.bins.count);
+      return Math.min(this.bins.count - 1, Math.max(0, bin));
+    }
+
+    begin(event) {
+      this.from = this.binAt(event);
+      this.wasChosen = this.choice.conditions.has(this.name);
+      this.moved = false;
+      this.drawing.setPointerCapture(event.pointerId);
+    }
+
+    drag(event) {
+      if (this.from === undefined) return;
+      const to = this.binAt(event);
+      if (to === this.from && !this.moved) return;
+      this.moved = true;
+      this.choose(this.range(Math.min(this.from, to), Math.max(this.from, to)));
+    }
+
+    // A click chooses one bin, or ends what was chosen.
+    end() {
+      if (this.from !== undefined && !this.moved) this.choose(this.wasChosen ? null : this.range(this.from, this.from));
+      this.from = undefined;
+    }
+
+    range(first, last) {
+      const { low, high, width, whole } = this.bins;
+      const end = low + (last + 1) * width;
+      return [low + first * width, Math.min(high, whole ? end - 1 : end)];
+    }
+
+    typed() {
+      const { low, high } = this.bins;
+      const [from, to] = this.inputs.map((input) => (input.value === "" ? NaN : Number(input.value)));
+      this.choose(Number.isNaN(from) && Number.isNaN(to) ? null : [Number.isNaN(from) ? low : from, Number.isNaN(to) ? high : to]);
+    }
+
+    choose(range) {
+      this.choice.set(this.name, range);
+      this.changed();
+    }
+
+    look() {
+      this.element.hidden = !this.bins;
+      if (!this.bins) return;
+      const { low, high, count, width } = this.bins;
+      const { all, chosen } = this.choice.histogram(this.name, this.bins);
+      const most = Math.max(1, ...all);
+      const range = this.choice.conditions.get(this.name);
+      const bars = (counts) => Array.from(counts, (of, bin) => {
+        const [x, next] = [(bin * WIDE) / count, ((bin + 0.86) * WIDE) / count];
+        const tall = of && Math.max(1.2, (HIGH * of) / most);
+        return of ? `M${x.toFixed(1)} ${HIGH}V${(HIGH - tall).toFixed(1)}H${next.toFixed(1)}V${HIGH}Z` : "";
+      }).join("");
+      this.all.setAttribute("d", bars(all));
+      const within = chosen.map((of, bin) => {
+        const middle = low + (bin + 0.5) * width;
+        return range && (middle + width / 2 <= range[0] || middle - width / 2 > range[1]) ? 0 : of;
+      });
+      this.chosen.setAttribute("d", bars(within));
+      const at = (value) => Math.min(WIDE, Math.max(0, ((value - low) / (count * width)) * WIDE));
+      this.brush.setAttribute("x", range ? at(range[0]) : 0);
+      this.brush.setAttribute("width", range ? Math.max(2, at(range[1] + (this.bins.whole ? 1 : 0)) - at(range[0])) : 0);
+      this.clear.hidden = !range;
+      [low, high].forEach((end, i) => {
+        this.inputs[i].placeholder = shown(end);
+        this.inputs[i].value = range ? Number(range[i].toPrecision(6)) : "";
+      });
+      const total = chosen.reduce((sum, of) => sum + of, 0);
+      this.drawing.setAttribute("aria-label", `Histogram of ${spoken(this.name)}: ${total} levels between ${shown(low)} and ${shown(high)}`);
+    }
+  }
+
+  class Panel {
+    constructor(columns, choice, changed) {
+      Object.assign(this, { columns, choice });
+      const worded = columns.about.columns.filter((column) => column.words);
+      const flag = (column) => column.words.every((word) => word === "yes" || word === "no");
+      const words = worded.map((column) => ({ column, filter: new Words(column, choice, changed) }));
+      const named = columns.about.columns.filter((column) => !column.words && column.name !== "level_id").map((column) => column.name);
+      const histograms = [...FIRST.filter((name) => named.includes(name)), ...named.filter((name) => !FIRST.includes(name))]
+        .map((name) => new Histogram(name, choice, changed));
+      this.histograms = histograms;
+      this.filters = [...words.map((of) => of.filter), ...histograms];
+      const at = (id) => document.getElementById(id);
+      at("words").append(...words.filter((of) => !flag(of.column)).map((of) => of.filter.element));
+      at("histograms").append(...histograms.filter((of) => FIRST.includes(of.name)).map((of) => of.element));
+      at("more").append(...words.filter((of) => flag(of.column) && of.column.words.length > 1).map((of) => of.filter.element),
+        ...histograms.filter((of) => !FIRST.includes(of.name)).map((of) => of.element));
+    }
+
+    // More rows have come.
+    grown() {
+      for (const histogram of this.histograms) histogram.bins = binsOf(this.columns, histogram.name);
+    }
+
+    look() {
+      for (const filter of this.filters) filter.look();
+    }
+  }
+
+  Object.assign(window.levelproof, { Panel, made, spoken, shown });
+})();

@@ -1,0 +1,198 @@
+"""What a gallery's files say is what the split says: rows, worlds and states."""
+
+import json
+from base64 import b64decode
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from experts.witness import steps_to_goal
+from pipeline.cli.gallery import MOST
+from pipeline.errors import Failure, UserError
+from pipeline.look.gallery import gallery as module
+from pipeline.look.gallery.columns import FLAGS, NOTHING, NUMBERS, kind_of_reason
+from pipeline.look.gallery.gallery import BLOCK, gallery
+from pipeline.look.gallery.worlds import ANGLE, LENGTH, angles
+from pipeline.look.things import things_of
+from pipeline.read.levels import levels_of
+from pipeline.read.rows import read_row
+from pipeline.store.manifest import Manifest, require_manifest
+from tests.pipeline.made import PLAYED, played_split
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return played_split(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def manifest(split: Path) -> Manifest:
+    return require_manifest(split)
+
+
+@pytest.fixture(scope="module")
+def site(split: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("site") / "gallery"
+    gallery(split, out, None, MOST)
+    return out
+
+
+def told(site: Path, name: str) -> Any:
+    """What a data file hands over."""
+    before, after = f'levelproof.arrived("{name}",', ");\n"
+    text = (site / "data" / f"{name}.js").read_text()
+    assert text.startswith(before)
+    assert text.endswith(after)
+    return json.loads(text.removeprefix(before).removesuffix(after))
+
+
+def numbers(text: str, kind: str) -> np.ndarray:
+    return np.frombuffer(b64decode(text), kind)
+
+
+def test_columns_are_those_of_the_manifest(site: Path, manifest: Manifest) -> None:
+    about, page, table = told(site, "about"), told(site, "columns/0"), manifest.table
+    assert about["levels"] == about["found"] == PLAYED
+    columns = {column["name"]: column for column in about["columns"]}
+    for name in NUMBERS:
+        found = numbers(page[name], f"<f{columns[name]['bits'] // 8}")
+        np.testing.assert_array_equal(found, table[name].to_numpy().astype(float))
+    for name in ("label", "label_reason", "witness", *FLAGS):
+        words = {NOTHING: None} | dict(enumerate(columns[name]["words"]))
+        found = [words[place] for place in numbers(page[name], "<u2")]
+        if name in FLAGS:
+            found = [None if word is None else word == "yes" for word in found]
+        assert found == [kind_of_reason(x) if name == "label_reason" else x for x in table[name].to_pylist()]
+    for name, counts in things_of(levels_of(manifest, table)).items():
+        np.testing.assert_array_equal(numbers(page[name], "<f4"), counts)
+
+
+def test_a_level_has_its_row_and_where_its_witness_goes(site: Path, manifest: Manifest) -> None:
+    worlds = told(site, "worlds/0")
+    for number, row in enumerate(manifest.table.to_pylist()):
+        page = told(site, f"levels/0/{row['level_id']}")
+        assert page["row"]["command"] == row["command"]
+        assert page["row"]["learning_curve"] == [None, 0.5]
+        assert ("states" in page) == bool(row["shard"])
+        if not row["shard"]:
+            continue
+        arrays = read_row(manifest.split, row)
+        steps, moving = int(steps_to_goal(arrays["record/done"])[0]), moving_bodies(arrays)
+        count, still = numbers(worlds[number], "<i2")[:2]
+        assert count - still == len(moving)
+        states = numbers(page["states"], "<i2").reshape(steps + 1, len(moving), 3)
+        position, rotation = (arrays[f"record/state/{name}"][:steps, ..., 0] for name in ("position", "rotation"))
+        assert np.abs(states[:-1, :, :2] * LENGTH - position[:, moving]).max() <= 0.501 * LENGTH
+        turned = states[:-1, :, 2] * ANGLE - rotation[:, moving]
+        assert np.abs(np.angle(np.exp(1j * turned))).max() <= 0.51 * ANGLE
+        actions = numbers(page["actions"], "u1").reshape(steps, 6)
+        np.testing.assert_array_equal(actions, arrays["record/action"][:steps, :, 0])
+
+
+def moving_bodies(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    return np.flatnonzero(arrays["level/model/active"][:, 0] & (arrays["level/model/inverse_mass"][:, 0] != 0))
+
+
+def test_the_last_state_is_where_green_and_blue_touch(split: Path, manifest: Manifest, site: Path) -> None:
+    """Records end before the step that reaches the goal; the film does not."""
+    row = next(row for row in manifest.table.to_pylist() if row["shard"])
+    states = numbers(told(site, f"levels/0/{row['level_id']}")["states"], "<i2")
+    arrays = read_row(split, row)
+    last, moving = int(steps_to_goal(arrays["record/done"])[0]) - 1, moving_bodies(arrays)
+    position, velocity = (arrays[f"record/state/{name}"][last, moving, :, 0] for name in ("position", "velocity"))
+    found = states.reshape(-1, len(moving), 3)[-1, :, :2] * LENGTH
+    np.testing.assert_allclose(found, position + velocity / 60, atol=LENGTH)
+
+
+def test_worlds_hold_every_body(site: Path, manifest: Manifest) -> None:
+    levels = jax.tree.map(np.asarray, levels_of(manifest, manifest.table))
+    for lane, text in enumerate(told(site, "worlds/0")):
+        world = numbers(text, "<i2").tolist()
+        count, _, joints, thrusters = (world.pop(0) for _ in range(4))
+        model = jax.tree.map(lambda x, lane=lane: x[..., lane], levels.model)
+        assert (count, joints, thrusters) == (model.active.sum(), model.joint_active.sum(), model.thruster_active.sum())
+        found = []
+        for _ in range(count):
+            role, corners, x, y, _ = (world.pop(0) for _ in range(5))
+            shape = [world.pop(0) for _ in range(2 * corners or 1)]
+            found.append((role, corners, round(x * LENGTH, 2), round(y * LENGTH, 2), len(shape)))
+        polygons = levels.size.polygons
+        corners = [model.n_vertices[body] if body < polygons else 0 for body in range(levels.size.bodies)]
+        there = np.flatnonzero(model.active)
+        places = levels.state.position[..., lane]
+        assert sorted(of[:2] for of in found) == sorted((levels.role[body, lane], corners[body]) for body in there)
+        assert sorted(of[2] for of in found) == pytest.approx(sorted(places[there, 0]), abs=0.01)
+        assert len(world) == 5 * joints + 5 * thrusters
+
+
+def test_angles_come_within_a_turn() -> None:
+    turned = np.array([0.0, 3.0, -3.0, 50.0, -50.0, np.pi, 1e6])
+    np.testing.assert_allclose(np.exp(1j * angles(turned) * ANGLE), np.exp(1j * turned), atol=ANGLE)
+
+
+def test_the_pages_ask_nobody_else(site: Path) -> None:
+    """No address of another host, and no colour beside those of pictures."""
+    for path in [*site.glob("*.js"), *site.glob("*.html"), *site.glob("*.css")]:
+        text = path.read_text().replace("http://www.w3.org/2000/svg", "")
+        assert "http" not in text
+        assert "fetch(" not in text
+    assert "rgb(" not in (site / "style.css").read_text()
+    assert "--green: rgb(62, 176, 92);" in (site / "palette.css").read_text()
+
+
+def test_some_levels(split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gallery(split, tmp_path / "some", "level_id >= 10 AND level_id < 60", 3)
+    about = told(tmp_path / "some", "about")
+    assert (about["levels"], about["found"], about["where"]) == (3, 50, "level_id >= 10 AND level_id < 60")
+    assert numbers(told(tmp_path / "some", "columns/0")["level_id"], "<f4").tolist() == [10, 34, 59]
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"{tmp_path / 'some' / 'index.html'}: 3 of 50 levels, spread evenly over their ids, of ")
+    assert second.endswith(f"-m webbrowser {tmp_path / 'some' / 'index.html'}")
+    with pytest.raises(UserError, match=r"No level of .* fits"):
+        gallery(split, tmp_path / "none", "level_id < 0", MOST)
+
+
+def test_a_gallery_makes_way_for_the_next_and_nothing_else_does(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "gallery"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match=r"There is something at .* already"):
+        gallery(split, out, None, 1)
+    assert (out / "notes.txt").read_text() == "mine"
+    (out / "notes.txt").unlink()
+    out.rmdir()
+    gallery(split, out, None, 1)
+    (out / "old").write_text("")
+    gallery(split, out, None, 2)
+    assert told(out, "about")["levels"] == 2
+    assert not (out / "old").exists()
+
+    def dies(_: object) -> str:
+        raise Failure("the shard is damaged")
+
+    monkeypatch.setattr(module, "world_of", dies)
+    with pytest.raises(Failure):
+        gallery(split, out, None, MOST)
+    assert told(out, "about")["levels"] == 2  # as it was
+    assert [path.name for path in tmp_path.iterdir()] == ["gallery"]
+
+
+def test_levels_are_read_block_by_block(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, manifest: Manifest
+) -> None:
+    read: list[int] = []
+    rows = module.read_rows
+    monkeypatch.setattr(module, "BLOCK", 7)
+    monkeypatch.setattr(
+        module, "read_rows", lambda at, table, fields: read.append(table.num_rows) or rows(at, table, fields)
+    )
+    gallery(split, tmp_path / "gallery", None, MOST)
+    assert BLOCK == 64
+    assert max(read) <= 7
+    assert sum(read) == manifest.table["shard"].is_valid().to_numpy().sum()
+    assert len(list((tmp_path / "gallery/data/worlds").iterdir())) == -(-PLAYED // 7)

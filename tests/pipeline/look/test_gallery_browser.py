@@ -1,0 +1,202 @@
+"""The gallery in a real browser: what people see, press and read."""
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.browser import browser
+from experts.witness import steps_to_goal
+from pipeline.errors import Failure
+from pipeline.look.gallery.gallery import gallery
+from pipeline.look.gallery.worlds import ANGLE, LENGTH
+from pipeline.read.rows import read_row
+from pipeline.store.manifest import require_manifest
+from tests.pipeline.made import PLAYED, played_split
+
+DEMANDED = "LEVELPROOF_TEST_BROWSER"
+DESKTOP, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
+STATES = """async (id) => {
+    const { load, worldOf, statesOf, bytesOf } = levelproof;
+    const [worlds, told] = [await load("worlds/0"), await load(`levels/0/${id}`)];
+    const steps = bytesOf(told.actions).length / 6;
+    return statesOf(worldOf(worlds[id]), told.states, steps + 1).map((places) => Array.from(places));
+}"""
+COLOURED = """(canvas) => {
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    const seen = new Set();
+    for (let i = 0; i < data.length; i += 4) seen.add(`${data[i]},${data[i + 1]},${data[i + 2]}`);
+    return [...seen];
+}"""
+UNNAMED = """() => [...document.querySelectorAll("button, input, select, a, [role=img]")]
+    .filter((of) => of.checkVisibility() && !(of.ariaLabel || of.textContent.trim() || of.labels?.length))
+    .map((of) => of.outerHTML)"""
+
+pytestmark = pytest.mark.campaign
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return played_split(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def address(split: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    out = tmp_path_factory.mktemp("site") / "gallery"
+    gallery(split, out, None, PLAYED)
+    return (out / "index.html").as_uri()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """Skips where there is none; fails there with LEVELPROOF_TEST_BROWSER=1."""
+    try:
+        with browser() as opened:
+            yield opened
+    except Failure as failure:
+        if os.environ.get(DEMANDED):
+            raise
+        pytest.skip(f"no browser: {failure}")
+
+
+@pytest.fixture
+def page(chromium: Any) -> Iterator[Any]:
+    """A page that must not complain, nor ask another host for anything."""
+    context = chromium.new_context(viewport=DESKTOP, reduced_motion="reduce")
+    opened, said = context.new_page(), list[str]()
+    opened.on("console", lambda message: said.append(message.text))
+    opened.on("pageerror", lambda error: said.append(str(error)))
+    opened.on(
+        "request", lambda request: said.append(request.url) if not request.url.startswith(("file:", "data:")) else None
+    )
+    yield opened
+    assert said == []
+    context.close()
+
+
+def rows(split: Path) -> list[dict[str, Any]]:
+    return require_manifest(split).table.to_pylist()
+
+
+def drawn(page: Any) -> None:
+    page.wait_for_function("performance.getEntriesByName('levels are drawn').length > 0")
+
+
+def solved(split: Path) -> int:
+    return next(int(row["level_id"]) for row in rows(split) if row["shard"])
+
+
+def test_levels_are_drawn(page: Any, address: str) -> None:
+    page.goto(address)
+    drawn(page)
+    assert page.locator("#count").inner_text() == f"{PLAYED} levels"
+    cells = page.locator(".cell:visible")
+    assert 12 <= cells.count() < PLAYED  # those on the screen alone
+    seen = {colour for i in range(6) for colour in cells.nth(i).locator("canvas").evaluate(COLOURED)}
+    assert {"62,176,92", "58,124,220", "247,247,243"} <= seen  # green, blue, sky
+    assert page.evaluate(UNNAMED) == []
+
+
+def test_brushes_words_and_orders_are_in_the_address(page: Any, address: str, split: Path) -> None:
+    page.goto(address)
+    drawn(page)
+    page.get_by_role("button", name=re.compile("^solved")).click()
+    count = sum(row["label"] == "solved" for row in rows(split))
+    assert page.locator("#count").inner_text() == f"{count} of {PLAYED} levels"
+    box = page.get_by_label(re.compile("^Histogram of bodies")).bounding_box()
+    page.mouse.move(box["x"] + 2, box["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.3, box["y"] + 20, steps=4)
+    page.mouse.up()
+    brushed = int(page.locator("#count").inner_text().split(" of ")[0])
+    assert 0 < brushed < count
+    assert re.search(r"#label=solved&bodies=\d\.\.\d$", page.url)
+    page.select_option("#sort", "level_id")
+    page.locator("#direction").click()
+    first = page.locator("[aria-posinset='1'] a")
+    shown = first.get_attribute("href")
+    page.reload()
+    drawn(page)
+    assert page.locator("#count").inner_text() == f"{brushed} of {PLAYED} levels"
+    assert first.get_attribute("href") == shown
+    page.locator("#clear").click()
+    assert page.locator("#count").inner_text() == f"{PLAYED} levels"
+    assert first.get_attribute("href") == f"#level={PLAYED - 1}"
+
+
+def test_a_level_plays_what_its_record_has(page: Any, address: str, split: Path) -> None:
+    level_id = solved(split)
+    page.goto(f"{address}#level={level_id}")
+    page.wait_for_selector("#title:has-text('Level')")
+    arrays = read_row(split, next(row for row in rows(split) if row["level_id"] == level_id))
+    steps = int(steps_to_goal(arrays["record/done"])[0])
+    states = np.array(page.evaluate(STATES, level_id)).reshape(steps + 1, -1, 3)
+    present = np.flatnonzero(arrays["level/model/active"][:, 0])
+    order = present[np.argsort(arrays["level/model/inverse_mass"][present, 0] != 0, kind="stable")]
+    where, turned = (arrays[f"record/state/{name}"][:steps, order, ..., 0] for name in ("position", "rotation"))
+    np.testing.assert_allclose(states[:-1, :, :2], where, atol=0.51 * LENGTH)
+    np.testing.assert_allclose(np.exp(1j * states[:-1, :, 2]), np.exp(1j * turned), atol=ANGLE)
+    start = page.locator("#stage").evaluate("(canvas) => canvas.toDataURL()")
+    page.keyboard.press("End")
+    assert page.locator("#clock").inner_text().startswith(f"step {steps} of {steps} · ")
+    assert page.locator("#stage").evaluate("(canvas) => canvas.toDataURL()") != start
+    page.keyboard.press("ArrowLeft")
+    assert page.locator("#clock").inner_text().startswith(f"step {steps - 1} of {steps} · ")
+    page.get_by_role("button", name="Play").click()
+    page.wait_for_timeout(200)
+    assert page.locator("#play").inner_text() == "Pause"
+    assert page.locator("#command").inner_text().startswith("levelproof generate")
+    assert page.locator("#reason").inner_text() == "Made for a test."
+    assert "to 50%" in page.locator("#curve").get_attribute("aria-label")
+    assert page.evaluate(UNNAMED) == []
+
+
+def test_search_keyboard_and_the_way_back(page: Any, address: str) -> None:
+    page.goto(address)
+    drawn(page)
+    page.get_by_label("Level id").fill("999")
+    page.keyboard.press("Enter")
+    assert page.get_by_role("alert").inner_text() == "There is no level 999 in this gallery."
+    page.locator("[aria-posinset='1'] a").focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowDown")
+    name = page.evaluate("document.activeElement.ariaLabel")
+    assert re.match(r"Level \d+, (un)?solved", name)
+    page.keyboard.press("End")
+    assert page.evaluate("document.activeElement.ariaLabel").startswith(f"Level {PLAYED - 1}, ")
+    assert page.evaluate("scrollY") > 0
+    page.keyboard.press("Enter")
+    page.wait_for_selector(f"#title:has-text('Level {PLAYED - 1}')")
+    page.keyboard.press("p")
+    page.wait_for_selector(f"#title:has-text('Level {PLAYED - 2}')")
+    page.keyboard.press("Escape")
+    page.wait_for_selector("#overview:visible")
+    assert page.evaluate("scrollY") > 0  # where it was
+    page.goto(f"{address}#level=12345")
+    page.wait_for_selector("#problem:has-text('no level 12345')")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_phone_by_day_and_by_night(chromium: Any, address: str, split: Path, scheme: str) -> None:
+    context = chromium.new_context(viewport=PHONE, color_scheme=scheme, device_scale_factor=2, has_touch=True)
+    page = context.new_page()
+    for at in ("", f"#level={solved(split)}"):
+        page.goto(address + at)
+        page.wait_for_timeout(400)
+        assert page.evaluate("document.scrollingElement.scrollWidth") <= PHONE["width"]
+    dark = page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(19, 21, 25)"
+    assert dark == (scheme == "dark")
+    context.close()
+
+
+def test_a_damaged_file_is_told(chromium: Any, tmp_path: Path, split: Path) -> None:
+    gallery(split, tmp_path / "gallery", None, PLAYED)
+    (tmp_path / "gallery/data/columns/0.js").write_text("levelproof.nothing = 1;\n")
+    page = chromium.new_page()
+    page.goto((tmp_path / "gallery/index.html").as_uri())
+    page.wait_for_selector("#problem:has-text('write the gallery again with levelproof gallery')")
+    page.close()
