@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from configs.errors import ConfigError
 from pipeline.cli import (
     card,
+    diff,
     export,
     gallery,
     generate,
@@ -29,7 +30,22 @@ from pipeline.cli.command import EXITS
 from pipeline.errors import Exit, LevelproofError
 from pipeline.version import __version__
 
-COMMANDS = (generate, regenerate, settings, sample, inspect, show, gallery, export, import_, card, status, verify, seal)
+COMMANDS = (
+    generate,
+    regenerate,
+    settings,
+    sample,
+    inspect,
+    diff,
+    show,
+    gallery,
+    export,
+    import_,
+    card,
+    status,
+    verify,
+    seal,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

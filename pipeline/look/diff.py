@@ -1,0 +1,201 @@
+"""The same levels in two splits, made with two budgets or procedures: which were solved where, and at what cost.
+
+By the manifests alone; reads no shard's data.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Bool
+from rich.console import Console
+from rich.table import Table
+
+from experts.labels import TRAINED, WITNESSED, Label
+from pipeline.errors import UserError
+from pipeline.look.inspect import QUANTILES
+from pipeline.read.select import columns_in, select
+from pipeline.store.manifest import Manifest, differences, require_manifest, told
+from pipeline.store.remote import as_typed
+
+SPENT = ("scout_steps", "search_steps", "env_steps", "evaluation_steps")  # what a level cost, env steps
+READ = ("content_hash", "signature", "label", "steps_to_goal", *SPENT)
+LABELS = [label.value for label in Label]
+
+
+def diff(one: Path, other: Path, where: str | None, rows: int, as_json: bool) -> None:
+    """Print how two splits of the same levels differ; `where` is a condition on the first one's rows.
+
+    Raises:
+        UserError: no split, a condition that DuckDB cannot use, or splits of different levels.
+        Failure: a fragment is damaged.
+    """
+    facts = compare(one, other, where, rows)
+    if as_json:
+        json.dump(facts, sys.stdout, indent=2, allow_nan=False)
+        print()
+    else:
+        _print(facts, Console(highlight=False))
+
+
+def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) -> dict[str, Any]:
+    """The facts that `diff` prints, as JSON's types."""
+    manifests = [require_manifest(one, [*READ, *columns_in(where)], compact=True), _read(other)]
+    chosen = select(manifests[0].table, where)
+    left, right = _common(chosen, manifests[1].table, (one, other))
+    solved, tried = np.stack([_labelled(of, WITNESSED) for of in (left, right)]), _labelled(left, TRAINED)
+    tried |= _labelled(right, TRAINED)
+    only = [solved[i] & ~solved[1 - i] for i in range(2)]
+    ids, spent = left["level_id"].to_numpy(), [_spent(of) for of in (left, right)]
+    totals, gained = [sum(of.values()) for of in spent], int(only[1].sum() - only[0].sum())
+    counts = [[int(part.sum()) for part in (of & tried, tried)] for of in solved]
+    return {
+        "splits": [as_typed(one), as_typed(other)],
+        "settings": _settings(manifests[0], manifests[1]),
+        "levels": left.num_rows,
+        "alone": [
+            chosen.num_rows - left.num_rows,
+            manifests[1].table.num_rows - left.num_rows if where is None else None,
+        ],
+        "solved": [{"solved": of, "tried": tried} for of, tried in counts],
+        "both": int((solved[0] & solved[1]).sum()),
+        "neither": int((~solved[0] & ~solved[1] & tried).sum()),
+        "only": [int(of.sum()) for of in only],
+        "p": exact_p(*(int(of.sum()) for of in only)),
+        "only_rows": [ids[of][: max(rows, 0)].tolist() for of in only],
+        "labels": _moves(left, right),
+        "env_steps": spent,
+        "env_steps_more": totals[1] - totals[0],
+        "env_steps_for_one_more": (totals[1] - totals[0]) / gained if gained else None,
+        "steps_to_goal": _paired(left, right, solved[0] & solved[1]),
+    }
+
+
+def exact_p(fewer: int, more: int) -> float:
+    """Two-sided p of so many and so many of paired outcomes, by exact binomial: a fair coin decides each (McNemar)."""
+    few, flips = min(fewer, more), fewer + more
+    heads = np.arange(1, few + 1)
+    chances = np.cumsum(np.log((flips - heads + 1) / heads))  # of 1, 2, ... heads, as logarithms of those of none
+    return float(min(1.0, 2 * np.exp(np.concatenate([[0.0], chances]) - flips * np.log(2)).sum()))
+
+
+def _read(split: Path) -> Manifest:
+    return require_manifest(split, READ, compact=True)
+
+
+def _common(one: pa.Table, other: pa.Table, splits: tuple[Path, Path]) -> tuple[pa.Table, pa.Table]:
+    """The rows of the levels that both have, side by side.
+
+    Raises:
+        UserError: there is none, or one is another level there. Of one level, the hash may be another on another
+            stack, where bits differ; a half of the signature is the same.
+    """
+    _, here, there = np.intersect1d(one["level_id"].to_numpy(), other["level_id"].to_numpy(), True, True)
+    sides = "{} and {}".format(*splits)
+    if not len(here):
+        raise UserError(f"No level is in {sides} both: give two splits of the same levels.")
+    left, right = one.take(here), other.take(there)
+    unlike = np.flatnonzero(pc.not_equal(left["content_hash"], right["content_hash"]))  # pyright: ignore[reportAttributeAccessIssue]
+    for place in unlike.tolist():
+        if not set(left["signature"][place].as_py()) & set(right["signature"][place].as_py()):
+            raise UserError(
+                f"Level {left['level_id'][place]} is not the same in {sides}: "
+                "give two splits with one size and one distribution."
+            )
+    return left, right
+
+
+def _labelled(rows: pa.Table, labels: frozenset[Label]) -> Bool[np.ndarray, " row"]:
+    names = pa.array([label.value for label in labels])
+    return pc.is_in(rows["label"].cast(pa.string()), names).to_numpy().copy()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _spent(rows: pa.Table) -> dict[str, int]:
+    return {name: int(rows[name].to_numpy().sum()) for name in SPENT}
+
+
+def _settings(one: Manifest, other: Manifest) -> dict[str, list[Any]]:
+    """Those that differ and decide results."""
+    return {name: list(values) for name, values in differences(one.config or {}, other.config or {}).items()}
+
+
+def _moves(left: pa.Table, right: pa.Table) -> dict[str, dict[str, int]]:
+    """How many levels have which label there, by the label they have here."""
+    places = [np.array([LABELS.index(word) for word in of["label"].to_pylist()]) for of in (left, right)]
+    counts = np.zeros((len(LABELS), len(LABELS)), int)
+    np.add.at(counts, (places[0], places[1]), 1)
+    return {
+        label: {to: int(count) for to, count in zip(LABELS, row, strict=True) if count}
+        for label, row in zip(LABELS, counts, strict=True)
+        if row.any()
+    }
+
+
+def _paired(left: pa.Table, right: pa.Table, both: np.ndarray) -> dict[str, Any] | None:
+    """Steps to the goal of the levels that both solve; the sign test tells whether one side's are shorter."""
+    steps = np.stack([of["steps_to_goal"].to_numpy()[both] for of in (left, right)]).astype(float)
+    steps = steps[:, ~np.isnan(steps).any(0)]
+    if not steps.size:
+        return None
+    shorter, longer = int((steps[1] < steps[0]).sum()), int((steps[1] > steps[0]).sum())
+    quantiles = [np.quantile(of, QUANTILES, method="nearest").tolist() for of in steps]
+    return {
+        "levels": steps.shape[1],
+        "quantiles": [dict(zip((f"{q:.0%}" for q in QUANTILES), of, strict=True)) for of in quantiles],
+        "shorter": shorter,
+        "longer": longer,
+        "p": exact_p(shorter, longer),
+        "median_change": float(np.median(steps[1] - steps[0])),
+    }
+
+
+def _print(facts: dict[str, Any], console: Console) -> None:
+    one, other = facts["splits"]
+    table = Table("", one, other, "difference", box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    for name in table.columns[1:]:
+        name.justify = "right"
+    shares = [f"{of['solved'] / of['tried']:.1%}" if of["tried"] else "-" for of in facts["solved"]]
+    gained = facts["only"][1] - facts["only"][0]
+    table.add_row("levels solved", *(f"{of['solved']:,}" for of in facts["solved"]), f"{gained:+,}")
+    table.add_row("of levels that could use an expert", *shares, f"p {_p(facts['p'])}")
+    table.add_row("solved only there", *(f"{count:,}" for count in facts["only"]), "")
+    for name in SPENT:
+        here, there = (of[name] for of in facts["env_steps"])
+        if here or there:
+            table.add_row(name.replace("_", " "), f"{here:,}", f"{there:,}", f"{there - here:+,}")
+    if steps := facts["steps_to_goal"]:
+        for quantile in steps["quantiles"][0]:
+            here, there = (of[quantile] for of in steps["quantiles"])
+            name = "median" if quantile == "50%" else quantile
+            table.add_row(f"steps to goal, {name}", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
+    console.print(table)
+    say = lambda text: console.print(text, markup=False, soft_wrap=not console.is_terminal)
+    say("")
+    alone = [
+        f"{count:,} only in {split}" for count, split in zip(facts["alone"], facts["splits"], strict=True) if count
+    ]
+    say(f"{facts['levels']:,} levels are in both" + (f" ({', '.join(alone)})." if alone else "."))
+    changed = told({name: (a, b) for name, (a, b) in facts["settings"].items()})
+    say(f"Settings that differ: {changed or 'none'}.")
+    if facts["env_steps_for_one_more"] is not None:
+        more = facts["env_steps_for_one_more"]
+        say(f"{facts['env_steps_more']:+,} env steps for {gained:+,} solved levels: {more:,.0f} for each one more.")
+    if steps:
+        say(
+            f"Of {steps['levels']:,} levels that both solve, {steps['shorter']:,} take fewer steps in {other} and "
+            f"{steps['longer']:,} more, p {_p(steps['p'])}."
+        )
+    for split, ids in zip(facts["splits"], facts["only_rows"], strict=True):
+        if ids:
+            say(
+                f"Solved only in {split}: {', '.join(map(str, ids))}"
+                + ("" if len(ids) == facts["only"][facts["splits"].index(split)] else ", ...")
+            )
+
+
+def _p(p: float) -> str:
+    return f"= {p:.2g}" if p >= 1e-4 else "< 0.0001"
