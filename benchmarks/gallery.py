@@ -56,7 +56,7 @@ SCROLLING = """async ([length, pace]) => {
 JUMPING = """async (jumps) => {
     for (let i = 0; i <= jumps; i++) {
         scrollTo(0, (document.body.scrollHeight - innerHeight) * i / jumps);
-        for (let frame = 0; frame < 12; frame++) await new Promise(requestAnimationFrame);
+        for (let frame = 0; frame < 6; frame++) await new Promise(requestAnimationFrame);
     }
 }"""
 # Brushes a histogram as a pointer does, and sorts; milliseconds of each

@@ -25,6 +25,7 @@ MOST_MAPS = 40_000
 TOGETHER = {
     "jobs": ("tests/pipeline/jobs", "tests/pipeline/cli", "tests/test_manifests", "tests/benchmarks/test_handmade"),
     "experts": ("tests/experts",),
+    "look": ("tests/pipeline/look/test_show", "tests/pipeline/look/test_gallery"),
 }
 FIRST, BESIDE = "jobs", "tests/physics/"
 DESELECTED = pytest.StashKey[int]()

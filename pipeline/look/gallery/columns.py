@@ -33,7 +33,7 @@ def kind_of_reason(reason: str) -> str:
 
 def worded(column: pa.ChunkedArray | pa.Array, name: str) -> tuple[list[str], np.ndarray]:
     """The words of a column, the most frequent first, and for each row the place of its word."""
-    values = column.cast(pa.string()).to_pylist()
+    values: list[Any] = column.cast(pa.string()).to_pylist()
     if name in FLAGS:
         values = [None if value is None else {"true": "yes", "false": "no"}[value] for value in values]
     if name == "label_reason":

@@ -8,6 +8,7 @@ from base64 import b64encode
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from levelgen.level import Level
 from physics.types import MAX_VERTICES
@@ -17,15 +18,15 @@ ANGLE = 1 / 10_000  # rad, of -pi to pi
 MOST = 2**15 - 1
 
 
-def lengths(values: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
+def lengths(values: ArrayLike) -> Int[np.ndarray, "..."]:
     """Metres as whole numbers of LENGTH, as far as 16 bits reach."""
-    return np.clip(np.nan_to_num(values / LENGTH), -MOST, MOST).round().astype(np.int16)
+    return np.clip(np.nan_to_num(np.asarray(values) / LENGTH), -MOST, MOST).round().astype(np.int16)
 
 
-def angles(values: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
+def angles(values: ArrayLike) -> Int[np.ndarray, "..."]:
     """Radians as whole numbers of ANGLE, within a turn."""
-    turn = 2 * np.pi
-    within = np.nan_to_num(values) - turn * np.round(np.nan_to_num(values) / turn)
+    turn, known = 2 * np.pi, np.nan_to_num(np.asarray(values, np.float64))
+    within = known - turn * np.round(known / turn)
     return (within / ANGLE).round().astype(np.int16)
 
 

@@ -20,12 +20,7 @@ from pipeline.look.things import things_of
 from pipeline.read.levels import levels_of
 from pipeline.read.rows import read_row
 from pipeline.store.manifest import Manifest, require_manifest
-from tests.pipeline.made import PLAYED, played_split
-
-
-@pytest.fixture(scope="module")
-def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return played_split(tmp_path_factory.mktemp("data"))
+from tests.pipeline.made import PLAYED
 
 
 @pytest.fixture(scope="module")

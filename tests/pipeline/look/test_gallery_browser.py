@@ -16,7 +16,7 @@ from pipeline.look.gallery.gallery import gallery
 from pipeline.look.gallery.worlds import ANGLE, LENGTH
 from pipeline.read.rows import read_row
 from pipeline.store.manifest import require_manifest
-from tests.pipeline.made import PLAYED, played_split
+from tests.pipeline.made import PLAYED
 
 DEMANDED = "LEVELPROOF_TEST_BROWSER"
 DESKTOP, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
@@ -37,11 +37,6 @@ UNNAMED = """() => [...document.querySelectorAll("button, input, select, a, [rol
     .map((of) => of.outerHTML)"""
 
 pytestmark = pytest.mark.campaign
-
-
-@pytest.fixture(scope="module")
-def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return played_split(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")
@@ -107,14 +102,14 @@ def test_brushes_words_and_orders_are_in_the_address(page: Any, address: str, sp
     page.get_by_role("button", name=re.compile("^solved")).click()
     count = sum(row["label"] == "solved" for row in rows(split))
     assert page.locator("#count").inner_text() == f"{count} of {PLAYED} levels"
-    box = page.get_by_label(re.compile("^Histogram of bodies")).bounding_box()
+    box = page.get_by_label(re.compile("^Histogram of thrusters")).bounding_box()
     page.mouse.move(box["x"] + 2, box["y"] + 20)
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * 0.3, box["y"] + 20, steps=4)
     page.mouse.up()
     brushed = int(page.locator("#count").inner_text().split(" of ")[0])
     assert 0 < brushed < count
-    assert re.search(r"#label=solved&bodies=\d\.\.\d$", page.url)
+    assert re.search(r"#label=solved&thrusters=\d\.\.\d$", page.url)
     page.select_option("#sort", "level_id")
     page.locator("#direction").click()
     first = page.locator("[aria-posinset='1'] a")
@@ -137,7 +132,7 @@ def test_a_level_plays_what_its_record_has(page: Any, address: str, split: Path)
     states = np.array(page.evaluate(STATES, level_id)).reshape(steps + 1, -1, 3)
     present = np.flatnonzero(arrays["level/model/active"][:, 0])
     order = present[np.argsort(arrays["level/model/inverse_mass"][present, 0] != 0, kind="stable")]
-    where, turned = (arrays[f"record/state/{name}"][:steps, order, ..., 0] for name in ("position", "rotation"))
+    where, turned = (arrays[f"record/state/{name}"][:steps, ..., 0][:, order] for name in ("position", "rotation"))
     np.testing.assert_allclose(states[:-1, :, :2], where, atol=0.51 * LENGTH)
     np.testing.assert_allclose(np.exp(1j * states[:-1, :, 2]), np.exp(1j * turned), atol=ANGLE)
     start = page.locator("#stage").evaluate("(canvas) => canvas.toDataURL()")

@@ -24,14 +24,9 @@ from pipeline.look import show as show_module
 from pipeline.look.show import do_nothing, film_of, show, witness_film
 from pipeline.read.levels import find_level
 from pipeline.store.manifest import require_manifest
-from tests.pipeline.made import PLAYED, made_job, played_split
+from tests.pipeline.made import PLAYED, made_job
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def split(tmp_path_factory) -> Path:
-    return played_split(tmp_path_factory.mktemp("data"))
 
 
 def level_with(split: Path, label: str) -> int:

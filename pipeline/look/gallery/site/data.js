@@ -4,7 +4,7 @@
 
 (function () {
   const { bytesOf, worldOf } = window.levelproof;
-  const BLOCKS = 256; // of worlds that are kept
+  const BLOCKS = 128; // of worlds that are kept
   const waiting = new Map(); // name: {promise, resolve, reject}
 
   // Called by every data file.

@@ -95,6 +95,7 @@
     release(cell) {
       cell.row = undefined;
       cell.element.hidden = true;
+      cell.element.removeAttribute("aria-posinset");
       this.free.push(cell);
     }
 
@@ -103,7 +104,8 @@
       const id = this.columns.values.level_id[row];
       const label = this.columns.word("label", row);
       const value = this.columns.values[this.detail][row];
-      const detail = Number.isNaN(value) ? "" : `${shown(value)} ${{ steps_to_goal: "steps", level_id: "" }[this.detail] ?? ""}`;
+      const unit = this.detail === "steps_to_goal" ? ` step${value === 1 ? "" : "s"}` : "";
+      const detail = Number.isNaN(value) ? label : shown(value) + unit;
       cell.row = row;
       cell.element.place = place;
       cell.element.hidden = false;
@@ -118,7 +120,7 @@
       cell.link.setAttribute("aria-label", `Level ${id}, ${label}${Number.isNaN(steps) ? "" : `, ${steps} steps to the goal`}`);
       cell.dot.dataset.label = label;
       cell.name.textContent = id;
-      cell.detail.textContent = this.detail === "level_id" || !detail ? label : detail;
+      cell.detail.textContent = detail;
       const pixels = Math.round((this.wide - 8) * Math.min(2, devicePixelRatio));
       if (cell.canvas.width !== pixels) cell.canvas.width = cell.canvas.height = pixels;
       else {

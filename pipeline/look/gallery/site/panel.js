@@ -106,7 +106,8 @@
       if (this.from === undefined) return;
       const to = this.binAt(event);
       if (to === this.from && !this.moved) return;
-      this.moved = true;
+      if (this.moved && to === this.to) return;
+      [this.moved, this.to] = [true, to];
       this.choose(this.range(Math.min(this.from, to), Math.max(this.from, to)));
     }
 
@@ -176,6 +177,8 @@
       this.histograms = histograms;
       this.filters = [...words.map((of) => of.filter), ...histograms];
       const at = (id) => document.getElementById(id);
+      this.more = at("more").parentElement;
+      this.more.addEventListener("toggle", () => this.look());
       at("words").append(...words.filter((of) => !flag(of.column)).map((of) => of.filter.element));
       at("histograms").append(...histograms.filter((of) => FIRST.includes(of.name)).map((of) => of.element));
       at("more").append(...words.filter((of) => flag(of.column) && of.column.words.length > 1).map((of) => of.filter.element),
@@ -187,8 +190,11 @@
       for (const histogram of this.histograms) histogram.bins = binsOf(this.columns, histogram.name);
     }
 
+    // Those that are folded away look when they are unfolded.
     look() {
-      for (const filter of this.filters) filter.look();
+      for (const filter of this.filters) {
+        if (this.more.open || !this.more.contains(filter.element)) filter.look();
+      }
     }
   }
 

@@ -1,0 +1,12 @@
+"""What all that looks at a split looks at; nobody writes to it."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.pipeline.made import played_split
+
+
+@pytest.fixture(scope="session")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return played_split(tmp_path_factory.mktemp("data"))
