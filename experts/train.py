@@ -127,7 +127,8 @@ class TrainingRun:
         witnesses = [chosen[i] for i in left]
         judged = judge(trained, witnesses, take(record, left), self.pool.updates, config, failed[left])
         verdicts = {
-            i: with_looks(verdict, found, at) for i, verdict, at in zip(left.tolist(), judged, asked, strict=True)
+            i: with_looks(verdict, found, at)
+            for i, verdict, at in zip(left.tolist(), judged, asked.tolist(), strict=True)
         }
         shares = [None if witness is None else witness.portability for witness in chosen]
         known = [

@@ -4,11 +4,11 @@ Knows nothing of files, of Ray, or of the time.
 """
 
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from heapq import nlargest
 from itertools import chain, groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,7 +39,7 @@ class WorkUnit:
     def only(self, level_ids: Collection[int]) -> "WorkUnit | None":
         """Its levels that are among these; None: there are none."""
         at = [i for i, level_id in enumerate(self.level_ids) if level_id in level_ids]
-        ids, origins = (tuple(of[i] for i in at if of) for of in (self.level_ids, self.origins))
+        ids, origins = tuple(self.level_ids[i] for i in at), tuple(self.origins[i] for i in at if self.origins)
         return WorkUnit(ids, origins) if ids else None
 
 
@@ -153,8 +153,8 @@ class Scheduler:
         self.waiting, self._smallest = levels, max(1, unit // PARTS)  # levels
         self.attempts: dict[WorkUnit, int] = {}  # that failed
         self.quarantined: list[WorkUnit] = []
-        self.workers: dict[Hashable, Assignment] = {}
-        self._idle: set[Hashable] = set()  # workers without units
+        self.workers: dict[Any, Assignment] = {}  # by whatever tells them apart
+        self._idle: set[Any] = set()  # workers without units
 
     @property
     def over(self) -> bool:
@@ -168,12 +168,12 @@ class Scheduler:
         units = chain(under_way, self._again[0], [self._next] if self._next else [])
         return min((unit.level_ids[0] for unit in units), default=None)
 
-    def join(self, worker: Hashable, now: float) -> None:
+    def join(self, worker: Any, now: float) -> None:
         """A worker is there, and has nothing."""
         self.workers[worker] = Assignment(heard=now)
         self._idle.add(worker)
 
-    def order(self, worker: Hashable, now: float) -> Order:
+    def order(self, worker: Any, now: float) -> Order:
         """What to tell a worker that has nothing more to report."""
         mine, new = self.workers[worker], []
         mine.heard = now
@@ -184,7 +184,7 @@ class Scheduler:
             new.append(unit)
         return Order(new, mine.asked)
 
-    def report(self, worker: Hashable, round: Round, now: float) -> None:
+    def report(self, worker: Any, round: Round, now: float) -> None:
         """What a worker has done of what it has. Its failures are told to `failed` by whom they concern, too."""
         mine = self.workers[worker]
         for unit, kept, back in round.cuts:
@@ -198,12 +198,12 @@ class Scheduler:
         if not mine.units:
             self._idle.add(worker)
 
-    def leave(self, worker: Hashable) -> None:
+    def leave(self, worker: Any) -> None:
         """A worker goes that could say so; others do what it still has."""
         for unit in self._remove(worker):
             self._put_back(unit)
 
-    def lost(self, worker: Hashable, reason: str) -> list[UnitOutcome]:
+    def lost(self, worker: Any, reason: str) -> list[UnitOutcome]:
         """A worker died, and its units failed."""
         return [UnitOutcome(unit, reason=reason) for unit in self._remove(worker)]
 
@@ -225,7 +225,7 @@ class Scheduler:
         for of in nlargest(len(self._idle), can, key=lambda of: of.spare):
             of.asked = -(-of.spare // 2)
 
-    def silent(self, since: float) -> list[Hashable]:
+    def silent(self, since: float) -> list[Any]:
         """Workers that have units and have not been heard of since then."""
         return [worker for worker, of in self.workers.items() if of.units and of.heard < since]
 
@@ -253,17 +253,18 @@ class Scheduler:
         while size > self._smallest and size * len(self.workers) > self.waiting + count:
             size = -(-size // 2)
         part, rest = (unit.only(ids) for ids in (unit.level_ids[:size], unit.level_ids[size:]))
-        if rest:
-            self._again[0].appendleft(rest)
-            self.waiting += count - size
-        return part if rest else unit
+        if not (part and rest):
+            return unit
+        self._again[0].appendleft(rest)
+        self.waiting += count - size
+        return part
 
     def _put_back(self, unit: WorkUnit | None) -> None:
         if unit:
             self._again[self.attempts.get(unit, 0)].append(unit)
             self.waiting += len(unit.level_ids)
 
-    def _remove(self, worker: Hashable) -> list[WorkUnit]:
+    def _remove(self, worker: Any) -> list[WorkUnit]:
         self._idle.discard(worker)
         return list(self.workers.pop(worker).units)
 

@@ -1,5 +1,6 @@
 """Workers that die and clusters that shrink, on real Ray: everything that can be done is done."""
 
+import socket
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,9 @@ import pytest
 from rich.console import Console
 
 from pipeline.jobs import cluster
+from pipeline.jobs.likeness import program_of, unlike
 from pipeline.jobs.progress import Board, Tally
-from pipeline.jobs.schedule import COMPANY
+from pipeline.jobs.schedule import COMPANY, Scheduler
 from pipeline.store.layout import JOB
 from pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import PATIENCE, assert_refused, descendants, run, start, title, until
@@ -65,29 +67,50 @@ def test_workers_read_no_relative_path() -> None:
     assert cluster._seen_from_elsewhere(made_job()).continue_from == ""
 
 
-def test_there_are_as_many_workers_as_a_cluster_has_room_for_now(monkeypatch: pytest.MonkeyPatch) -> None:
-    now: dict[str, float] = {}  # a head without a core
-    monkeypatch.setattr(cluster.ray, "cluster_resources", lambda: now)
+def test_there_are_as_many_workers_as_machines_have_room_for_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    cores: dict[str, int] = {"head": 0}
+    named = lambda name, number: {"NodeID": name, "NodeManagerHostname": name, "Resources": {"CPU": number}}
+    nodes = lambda: [named(name, number) | {"Alive": True} for name, number in cores.items()]
+    monkeypatch.setattr(cluster.ray, "nodes", nodes)
+    monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
     monkeypatch.setattr(cluster, "RESCAN", 0.0)
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
-    crew = cluster.Crew(made_job(), SPLIT, 6, Board(Tally(1, 0, 0), Console()))
-    capped = cluster.Crew(made_job("data", "workers=2"), SPLIT, 6, Board(Tally(1, 0, 0), Console()))
-    assert len(crew._handles) == 1  # it waits for machines that join
-    for cores in (4, 3, 8, 0):
-        now["CPU"] = cores
-        for each in (crew, capped):
+    crew, capped = (
+        cluster.Crew(made_job("data", "unit=1", *words), SPLIT, Scheduler([], 6), Board(Tally(1, 0, 0), Console()))
+        for words in ((), ("workers=2",))
+    )
+    there = lambda crew: sorted(handle.node for handle in crew._handles)
+    for changes, most, two in (
+        ({}, [], []),  # they wait for machines that join
+        ({"a": 2}, ["a", "a"], ["a", "a"]),
+        ({"b": 2}, ["a", "a", "b", "b"], ["a", "b"]),
+        ({"b": 8}, ["a", "a", "b", "b", "b", "b"], ["a", "b"]),  # of six units, each
+        ({"a": 0}, ["b"] * 6, ["b", "b"]),
+    ):
+        cores |= changes
+        for each, wanted in ((crew, most), (capped, two)):
             each.follow_cluster()
-        assert len(crew._handles) == min(max(cores, 1), 6)  # of six units, each
-        assert len(capped._handles) == min(max(cores, 1), 2)
-    crew._handles[0].actor, crew._handles[0].up = "one that has answered", True
-    now["CPU"] = 2
+            each.follow_cluster()
+            assert there(each) == wanted
+    assert {handle.neighbours for handle in crew._handles} == {0}, "not every core has a worker"
+    crew._handles[0].up = True
+    cores |= {"b": 0, "c": 3}
     crew.follow_cluster()
-    now["CPU"] = 1
+    assert there(crew) == ["b", "c", "c", "c"], "one that is at work stays"
+    assert {handle.neighbours for handle in crew._handles if handle.node == "c"} == {3}
+    crew._refuse(crew._handles[-1], "The worker on c has jax 0.1, and this command jax 0.2: install the same.")
     crew.follow_cluster()
-    assert [handle.actor for handle in crew._handles] == ["one that has answered"]
-    assert cluster._room(True, 6) == [None]
-    now["GPU"] = 2.0
-    assert cluster._room(True, 6) == [None] * 2
+    assert there(crew) == ["b"]
+
+
+def test_a_worker_with_another_program_is_refused_in_a_sentence() -> None:
+    job = made_job()
+    program = program_of(job)
+    assert unlike(program, job) == ""
+    for name, other in (("jax", "0.1"), ("levelproof", "7"), ("configuration", "abc"), ("source", "def")):
+        refusal = unlike(program | {name: other}, job)
+        assert f" has {name} {program[name]}, and this command {name} {other}: install" in refusal
+        assert socket.gethostname() in refusal
 
 
 @pytest.mark.campaign
@@ -116,7 +139,7 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
         process.terminate()
         _, err = process.communicate(timeout=PATIENCE)
         assert process.returncode == 130, err
-        assert "The worker died" in err
+        assert " is gone; others go on with level" in err
         assert "Traceback" not in err
 
         rows = read_manifest(tmp_path / SPLIT).table.to_pylist()
