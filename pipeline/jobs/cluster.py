@@ -84,7 +84,6 @@ class WorkerHandle:
 
     node: str  # Ray's id of its machine
     host: str
-    neighbours: int  # as in `runtime.own_core`
     actor: Any = None
     answer: Any = None  # reference to what it will answer: to `begin`, then to `work`
     up: bool = False  # it has begun
@@ -105,7 +104,7 @@ class WorkerHandle:
         here = NodeAffinitySchedulingStrategy(self.node, soft=False)
         options = {"num_cpus": 1, "num_gpus": gpus, "max_restarts": 0, "scheduling_strategy": here}
         self.actor = ray.remote(WorkerActor).options(name=f"{name} on {self.host}", **options).remote()
-        self.answer = self.actor.begin.remote(*begin, self.neighbours)
+        self.answer = self.actor.begin.remote(*begin)
 
     def end(self) -> None:
         """It dies, if it is not dead; its place is free for another."""
@@ -190,7 +189,8 @@ class Crew:
         for handle in without[: max(0, self._scheduler.waiting - starting)]:
             self._started += 1
             name = f"levelproof {self._job.budget}/{self._job.size} worker {self._started}"
-            handle.start(name, int(self._gpus), program_of(self._job), self._job, self._split)
+            neighbours = 0 if self._gpus else sum(of.node == handle.node for of in self._handles)
+            handle.start(name, int(self._gpus), program_of(self._job), self._job, self._split, neighbours)
 
     def order(self) -> None:
         """Give units to the workers that have reported, and let them go on."""
@@ -383,11 +383,12 @@ def _room(gpus: bool, most: int, refused: Collection[str]) -> dict[str, list[Wor
     """A place for each worker that there is room for now, at most so many, by machine: one for each GPU or core."""
     nodes = {name: node for name, node in _machines().items() if name not in refused}
     count = {name: int(node["Resources"].get("GPU" if gpus else "CPU", 0)) for name, node in nodes.items()}
-    neighbours = {name: number if sum(count.values()) <= most and not gpus else 0 for name, number in count.items()}
-    place = lambda node: WorkerHandle(node, nodes[node]["NodeManagerHostname"], neighbours[node])
     turns = sorted((turn, name) for name, number in count.items() for turn in range(number))  # one on each, then more
-    taken = Counter(name for _, name in turns[:most])
-    return {name: [place(name) for _ in range(number)] for name, number in taken.items()}
+    host = lambda name: nodes[name]["NodeManagerHostname"]
+    return {
+        name: [WorkerHandle(name, host(name)) for _ in range(number)]
+        for name, number in Counter(name for _, name in turns[:most]).items()
+    }
 
 
 def _machines() -> dict[str, dict[str, Any]]:

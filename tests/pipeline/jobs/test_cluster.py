@@ -92,12 +92,10 @@ def test_there_are_as_many_workers_as_machines_have_room_for_now(monkeypatch: py
             each.follow_cluster()
             each.follow_cluster()
             assert there(each) == wanted
-    assert {handle.neighbours for handle in crew._handles} == {0}, "not every core has a worker"
     crew._handles[0].up = True
     cores |= {"b": 0, "c": 3}
     crew.follow_cluster()
     assert there(crew) == ["b", "c", "c", "c"], "one that is at work stays"
-    assert {handle.neighbours for handle in crew._handles if handle.node == "c"} == {3}
     crew._refuse(crew._handles[-1], "The worker on c has jax 0.1, and this command jax 0.2: install the same.")
     crew.follow_cluster()
     assert there(crew) == ["b"]
