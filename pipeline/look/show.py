@@ -22,7 +22,7 @@ from levelgen.pictures.words import Caption
 from levelgen.task.rules import TaskParams
 from physics.types import State
 from pipeline.errors import Failure, UserError
-from pipeline.read.levels import find_level, is_level_file, level_file, level_of, rules_of, writing_to
+from pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of, writing_to
 from pipeline.read.rows import read_row
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
@@ -86,7 +86,7 @@ def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
         return witness_film(manifest, row)
     caption = Caption(_title(row), outcome=row["label"], good=False)
     told = f"level {level_id} of size {row['size']} is {row['label']} ({row['label_reason']}): there is no witness"
-    return _without_witness(level_of(manifest, row), rules_of(manifest), caption, told, plays)
+    return _without_witness(levels_of(manifest, manifest.table), rules_of(manifest), caption, told, plays)
 
 
 def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:

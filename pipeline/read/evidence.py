@@ -28,6 +28,8 @@ from levelgen.task.rules import TaskParams
 from pipeline.errors import Failure
 from pipeline.read.findings import Findings
 from pipeline.read.level_files import level_at
+from pipeline.read.rows import COLUMNS as PLACED
+from pipeline.read.rows import read_placed
 from pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
 from pipeline.store.origins import RECORD, origin_of
 from pipeline.store.provenance import device, versions
@@ -61,6 +63,7 @@ class Evidence:
         self.making, self.shards, self.findings = making, shards, findings
         self.ids: np.ndarray = rows.column("level_id").to_numpy()
         self.of: dict[str, list[Any]] = {name: rows.column(name).to_pylist() for name in COLUMNS if name != "versions"}
+        self._placed = rows.select(PLACED)
         self.same_stack = same_stack(rows)
         self.told = np.zeros(len(self.ids), bool)
 
@@ -176,19 +179,32 @@ class Evidence:
         return lanes
 
     def _read(self, lanes: Lanes, fields: Iterable[str] | None = None) -> tuple[Lanes, dict[str, np.ndarray]]:
-        """The levels that could be read, and what their shards hold of them, side by side."""
-        by_shard: dict[str, list[int]] = {}
-        for i in lanes:
-            by_shard.setdefault(self.of["shard"][i], []).append(int(i))
-        found, parts = [], []
-        for name, mine in by_shard.items():
-            shard = self.shards[name]
-            assert shard, "levels of one that is unusable have no claim to it"
-            for lanes_read, arrays in self._readable(name, shard, mine, fields):
-                found += lanes_read
-                parts.append(arrays)
-        names = parts[0] if parts else {}
-        return np.array(found, int), {name: np.concatenate([part[name] for part in parts], -1) for name in names}
+        """The levels that could be read, and what their shards hold of them: all at once, or one by one if need be."""
+        if not len(lanes):
+            return lanes, {}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", EngineDiffers)  # is told level by level
+            try:
+                return lanes, self._stored(lanes, fields)
+            except Failure:
+                found = {i: arrays for i in lanes.tolist() if (arrays := self._alone(i, fields))}
+        return np.array([*found], int), jax.tree.map(lambda *xs: np.concatenate(xs, -1), *found.values() or ({},))
+
+    def _stored(self, lanes: Lanes, fields: Iterable[str] | None) -> dict[str, np.ndarray]:
+        """Raises Failure where a shard is damaged."""
+        opened: dict[str, Any] = self.shards  # levels of one that is unusable have no claim to it
+        arrays = read_placed(self.making.split, self._placed.take(lanes), fields, lambda _, name, __: opened[name])
+        return {name: np.moveaxis(x, 0, -1) for name, x in arrays.items()}
+
+    def _alone(self, i: int, fields: Iterable[str] | None) -> dict[str, np.ndarray] | None:
+        """Of one level; None: it is damaged, which is told."""
+        try:
+            return self._stored(np.array([i]), fields)
+        except Failure as failure:
+            self.findings.unlike.add(self.of["shard"][i])
+            self.findings.tell(str(failure), [int(self.ids[i])])
+            self.told[i] = True
+        return None
 
     def _restored_otherwise(self, lanes: Lanes) -> Mask:
         """Of which levels this machine computes other states than those that were not stored."""
@@ -199,26 +215,6 @@ class Evidence:
             if shard and shard.encoding.density != "full":
                 wrong[names == name] = shard.unlike([self.of["row"][i] for i in lanes[names == name]]) >= 0
         return wrong
-
-    def _readable(
-        self, name: str, shard: Shard, lanes: list[int], fields: Iterable[str] | None
-    ) -> list[tuple[list[int], dict[str, np.ndarray]]]:
-        """Levels of one shard and what it holds of them: all at once, or one by one where it is damaged."""
-        read = lambda of: shard.read([self.of["row"][i] for i in of], fields)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", EngineDiffers)  # is told level by level
-            try:
-                found = [(lanes, read(lanes))]
-            except Failure:
-                self.findings.unlike.add(name)
-                found = []
-                for i in lanes:
-                    try:
-                        found.append(([i], read([i])))
-                    except Failure as failure:
-                        self.findings.tell(str(failure), [int(self.ids[i])])
-                        self.told[i] = True
-        return found
 
     def _worlds(self, lanes: Lanes, stored: Level, levels: Level) -> None:
         """Compare the worlds in shards with those that ids make, and put them in their place."""

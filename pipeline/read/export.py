@@ -4,7 +4,7 @@ from pathlib import Path
 
 from levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
 from pipeline.errors import UserError
-from pipeline.read.levels import find_level, level_of, rules_of, writing_to
+from pipeline.read.levels import find_level, levels_of, rules_of, writing_to
 
 
 def export(split: Path, level_id: int, out: Path) -> None:
@@ -17,7 +17,7 @@ def export(split: Path, level_id: int, out: Path) -> None:
     if out.suffix.lower() != ".json":
         raise UserError(f"Cannot export to {out}: its name has to end in .json.")
     manifest, row = find_level(split, level_id)
-    file = LevelFile(level_of(manifest, row), rules_of(manifest))
+    file = LevelFile(levels_of(manifest, manifest.table), rules_of(manifest))
     try:
         with writing_to(out):
             write_level_file(file, out)

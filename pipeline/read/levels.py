@@ -16,8 +16,8 @@ from levelgen.level import Level, size_of
 from levelgen.sampling.sampler import Distribution, sample_levels
 from levelgen.task.rules import TaskParams
 from pipeline.errors import UserError
-from pipeline.read.level_files import level_at, levels_at
-from pipeline.read.rows import read_row, read_rows
+from pipeline.read.level_files import levels_at
+from pipeline.read.rows import read_rows
 from pipeline.runtime import prepare_jax
 from pipeline.store.contents import table_for
 from pipeline.store.fields import tree_of
@@ -43,23 +43,14 @@ def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
     return manifest, manifest.table.to_pylist()[0]
 
 
-def level_of(manifest: Manifest, row: dict[str, Any]) -> Level:
-    """The level of a row, one lane: as its shard has it, or made again from its id or its file where it has no shard.
+def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
+    """The levels of these rows, with COLUMNS, in their order: numpy arrays, level axis last.
+
+    As their shards have them, or made again from their ids or files where they have no shard.
 
     Raises:
-        Failure: the shard is damaged, or the file is gone or another one.
+        Failure: a shard is damaged, or a file is gone or another one.
     """
-    if row["shard"]:
-        return tree_of(Level, read_row(manifest.split, row), "level/")
-    prepare_jax()
-    if from_files(manifest.config or {}):
-        return level_at(origin_of(manifest.split, row))
-    distribution = typed(Distribution, (manifest.config or {})["distribution"])
-    return sample_levels([row["level_id"]], size_of(row["size"]), distribution)
-
-
-def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
-    """The levels of many rows, with COLUMNS, in their order: numpy arrays, level axis last; raises as `level_of`."""
     stored = rows.column("shard").is_valid().to_numpy()
     size = size_of(rows.column("size")[0].as_py())
     parts = []

@@ -23,7 +23,7 @@ from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
 from pipeline.store.density import KEY, kept
 from pipeline.store.fields import arrays_of
 from pipeline.store.packing import pack
-from pipeline.store.schema import FLAT, Encoding, FieldSpec, field_table
+from pipeline.store.schema import FLAT, ContentsError, Encoding, FieldSpec, field_table
 
 COUNTED = (  # fields with one entry for each thing of a kind, in the order of Size
     "level/model/n_vertices",
@@ -33,10 +33,6 @@ COUNTED = (  # fields with one entry for each thing of a kind, in the order of S
 )
 FEWEST = Size(FIXED_POLYGONS, 0, 0, 0)
 FULL = Encoding()
-
-
-class ContentsError(ValueError):
-    """A shard does not hold what it should; the message is the end of a sentence."""
 
 
 @cache
@@ -67,18 +63,6 @@ def blank_row(size: Size, encoding: Encoding) -> np.ndarray:
         start = empty.get(field.name.replace(KEY, "level/", 1), np.zeros((*field.shape, 1), field.dtype))
         arrays[field.name] = start if field.constant else np.repeat(start[None], field.steps, 0)
     return pack(arrays, table)[FLAT][0]
-
-
-def encoding_in(attributes: Mapping[str, Any]) -> Encoding:
-    """How a shard with these attributes stores records.
-
-    Raises:
-        ContentsError: as this program does not.
-    """
-    try:
-        return Encoding.of(attributes)
-    except ValueError as error:
-        raise ContentsError(str(error)) from error
 
 
 def size_in(fields: Any, encoding: Encoding) -> Size:

@@ -98,6 +98,10 @@ FLAT = "witness"  # the bytes of everything, field after field: one small chunk 
 WIDE = "record/timestep"  # the integers that do not fit 8 bits; others count, index or enumerate things of one level
 
 
+class ContentsError(ValueError):
+    """A shard does not hold what it should; the message is the end of a sentence."""
+
+
 @dataclass(frozen=True)
 class Encoding:
     """How a shard stores records."""
@@ -115,17 +119,17 @@ class Encoding:
         """What a shard's attributes say.
 
         Raises:
-            ValueError: nothing that this program writes.
+            ContentsError: nothing that this program writes.
         """
         try:
             density, key_every = attributes["density"], attributes.get("key_every", KEY_EVERY)
             encoding = Encoding(density, key_every, typed(TaskParams, attributes["task"]))
         except (KeyError, TypeError, ConfigError) as error:
-            raise ValueError("it does not say how records are stored") from error
+            raise ContentsError("it does not say how records are stored") from error
         if density not in get_args(Density) or type(key_every) is not int or key_every not in KEYS_EVERY:
-            raise ValueError("it does not say how records are stored")
+            raise ContentsError("it does not say how records are stored")
         if density != "full" and encoding.rules.frame_skip > MOST_FRAME_SKIP:
-            raise ValueError(f"its env steps have more than {MOST_FRAME_SKIP} physics steps")
+            raise ContentsError(f"its env steps have more than {MOST_FRAME_SKIP} physics steps")
         return encoding
 
 

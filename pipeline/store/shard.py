@@ -26,7 +26,6 @@ from pipeline.store.contents import (
     blank_row,
     check_level_ids,
     check_numbers,
-    encoding_in,
     size_in,
     size_of_levels,
     table_for,
@@ -129,7 +128,7 @@ class Shard:
                     f"The shard {path} has version {str(version)[:20]}, this program reads {SHARD_VERSION}: "
                     "use the levelproof that wrote it."
                 )
-            self.encoding = encoding_in(attributes)
+            self.encoding = Encoding.of(attributes)
             self.size = size_in(attributes["fields"], self.encoding)
             if size not in (None, name_of(self.size)):
                 raise ContentsError(f"it has levels of size {name_of(self.size)}, and its row says {size}")
