@@ -19,6 +19,7 @@ from experts.advance import advance
 from experts.config import RECORD_STEPS, ExpertConfig, check_budget
 from experts.found import Found, nothing_found
 from experts.judge import Evaluation, Kept, Trained, Witness, candidates_of
+from experts.ledger import Lap, Ledger, Steps, lap
 from experts.procedure import Procedure
 from experts.queue import GROUP, empty_queue, enter, next_indices
 from experts.slots import Begun, LevelQueue, Mode, Report, Slots, empty_slots
@@ -62,6 +63,7 @@ class Submission:
         self.solved = 0
         self.trained_rollouts = self.idle_rollouts = 0
         self.evaluated_rollouts = np.zeros(count, int)
+        self.ledger = Ledger(count)
 
     def trained(self, config: ExpertConfig) -> list[Trained]:
         evaluated = (self.evaluated_rollouts * config.steps_per_update).tolist()
@@ -86,6 +88,7 @@ class Pool:
         self._at: dict[int, tuple[Submission, int]] = {}
         self._coming: deque[tuple[Submission, Sequence[int]]] = deque()  # levels that wait for room in the queue
         self._submissions: list[Submission] = []  # not finished
+        self._steps = Steps()
 
     def submit(
         self,
@@ -162,15 +165,23 @@ class Pool:
 
     def _advance(self) -> None:
         """A rollout in every slot, and the account of it."""
-        self._fill()
-        assert self._queue is not None
-        assert self._slots is not None
-        self._slots, report = advance(self._slots, self._queue, self.config, self._stopping, self._shaped)
-        seen = jax.device_get(report)
-        self._taken = int(seen.taken)
-        self._submissions[-1].idle_rollouts += int((seen.mode == Mode.EMPTY).sum())
-        for slot in np.flatnonzero(seen.mode != Mode.EMPTY).tolist():
-            self._note(slot, seen)
+        with lap() as took:
+            self._fill()
+            assert self._queue is not None
+            assert self._slots is not None
+            self._slots, report = advance(self._slots, self._queue, self.config, self._stopping, self._shaped)
+            seen = jax.device_get(report)
+            self._taken = int(seen.taken)
+            self._submissions[-1].idle_rollouts += int((seen.mode == Mode.EMPTY).sum())
+            busy = np.flatnonzero(seen.mode != Mode.EMPTY).tolist()
+            levels = [self._at[int(seen.queue_index[slot])] for slot in busy]
+            for slot, (submission, i) in zip(busy, levels, strict=True):
+                self._note(slot, seen, submission, i)
+        trains = (seen.mode[busy] == Mode.TRAIN).tolist()
+        training, evaluation = self._steps.part(took.seconds, sum(trains), len(trains) - sum(trains))
+        for train, (submission, i) in zip(trains, levels, strict=True):
+            submission.ledger.put(*(("training", i, training) if train else ("evaluation", i, evaluation)))
+        self._submissions[-1].ledger.add("training", Lap(0.0, took.compiling))
 
     def _fill(self) -> None:
         """Let levels into the queue while there is room for the next group of them."""
@@ -190,11 +201,9 @@ class Pool:
             self._at.update({index: (submission, i) for index, i in zip(indices, some, strict=True)})
             self._coming.popleft()
 
-    def _note(self, slot: int, seen: Report) -> None:
-        """What became of the level in a slot."""
+    def _note(self, slot: int, seen: Report, submission: Submission, i: int) -> None:
+        """What became of a submission's level in its slot."""
         assert self._slots is not None
-        index = int(seen.queue_index[slot])
-        submission, i = self._at[index]
         if seen.mode[slot] == Mode.TRAIN:
             submission.trained_rollouts += 1
             submission.curves[i].append(float(seen.share[slot]))
@@ -208,7 +217,7 @@ class Pool:
             candidates = candidates_of(submission.evaluations[i], submission.found.source[i], self.config)
             submission.candidates[i] = candidates
             submission.solved += bool(candidates)
-            del self._at[index]
+            del self._at[int(seen.queue_index[slot])]
             submission.under_way.remove(i)
 
 

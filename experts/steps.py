@@ -1,4 +1,4 @@
-"""Env steps by what they were for. Knows nothing of JAX: it travels to whoever shows progress."""
+"""Env steps and seconds by what they were for. Knows nothing of JAX: they travel to whoever shows progress."""
 
 from typing import NamedTuple
 
@@ -16,3 +16,18 @@ class EnvSteps(NamedTuple):
     def shown(self) -> int:
         """Those that a progress bar counts."""
         return self.scouted + self.searched + self.trained
+
+
+class Seconds(NamedTuple):
+    """Of a worker that was busy, and with it of its core or its GPU."""
+
+    sampling: float = 0.0  # or reading levels, and deciding those that need no expert
+    search: float = 0.0  # of scouts, too
+    training: float = 0.0
+    evaluation: float = 0.0
+    replay: float = 0.0  # of witnesses: choosing, recording and checking them
+    writing: float = 0.0  # of shards, experts and rows; not of the fragment itself
+    compiling: float = 0.0  # or reading what was compiled before
+
+
+NO_SECONDS = Seconds()

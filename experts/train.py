@@ -12,6 +12,7 @@ from experts.config import RECORD_STEPS, ExpertConfig, Rule
 from experts.found import Found, Looking
 from experts.judge import Kept, Trained, Witness, judge, repeating
 from experts.labels import WITNESSED, Source, Verdict
+from experts.ledger import Ledger, lap
 from experts.pool import NOTHING_BEGUN, Pool, Submission, Totals
 from experts.portability import choose
 from experts.steps import EnvSteps
@@ -31,6 +32,7 @@ class UnitResult:
     verdicts: list[Verdict]
     spent: EnvSteps
     experts: dict[int, Kept] = field(default_factory=dict)  # by level id, where they are kept
+    ledger: Ledger | None = None  # None: nobody has counted
 
 
 class TrainingRun:
@@ -43,6 +45,7 @@ class TrainingRun:
         level_ids: np.ndarray,
         begun: Mapping[int, Kept] = NOTHING_BEGUN,
         keep: bool = False,
+        ledger: Ledger | None = None,
     ) -> None:
         """
         Args:
@@ -51,25 +54,33 @@ class TrainingRun:
             level_ids: their ids; the seeds of all randomness.
             begun: by level id, experts that go on with what they have left of the budget; the others begin.
             keep: whether the result has the experts.
+            ledger: what the levels have cost before.
         """
+        self.ledger = ledger or Ledger(len(level_ids))
         self.pool, self.level_ids, self._begun, self._keep = pool, level_id_array(level_ids), begun, keep
-        self.levels: Level = jax.tree.map(np.asarray, levels)
-        self.before = decide(self.levels, pool.rules)
+        with self.ledger.timing("sampling"):
+            self.levels: Level = jax.tree.map(np.asarray, levels)
+            self.before = decide(self.levels, pool.rules)
         self.left = np.array([i for i, verdict in enumerate(self.before.verdicts) if verdict is None], int)
-        self.looking = Looking(*self._some(self.left), pool.procedure, pool.rules)
+        with self.ledger.timing("search"):
+            self.looking = Looking(*self._some(self.left), pool.procedure, pool.rules)
         self.submission: Submission | None = None  # of those that an expert is asked for
         self._gone: set[int] = set()  # ids of levels that others label
         self.look()
 
     def look(self) -> None:
         """Search a little further; submit to the pool once there is nothing left to search."""
-        if self.submission is None and not self.looking.step():
-            some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
-            levels, level_ids = self._some(some)
-            mine = {
-                i: self._begun[level_id] for i, level_id in enumerate(level_ids.tolist()) if level_id in self._begun
-            }
-            self.submission = self.pool.submit(levels, level_ids, self.looking.found, mine, self._keep)
+        if self.submission is None:
+            with self.ledger.timing("search"):
+                looking = self.looking.step()
+            if not looking:
+                self._submit()
+
+    def _submit(self) -> None:
+        some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
+        levels, level_ids = self._some(some)
+        mine = {i: self._begun[level_id] for i, level_id in enumerate(level_ids.tolist()) if level_id in self._begun}
+        self.submission = self.pool.submit(levels, level_ids, self.looking.found, mine, self._keep)
 
     @property
     def searching(self) -> int:
@@ -107,6 +118,18 @@ class TrainingRun:
         """Choose witnesses and give verdicts, once the submission has finished; of all levels that are not left out."""
         found, submission = self.looking.found, self.submission
         assert submission is not None
+        with lap() as took:
+            result = self._judged(found, submission)
+        looks = np.zeros(len(self.level_ids), np.int64)
+        looks[self.left] = found.scout_steps + found.search_steps
+        self.ledger.share("search", looks)
+        if len(submission.level_ids):
+            self.ledger.take(submission.ledger, self.left)
+        ledger = self.ledger.only(np.flatnonzero(np.isin(self.level_ids, result.level_ids)))
+        ledger.add("replay", took)
+        return replace(result, ledger=ledger)
+
+    def _judged(self, found: Found, submission: Submission) -> UnitResult:
         config, rules = self.pool.config, self.pool.rules
         kept = np.flatnonzero(~np.isin(self.level_ids, list(self._gone)))
         levels, level_ids = self._some(kept)

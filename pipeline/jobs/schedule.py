@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experts.steps import EnvSteps
+from experts.steps import NO_SECONDS, EnvSteps, Seconds
 from pipeline.store.layout import unit_name
 from pipeline.store.origins import Origin
 from pipeline.store.runs import runs, told_levels
@@ -81,6 +81,7 @@ class Summary:
     levels: int
     solved: int
     spent: EnvSteps
+    seconds: Seconds = NO_SECONDS
 
 
 @dataclass(frozen=True)

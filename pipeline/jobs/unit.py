@@ -15,6 +15,7 @@ import numpy as np
 from configs.compose import again
 from configs.schema import JobConfig
 from experts.labels import WITNESSED, Label, Verdict
+from experts.ledger import Ledger
 from experts.pool import Pool
 from experts.train import TrainingRun, UnitResult
 from experts.witness import Record, replay, succeeds
@@ -30,7 +31,7 @@ from pipeline.read.level_files import LevelUnseen, levels_at
 from pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
 from pipeline.store.disk import REFUSALS
 from pipeline.store.fields import arrays_of, unlike_fields
-from pipeline.store.layout import new_attempt
+from pipeline.store.layout import Attempt, new_attempt
 from pipeline.store.locks import LockRefused, committing
 from pipeline.store.manifest import begin_fragment, write_fragment
 from pipeline.store.origins import RECORD, Origin
@@ -50,9 +51,10 @@ def begin_unit(job: JobConfig, unit: WorkUnit, pool: Pool) -> TrainingRun:
     Raises:
         Failure: levels cannot be read, or the experts that should go on.
     """
-    ids = level_id_array(unit.level_ids)
-    levels = levels_at(unit.origins) if unit.origins else sample_levels(ids, size_of(job.size), job.distribution)
-    return TrainingRun(pool, levels, ids, experts_for(job, unit.level_ids), job.keep_experts)
+    ids, ledger = level_id_array(unit.level_ids), Ledger(len(unit.level_ids))
+    with ledger.timing("sampling"):
+        levels = levels_at(unit.origins) if unit.origins else sample_levels(ids, size_of(job.size), job.distribution)
+    return TrainingRun(pool, levels, ids, experts_for(job, unit.level_ids), job.keep_experts, ledger)
 
 
 def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -> Summary:
@@ -63,10 +65,12 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
         OSError: the disk refuses; nothing is committed.
     """
     result = run.finish()
-    check_witnesses(result, job.task)
+    assert result.ledger is not None
+    with result.ledger.timing("replay"):
+        check_witnesses(result, job.task)
     commit(job, split, unit, result)
     labels = [verdict.label for verdict in result.verdicts]
-    return Summary(len(labels), labels.count(Label.SOLVED), result.spent)
+    return Summary(len(labels), labels.count(Label.SOLVED), result.spent, result.ledger.total())
 
 
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
@@ -107,29 +111,41 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult, comm
         OSError: the disk refuses; nothing is committed.
     """
     kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label in WITNESSED]
+    ledger = result.ledger or Ledger(len(result.level_ids))
+    with committing(split) as folder:
+        with ledger.timing("writing"):
+            paths = new_attempt(folder, unit.name)
+            rows = _rows(job, unit, result, kept, paths, folder, command)
+            begin_fragment(paths)
+            if result.experts:
+                save_experts(paths.experts, result.experts)
+            if kept:
+                write_shard(
+                    paths.shard,
+                    [int(result.level_ids[i]) for i in kept],
+                    shard_arrays(result.levels, result.record, kept),
+                    Encoding(job.density, job.key_every, job.task),
+                )
+        for i, row in enumerate(rows):
+            row["seconds"] = ledger.of(i)._asdict() if result.ledger else None
+        write_fragment(paths, rows, job.hash, job.results, densities=[job.stored])
+
+
+def _rows(
+    job: JobConfig, unit: WorkUnit, result: UnitResult, kept: list[int], paths: Attempt, folder: Path, command: str
+) -> list[dict[str, Any]]:
+    """The rows of a unit, but for what they cost; `kept` are the levels that the shard has."""
     rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
     for row, content, signature in zip(rows, content_hashes(result.levels), signatures(result.levels), strict=True):
         row |= {"content_hash": content, "signature": signature}
+    for row_of_shard, i in enumerate(kept):
+        rows[i] |= {"shard": str(paths.shard.relative_to(folder)), "row": row_of_shard}
     for row, origin in zip(rows, unit.origins, strict=bool(unit.origins)):
         row |= {"file": origin.file, "command": command or _command(job, origin, row["level_id"])}
-    with committing(split) as folder:
-        paths = new_attempt(folder, unit.name)
-        for row_of_shard, i in enumerate(kept):
-            rows[i] |= {"shard": str(paths.shard.relative_to(folder)), "row": row_of_shard}
-        for row in rows if result.experts else ():
-            if row["level_id"] in result.experts:
-                row["experts"] = str(paths.experts.relative_to(folder))
-        begin_fragment(paths)
-        if result.experts:
-            save_experts(paths.experts, result.experts)
-        if kept:
-            write_shard(
-                paths.shard,
-                [int(result.level_ids[i]) for i in kept],
-                shard_arrays(result.levels, result.record, kept),
-                Encoding(job.density, job.key_every, job.task),
-            )
-        write_fragment(paths, rows, job.hash, job.results, densities=[job.stored])
+    for row in rows if result.experts else ():
+        if row["level_id"] in result.experts:
+            row["experts"] = str(paths.experts.relative_to(folder))
+    return rows
 
 
 def _command(job: JobConfig, origin: Origin, level_id: int) -> str:
@@ -160,6 +176,7 @@ def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, A
         "config_hash": job.hash,
         "versions": versions(),
         "device": device(),
+        "seconds": None,
         "command": f"{again(job)} first_level={level_id} levels=1",
     }
 

@@ -21,7 +21,7 @@ from configs.schema import from_files
 from experts.config import RECORD_STEPS
 from experts.labels import DIVERGED, Label
 from levelgen.sampling.distribution import Distribution
-from pipeline.look import duplicates
+from pipeline.look import cost, duplicates
 from pipeline.read.select import columns_in, select
 from pipeline.store.layout import data_path
 from pipeline.store.manifest import require_manifest
@@ -54,7 +54,7 @@ def inspect(split: Path, where: str | None, rows: int, as_json: bool, against: S
 
 def survey(split: Path, where: str | None = None, rows: int = 10, against: Sequence[Path] = ()) -> dict[str, Any]:
     """The facts that `inspect` prints, as JSON's types."""
-    manifest, shown = require_manifest(split, [*READ, *columns_in(where)], compact=True), max(rows, 0)
+    manifest, shown = require_manifest(split, [*READ, *cost.READ, *columns_in(where)], compact=True), max(rows, 0)
     chosen = select(manifest.table, where)
     labels, reasons = _counts(chosen, "label"), _counts(chosen, "label_reason")
     told = chosen.select(["label_reason", "steps_to_goal", "steps_to_first_success", "env_steps"])
@@ -86,6 +86,7 @@ def survey(split: Path, where: str | None = None, rows: int = 10, against: Seque
         "env_steps": _total(chosen["env_steps"].to_numpy()),
         "env_steps_after_success": _total(solved["env_steps"].to_numpy() - solved["steps_to_first_success"].to_numpy()),
         "env_steps_unsolved": _total(unsolved["env_steps"].to_numpy()),
+        "cost": cost.cost_of(chosen),
         "split_bytes": stored,  # of all the split's shards, whatever the condition
         "bytes_per_transition": stored / (kept * RECORD_STEPS) if stored and kept else None,
         "rows": require_manifest(split, level_ids=ids[:shown]).table.to_pylist()
@@ -131,6 +132,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         "duplicates": duplicates.told(facts["duplicates"]),
         **{f"duplicates in {other}": duplicates.told(found) for other, found in facts["against"].items()},
         "training env steps": _steps_told(facts),
+        "cost": cost.cost_told(facts["cost"]) if facts["cost"] else None,
         "shards": f"{facts['split_bytes']:,} bytes" if facts["split_bytes"] is not None else None,
         "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
     }

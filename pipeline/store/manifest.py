@@ -35,6 +35,7 @@ from pipeline.store.schema import (
     REPETITIVE,
     SEALED_KEY,
     VERSION_KEY,
+    WITHOUT_SECONDS,
     schema_of,
 )
 
@@ -45,6 +46,7 @@ THREADS = 8  # fragments read at once: a shared folder takes its time for each
 ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
 ROUNDS = 20  # looks at a split that is sealed meanwhile; each takes a moment, and sealing a fragment takes seconds
 Each = Callable[[pa.Table], pa.Table]
+LAST = COLUMNS.field("seconds")  # which fragments of the version before do not have
 DATA_COLUMNS = ("shard", "experts")  # name what lies beside the manifest
 
 
@@ -136,7 +138,7 @@ def read_fragment(
             require_modest(file.metadata)
             metadata = file.schema_arrow.metadata or {}
             version = metadata.get(VERSION_KEY, b"?").decode()
-            if version != str(MANIFEST_VERSION):
+            if version not in (str(MANIFEST_VERSION), str(WITHOUT_SECONDS)):
                 raise Failure(
                     f"The fragment {path} has manifest version {version}, this program reads {MANIFEST_VERSION}: "
                     "use the levelproof that wrote it."
@@ -152,16 +154,17 @@ def read_fragment(
                 digests,
                 about.num_rows,
                 SEALED_KEY in metadata,
-                frozenset(map(str, json.loads(metadata[DENSITIES_KEY])))
-                if DENSITIES_KEY in metadata
-                else frozenset(FULL),
+                _densities_in(metadata),
             )
-            if not file.schema_arrow.equals(schema_of(COLUMNS.names, compact)) or true_hash != fragment.config_hash:
+            names = COLUMNS.names[: -1 if version == str(WITHOUT_SECONDS) else None]
+            if not file.schema_arrow.equals(schema_of(names, compact)) or true_hash != fragment.config_hash:
                 raise ValueError("its footer has other columns or another configuration than were written")
             groups = list(range(about.num_row_groups))
             if level_ids is not None and groups[1:]:  # of damaged statistics Arrow aborts: not read without need
                 groups = [i for i in groups if _may_have(about.row_group(i), level_ids)]
             table = file.read_row_groups(groups, None if columns is None else list(columns), use_threads=False)
+            if LAST.name not in names and (columns is None or LAST.name in columns):
+                table = table.append_column(LAST, pa.nulls(table.num_rows, LAST.type))
     except FileNotFoundError:
         raise
     except PermissionError:

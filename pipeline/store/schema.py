@@ -14,9 +14,11 @@ import pyarrow as pa
 from configs.convert import plain, typed
 from configs.errors import ConfigError
 from configs.schema import KEY_EVERY, KEYS_EVERY, MOST_FRAME_SKIP, Density
+from experts.steps import Seconds
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
-MANIFEST_VERSION = 6
+MANIFEST_VERSION = 7
+WITHOUT_SECONDS = 6  # the version before, which is read, too
 SHARD_VERSION = 2
 
 # Keys of a fragment's metadata
@@ -77,8 +79,13 @@ COLUMNS = pa.schema(
         ),
         pa.field("device", pa.string(), nullable=False),
         pa.field("command", pa.string(), nullable=False),  # makes this row again
+        pa.field("seconds", pa.struct([pa.field(stage, pa.float32()) for stage in Seconds._fields])),
+        # what the level cost the run that made it (`experts.ledger`); null: nobody has counted
     ]
 )
+
+# Columns that tell of the run that made a row, and not of its level: in all others two runs of a job agree, bit for bit
+OF_THE_RUN = ("shard", "row", "experts", "seconds")
 
 # Columns of strings that are the same in many rows
 REPETITIVE = ("size", "budget", "label", "label_reason", "witness", "shard", "experts", "config_hash", "device")

@@ -31,7 +31,8 @@ from pipeline.store.contents import highest
 from pipeline.store.fields import arrays_of, tree_of
 from pipeline.store.job_note import note_job
 from pipeline.store.layout import split_path
-from pipeline.store.manifest import fragment_paths
+from pipeline.store.manifest import fragment_paths, read_manifest
+from pipeline.store.schema import OF_THE_RUN
 
 T = TypeVar("T")
 PLAYED = 64  # levels of `played_split`
@@ -168,6 +169,12 @@ def honest_split(folder: Path, unit: int, units: int) -> Path:
         result = UnitResult(lanes, take(levels, lanes), take(record, lanes), told, SPENT)
         commit(job, path, WorkUnit(tuple(lanes.tolist())), result)
     return path
+
+
+def lasting(split: Path) -> list[dict[str, Any]]:
+    """What two runs of a job agree in: every row, without what tells of its run, and whether there is data."""
+    rows = read_manifest(split).table.to_pylist()
+    return [{k: v for k, v in row.items() if k not in OF_THE_RUN} | {"data": bool(row["shard"])} for row in rows]
 
 
 def made_split(folder: Path, units: Sequence[Sequence[Label]], *words: str) -> Path:

@@ -13,6 +13,7 @@ from pipeline.read.export import export
 from pipeline.read.verify import examine
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import read_manifest
+from pipeline.store.schema import OF_THE_RUN
 from pipeline.store.shard import Shard
 from tests.pipeline.command import assert_refused, run
 
@@ -66,9 +67,8 @@ def test_a_rows_command_makes_the_row_again(made: Path) -> None:
     done = run([*words, "executor=inline", "out=again"], made)
     assert done.returncode == 0, done.stderr
     again = read_manifest(made / "again" / "5k" / SIZE).table.to_pylist()[0]
-    where = ("shard", "row")
-    assert repr({k: v for k, v in again.items() if k not in where}) == repr(
-        {k: v for k, v in row.items() if k not in where}
+    assert repr({k: v for k, v in again.items() if k not in OF_THE_RUN}) == repr(
+        {k: v for k, v in row.items() if k not in OF_THE_RUN}
     )
     one, two = (
         Shard(path / r["shard"]).read([r["row"]])

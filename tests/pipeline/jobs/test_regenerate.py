@@ -15,7 +15,7 @@ from pipeline.store.checkpoints import load_experts, require_same_experts
 from pipeline.store.layout import new_attempt
 from pipeline.store.manifest import begin_fragment, read_manifest
 from tests.pipeline.command import here, run
-from tests.pipeline.made import made_job
+from tests.pipeline.made import lasting, made_job
 
 SETTINGS = ["levels=12", "executor=inline"]
 
@@ -32,11 +32,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows_of(split: Path) -> list[dict]:
-    """What a manifest says, but for names of files."""
-    rows = read_manifest(split).table.to_pylist()
-    return [
-        {name: str(value) for name, value in row.items() if name not in ("shard", "experts", "row")} for row in rows
-    ]
+    """What lasts of a manifest."""
+    return [{name: str(value) for name, value in row.items()} for row in lasting(split)]
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from pipeline.store.layout import JOB, new_attempt
 from pipeline.store.manifest import begin_fragment, fragment_paths, read_fragment, read_manifest, write_fragment
 from pipeline.store.shard import Shard
 from tests.pipeline.command import assert_refused, here
+from tests.pipeline.made import lasting
 from tests.pipeline.read.test_damage import files_of, flip
 
 pytestmark = pytest.mark.slow
@@ -54,11 +55,11 @@ def copied(tmp_path: Path) -> Callable[[Path], Path]:
 
 
 def content(split: Path) -> tuple[str, dict[int, dict[str, np.ndarray]]]:
-    """The rows but for where their data is, and the fields of every witness."""
+    """What lasts of the rows, and the fields of every witness."""
     rows = read_manifest(split).table.to_pylist()
     fields = {row["level_id"]: Shard(split / row["shard"]).read([row["row"]]) for row in rows if row["shard"]}
-    places = ("shard", "row", "experts")
-    return repr([{k: bool(v) if k in places else v for k, v in (row | {"row": 0}).items()} for row in rows]), fields
+    kept = [bool(row["experts"]) for row in rows]
+    return repr((lasting(split), kept)), fields
 
 
 def assert_as_before(split: Path, before: Path, deleted: bool = False) -> None:

@@ -13,6 +13,7 @@ from pipeline.store.fields import same_bits
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard
 from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, run, start, status, title, until
+from tests.pipeline.made import lasting
 
 LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
 COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
@@ -33,11 +34,11 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def content(split: Path) -> tuple[str, dict[int, dict]]:
-    """The rows without their shard rows, and the stored fields of every solved level."""
+    """What lasts of the rows, and the stored fields of every solved level."""
     manifest = read_manifest(split)
     rows = manifest.table.to_pylist()
     fields = {row["level_id"]: Shard(split / row["shard"]).read([row["row"]]) for row in rows if row["shard"]}
-    return repr([row | {"shard": bool(row["shard"]), "row": None} for row in rows]), fields
+    return repr(lasting(split)), fields
 
 
 def assert_same_content(split: Path, other: Path) -> None:

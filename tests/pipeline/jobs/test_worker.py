@@ -18,7 +18,7 @@ from pipeline.jobs.worker import Worker
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import read_manifest
 from pipeline.store.shard import Shard
-from tests.pipeline.made import made_job
+from tests.pipeline.made import lasting, made_job
 
 UNITS = [WorkUnit((0, 1, 2)), WorkUnit((3,)), WorkUnit((4, 5))]
 
@@ -74,6 +74,16 @@ def test_units_are_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
         assert (row["label"] in WITNESSED) == (row["shard"] is not None)
         if row["shard"]:
             assert Shard(tmp_path / row["shard"]).level_ids[row["row"]] == row["level_id"]
+    costs = [row["seconds"] for row in manifest.table.to_pylist()]
+    for stage in ("sampling", "training", "evaluation", "replay"):  # writing goes on until after the row was written
+        assert sum(getattr(summary.seconds, stage) for summary in summaries) == pytest.approx(
+            sum(cost[stage] for cost in costs), rel=1e-4
+        )
+    for row, cost in zip(manifest.table.to_pylist(), costs, strict=True):
+        assert min(cost.values()) >= 0 < min(cost["sampling"], cost["replay"], cost["writing"])
+        assert (cost["training"] > 0) == (row["env_steps"] > 0)
+        assert (cost["evaluation"] > 0) == (row["evaluation_steps"] > 0)
+        assert (cost["search"] > 0) == (row["scout_steps"] + row["search_steps"] > 0)
     for unit in UNITS:
         totals = [round.totals[unit] for round in rounds if unit in round.totals]
         assert totals == sorted(totals)
@@ -82,12 +92,13 @@ def test_units_are_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
 
 def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: JobConfig) -> None:
     """Beside others and by itself."""
-    outcomes(Worker(job, tmp_path / "beside"), UNITS)
-    outcomes(Worker(job, tmp_path / "alone"), UNITS[:1])
+    for name, units in ("beside", UNITS), ("alone", UNITS[:1]):
+        (tmp_path / name).mkdir()
+        assert all(outcome.summary for outcome in outcomes(Worker(job, tmp_path / name), units).values())
     ids = len(UNITS[0].level_ids)
+    assert repr(lasting(tmp_path / "beside")[:ids]) == repr(lasting(tmp_path / "alone"))
     beside, alone = (read_manifest(tmp_path / name).table.to_pylist()[:ids] for name in ("beside", "alone"))
     for one, two in zip(beside, alone, strict=True):
-        assert repr(one | {"shard": ""}) == repr(two | {"shard": ""})
         if one["shard"]:
             a = Shard(tmp_path / "beside" / one["shard"]).read([one["row"]])
             b = Shard(tmp_path / "alone" / two["shard"]).read([two["row"]])

@@ -139,7 +139,21 @@ def test_another_version_is_refused(tmp_path: Path, job: JobConfig) -> None:
     table = pq.read_table(path)
     metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"9"}
     pq.write_table(table.replace_schema_metadata(metadata), path)
-    with pytest.raises(Failure, match="has manifest version 9, this program reads 6"):
+    with pytest.raises(Failure, match="has manifest version 9, this program reads 7"):
+        read_manifest(tmp_path)
+
+
+def test_what_was_written_before_seconds_were_counted_is_read(tmp_path: Path, job: JobConfig) -> None:
+    path = commit(tmp_path, job, [0, 1])
+    table = pq.read_table(path)
+    metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"6"}
+    pq.write_table(table.drop(["seconds"]).replace_schema_metadata(metadata), path)
+    commit(tmp_path, job, [2])
+    assert read_manifest(tmp_path).table.schema.equals(COLUMNS)
+    assert read_manifest(tmp_path, ["seconds"]).table["seconds"].to_pylist() == [None] * 3
+    assert read_manifest(tmp_path, ["label"]).table.column_names == ["level_id", "label"]
+    pq.write_table(table.replace_schema_metadata(metadata), path)
+    with pytest.raises(Failure, match="is damaged"):
         read_manifest(tmp_path)
 
 

@@ -1,0 +1,38 @@
+"""What the levels of a manifest cost: seconds of cores or GPUs by what they were for, and those of a solved level."""
+
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from experts.labels import Label
+from experts.steps import Seconds
+
+READ = ("label", "device", "seconds")  # columns that this is from
+
+
+def cost_of(rows: pa.Table) -> dict[str, Any] | None:
+    """Of rows with READ, as JSON's types; None: nobody has counted.
+
+    What a solved level cost is everything, the levels that were not solved included, divided by those that were.
+    """
+    rows = rows.filter(pc.is_valid(rows.column("seconds")))  # pyright: ignore[reportAttributeAccessIssue]
+    if not rows.num_rows:
+        return None
+    seconds = {stage: pc.sum(pc.struct_field(rows.column("seconds"), stage)).as_py() for stage in Seconds._fields}  # pyright: ignore[reportAttributeAccessIssue]
+    devices = {str(device).partition(":")[0] for device in rows.column("device").unique().to_pylist()}
+    total, solved = sum(seconds.values()), (rows.column("label").cast(pa.string()).to_numpy() == Label.SOLVED).sum()
+    return {
+        "of": "core" if devices == {"cpu"} else "device" if "cpu" in devices else "GPU",
+        "levels": rows.num_rows,
+        "seconds": seconds,
+        "per_solved": total / solved if solved else None,
+    }
+
+
+def cost_told(cost: dict[str, Any]) -> str:
+    """In words, after `cost: `."""
+    total, each = sum(cost["seconds"].values()), cost["per_solved"]
+    shares = ", ".join(f"{part / total:.0%} {stage}" for stage, part in cost["seconds"].items() if total)
+    solved = "" if each is None else f", {each:.3g} a solved level"
+    return f"{total:,.0f} {cost['of']}-seconds ({shares}){solved}"

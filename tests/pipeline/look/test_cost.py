@@ -1,0 +1,32 @@
+"""What a manifest's levels cost, and a solved one."""
+
+import pyarrow as pa
+import pytest
+
+from experts.steps import Seconds
+from pipeline.look.cost import cost_of, cost_told
+from pipeline.store.schema import COLUMNS
+
+
+def table(labels: list[str], seconds: list[Seconds | None], device: str = "cpu: of some kind") -> pa.Table:
+    spent = [None if of is None else of._asdict() for of in seconds]
+    columns = {"label": labels, "device": [device] * len(labels), "seconds": spent}
+    return pa.table({name: pa.array(values, COLUMNS.field(name).type) for name, values in columns.items()})
+
+
+def test_a_solved_level_costs_what_the_others_did_too() -> None:
+    spent = [Seconds(training=6.0), Seconds(training=1.0, writing=1.0), None, Seconds(search=4.0)]
+    cost = cost_of(table(["unsolved", "solved", "solved", "solved"], spent))
+    assert cost is not None
+    assert (cost["of"], cost["levels"], cost["per_solved"]) == ("core", 3, pytest.approx(6.0))
+    assert cost["seconds"] == Seconds(search=4.0, training=7.0, writing=1.0)._asdict()
+    assert cost_told(cost).startswith("12 core-seconds (0% sampling, 33% search, 58% training")
+    assert cost_told(cost).endswith(", 6 a solved level")
+
+
+def test_where_nobody_counted_or_nothing_is_solved_no_number_is_made_up() -> None:
+    assert cost_of(table(["solved"], [None])) is None
+    cost = cost_of(table(["unsolved"], [Seconds(training=1.0)], "gpu: of some kind"))
+    assert cost is not None
+    assert (cost["of"], cost["per_solved"]) == ("GPU", None)
+    assert "solved" not in cost_told(cost)
