@@ -34,14 +34,14 @@ class _Compiled:
         self._last: list[tuple[float, float]] = []  # beginning and duration of the latest, none within another
         monitoring.register_event_duration_secs_listener(self._note)
 
-    def _note(self, event: str, duration: float, **_: object) -> None:
+    def _note(self, event: str, duration_secs: float, **_: object) -> None:
         if not event.startswith(COMPILING):
             return
-        begun = time.perf_counter() - duration
+        begun = time.perf_counter() - duration_secs
         while self._last and self._last[-1][0] >= begun:
             self.seconds -= self._last.pop()[1]
-        self._last = [*self._last[-99:], (begun, duration)]
-        self.seconds += duration
+        self._last = [*self._last[-99:], (begun, duration_secs)]
+        self.seconds += duration_secs
 
 
 _compiled = _Compiled()

@@ -36,6 +36,7 @@ from pipeline.store.schema import (
     SEALED_KEY,
     VERSION_KEY,
     WITHOUT_SECONDS,
+    completed,
     schema_of,
 )
 
@@ -46,7 +47,6 @@ THREADS = 8  # fragments read at once: a shared folder takes its time for each
 ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
 ROUNDS = 20  # looks at a split that is sealed meanwhile; each takes a moment, and sealing a fragment takes seconds
 Each = Callable[[pa.Table], pa.Table]
-LAST = COLUMNS.field("seconds")  # which fragments of the version before do not have
 DATA_COLUMNS = ("shard", "experts")  # name what lies beside the manifest
 
 
@@ -163,8 +163,7 @@ def read_fragment(
             if level_ids is not None and groups[1:]:  # of damaged statistics Arrow aborts: not read without need
                 groups = [i for i in groups if _may_have(about.row_group(i), level_ids)]
             table = file.read_row_groups(groups, None if columns is None else list(columns), use_threads=False)
-            if LAST.name not in names and (columns is None or LAST.name in columns):
-                table = table.append_column(LAST, pa.nulls(table.num_rows, LAST.type))
+            table = completed(table, columns)
     except FileNotFoundError:
         raise
     except PermissionError:

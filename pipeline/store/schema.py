@@ -98,6 +98,14 @@ def schema_of(names: Sequence[str], compact: bool = False) -> pa.Schema:
     return pa.schema([of.with_type(as_dictionary) if compact and of.name in REPETITIVE else of for of in fields])
 
 
+def completed(table: pa.Table, asked: Sequence[str] | None) -> pa.Table:
+    """A fragment's rows with all columns that were asked for (None: all), also if it is of the version before."""
+    field = COLUMNS.field("seconds")
+    if field.name in table.column_names or field.name not in (COLUMNS.names if asked is None else asked):
+        return table
+    return table.append_column(field, pa.nulls(table.num_rows, field.type))
+
+
 # Packed arrays of a shard; the number is the bits of a component. What changes along time: (level, component, 256).
 PACKED = {"dyn32": 32, "dyn8": 8, "act": 8, "lvl32": 32, "lvl8": 8, "witness": 8}
 ALONG_TIME = ("dyn32", "dyn8", "act")
