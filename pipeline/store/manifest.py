@@ -35,7 +35,7 @@ from pipeline.store.schema import (
     REPETITIVE,
     SEALED_KEY,
     VERSION_KEY,
-    WITHOUT_SECONDS,
+    VERSIONS,
     completed,
     schema_of,
 )
@@ -138,14 +138,14 @@ def read_fragment(
             require_modest(file.metadata)
             metadata = file.schema_arrow.metadata or {}
             version = metadata.get(VERSION_KEY, b"?").decode()
-            if version not in (str(MANIFEST_VERSION), str(WITHOUT_SECONDS)):
+            if version not in VERSIONS:
                 raise Failure(
                     f"The fragment {path} has manifest version {version}, this program reads {MANIFEST_VERSION}: "
                     "use the levelproof that wrote it."
                 )
             config, true_hash = _config_in(metadata[CONFIG_KEY])
             digests, about = json.loads(metadata.get(DIGESTS_KEY, b"{}")), file.metadata
-            if not isinstance(digests, dict) or not all(isinstance(files, dict) for files in digests.values()):
+            if not (isinstance(digests, dict) and all(isinstance(files, dict) for files in digests.values())):
                 raise ValueError("its digests are none")
             fragment = Fragment(
                 path,
@@ -156,14 +156,12 @@ def read_fragment(
                 SEALED_KEY in metadata,
                 _densities_in(metadata),
             )
-            names = COLUMNS.names[: -1 if version == str(WITHOUT_SECONDS) else None]
-            if not file.schema_arrow.equals(schema_of(names, compact)) or true_hash != fragment.config_hash:
+            if not file.schema_arrow.equals(schema_of(VERSIONS[version], compact)) or true_hash != fragment.config_hash:
                 raise ValueError("its footer has other columns or another configuration than were written")
             groups = list(range(about.num_row_groups))
             if level_ids is not None and groups[1:]:  # of damaged statistics Arrow aborts: not read without need
                 groups = [i for i in groups if _may_have(about.row_group(i), level_ids)]
-            table = file.read_row_groups(groups, None if columns is None else list(columns), use_threads=False)
-            table = completed(table, columns)
+            found = file.read_row_groups(groups, None if columns is None else list(columns), use_threads=False)
     except FileNotFoundError:
         raise
     except PermissionError:
@@ -173,7 +171,7 @@ def read_fragment(
             f"The fragment {path} is damaged ({type(error).__name__}): "
             + mended(path, f"run `levelproof verify {path.parent.parent} --repair` to make its levels again.")
         ) from error
-    return fragment, table
+    return fragment, completed(found, columns)
 
 
 def _may_have(group: pq.RowGroupMetaData, level_ids: np.ndarray) -> bool:
@@ -188,10 +186,10 @@ def _any_within(ordered: np.ndarray, first: int, last: int) -> bool:
 
 
 def _densities_in(metadata: Mapping[bytes, bytes]) -> frozenset[str]:
-    found = json.loads(metadata.get(DENSITIES_KEY, json.dumps(FULL)))
-    if not all(density in DENSITIES for density in found):
+    found = frozenset(json.loads(metadata.get(DENSITIES_KEY, json.dumps(FULL))))
+    if not found <= DENSITIES:
         raise ValueError("it says that shards are stored as none is")
-    return frozenset(found)
+    return found
 
 
 @lru_cache(maxsize=8)

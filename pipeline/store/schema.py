@@ -18,7 +18,6 @@ from experts.steps import Seconds
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
 MANIFEST_VERSION = 7
-WITHOUT_SECONDS = 6  # the version before, which is read, too
 SHARD_VERSION = 2
 
 # Keys of a fragment's metadata
@@ -83,6 +82,8 @@ COLUMNS = pa.schema(
         # what the level cost the run that made it (`experts.ledger`); null: nobody has counted
     ]
 )
+
+VERSIONS = {str(MANIFEST_VERSION): COLUMNS.names, "6": COLUMNS.names[:-1]}  # that are read: there were no seconds in 6
 
 # Columns that tell of the run that made a row, and not of its level: in all others two runs of a job agree, bit for bit
 OF_THE_RUN = ("shard", "row", "experts", "seconds")
