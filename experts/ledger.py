@@ -114,15 +114,13 @@ class Steps:
     def __init__(self) -> None:
         self._sums = np.zeros(5)  # of 1, training slots x, seconds y, x x, x y
 
-    def part(self, seconds: float, training: int, evaluating: int) -> tuple[float, float]:
-        """Of a step that took so long, the part of each slot that trains, and of each that is evaluated."""
-        if not training + evaluating:
-            return 0.0, 0.0
+    def part(self, seconds: float, training: int, slots: int) -> tuple[float, float]:
+        """Of a step of all slots that took so long, the part of each that trains, and of each other one."""
         x, y = training, seconds
         self._sums += 1, x, y, x * x, x * y
         n, xs, ys, xx, xy = self._sums
         spread = n * xx - xs * xs
         slope = (n * xy - xs * ys) / spread if spread else 0.0
         update = min(max(slope, 0.0), seconds / max(training, 1))
-        play = (seconds - training * update) / (training + evaluating)
+        play = (seconds - training * update) / slots
         return play + update, play

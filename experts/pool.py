@@ -178,10 +178,11 @@ class Pool:
             for slot, (submission, i) in zip(busy, levels, strict=True):
                 self._note(slot, seen, submission, i)
         trains = (seen.mode[busy] == Mode.TRAIN).tolist()
-        training, evaluation = self._steps.part(took.seconds, sum(trains), len(trains) - sum(trains))
+        training, evaluation = self._steps.part(took.seconds, sum(trains), len(seen.mode))
         for train, (submission, i) in zip(trains, levels, strict=True):
             submission.ledger.put(*(("training", i, training) if train else ("evaluation", i, evaluation)))
-        self._submissions[-1].ledger.add("training", Lap(0.0, took.compiling))
+        idle = evaluation * (len(seen.mode) - len(busy))
+        self._submissions[-1].ledger.add("idle", Lap(idle, took.compiling))
 
     def _fill(self) -> None:
         """Let levels into the queue while there is room for the next group of them."""

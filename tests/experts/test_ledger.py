@@ -49,8 +49,8 @@ def test_an_update_is_told_from_playing(update: float) -> None:
     for _ in range(200):
         training = int(rng.integers(0, slots + 1))
         seconds = 0.4 + training * update + rng.normal(0, 0.005)
-        train, play = steps.part(seconds, training, slots - training)
+        train, play = steps.part(seconds, training, slots)
         assert training * train + (slots - training) * play == pytest.approx(seconds)
-    train, play = steps.part(0.4 + 2 * update, 2, 2)
+    train, play = steps.part(0.4 + 2 * update, 2, slots)
     assert train - play == pytest.approx(update, abs=0.01)
-    assert steps.part(1.0, 0, 0) == (0, 0)
+    assert steps.part(1.0, 0, slots)[1] == pytest.approx(0.25)
