@@ -6,21 +6,43 @@ from pathlib import Path
 from pipeline.cli.command import add_json, add_split
 
 DOES = "show what is in a split"
-EXAMPLE = "levelproof inspect data/128k/s --where \"label = 'solved' AND steps_to_goal < 64\""
+EXAMPLE = """\
+levelproof inspect data/128k/s --where "label = 'solved' AND steps_to_goal < 64"
+levelproof inspect data/128k/s --columns level_id,env_steps --sort "env_steps DESC" --limit 20
+levelproof inspect data/128k/s --plot split.svg"""
 WHERE = "count only rows for which this condition on the manifest's columns holds"
 AGAINST = "look for the same levels in another split, a level file, or a folder of them (may be repeated)"
-ROWS = "rows, and pairs of duplicates, to show (default: 10)"
+COLUMNS = "columns of the rows to show, with commas between (default: a few on the screen, else all)"
+SORT = "order of the rows: a column or an SQL expression, with DESC the largest first (default: level_id)"
+LIMIT = "rows, and pairs of duplicates, to show (default: 10; of --csv all)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
     parser.add_argument("--where", metavar="SQL", help=WHERE)
     parser.add_argument("--against", type=Path, action="append", default=[], metavar="PATH", help=AGAINST)
-    parser.add_argument("--rows", type=int, default=10, help=ROWS)
-    add_json(parser)
+    parser.add_argument("--columns", metavar="NAMES", help=COLUMNS)
+    parser.add_argument("--sort", metavar="SQL", help=SORT)
+    parser.add_argument("--limit", "--rows", type=int, metavar="COUNT", help=LIMIT)
+    instead = parser.add_mutually_exclusive_group()
+    add_json(instead)
+    instead.add_argument("--csv", action="store_true", help="print the rows alone, as CSV")
+    instead.add_argument("--plot", type=Path, metavar="FILE", help="draw histograms and learning curves: .svg or .png")
 
 
 def run(arguments: argparse.Namespace) -> None:
+    import sys
+
+    from pipeline.look.rows import Asked, write_csv
+
+    columns = [name.strip() for name in arguments.columns.split(",")] if arguments.columns else None
+    asked = Asked(arguments.where, columns, arguments.sort, arguments.limit)
+    if arguments.csv:
+        return write_csv(arguments.split, asked, sys.stdout)
+    if arguments.plot:
+        from pipeline.look.plot import plot
+
+        return plot(arguments.split, asked, arguments.plot)
     from pipeline.look.inspect import inspect
 
-    inspect(arguments.split, arguments.where, arguments.rows, arguments.json, arguments.against)
+    return inspect(arguments.split, asked, arguments.json, arguments.against)

@@ -17,12 +17,11 @@ from rich.table import Table
 
 from experts.labels import TRAINED, WITNESSED, Label
 from pipeline.errors import UserError
-from pipeline.look.inspect import QUANTILES
+from pipeline.look.inspect import QUANTILES, SPENT
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import Manifest, differences, require_manifest, told
 from pipeline.store.remote import as_typed
 
-SPENT = ("scout_steps", "search_steps", "env_steps", "evaluation_steps")  # what a level cost, env steps
 READ = ("content_hash", "signature", "label", "steps_to_goal", *SPENT)
 LABELS = [label.value for label in Label]
 

@@ -37,6 +37,11 @@ class Share(NamedTuple):
         middle, half = p + z2 / 2, DEVIATIONS * sqrt((p * (1 - p) + z2 / 4) / self.of)
         return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
 
+    @property
+    def rounded(self) -> list[float]:
+        """The interval for people and JSON."""
+        return [round(end, 4) for end in self.interval]
+
     def __str__(self) -> str:
         low, high = self.interval
         return f"{self.hits / self.of:.1%} ({low:.1%} to {high:.1%})"
@@ -71,9 +76,45 @@ def draw_histograms(values: Mapping[str, np.ndarray], most: int, bins: int, titl
         low = height - (number // ACROSS + 1) * (HIGH + 0.75) + 0.4
         counts, _ = np.histogram(numbers, bins, (0.5, most + 0.5))
         parts += _histogram(counts / counts.sum(), (left, low), f"{name}: {len(numbers):,}")
-        for words, x in (("1", left), (str(most), left + PANEL - text_width(str(most), SMALL))):
-            parts.append(text((x, low - 0.14), words, MUTED, SMALL))
+        parts += _ends((left, low), "1", str(most))
     _write(parts, (0.3 + min(len(values), ACROSS) * (PANEL + GAP), height + 0.5), path)
+
+
+def draw_panels(
+    values: Mapping[str, np.ndarray], curves: Mapping[str, Sequence[np.ndarray]], bins: int, title: str, path: Path
+) -> None:
+    """A histogram for each name, over the range of its numbers; then shares along updates, a line for each level."""
+    panels = len(values) + len(curves)
+    height = -(-panels // ACROSS) * (HIGH + 0.75)
+    parts = [text((0.05, height + 0.25), title, INK, LETTER)]
+    corners = [
+        (0.15 + (number % ACROSS) * (PANEL + GAP), height - (number // ACROSS + 1) * (HIGH + 0.75) + 0.4)
+        for number in range(panels)
+    ]
+    for (name, numbers), (left, low) in zip(values.items(), corners, strict=False):
+        counts, edges = np.histogram(numbers, bins)
+        parts += _histogram(counts / counts.sum(), (left, low), f"{name}: {len(numbers):,}")
+        parts += _ends((left, low), *(f"{edge:,.0f}" if edge > 9 else f"{edge:.2g}" for edge in (edges[0], edges[-1])))
+    for (name, lines), (left, low) in zip(curves.items(), corners[len(values) :], strict=True):
+        last = max(2, *map(len, lines))
+        parts += [line([(left, low + y), (left + PANEL, low + y)], GRID, 0.012) for y in (0, HIGH / 2, HIGH)]
+        for of in lines:
+            updates = np.flatnonzero(~np.isnan(of))
+            points = np.stack([left + PANEL * updates / (last - 1), low + HIGH * of[updates]], -1)
+            parts.append(line(points, ROLE_COLOUR[Role.GREEN], 0.012))
+        parts.append(text((left, low + HIGH + 0.18), f"{name}: {len(lines):,}", INK, SMALL))
+        parts.append(text((left + PANEL, low + HIGH + 0.18), "100%", MUTED, SMALL, ends=True))
+        parts += _ends((left, low), "update 1", str(last))
+    _write(parts, (0.3 + min(panels, ACROSS) * (PANEL + GAP), height + 0.5), path)
+
+
+def _ends(corner: tuple[float, float], first: str, last: str) -> list[str]:
+    """Words below both ends of a panel's axis."""
+    left, low = corner
+    return [
+        text((left, low - 0.14), first, MUTED, SMALL),
+        text((left + PANEL, low - 0.14), last, MUTED, SMALL, ends=True),
+    ]
 
 
 def _histogram(shares: np.ndarray, corner: tuple[float, float], title: str) -> list[str]:
@@ -100,4 +141,7 @@ def _write(parts: Sequence[str], size: tuple[float, float], path: Path) -> None:
         f'height="{100 * SHARP * height:.0f}" viewBox="0 {-height} {width} {height}"><g transform="scale(1,-1)">'
         f"{rectangle((0, 0), size, PAPER)}{''.join(parts)}</g></svg>"
     )
-    write_png(picture_of(drawing), path)
+    if path.suffix.lower() == ".svg":
+        path.write_text(drawing, encoding="utf-8")
+    else:
+        write_png(picture_of(drawing), path)

@@ -6,6 +6,7 @@ Reads no shard's data.
 import json
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from rich.console import Console
-from rich.table import Table
 
 from configs.compose import identified
 from configs.convert import typed
@@ -22,76 +22,94 @@ from experts.config import RECORD_STEPS
 from experts.labels import DIVERGED, Label
 from levelgen.sampling.distribution import Distribution
 from pipeline.look import cost, duplicates
+from pipeline.look.facts import print_facts
+from pipeline.look.figures import Share
+from pipeline.look.reasons import kinds_of_reasons
+from pipeline.look.rows import EVERYTHING, SHOWN, Asked, ids_of, rows_of
+from pipeline.look.shares import solved_by_things
 from pipeline.read.select import columns_in, select
 from pipeline.store.layout import data_path
-from pipeline.store.manifest import require_manifest
+from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.remote import as_typed, is_listed
 from pipeline.store.shard import stored_bytes
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+SPENT = ("scout_steps", "search_steps", "env_steps", "evaluation_steps")  # what levels cost, env steps
 READ = (  # columns that the facts are from
-    "label", "label_reason", "failed_by_noop", "steps_to_goal", "steps_to_first_success", "env_steps", "shard",
+    "label", "label_reason", "failed_by_noop", "witness", "steps_to_goal", "steps_to_first_success", *SPENT, "shard",
 )  # fmt: skip
-SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps")
+LIMIT = 10  # rows on a screen
 
 
-def inspect(split: Path, where: str | None, rows: int, as_json: bool, against: Sequence[Path] = ()) -> None:
-    """Print what is in `split`, of the rows for which the SQL condition `where` holds.
+def inspect(split: Path, asked: Asked, as_json: bool, against: Sequence[Path] = ()) -> None:
+    """Print what is in `split`, of the rows that are asked for.
 
     The same levels are looked for in `against`: other splits, level files, folders of level files.
 
     Raises:
-        UserError: no split, a condition that DuckDB cannot use, or nothing to look in.
+        UserError: no split, a condition or an order that DuckDB cannot use, or nothing to look in.
         Failure: a fragment is damaged, or names data that is not in the split.
     """
-    facts = survey(split, where, rows, against)
+    facts = survey(split, asked, against, things=True)
     if as_json:
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)
         print()
     else:
-        _print(facts, Console(highlight=False))
+        print_facts(facts, asked.columns or SHOWN, Console(highlight=False))
 
 
-def survey(split: Path, where: str | None = None, rows: int = 10, against: Sequence[Path] = ()) -> dict[str, Any]:
-    """The facts that `inspect` prints, as JSON's types."""
-    manifest, shown = require_manifest(split, [*READ, *cost.READ, *columns_in(where)], compact=True), max(rows, 0)
-    chosen = select(manifest.table, where)
-    labels, reasons = _counts(chosen, "label"), _counts(chosen, "label_reason")
-    told = chosen.select(["label_reason", "steps_to_goal", "steps_to_first_success", "env_steps"])
-    solved, unsolved, unsolvable = (
-        told.filter(pc.equal(chosen["label"], label.value))  # pyright: ignore[reportAttributeAccessIssue]
-        for label in (Label.SOLVED, Label.UNSOLVED, Label.UNSOLVABLE)
-    )
-    tried, ids = solved.num_rows + unsolved.num_rows, chosen["level_id"].to_numpy()
+def survey(
+    split: Path, asked: Asked = EVERYTHING, against: Sequence[Path] = (), things: bool = False
+) -> dict[str, Any]:
+    """The facts that `inspect` prints, as JSON's types; `things`: which levels are solved by what they are made of."""
+    asked.check()
+    columns = [*READ, *cost.READ, *columns_in(asked.where), *columns_in(asked.sort)]
+    manifest = require_manifest(split, columns, compact=True)
+    asked = asked._replace(limit=LIMIT if asked.limit is None else max(asked.limit, 0))
+    chosen, shown = select(manifest.table, asked.where), asked.limit or 0
+    ids, labels = chosen["level_id"].to_numpy(), _counts(chosen, "label")
+    with ThreadPoolExecutor(1) as beside:  # what takes seconds of millions of levels leaves a core to others
+        made_of = beside.submit(solved_by_things, manifest, ids) if things else None
+        facts = _told(split, manifest, chosen, labels)
+        others = {str(other): duplicates.compared_in(other) for other in against}
+        levels = duplicates.compared_of(split, ids) if others else None
+        facts["duplicates"] = duplicates.within(duplicates.perhaps_alike(split, ids), shown)
+        facts["against"] = {name: duplicates.between(levels, other, shown) for name, other in others.items()}
+    rows = [row for block in rows_of(split, ids_of(chosen, asked), asked.columns) for row in block.to_pylist()]
+    return facts | {"solved_by": made_of.result() if made_of else None, "rows": rows}
+
+
+def _told(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str, int]) -> dict[str, Any]:
+    """What the rows that are chosen say."""
+    of_label = {label: chosen.filter(pc.equal(chosen["label"], label)) for label in labels}  # pyright: ignore[reportAttributeAccessIssue]
+    none = chosen.slice(0, 0)
+    solved, unsolved = (of_label.get(label, none) for label in (Label.SOLVED, Label.UNSOLVED))
+    tried = solved.num_rows + unsolved.num_rows
     stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards) if is_listed(split) else None
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
     config = manifest.config or {}
     distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
-    others = {str(other): duplicates.compared_in(other) for other in against}
-    levels = duplicates.compared_of(split, ids) if others else None
     return {
         "split": as_typed(split),
         "config_hash": manifest.config_hash,
         "distribution": dict(zip(("name", "hash"), identified(distribution), strict=True)) if distribution else None,
         "levels": chosen.num_rows,
         "labels": labels,
-        "unsolvable": _counts(unsolvable, "label_reason"),
-        "diverged": sum(count for reason, count in reasons.items() if DIVERGED in reason),
+        "reasons": {label: kinds_of_reasons(of["label_reason"]) for label, of in of_label.items()},
+        "unsolvable": _counts(of_label.get(Label.UNSOLVABLE, none), "label_reason"),
+        "diverged": sum(count for reason, count in _counts(unsolved, "label_reason").items() if DIVERGED in reason),
         "failed_by_noop": _total(chosen["failed_by_noop"].to_numpy()),
         "solve_rate": solved.num_rows / tried if tried else None,  # of the levels with an expert
+        "solve_interval": Share(solved.num_rows, tried).rounded if tried else None,  # of 95%
+        "witness": _counts(chosen.filter(pc.is_valid(chosen["witness"])), "witness"),  # pyright: ignore[reportAttributeAccessIssue]
         "steps_to_goal": _quantiles(solved, "steps_to_goal"),
         "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
-        "duplicates": duplicates.within(duplicates.perhaps_alike(split, ids), shown),
-        "against": {name: duplicates.between(levels, other, shown) for name, other in others.items()},
-        "env_steps": _total(chosen["env_steps"].to_numpy()),
+        **{name: _total(chosen[name].to_numpy()) for name in SPENT},
         "env_steps_after_success": _total(solved["env_steps"].to_numpy() - solved["steps_to_first_success"].to_numpy()),
         "env_steps_unsolved": _total(unsolved["env_steps"].to_numpy()),
         "cost": cost.cost_of(chosen),
         "split_bytes": stored,  # of all the split's shards, whatever the condition
         "bytes_per_transition": stored / (kept * RECORD_STEPS) if stored and kept else None,
-        "rows": require_manifest(split, level_ids=ids[:shown]).table.to_pylist()
-        if len(ids[:shown])
-        else [],  # with all columns
     }
 
 
@@ -112,51 +130,3 @@ def _quantiles(table: pa.Table, column: str) -> dict[str, float] | None:
         return None
     found = np.quantile(values, QUANTILES, method="nearest").tolist()
     return {f"{quantile:.0%}": value for quantile, value in zip(QUANTILES, found, strict=True)}
-
-
-def _print(facts: dict[str, Any], console: Console) -> None:
-    labels = ", ".join(f"{count} {label}" for label, count in facts["labels"].items()) or "none"
-    of = facts["distribution"]
-    lines = {
-        "split": facts["split"],
-        "distribution": f"{of['name'] or 'of its own'} ({of['hash']})"
-        if of
-        else "none, levels are of level files or imported",
-        "levels": f"{facts['levels']} ({labels})",
-        "unsolvable": "; ".join(f"{count} {reason}" for reason, count in facts["unsolvable"].items()) or None,
-        "experts that diverged": str(facts["diverged"]) if facts["diverged"] else None,
-        "failed by doing nothing": str(facts["failed_by_noop"]),
-        "solve rate of experts": f"{facts['solve_rate']:.1%}" if facts["solve_rate"] is not None else None,
-        "steps to goal": _told(facts["steps_to_goal"]),
-        "training steps to first success": _told(facts["steps_to_first_success"]),
-        "duplicates": duplicates.told(facts["duplicates"]),
-        **{f"duplicates in {other}": duplicates.told(found) for other, found in facts["against"].items()},
-        "training env steps": _steps_told(facts),
-        "cost": cost.cost_told(facts["cost"]) if facts["cost"] else None,
-        "shards": f"{facts['split_bytes']:,} bytes" if facts["split_bytes"] is not None else None,
-        "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
-    }
-    for name, text in lines.items():
-        if text is not None:
-            console.print(f"{name + ':':32} {text}", markup=False, soft_wrap=True)
-    table = Table(*SHOWN, box=None, pad_edge=False, padding=(0, 1, 0, 0))  # fits 80 columns
-    for row in facts["rows"]:
-        table.add_row(*(_cell(row[name]) for name in SHOWN))
-    if facts["rows"]:
-        console.print()
-        console.print(table)
-
-
-def _steps_told(facts: dict[str, Any]) -> str:
-    steps, after, unsolved = (facts[f"env_steps{of}"] for of in ("", "_after_success", "_unsolved"))
-    if not steps:
-        return "0"
-    return f"{steps:,} ({after / steps:.0%} after a first success, {unsolved / steps:.0%} of levels unsolved)"
-
-
-def _told(quantiles: dict[str, float] | None) -> str | None:
-    return ", ".join(f"{name}: {value:,.0f}" for name, value in quantiles.items()) if quantiles else None
-
-
-def _cell(value: Any) -> str:
-    return "-" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)

@@ -3,7 +3,6 @@
 A number that does not exist is NaN, a word that does not exist is NOTHING.
 """
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.look.gallery.worlds import text_of
+from pipeline.look.reasons import kind_of_reason
 from pipeline.store.schema import COLUMNS
 
 PAGE = 8192  # rows
@@ -24,11 +24,6 @@ NUMBERS = [
     if (pa.types.is_integer(of.type) or pa.types.is_floating(of.type)) and of.name not in NOT_SHOWN
 ]
 READ = [*NUMBERS, *FLAGS, *WORDS]  # columns of the manifest
-
-
-def kind_of_reason(reason: str) -> str:
-    """What a reason says, whatever its numbers: levels have few kinds of reasons and many numbers."""
-    return re.sub(r"\d[\d,.]*\d|\d", "N", reason)
 
 
 def worded(column: pa.ChunkedArray | pa.Array, name: str) -> tuple[list[str], np.ndarray]:

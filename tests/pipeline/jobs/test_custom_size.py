@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from pipeline.look.inspect import inspect, survey
+from pipeline.look.rows import Asked
 from pipeline.look.show import show
 from pipeline.look.status import look
 from pipeline.read.export import export
@@ -38,7 +39,7 @@ def test_the_manifest_names_size_and_distribution(made: Path, capsys: pytest.Cap
     rows = read_manifest(made / SPLIT).table.to_pylist()
     assert [row["size"] for row in rows] == [SIZE] * 4
     assert rows[0]["command"] == f"levelproof generate size={SIZE} budget=5k distribution=free first_level=0 levels=1"
-    inspect(made / SPLIT, None, 0, False)
+    inspect(made / SPLIT, Asked(limit=0), False)
     name, mark = survey(made / SPLIT)["distribution"].values()
     assert name == "free"
     assert f"free ({mark})" in capsys.readouterr().out

@@ -20,6 +20,7 @@ from levelgen.task.rules import TaskParams
 from pipeline.jobs.schedule import WorkUnit, plan_units
 from pipeline.jobs.unit import failure
 from pipeline.look.inspect import survey
+from pipeline.look.rows import Asked
 from pipeline.look.status import look
 from pipeline.read.level_files import LevelUnseen, level_at, levels_below
 from pipeline.read.verify import examine
@@ -164,7 +165,7 @@ def test_levels_are_regenerated_from_shard_and_file(once: Path, tmp_path: Path) 
 
 def test_questions_are_answered(once: Path, tmp_path: Path) -> None:
     split = once / "data/5k/s"
-    facts = survey(split, "file LIKE '%a.json'")
+    facts = survey(split, Asked("file LIKE '%a.json'"))
     assert (facts["levels"], facts["distribution"]) == (1, None)
     assert here(["inspect", str(split)], tmp_path).stdout.count("level files") == 1
     assert json.loads(here(["inspect", str(split), "--json"], tmp_path).stdout)["levels"] == 2

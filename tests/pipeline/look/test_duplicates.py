@@ -20,6 +20,7 @@ from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
 from pipeline.look.duplicates import _numbers, between, compared_in, told, within
 from pipeline.look.inspect import survey
+from pipeline.look.rows import Asked
 from pipeline.store.layout import split_path
 from pipeline.store.manifest import require_manifest
 from tests.levelgen.opened import handmade_levels
@@ -112,13 +113,13 @@ def test_every_row_has_the_identity_of_its_level(split: Path) -> None:
 
 
 def test_planted_duplicates_are_told(split: Path) -> None:
-    facts = survey(split, rows=3)
+    facts = survey(split, Asked(limit=3))
     assert facts["duplicates"] == {
         "same": {"levels": 1, "pairs": [[COPY, 3]]},
         "near": {"levels": 1, "pairs": [[NUDGED, 5]]},
     }
     assert facts["against"] == {}
-    assert survey(split, "level_id != 3")["duplicates"]["same"] == NONE
+    assert survey(split, Asked("level_id != 3"))["duplicates"]["same"] == NONE
 
 
 @pytest.mark.slow

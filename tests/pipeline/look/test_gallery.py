@@ -13,9 +13,10 @@ from experts.witness import steps_to_goal
 from pipeline.cli.gallery import MOST
 from pipeline.errors import Failure, UserError
 from pipeline.look.gallery import gallery as module
-from pipeline.look.gallery.columns import FLAGS, NOTHING, NUMBERS, kind_of_reason
+from pipeline.look.gallery.columns import FLAGS, NOTHING, NUMBERS
 from pipeline.look.gallery.gallery import BLOCK, gallery
 from pipeline.look.gallery.worlds import ANGLE, LENGTH, angles
+from pipeline.look.reasons import kind_of_reason
 from pipeline.look.things import things_of
 from pipeline.read.levels import levels_of
 from pipeline.read.rows import read_row

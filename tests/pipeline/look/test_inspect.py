@@ -1,21 +1,39 @@
 """Questions about a manifest: what a condition chooses, and that nothing more is read than it takes."""
 
+import csv
 import dataclasses
+import io
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
+from PIL import Image
+from rich.console import Console
 
 from experts.labels import Label, unsolved_reason
+from levelgen.level import SIZES
+from levelgen.sampling.sampler import sample_levels
+from pipeline.errors import UserError
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
+from pipeline.look import rows as rows_module
+from pipeline.look import shares
+from pipeline.look.facts import print_facts
 from pipeline.look.inspect import inspect, survey
+from pipeline.look.plot import plot
+from pipeline.look.reasons import kind_of_reason
+from pipeline.look.rows import SHOWN, Asked, write_csv
+from pipeline.look.shares import solved_by_things
+from pipeline.look.things import things_of
+from pipeline.read import levels as levels_module
 from pipeline.read.select import columns_in
 from pipeline.store import manifest
 from pipeline.store.layout import split_path
-from pipeline.store.manifest import Fragment, read_fragment
+from pipeline.store.manifest import Fragment, read_fragment, read_manifest
 from pipeline.store.schema import COLUMNS
 from tests.pipeline.made import made_job, made_result, made_split, made_verdict
 
@@ -38,7 +56,7 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_what_has_no_number_is_neither_above_nor_below_one(split: Path, condition: str, labels: dict) -> None:
-    assert survey(split, condition)["labels"] == labels
+    assert survey(split, Asked(condition))["labels"] == labels
 
 
 def test_only_the_columns_of_the_question_are_read(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,10 +70,10 @@ def test_only_the_columns_of_the_question_are_read(split: Path, monkeypatch: pyt
         return fragment, table
 
     monkeypatch.setattr(manifest, "read_fragment", counted)
-    facts = survey(split, "env_steps > 0 AND level_id >= 4", rows=2)
+    facts = survey(split, Asked("env_steps > 0 AND level_id >= 4", limit=2))
     assert [row["level_id"] for row in facts["rows"]] == [4, 5]
     assert facts["rows"][0].keys() == set(COLUMNS.names)
-    assert sorted(read) == [(4, 3)] * 3 + [(4, 10)] * 3 + [(4, len(COLUMNS))]
+    assert sorted(read) == [(4, 3)] * 3 + [(4, 14)] * 3 + [(4, len(COLUMNS))]
 
 
 @pytest.mark.parametrize(
@@ -81,6 +99,84 @@ def test_experts_that_diverged_are_counted(tmp_path: Path, capsys: pytest.Captur
     result = dataclasses.replace(made_result(ids, [Label.UNSOLVED] * 3), verdicts=verdicts)
     commit(job, split, WorkUnit(tuple(ids)), result)
     assert survey(split)["diverged"] == 2
-    assert survey(split, "level_id < 2")["diverged"] == 1
-    inspect(split, None, 0, as_json=False)
+    assert survey(split, Asked("level_id < 2"))["diverged"] == 1
+    inspect(split, Asked(limit=0), as_json=False)
     assert "experts that diverged:           2\n" in capsys.readouterr().out
+
+
+def test_rows_come_as_they_are_asked_for(split: Path) -> None:
+    rows = survey(split, Asked(columns=["label", "level_id"], sort="steps_to_goal DESC", limit=4))["rows"]
+    assert rows == [
+        {"label": label, "level_id": level_id}
+        for label, level_id in [("solved", 0), ("solved", 4), ("solved", 8), ("trivial", 1)]  # without a number: last
+    ]
+    with pytest.raises(UserError, match=r"^Cannot sort by 'no_such' "):
+        survey(split, Asked(sort="no_such"))
+    with pytest.raises(UserError, match=r"^There is no column 'labels': choose of level_id, "):
+        survey(split, Asked(columns=["labels"]))
+
+
+def test_rows_as_csv(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of them, block by block; lists and records as JSON."""
+    monkeypatch.setattr(rows_module, "BLOCK", 5)
+    write_csv(split, Asked("label != 'trivial'", sort="level_id DESC"), text := io.StringIO())
+    read = list(csv.DictReader(text.getvalue().splitlines()))
+    assert [int(row["level_id"]) for row in read] == [11, 10, 8, 7, 6, 4, 3, 2, 0]
+    assert list(read[0]) == COLUMNS.names
+    assert json.loads(read[0]["learning_curve"]) == [None, 0.5]
+    assert json.loads(read[0]["versions"])["sampler"] == 1
+    assert (read[0]["witness"], read[2]["witness"], read[2]["steps_to_goal"]) == ("", "sampled", "17")
+    write_csv(split, Asked(columns=["row", "label"], limit=1), text := io.StringIO())
+    assert text.getvalue() == "row,label\n0,solved\n"
+
+
+def test_reasons_witnesses_and_what_steps_were_for(split: Path) -> None:
+    facts = survey(split)
+    assert facts["reasons"] == {label: {"made for a test": 3} for label in LABELS}
+    assert facts["witness"] == {"sampled": 3}
+    assert [facts[f"{of}_steps"] for of in ("env", "scout", "search", "evaluation")] == [12 * 4096, 0, 0, 0]
+    low, high = facts["solve_interval"]
+    assert 0.15 < low < facts["solve_rate"] == 0.5 < high < 0.85
+    assert kind_of_reason("doing nothing reaches the goal in 12 env steps, or 1,024") == (
+        "doing nothing reaches the goal in N env steps, or N"
+    )
+
+
+def test_shares_by_what_levels_are_made_of(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of levels made again from their ids: no shard is read."""
+    monkeypatch.setattr(levels_module, "read_rows", None)
+    monkeypatch.setattr(shares, "SAMPLED", 8)
+    found = solved_by_things(read_manifest(split, ["label"]), np.arange(12))
+    assert (found["looked_at"], found["of"], found["levels"]) == (8, 12, 5)
+    levels = sample_levels(np.arange(12), SIZES["s"])
+    for name, counts in things_of(levels).items():
+        assert set(found[name]) <= {str(count) for count in counts}
+        assert sum(of["tried"] for of in found[name].values()) == 5
+
+
+def test_a_terminal_is_not_wider_than_it_is(split: Path) -> None:
+    facts = survey(split)
+    facts["reasons"]["solved"] = {"a reason of many words " * 9: 3}
+    narrow = Console(file=io.StringIO(), width=70, force_terminal=True, highlight=False, color_system=None)
+    print_facts(facts, SHOWN, narrow)
+    assert all(len(line.rstrip()) <= 70 for line in narrow.file.getvalue().splitlines())  # type: ignore[attr-defined]
+    wide = Console(file=io.StringIO(), highlight=False)
+    print_facts(facts, SHOWN, wide)
+    assert "a reason of many words " * 9 in wide.file.getvalue()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", ["split.svg", "split.png"])
+def test_a_plot(split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    plot(split, Asked(), tmp_path / name)
+    told = capsys.readouterr().out
+    assert told.startswith(f"{tmp_path / name}: steps to goal, ")
+    assert "solved levels, success rate" in told
+    if name.endswith("svg"):
+        assert f"{split}: 12 levels" in (tmp_path / name).read_text()
+    else:
+        with Image.open(tmp_path / name) as picture:
+            assert picture.width > 1000
+    with pytest.raises(UserError, match=r"has to end in \.svg or \.png"):
+        plot(split, Asked(), tmp_path / "split.pdf")
+    with pytest.raises(UserError, match="nothing to draw"):
+        plot(split, Asked("level_id < 0"), tmp_path / name)

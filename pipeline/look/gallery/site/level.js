@@ -63,7 +63,7 @@
         if (of === null) return "–";
         if (typeof of === "number") return shown(of);
         if (typeof of === "boolean") return of ? "yes" : "no";
-        return Array.isArray(of) ? of.join(" ") : typeof of === "object" ? Object.entries(of).map(([name, x]) => `${name} ${x}`).join(", ") : of;
+        return Array.isArray(of) ? of.join(" ") : typeof of === "object" ? Object.entries(of).map(([name, x]) => `${name} ${value(x)}`).join(", ") : of;
       };
       const told = Object.entries(row).filter(([name]) => !["label_reason", "command", "learning_curve"].includes(name));
       at("row").replaceChildren(...told.flatMap(([name, of]) => [made("dt", {}, spoken(name)), made("dd", {}, name === "level_id" ? String(of) : value(of))]));

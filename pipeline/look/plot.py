@@ -1,0 +1,50 @@
+"""A manifest as a figure: histograms of its numbers, and learning curves."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from experts.labels import TRAINED, Label
+from pipeline.errors import UserError
+from pipeline.look.figures import draw_panels
+from pipeline.look.rows import Asked
+from pipeline.read.levels import writing_to
+from pipeline.read.select import columns_in, select
+from pipeline.store.manifest import require_manifest
+
+KINDS = (".svg", ".png")
+NUMBERS = ("steps_to_goal", "steps_to_first_success", "env_steps", "success_rate", "portability")
+BINS = 32
+CURVES = 100  # levels of a label whose learning curves are drawn, spread evenly
+
+
+def plot(split: Path, asked: Asked, out: Path) -> None:
+    """Draw the rows that are asked for to `out`, and tell in one line what was drawn.
+
+    Raises:
+        UserError: no split, no row that fits, or a file that cannot be written.
+        Failure: a fragment is damaged.
+    """
+    if out.suffix.lower() not in KINDS:
+        raise UserError(f"Cannot draw to {out}: its name has to end in {' or '.join(KINDS)}.")
+    table = select(require_manifest(split, ["label", *NUMBERS, *columns_in(asked.where)]).table, asked.where)
+    values = {name.replace("_", " "): table[name].drop_null().to_numpy() for name in NUMBERS}
+    values = {name: of[~np.isnan(of)] for name, of in values.items()}
+    values = {name: of for name, of in values.items() if len(of)}
+    curves = {f"{label} levels, success rate": of for label in sorted(TRAINED) if (of := _curves(split, table, label))}
+    if not values and not curves:
+        raise UserError(f"There is nothing to draw of {split}: choose other rows with --where.")
+    with writing_to(out):
+        draw_panels(values, curves, BINS, f"{split}: {table.num_rows:,} levels", out)
+    print(f"{out}: {', '.join([*values, *curves])}")
+
+
+def _curves(split: Path, table: pa.Table, label: Label) -> list[np.ndarray]:
+    """Success rates per update of some levels of a label; null where no episode ended."""
+    ids = table["level_id"].to_numpy()[np.array(table["label"].to_pylist()) == label]
+    if not len(ids):
+        return []
+    chosen = ids[np.unique(np.linspace(0, len(ids) - 1, min(CURVES, len(ids))).round().astype(int))]
+    found = require_manifest(split, ["learning_curve"], chosen).table["learning_curve"].to_pylist()
+    return [curve for rates in found if not np.isnan(curve := np.array(rates, np.float64)).all()]
