@@ -1,7 +1,7 @@
 """How a gallery of many levels feels in a browser: how soon it shows, how smoothly it scrolls, what it keeps.
 
-Chromium without a window and without a GPU, the site opened from the disk. The split is made for this: sampled levels
-under random actions, of which some reach the goal.
+Chromium without a window and without a GPU, the site opened from the disk. The split is made for this: sampled levels,
+of which the first were played at random and some reach the goal.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from experts.config import RECORD_STEPS
 from experts.labels import Label, Source, Verdict
 from experts.steps import EnvSteps
 from experts.train import UnitResult
-from experts.witness import replay, steps_to_goal, succeeds
+from experts.witness import replay, steps_to_goal, succeeds, take
 from levelgen.level import ACTIONS, size_of
 from levelgen.sampling.sampler import sample_levels
 from pipeline.jobs.schedule import WorkUnit
@@ -201,24 +201,26 @@ def made_gallery(folder: Path, size: str, levels: int) -> tuple[Path, float | No
 
 
 def made_split(folder: Path, size: str, levels: int) -> Path:
-    """A split of levels under random actions: what reaches the goal is solved."""
+    """A split of levels of which the first UNIT were played at random: what reaches the goal is solved."""
     prepare_jax()
     job, rng = compose_job([f"out={folder}", f"size={size}", f"levels={levels}"]), np.random.default_rng(0)
-    split = split_path(job.out, job.budget, job.size)
+    split, count = split_path(job.out, job.budget, job.size), min(UNIT, levels)
     split.mkdir(parents=True)
+    choices = rng.integers(0, 2, (RECORD_STEPS // HELD, ACTIONS, count))
+    played = jax.tree.map(np.asarray, sample_levels(np.arange(count), size_of(size), job.distribution))
+    record = replay(played, np.repeat(choices, HELD, axis=0), job.task)
+    solved, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
     for first in range(0, levels, UNIT):
         ids = np.arange(first, min(first + UNIT, levels))
         level = jax.tree.map(np.asarray, sample_levels(ids, size_of(size), job.distribution))
-        choices = rng.integers(0, 2, (RECORD_STEPS // HELD, ACTIONS, len(ids)))
-        record = replay(level, np.repeat(choices, HELD, axis=0), job.task)
-        solved, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
         verdicts = [
             Verdict(
                 Label.SOLVED, "random actions", False, Source.SCOUT, steps_to_goal=int(steps[i]), env_steps=int(spent)
             )
-            if solved[i]
-            else Verdict(Label.UNSOLVED, "random actions", False, success_rate=0.0, env_steps=int(spent))
+            if solved[i] and not first
+            else Verdict(Label.UNSOLVED, "not played", False, success_rate=0.0, env_steps=int(spent))
             for i, spent in enumerate(rng.integers(0, 2**18, len(ids)))
         ]
-        commit(job, split, WorkUnit(tuple(ids.tolist())), UnitResult(ids, level, record, verdicts, EnvSteps()))
+        here = take(record, np.arange(len(ids)))  # of levels without a witness nobody stores it
+        commit(job, split, WorkUnit(tuple(ids.tolist())), UnitResult(ids, level, here, verdicts, EnvSteps()))
     return split

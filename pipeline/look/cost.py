@@ -2,8 +2,10 @@
 
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from jaxtyping import Float
 
 from experts.labels import Label
 from experts.steps import Seconds
@@ -28,6 +30,12 @@ def cost_of(rows: pa.Table) -> dict[str, Any] | None:
         "seconds": seconds,
         "per_solved": total / solved if solved else None,
     }
+
+
+def seconds_of(rows: pa.Table) -> Float[np.ndarray, " row"]:
+    """Of each row, all stages; NaN: nobody has counted."""
+    stages = [pc.struct_field(rows.column("seconds"), stage).to_numpy() for stage in Seconds._fields]  # pyright: ignore[reportAttributeAccessIssue]
+    return np.sum(stages, axis=0, dtype=np.float64)
 
 
 def cost_told(cost: dict[str, Any]) -> str:

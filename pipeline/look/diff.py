@@ -17,12 +17,13 @@ from rich.table import Table
 
 from experts.labels import TRAINED, WITNESSED, Label
 from pipeline.errors import UserError
+from pipeline.look import cost
 from pipeline.look.inspect import QUANTILES, SPENT
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import Manifest, differences, require_manifest, told
 from pipeline.store.remote import as_typed
 
-READ = ("content_hash", "signature", "label", "steps_to_goal", *SPENT)
+READ = (*cost.READ, "content_hash", "signature", "steps_to_goal", *SPENT)
 LABELS = [label.value for label in Label]
 
 
@@ -51,6 +52,8 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
     only = [solved[i] & ~solved[1 - i] for i in range(2)]
     ids, spent = left["level_id"].to_numpy(), [_spent(of) for of in (left, right)]
     totals, gained = [sum(of.values()) for of in spent], int(only[1].sum() - only[0].sum())
+    prices = [cost.cost_of(of) for of in (left, right)]
+    seconds = [sum(of["seconds"].values()) if of else 0.0 for of in prices]
     counts = [[int(part.sum()) for part in (of & tried, tried)] for of in solved]
     return {
         "splits": [as_typed(one), as_typed(other)],
@@ -68,8 +71,9 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
         "only_rows": [ids[of][: max(rows, 0)].tolist() for of in only],
         "labels": _moves(left, right),
         "env_steps": spent,
-        "env_steps_more": totals[1] - totals[0],
         "env_steps_for_one_more": (totals[1] - totals[0]) / gained if gained else None,
+        "cost": prices,
+        "seconds_for_one_more": (seconds[1] - seconds[0]) / gained if gained and all(prices) else None,
         "steps_to_goal": _paired(left, right, solved[0] & solved[1]),
     }
 
@@ -166,6 +170,9 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         here, there = (of[name] for of in facts["env_steps"])
         if here or there:
             table.add_row(name.replace("_", " "), f"{here:,}", f"{there:,}", f"{there - here:+,}")
+    if all(facts["cost"]):
+        here, there = (sum(of["seconds"].values()) for of in facts["cost"])
+        table.add_row(f"{facts['cost'][0]['of']}-seconds", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
     if steps := facts["steps_to_goal"]:
         for quantile in steps["quantiles"][0]:
             here, there = (of[quantile] for of in steps["quantiles"])
@@ -180,9 +187,9 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     say(f"{facts['levels']:,} levels are in both" + (f" ({', '.join(alone)})." if alone else "."))
     changed = told({name: (a, b) for name, (a, b) in facts["settings"].items()})
     say(f"Settings that differ: {changed or 'none'}.")
-    if facts["env_steps_for_one_more"] is not None:
-        more = facts["env_steps_for_one_more"]
-        say(f"{facts['env_steps_more']:+,} env steps for {gained:+,} solved levels: {more:,.0f} for each one more.")
+    for name, unit in (("env_steps", "env steps"), ("seconds", "seconds")):
+        if (more := facts[f"{name}_for_one_more"]) is not None:
+            say(f"{more * gained:+,.0f} {unit} for {gained:+,} solved levels: {more:,.3g} for each one more.")
     if steps:
         say(
             f"Of {steps['levels']:,} levels that both solve, {steps['shorter']:,} take fewer steps in {other} and "

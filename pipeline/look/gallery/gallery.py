@@ -22,6 +22,7 @@ from experts.witness import steps_to_goal, succeeds
 from levelgen.level import Level
 from levelgen.pictures.palette import palette_css
 from pipeline.errors import Failure, UserError
+from pipeline.look import cost
 from pipeline.look.gallery.columns import NOTHING, PAGE, columns_of, page_of
 from pipeline.look.gallery.worlds import drawn_bodies, states_of, text_of, world_of
 from pipeline.look.things import THINGS, things_of
@@ -59,7 +60,7 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
         )
         counted = [_write_block(folder, manifest, first) for first in blocks]
         things = {name: np.concatenate([of[name] for of in counted]) for name in THINGS}
-        about, values = columns_of(manifest.table, things)
+        about, values = columns_of(manifest.table, things | {"seconds": cost.seconds_of(manifest.table)})
         for page in range(math.ceil(count / PAGE)):
             _write(folder, f"columns/{page}", page_of(values, page))
         _write(folder, "about", _about(manifest, found, where, about))

@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import binomtest
 
 from experts.labels import Label
+from experts.ledger import Ledger
 from pipeline.errors import UserError
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
@@ -29,7 +30,10 @@ def split_of(folder: Path, labels: list[Label], budget: str = "64k", steps: int 
     verdicts = [
         replace(of, **cost, steps_to_goal=steps + i if of.label == S else None) for i, of in enumerate(result.verdicts)
     ]
-    commit(job, split, WorkUnit(tuple(ids)), replace(result, verdicts=verdicts))
+    ledger = Ledger(len(ids))
+    for i in ids:
+        ledger.put("training", i, 2.0 * steps)
+    commit(job, split, WorkUnit(tuple(ids)), replace(result, verdicts=verdicts, ledger=ledger))
     return split
 
 
@@ -52,9 +56,10 @@ def test_who_solved_what(splits: tuple[Path, Path]) -> None:
 
 def test_what_the_difference_costs(splits: tuple[Path, Path]) -> None:
     facts = compare(*splits)
+    assert [of["seconds"]["training"] for of in facts["cost"]] == [7 * 34, 7 * 32]
     assert [of["env_steps"] for of in facts["env_steps"]] == [7 * 1700, 7 * 1600]
-    assert facts["env_steps_more"] == -700
     assert facts["env_steps_for_one_more"] == -700
+    assert facts["seconds_for_one_more"] == pytest.approx(-14, abs=1)  # and what writing took
     assert facts["steps_to_goal"]["shorter"] == facts["steps_to_goal"]["levels"] == 2
     assert facts["steps_to_goal"]["median_change"] == -1
 
