@@ -13,6 +13,7 @@ from experts.networks.entity import EntityNetwork
 from experts.policy import Params, forward, initial
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
+from levelgen.sampling.scenery import empty_level
 from levelgen.sampling.shuffle import OrderDraws, shuffle, shuffled_rows
 from levelgen.task.observe.entities import EntityObservation, entities
 from levelgen.task.observe.flat import BODY_ROWS, LIMIT, UNSEEN_WALLS, state_features
@@ -26,12 +27,14 @@ FROM_TANH = 1e-5  # float32, sums of a few hundred terms
 @cache
 def network_of(name: str) -> tuple[EntityNetwork, Params]:
     network = EntityNetwork(SIZES[name], width=8, depth=2, encoding=12)
-    return network, jax.tree.map(lambda x: np.asarray(x) + np.float32(0.1), first(network))  # biases count too
+    return network, jax.tree.map(
+        lambda x: np.asarray(x) + np.float32(0.1), first(network, empty_level(SIZES[name], 1))
+    )  # biases count too
 
 
-def first(network: EntityNetwork) -> Params:
+def first(network: EntityNetwork, level: Level) -> Params:
     """The parameters with which training starts."""
-    constant = jax.jit(network.constant)(sample_levels(jnp.arange(1), network.size))
+    constant = jax.jit(network.constant)(level)
     return jax.jit(initial, static_argnums=1)(jax.random.key(0), network, jax.tree.map(lambda x: x[..., 0], constant))
 
 
@@ -111,9 +114,9 @@ def test_the_order_of_things_does_not_matter(name: str, seed: int) -> None:
 def test_a_size_may_lack_kinds() -> None:
     """No circles and no thrusters: their encoders have no parameters."""
     size = SIZES["s"]._replace(circles=0, thrusters=0, polygons=7)
-    level = sample_levels(jnp.arange(2), size)
+    level = empty_level(size, 2)
     network = EntityNetwork(size, width=8, depth=1, encoding=4)
-    params = first(network)
+    params = first(network, level)
     assert set(params["params"]["policy"]) == {"polygons", "joints", "Dense_0"}
     assert np.isfinite(outputs(network, params, level, level.state)).all()
 

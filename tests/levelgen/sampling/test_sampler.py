@@ -30,6 +30,7 @@ COUNTS = {"s": 1024, "m": 1024, "l": 512}  # levels
 MANY = {"s": 4096, "m": 4096, "l": 2048}  # in a campaign
 MORE = pytest.mark.campaign
 ROUND = Size(4, 3, 2, 2)  # no polygon but the scenery
+CROWD = Size(7, 3, 1, 1)
 SIGNIFICANT = 1e-3  # over all statistics of a size together
 RARE = 10  # values seen less often, in both samples together, are counted as one
 
@@ -277,15 +278,21 @@ def test_what_must_act_follows_its_weights() -> None:
     assert abs(model.joint_active.any(0).mean() - 0.75) < 0.03
 
 
+def crowd(floor: Role, wheels: float) -> Level:
+    """Levels of a floor that is green or blue, the other one, a body, and one joined to one of them: a rectangle to
+    anything or, by this chance, a circle to rectangles."""
+    never = ("thruster_only_weight", "connected_weight", "free_weight", "floor_red_chance", "floor_blue_chance")
+    chances = dict.fromkeys(never, 0.0) | {f"floor_{floor.name.lower()}_chance": 1.0, "fixed_chance": 0.5}
+    how = Distribution(connected_circle_chance=wheels, small_world=0, proposals=1, **chances)  # type: ignore[arg-type]
+    return sampled(CROWD, CHUNK, how)
+
+
 @pytest.mark.parametrize("chance", [pytest.param(0.0, marks=MORE), 1.0])
 def test_wheels_follow_their_chance(chance: float) -> None:
-    """Green, blue and a body joined to one of them: a rectangle to anything, or a circle to rectangles."""
-    of = {"thruster_only_weight": 0.0, "connected_weight": 0.0, "free_weight": 0.0, "proposals": 1}
-    size = Size(7, 3, 1, 1)
-    model = sampled(size, CHUNK, Distribution(connected_circle_chance=chance, **of)).model  # type: ignore[arg-type]
-    circles, joint = model.active[size.polygons :].sum(0), model.joint_active[0]
-    assert joint.all()
-    assert circles.min() == chance  # of the levels whose green and blue are rectangles
+    model = crowd(Role.GREEN, chance).model
+    assert model.joint_active[0].all()
+    circles = model.active[CROWD.polygons :].sum(0)
+    assert circles.min() == chance  # of the levels whose free bodies are rectangles
 
 
 PRESETS = [pytest.param(name, marks=() if name == "vehicles" else MORE) for name in distributions()]
@@ -313,10 +320,8 @@ def test_presets_are_what_they_say(name: str) -> None:
 
 @pytest.mark.parametrize("floor", [Role.GREEN, pytest.param(Role.BLUE, marks=MORE)])
 def test_a_floor_that_is_green_or_blue_comes_with_the_other(floor: Role) -> None:
-    other = Role.GREEN + Role.BLUE - floor
-    chances = {"floor_red_chance": 0.0, "floor_blue_chance": 0.0, f"floor_{floor.name.lower()}_chance": 1.0}
-    level = sampled(ROUND, CHUNK, Distribution(small_world=0, proposals=1, fixed_chance=0.5, **chances))
-    assert_possible(level, ROUND)
+    other, level = Role.GREEN + Role.BLUE - floor, crowd(floor, 1.0)
+    assert_possible(level, CROWD)
     assert (level.role[0] == floor).all()
     body = level.model.active & (level.role == other)
     assert (body.sum(0) == 1).all()
