@@ -1,0 +1,88 @@
+"""What `levelproof plan` says of a job, and what the job then takes, sealed, on the same cores."""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import oracle
+from benchmarks.report import Report, Table
+from experts.labels import Label
+from pipeline.look.cost import READ, cost_of
+from pipeline.store.manifest import read_manifest
+from pipeline.store.shard import stored_bytes
+
+TARGET = 0.15  # by which wall time may be off
+SIZE, LEVELS, BUDGET = "s", "4k", "64k"
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    words = [f"size={SIZE}", f"levels={LEVELS}", f"budget={BUDGET}"]
+    parser.add_argument("settings", nargs="*", default=words, help=f"of the job (default: {' '.join(words)})")
+
+
+def run(given: argparse.Namespace) -> Report:
+    with tempfile.TemporaryDirectory() as out:
+        planned = json.loads(_levelproof("plan", *given.settings, "--json"))
+        begun = time.monotonic()
+        _levelproof("generate", *given.settings, f"out={out}")
+        wall = time.monotonic() - begun
+        (split,) = (path.parent for path in Path(out).glob("*/*/manifest"))
+        _levelproof("seal", str(split))
+        found = {"wall": wall, **measured(split, planned["workers"], wall)}
+    results = [compared(name, planned, found[name]) for name in found]
+    head = ("", "forecast", "interval", "measured", "forecast / measured")
+    off = abs(results[0]["ratio"] - 1)
+    return Report(
+        title="A forecast against its run",
+        results=results,
+        tables=[Table(head, [row(of) for of in results])],
+        notes=[
+            f"`levelproof plan {' '.join(given.settings)}` made {planned['sample']['levels']} of the levels in "
+            f"{planned['sample']['wall']:.0f} s, compiling included, on {planned['sample']['workers']} workers; then "
+            f"`levelproof generate` made all {planned['levels']:,} with {planned['workers']} workers, with the same "
+            "compiled programs. *interval*: of nine cases in ten. *bytes* and *files* are those of the sealed split."
+        ],
+        fault=f"The wall time is {off:.0%} off, and the target is {TARGET:.0%}." if off > TARGET else "",
+    )
+
+
+def measured(split: Path, workers: int, wall: float) -> dict[str, Any]:
+    """The same numbers of a split that was made in `wall` s and sealed."""
+    table = read_manifest(split, READ).table
+    labels, cost = table.column("label").to_pylist(), cost_of(table)
+    assert cost is not None
+    solved = labels.count(Label.SOLVED)
+    folders = [split / name for name in ("manifest", "shards")]
+    return {
+        "hours": wall * workers / 3600,
+        "solved": solved,
+        "seconds_per_solved": wall * workers / solved if solved else None,
+        "bytes": sum(map(stored_bytes, folders)),
+        "files": 1 + sum(not path.is_dir() for folder in folders for path in folder.rglob("[!.]*")),
+    }
+
+
+def compared(name: str, planned: Mapping[str, Any], value: float) -> dict[str, Any]:
+    guess = planned[name]["full"] if name in ("bytes", "files") else planned[name]
+    guess = guess if isinstance(guess, dict) else {"expected": guess, "low": guess, "high": guess}
+    return {"what": name, **guess, "measured": value, "ratio": guess["expected"] / value}
+
+
+def row(of: Mapping[str, Any]) -> Sequence[str]:
+    about = lambda value: f"{value:,.0f}" if value >= 1000 else f"{value:,.3g}"
+    names = {"wall": "wall time, s", "hours": "core- or GPU-hours", "seconds_per_solved": "seconds a solved level"}
+    interval = f"{about(of['low'])} to {about(of['high'])}" if of["low"] < of["high"] else "-"
+    name = names.get(of["what"], of["what"])
+    return [name, about(of["expected"]), interval, about(of["measured"]), f"{of['ratio']:.2f}"]
+
+
+def _levelproof(*words: str) -> str:
+    oracle.tell(f"levelproof {' '.join(words)}")
+    command, environment = [sys.executable, "-m", "levelproof", *words], dict(oracle.our_environment())
+    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment).stdout

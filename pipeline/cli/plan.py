@@ -1,0 +1,23 @@
+"""`levelproof plan`: what a job would take."""
+
+import argparse
+
+from pipeline.cli.command import add_json
+
+DOES = "tell what a job would take: hours, bytes, files, solved levels"
+EXAMPLE = """levelproof plan size=s levels=6M budget=256k
+levelproof plan size=m levels=1M budget=1M workers=64"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("settings", nargs="*", metavar="NAME=VALUE", help="settings, as of generate")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from rich.console import Console
+
+    from configs.compose import compose_job
+    from pipeline.jobs.plan import plan
+
+    plan(compose_job(arguments.settings), arguments.json, Console(stderr=True))

@@ -1,0 +1,57 @@
+"""A forecast holds: of many jobs, of what becomes of their levels, and of the files that sealing makes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from experts.labels import Label
+from pipeline.jobs.forecast import Sample, Stored, forecast
+from pipeline.jobs.seal import seal_split
+from pipeline.store.merge import FILE_BYTES
+from pipeline.store.seal import ROWS
+from pipeline.store.shard import stored_bytes
+from tests.pipeline.made import made_split
+
+
+def sample(busy: np.ndarray, solved: np.ndarray, **changes: object) -> Sample:
+    of = {"device": "core", "workers": 2, "wall": 60.0, "once": 5.0, "compiling": 20.0, "row_bytes": 200.0}
+    stored = {"full": Stored(10_000.0, 5)}
+    return Sample(**(of | {"busy": busy, "solved": solved, "witnessed": solved, "stored": stored} | changes))  # pyright: ignore[reportArgumentType]
+
+
+def test_nine_intervals_of_ten_hold_what_comes() -> None:
+    rng, held = np.random.default_rng(0), 0
+    for _ in range(50):
+        seconds = rng.gamma(0.4, 2.0, 4256)
+        of = forecast(sample(seconds[:256], seconds[:256] < 1), 4000, 2)
+        truth = seconds[256:].sum() / 2 + 5
+        held += of.wall.low <= truth <= of.wall.high
+    assert 38 <= held <= 50
+
+
+def test_numbers_follow_levels_and_workers() -> None:
+    seconds = np.tile([0.5, 1.5], 100)
+    of = forecast(sample(seconds, seconds < 1), 6_000_000, 64)
+    assert of.wall.expected == pytest.approx(6_000_000 / 64 + 5)
+    assert of.hours.expected == pytest.approx(of.wall.expected * 64 / 3600)
+    assert of.solved.expected == 3_000_000
+    assert of.seconds_per_solved
+    assert of.seconds_per_solved.expected == pytest.approx(2.0, rel=1e-3)
+    assert of.bytes["full"].expected == 3_000_000 * 10_000 + 6_000_000 * 200
+    rows = ROWS // 2
+    assert of.files["full"] == 60 * (1 + 1 + 5 * (1 + -(-rows // 8192))) + 1
+    assert FILE_BYTES / 10_000 <= 8192
+    assert forecast(sample(seconds, np.zeros(200, bool)), 100, 2).seconds_per_solved is None
+
+
+def test_files_are_those_that_sealing_makes(tmp_path: Path) -> None:
+    split = made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]] * 4)
+    seal_split(split, None, Console(quiet=True))
+    (shard,) = (split / "shards").iterdir()
+    stored = Stored(stored_bytes(shard) / 4, sum(entry.is_dir() for entry in shard.iterdir()))
+    solved = np.tile([True, False], 4)
+    of = forecast(sample(np.ones(8), solved, stored={"full": stored}), 8, 2)
+    files = [path for path in split.rglob("[!.]*") if path.is_file()]
+    assert of.files["full"] == len(files), files
