@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import Console
-from rich.progress import track
 
 from experts.witness import take
 from levelgen.identity.content import content_hashes
@@ -19,7 +18,8 @@ from pipeline.errors import UserError
 from pipeline.read.columns import columns_for
 from pipeline.read.created import new_folder
 from pipeline.read.levels import levels_of
-from pipeline.read.select import select
+from pipeline.read.pace import Pace
+from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import Manifest, read_fragment, require_manifest
 from pipeline.store.schema import COLUMNS
 
@@ -39,32 +39,32 @@ def export_parquet(split: Path, where: str | None, out: Path) -> None:
         UserError: no split, no such level, a condition that DuckDB cannot use, or a folder that is there already.
         Failure: the split is damaged, or the disk refuses.
     """
-    manifest = require_manifest(split)
-    rows = select(manifest.table, where)
-    if not rows.num_rows:
+    manifest = require_manifest(split, columns_in(where), compact=True)
+    ids = select(manifest.table, where).column("level_id").to_numpy()
+    if not len(ids):
         raise UserError(f"No level of {split} is {where}: choose another condition with --where.")
     metadata = read_fragment(manifest.fragments[0].path, [])[1].schema.metadata
     written = 0
     with new_folder(out) as folder:
-        for number, first in enumerate(range(0, rows.num_rows, FILE)):
-            groups = _groups(manifest, rows.slice(first, FILE))
+        for number, first in enumerate(range(0, len(ids), FILE)):
+            groups = _groups(split, ids[first : first + FILE])
             written += _write(folder / f"levels-{number:05d}.parquet", groups, metadata)
-    left_out = rows.num_rows - written
+    left_out = len(ids) - written
     print(
         f"{out}: {written} levels" + (f", without {left_out} that come out otherwise here" if left_out else "") + ". "
         f'In Python: levelproof.levels_from(pyarrow.parquet.read_table("{out}"))'
     )
 
 
-def _groups(manifest: Manifest, rows: pa.Table) -> Iterator[pa.Table]:
-    console = Console(stderr=True)
-    blocks = range(0, rows.num_rows, CHUNK)
-    group: list[pa.Table] = []
-    for first in track(blocks, "levels", console=console, transient=True, disable=not console.is_terminal):
-        group.append(with_worlds(manifest, rows.slice(first, CHUNK)))
-        if len(group) * CHUNK >= GROUP or first == blocks[-1]:
+def _groups(split: Path, ids: np.ndarray) -> Iterator[pa.Table]:
+    """Rows and worlds of these levels, GROUP of them at a time."""
+    with Pace("levels", len(ids), Console(stderr=True)) as pace:
+        for first in range(0, len(ids), GROUP):
+            manifest, group = require_manifest(split, level_ids=ids[first : first + GROUP]), []
+            for rows in (manifest.table.slice(block, CHUNK) for block in range(0, manifest.table.num_rows, CHUNK)):
+                group.append(with_worlds(manifest, rows))
+                pace.advance(rows.num_rows)
             yield pa.concat_tables(group)
-            group = []
 
 
 def with_worlds(manifest: Manifest, rows: pa.Table) -> pa.Table:

@@ -26,13 +26,17 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_rows_and_worlds_are_those_of_the_split(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     """Stored levels and those made again, side by side, in several files."""
-    monkeypatch.setattr(parquet, "FILE", 40)
+    seen, real = [], parquet.require_manifest
+    for name, rows in {"FILE": 40, "GROUP": 20, "CHUNK": 16}.items():
+        monkeypatch.setattr(parquet, name, rows)
+    monkeypatch.setattr(parquet, "require_manifest", lambda *words, **how: seen.append(real(*words, **how)) or seen[-1])
     assert main(["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels")]) == 0
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'levels'}: {PLAYED} levels. In Python: ")
     assert sorted(path.name for path in (tmp_path / "levels").iterdir()) == [
         "levels-00000.parquet",
         "levels-00001.parquet",
     ]
+    assert [of.table.num_rows for of in seen if len(of.table.column_names) > 1] == [20, 20, 20, 4], "some at a time"
     table = pq.read_table(tmp_path / "levels")
     assert table.select(COLUMNS.names).equals(read_manifest(split).table.replace_schema_metadata())
     made = levelproof.sample_levels(np.arange(PLAYED), levelproof.SIZES["s"], made_job().distribution)
