@@ -57,7 +57,7 @@ class JobConfig:
     first_level: int = 0  # id of the first of them
     level_files: str = ""  # a level file, or a folder of them, to label instead of random levels; empty: random levels
     budget: str = "128k"  # environment steps an expert may use; names the folder
-    out: str = "data"  # folder; the split is written to {out}/{budget}/{size}
+    out: str = "data"  # folder, or URL of an object store; the split is written to {out}/{budget}/{size}
     unit: int | None = None  # levels per work unit, lost when its worker dies; null: 32 to 4, the larger the fewer
     executor: Literal["ray", "inline"] = "ray"  # ray: a worker per core or GPU; inline: this process, for debugging
     workers: int = 0  # at most so many; 0: one per core, or one per GPU where JAX can use them

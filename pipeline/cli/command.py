@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 EXITS = "exit codes: 0 done, 1 failed, 2 change the command, 3 some units quarantined"
-SPLIT = "folder of a split, such as data/128k/s; what only reads takes URLs, too"
+SPLIT = "folder or URL of a split, such as data/128k/s or s3://bucket/data/128k/s"
 
 
 def add_split(parser: argparse.ArgumentParser) -> None:

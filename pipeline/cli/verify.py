@@ -29,8 +29,8 @@ def run(arguments: argparse.Namespace) -> Exit:
 
     from pipeline.store.remote import require_folder
 
-    require_folder(arguments.split, "verify it")
     if arguments.repair is not None:
+        require_folder(arguments.split, "repair it")
         from pipeline.jobs.repair import repair
 
         return repair(arguments.split, arguments.repair, Console(stderr=True))

@@ -16,11 +16,14 @@ from pipeline.errors import Exit, Failure
 from pipeline.jobs.progress import Board, Tally, say
 from pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, plan_units
 from pipeline.jobs.seal import Sealer, sealing
+from pipeline.store import quarantine
 from pipeline.store.checkpoints import require_same_experts
+from pipeline.store.files import remove
 from pipeline.store.job_note import note_job
 from pipeline.store.layout import quarantine_path
 from pipeline.store.manifest import Manifest, read_manifest
 from pipeline.store.origins import Origin, require_same_levels
+from pipeline.store.remote import as_typed
 from pipeline.store.runs import ascending, runs
 from pipeline.store.split import writing
 
@@ -57,7 +60,8 @@ def generate(
             solved = manifest.counts(is_done).get(Label.SOLVED, 0)
             board = Board(Tally(len(wanted), len(done), solved), console)
             there = f", {len(done)} are there already" if len(done) else ""
-            board.say(f"{len(wanted)} levels of size {job.size}, {job.budget} env steps each, into {split}{there}")
+            each = f"{len(wanted)} levels of size {job.size}, {job.budget} env steps each"
+            board.say(f"{each}, into {as_typed(split)}{there}")
             try:
                 with board.shown(), sealing(split, manifest.counting, board.say) as sealer:
                     _work(job, split, scheduler, board, sealer)
@@ -76,6 +80,8 @@ def generate(
 
 
 def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, sealer: Sealer) -> None:
+    notes = set(quarantine.given_up(split))
+
     def settle(outcomes: Sequence[UnitOutcome]) -> None:
         """Account for attempts that ended together."""
         failed: dict[tuple[str, bool], list[WorkUnit]] = {}  # by cause, and whether they are given up
@@ -87,13 +93,14 @@ def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, seale
             note = quarantine_path(split, unit.name)
             if outcome.summary:
                 sealer.committed(unit)
-                note.unlink(missing_ok=True)
+                if note in notes:
+                    remove(note)
                 continue
             last = scheduler.failed(unit)
             failed.setdefault((outcome.reason.strip().splitlines()[-1], last), []).append(unit)
             if last:
-                note.parent.mkdir(exist_ok=True)
-                note.write_text(f"Failed {scheduler.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n")
+                reason = f"Failed {scheduler.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n"
+                quarantine.give_up(split, unit.name, reason)
         for (cause, last), units in failed.items():
             board.say(f"{levels_text(units).capitalize()} failed ({cause}): {'given up' if last else 'trying again'}.")
         if outcomes:
@@ -124,14 +131,15 @@ def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
 
 def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, given_up: list[WorkUnit], spent: str) -> None:
     """Where it is, what came of it, and what to type next. On stdout."""
-    labels, folder = manifest.counts(np.isin(manifest.level_ids, wanted)), shlex.quote(str(split))
+    labels, folder = manifest.counts(np.isin(manifest.level_ids, wanted)), shlex.quote(as_typed(split))
     total = sum(labels.values())
     counts = ", ".join(f"{count} {label}" for label, count in labels.items())
-    print(f"{split}: {total} levels, {counts}." if total else f"{split}: nothing is committed.")
+    where = as_typed(split)
+    print(f"{where}: {total} levels, {counts}." if total else f"{where}: nothing is committed.")
     if spent:
         print(spent)
     for unit in given_up:
-        print(f"Given up: {levels_text([unit])}, for the reason in {quarantine_path(split, unit.name)}")
+        print(f"Given up: {levels_text([unit])}, for the reason in {as_typed(quarantine_path(split, unit.name))}")
     if total:
         print(f"Next:  levelproof inspect {folder}")
     solved = pc.index(manifest.table.column("label").cast("string"), Label.SOLVED.value).as_py()

@@ -32,6 +32,7 @@ from pipeline.store.disk import REFUSALS
 from pipeline.store.job_note import note_job
 from pipeline.store.manifest import Manifest, read_manifest
 from pipeline.store.origins import Origin, RecordPlace
+from pipeline.store.remote import require_folder
 from pipeline.store.runs import runs
 from pipeline.store.split import writing
 
@@ -55,6 +56,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
             written to, was made otherwise or of another folder.
         Failure: a chunk is damaged, or the disk refuses; what is committed stays.
     """
+    require_folder(out, "import to it")
     try:
         found = open_folder(folder.expanduser().absolute())
     except FormatError as error:

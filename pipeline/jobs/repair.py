@@ -55,7 +55,7 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
     else:
         ids = lost | {i for first, last in findings.missing for i in range(first, last + 1)}
     try:
-        with locked(split), nobody_commits(split, partial(say, console)):
+        with locked(split, partial(say, console)), nobody_commits(split, partial(say, console)):
             _note(split, job, findings)
             take_out(split, lost, findings.unlike, list(findings.fragments))
         with taken(split, partial(say, console)):

@@ -20,6 +20,7 @@ from pipeline.store import seal as store
 from pipeline.store.disk import REFUSALS
 from pipeline.store.layout import fragment_path, unit_name
 from pipeline.store.manifest import Fragment, require_manifest
+from pipeline.store.remote import as_typed
 from pipeline.store.seal import Piece, seal
 from pipeline.store.split import taken
 
@@ -64,8 +65,8 @@ def seal_split(
     levels, fragments = sum(piece.rows for piece in pieces), len(pieces) - merged + len(groups)
     done = f"{merged:,} fragments were merged into {len(groups):,}" if groups else "there was nothing to seal"
     now = f"{fragments:,} fragment{'s' if fragments > 1 else ''}"
-    print(f"{split}: {done}; it has {levels:,} levels in {now} now.")
-    print(f"Next:  levelproof inspect {shlex.quote(str(split))}")
+    print(f"{as_typed(split)}: {done}; it has {levels:,} levels in {now} now.")
+    print(f"Next:  levelproof inspect {shlex.quote(as_typed(split))}")
 
 
 def _refused(split: Path, error: OSError) -> Failure:
@@ -146,4 +147,5 @@ class Sealer:
         self._broken = True
         told = _refused(self._split, error) if isinstance(error, OSError) else error
         reason = str(told) if isinstance(told, LevelproofError) else f"{type(told).__name__}: {told}"
-        self._tell(f"Not sealed ({reason.rstrip('.')}): `levelproof seal {self._split}` seals it when this has ended.")
+        split = as_typed(self._split)
+        self._tell(f"Not sealed ({reason.rstrip('.')}): `levelproof seal {split}` seals it when this has ended.")

@@ -6,7 +6,8 @@ Idempotent: an attempt that dies anywhere leaves at most a shard that no fragmen
 import math
 import shlex
 import traceback
-from dataclasses import asdict
+from collections.abc import Collection
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from experts.labels import WITNESSED, Label, Verdict
 from experts.ledger import Ledger
 from experts.pool import Pool
 from experts.train import TrainingRun, UnitResult
-from experts.witness import Record, replay, succeeds
+from experts.witness import Record, replay, succeeds, take
 from levelgen.identity.content import content_hashes
 from levelgen.identity.keys import level_id_array
 from levelgen.identity.signature import signatures
@@ -32,10 +33,13 @@ from pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
 from pipeline.store.disk import REFUSALS
 from pipeline.store.fields import arrays_of, unlike_fields
 from pipeline.store.layout import Attempt, new_attempt
+from pipeline.store.leases import LeaseLost
 from pipeline.store.locks import LockRefused, committing
 from pipeline.store.manifest import begin_fragment, write_fragment
 from pipeline.store.origins import RECORD, Origin
 from pipeline.store.provenance import device, versions
+from pipeline.store.publish import committed_levels
+from pipeline.store.remote import StoreFailure
 from pipeline.store.schema import Encoding
 from pipeline.store.shard import write_shard
 
@@ -76,7 +80,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     """A failed attempt as a value: exceptions do not travel between processes."""
     reason, fatal = "".join(traceback.format_exception(error)), ""
-    if isinstance(error, (LockRefused, SourceUnseen, LevelUnseen)):
+    if isinstance(error, (LockRefused, SourceUnseen, LevelUnseen, LeaseLost, StoreFailure)):
         fatal = str(error)
     elif isinstance(error, OSError) and (what := REFUSALS.get(error.errno or 0)):
         fatal = f"Cannot write to {split}, {what}, then run the same command again."
@@ -110,6 +114,11 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult, comm
     Raises:
         OSError: the disk refuses; nothing is committed.
     """
+    if there := committed_levels(split, unit.name):
+        left, result = unit.only(set(unit.level_ids) - there), _without(result, there)
+        if left is None:
+            return
+        unit = left
     kept = [i for i, verdict in enumerate(result.verdicts) if verdict.label in WITNESSED]
     ledger = result.ledger or Ledger(len(result.level_ids))
     with committing(split) as folder:
@@ -146,6 +155,20 @@ def _rows(
         if row["level_id"] in result.experts:
             row["experts"] = str(paths.experts.relative_to(folder))
     return rows
+
+
+def _without(result: UnitResult, level_ids: Collection[int]) -> UnitResult:
+    """What came of the others."""
+    lanes = np.array([i for i, level_id in enumerate(result.level_ids.tolist()) if level_id not in level_ids], int)
+    return replace(
+        result,
+        level_ids=result.level_ids[lanes],
+        levels=take(result.levels, lanes),
+        record=take(result.record, lanes),
+        verdicts=[result.verdicts[i] for i in lanes],
+        experts={level_id: kept for level_id, kept in result.experts.items() if level_id not in level_ids},
+        ledger=result.ledger and result.ledger.only(lanes),
+    )
 
 
 def _command(job: JobConfig, origin: Origin, level_id: int) -> str:

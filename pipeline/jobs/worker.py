@@ -11,12 +11,14 @@ from configs.schema import JobConfig
 from experts.train import TrainingRun
 from pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
 from pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
+from pipeline.store.leases import serve
 
 
 class Worker:
     """Units under way in this process."""
 
     def __init__(self, job: JobConfig, split: Path) -> None:
+        serve(split)
         self._job, self._split = job, split
         self._pool = pool_for(job)
         self._runs: dict[WorkUnit, TrainingRun] = {}

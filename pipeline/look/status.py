@@ -9,7 +9,8 @@ from pipeline.store.job_note import NoteError, read_note
 from pipeline.store.layout import JOB, QUARANTINE
 from pipeline.store.locks import is_written
 from pipeline.store.manifest import read_manifest
-from pipeline.store.remote import require_folder
+from pipeline.store.quarantine import given_up
+from pipeline.store.remote import as_typed
 from pipeline.store.runs import inside
 
 
@@ -25,9 +26,9 @@ def status(split: Path, as_json: bool) -> None:
         print(json.dumps(facts, indent=2))
         return
     counts = "".join(f", {count} {label}" for label, count in facts["labels"].items())
-    print(f"{split}: {facts['done']} of {facts['wanted']} levels committed{counts}.")
+    print(f"{as_typed(split)}: {facts['done']} of {facts['wanted']} levels committed{counts}.")
     for note in facts["quarantined"]:
-        print(f"Given up: {split / QUARANTINE / note}")
+        print(f"Given up: {as_typed(split / QUARANTINE / note)}")
     if facts["running"]:
         print("A run is at work now.")
     elif facts["done"] < facts["wanted"]:
@@ -36,7 +37,6 @@ def status(split: Path, as_json: bool) -> None:
 
 def look(split: Path) -> dict[str, Any]:
     """The facts that `status` prints."""
-    require_folder(split, "see how far it is")
     try:
         note = read_note(split)
     except FileNotFoundError:
@@ -49,11 +49,11 @@ def look(split: Path) -> dict[str, Any]:
     manifest = read_manifest(split, ["label"], compact=True)
     done = inside(manifest.level_ids, wanted)
     return {
-        "split": str(split),
+        "split": as_typed(split),
         "wanted": int((wanted[:, 1] - wanted[:, 0] + 1).sum()),
         "done": int(done.sum()),
         "labels": dict(sorted(manifest.counts(done).items())),
-        "quarantined": sorted(path.name for path in (split / QUARANTINE).glob("*.txt")),
+        "quarantined": [path.name for path in given_up(split)],
         "running": is_written(split),
         "command": note.command,
     }

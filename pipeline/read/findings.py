@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.store.origins import Origin
+from pipeline.store.remote import as_typed
 from pipeline.store.runs import runs, told_levels
 
 
@@ -45,8 +46,9 @@ class Findings:
 
     def report(self, split: Path) -> str:
         """A line for everything that is wrong, and what was looked at."""
+        where = as_typed(split)
         looked = (
-            f"{split}: {self.levels} levels made again, {self.shards} shards read, {self.witnesses} witnesses "
+            f"{where}: {self.levels} levels made again, {self.shards} shards read, {self.witnesses} witnesses "
             f"replayed, {self.same_bits} of them bit for bit, {len(self.wrong)} problems."
         )
         return "\n".join([*self.sentences, looked])

@@ -33,10 +33,22 @@ from pipeline.read.pace import Pace
 from pipeline.runtime import prepare_jax
 from pipeline.store.checksums import digests_of, has_own
 from pipeline.store.job_note import JobNote, sound_note
-from pipeline.store.layout import BEGUN, JOB, MANIFEST, attempt_of, data_path, data_paths, entries, ids_of, unit_ids
+from pipeline.store.layout import (
+    BEGUN,
+    FRAGMENT,
+    JOB,
+    MANIFEST,
+    attempt_of,
+    data_path,
+    data_paths,
+    entries,
+    ids_of,
+    unit_ids,
+)
 from pipeline.store.locks import is_written
 from pipeline.store.manifest import Fragment, differences, fragment_paths, read_fragment, require_manifest, told
 from pipeline.store.origins import origin_of
+from pipeline.store.remote import bytes_of, is_remote
 from pipeline.store.runs import runs, told_levels, without
 from pipeline.store.shard import Shard, open_shard
 
@@ -59,7 +71,7 @@ def verify(split: Path, as_json: bool, console: Console) -> Exit:
         print(json.dumps(findings.as_json(), indent=2))
     else:
         print(findings.report(split))
-        if findings.wrong:
+        if findings.wrong and not is_remote(split):
             print(f"Next:  levelproof verify {shlex.quote(str(split))} --repair")
     return Exit.FAILED if findings.wrong else Exit.DONE
 
@@ -80,7 +92,7 @@ def examine(split: Path, console: Console | None = None) -> Findings:
 
 def _inodes(split: Path) -> set[tuple[Path, int]]:
     """Fragments, each with the number by which the file system knows what has its name now."""
-    return {(path, path.stat().st_ino) for path in fragment_paths(split) if path.exists()}
+    return {*entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()}
 
 
 def _examined(split: Path, console: Console | None) -> Findings:
@@ -124,7 +136,7 @@ def _note(split: Path, findings: Findings) -> JobNote | None:
 
 def _rows_in(path: Path) -> int:
     try:
-        return pq.read_metadata(path).num_rows
+        return pq.read_metadata(pa.BufferReader(bytes_of(path)) if is_remote(path) else path).num_rows
     except (OSError, pa.ArrowException):
         return 0
 
@@ -134,7 +146,8 @@ def _groups(paths: Sequence[Path], findings: Findings) -> Iterator[list[Part]]:
     group: list[Part] = []
     for path in paths:
         try:
-            group.append(_part(path))
+            part = _part(path)
+            group += [part] if part[0].rows else []  # others are fences
         except Failure as failure:
             findings.fragments[path] = str(failure)
         if sum(rows.num_rows for _, rows in group) >= AT_ONCE or (group and path == paths[-1]):
@@ -155,7 +168,7 @@ def _part(path: Path) -> Part:
     except OSError as error:
         raise Failure(f"The fragment {path} cannot be read ({error.strerror or type(error).__name__}).") from None
     ids, (first, last) = rows.column("level_id").to_numpy(), ids_of(path)
-    if not len(ids) or ids.min() < first or ids.max() > last:
+    if len(ids) and (ids.min() < first or ids.max() > last):
         raise Failure(f"The fragment {path} has other levels than its name says.")
     return fragment, rows
 

@@ -21,6 +21,7 @@ from pipeline.store.disk import flush
 from pipeline.store.fields import arrays_of
 from pipeline.store.layout import MANIFEST, data_path
 from pipeline.store.manifest import differences, read_manifest, require_manifest, told
+from pipeline.store.remote import require_folder
 
 
 class SourceUnseen(Failure):
@@ -132,7 +133,9 @@ def require_same_experts(job: JobConfig) -> None:
     """
     if not job.continue_from:
         return
-    source = require_manifest(Path(job.continue_from).expanduser(), ["experts"])
+    path = Path(job.continue_from).expanduser()
+    require_folder(path, "go on with its experts")
+    source = require_manifest(path, ["experts"])
     if source.table.column("experts").null_count == source.table.num_rows:
         raise UserError(
             f"{source.split} has kept no experts: make it with keep_experts=true, or leave out continue_from."

@@ -7,7 +7,11 @@ of parquet's footer: readers go to places that the footer names, counted from th
 import hashlib
 import os
 import stat
+from collections.abc import Iterable, Mapping
+from io import BytesIO
 from pathlib import Path
+
+from pipeline.store.remote import at_once, bytes_of, is_remote, stored_in
 
 MARK = b"levelproof.sha256:"  # before a fragment's own digest
 OWN = len(MARK) + hashlib.sha256().digest_size
@@ -23,10 +27,24 @@ def digests_of(path: Path) -> dict[str, str]:
     Raises:
         OSError: it cannot be read.
     """
+    if is_remote(path):
+        files = [*stored_in(path)] or [path]
+        found = at_once(path, lambda file: hashlib.sha256(bytes_of(file)).hexdigest(), files)
+        return {
+            "" if file == path else file.relative_to(path).as_posix(): of for file, of in zip(files, found, strict=True)
+        }
     if not stat.S_ISDIR(path.lstat().st_mode):
         return {"": _digest(path)}
     below = sorted(Path(folder, name) for folder, _, names in os.walk(path) for name in names)
     return {file.relative_to(path).as_posix(): _digest(file) for file in below}
+
+
+def digests_below(
+    split: Path, names: Iterable[str], elsewhere: Mapping[str, dict[str, str]]
+) -> dict[str, dict[str, str]]:
+    """Of the files of shards and checkpoints with these names, as they are on the disk now, or `elsewhere`."""
+    there = {name: digests_of(split / name) for name in names if (split / name).exists()}
+    return dict(sorted(({name: elsewhere[name] for name in names if name in elsewhere} | there).items()))
 
 
 def _digest(path: Path) -> str:
@@ -48,7 +66,7 @@ def has_own(path: Path) -> bool:
     Raises:
         OSError: it cannot be read.
     """
-    with path.open("rb") as file:
+    with BytesIO(bytes_of(path)) if is_remote(path) else path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - TAIL))
         start = max(0, _footer(file.read(), size) - OWN)

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,10 @@ from typing import Any
 import numpy as np
 
 from configs.schema import JobConfig, hash_of
+from pipeline.store.files import write
 from pipeline.store.layout import JOB
+from pipeline.store.objects import get
+from pipeline.store.remote import is_remote
 
 MOST_BYTES = 2**25  # of a file; a run of level ids takes about 30
 DIGEST = "sha256"  # its key
@@ -40,9 +42,7 @@ def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequen
         "config_hash": job.hash,
         "config": job.results,
     }
-    temporary = split / f".{JOB}.{os.getpid()}"
-    temporary.write_text(_text(note))
-    temporary.replace(split / JOB)
+    write(split / JOB, _text(note).encode())
 
 
 def read_note(split: Path) -> JobNote:
@@ -52,24 +52,33 @@ def read_note(split: Path) -> JobNote:
         FileNotFoundError: there is none.
         NoteError: it says nothing that can be understood.
     """
-    path = split / JOB
-    if not path.exists():
-        raise FileNotFoundError(path)
-    if path.is_symlink() or not path.is_file() or path.stat().st_size > MOST_BYTES:
-        raise NoteError("it is no ordinary file of a few megabytes")
+    data = _bytes(split / JOB)
     try:
-        text = path.read_text()
+        text = data.decode()
         note = json.loads(text)
         runs = np.array(sorted(note["level_ids"]), np.int64).reshape(-1, 2)
         command, config = note["command"], note.get("config")
         if not isinstance(command, str) or (runs[:, 0] > runs[:, 1]).any():
             raise ValueError
         known = isinstance(config, dict) and hash_of(config) == note["config_hash"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise NoteError(type(error).__name__) from None
     said = {name: value for name, value in note.items() if name != DIGEST}
     command = "".join(c if c.isprintable() else "?" for c in command)  # no terminal obeys it
     return JobNote(command, runs, config if known else None, text == _text(said))
+
+
+def _bytes(path: Path) -> bytes:
+    if is_remote(path):
+        return get(path).data
+    if not path.exists():
+        raise FileNotFoundError(path)
+    if path.is_symlink() or not path.is_file() or path.stat().st_size > MOST_BYTES:
+        raise NoteError("it is no ordinary file of a few megabytes")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise NoteError(type(error).__name__) from None
 
 
 def sound_note(split: Path) -> JobNote | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.errors import Failure
-from pipeline.store.remote import fragments_in, is_remote
+from pipeline.store.remote import BUCKETS, fragments_in, is_remote, names_in
 
 FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE = "manifest", "shards", "experts", "quarantine"
 WRITER_LOCK, COMMIT_LOCK, JOB = ".writer.lock", ".commit.lock", "job.json"
@@ -108,8 +108,11 @@ def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[
     has this name now.
     """
     if is_remote(split):
-        found = fragments_in(split / folder) if folder == MANIFEST else {}
-        return {path: hash(about) for path, about in found.items() if paths.fullmatch(f"{folder}/{path.name}")}
+        if folder == MANIFEST:
+            there = {path: hash(about) for path, about in fragments_in(split / folder).items()}
+        else:
+            there = dict.fromkeys(names_in(split / folder) if split.parts[0] in BUCKETS else [], 0)
+        return {path: number for path, number in there.items() if paths.fullmatch(os.path.join(folder, path.name))}
     if not (split / folder).is_dir():
         return {}
     with os.scandir(split / folder) as found:

@@ -1,14 +1,17 @@
 """What attempts that died have left in a split, and what of it may go; and what was merged into sealed fragments."""
 
-import shutil
 from collections.abc import Callable, Iterable
 from os import DirEntry
 from pathlib import Path
 
 from pipeline.store.disk import flush_entry
-from pipeline.store.layout import BEGUN, DATA, EXPERTS, JOB_BEGUN, MANIFEST, SHARDS, begun_path, data_path, entries
+from pipeline.store.files import remove, remove_data
+from pipeline.store.layout import BEGUN, JOB_BEGUN, MANIFEST, begun_path, data_path, data_paths, entries
 from pipeline.store.locks import nobody_commits
 from pipeline.store.manifest import DATA_COLUMNS, Manifest, named_by, read_fragment, read_manifest
+from pipeline.store.objects import put
+from pipeline.store.publish import OVER, ended
+from pipeline.store.remote import is_remote
 
 
 def clean(split: Path, say: Callable[[str], None]) -> Manifest:
@@ -29,19 +32,19 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
             _, table = read_fragment(fragment.path, DATA_COLUMNS)
             theirs = frozenset.union(*(named_by([table], name) for name in DATA_COLUMNS))
             disown(data_path(split, name) for name in theirs - named)
-            fragment.path.unlink()
-        made = [*entries(split, SHARDS, DATA, DirEntry.is_dir), *entries(split, EXPERTS, DATA, DirEntry.is_file)]
-        unnamed = [path for path in made if path.relative_to(split).as_posix() not in named]
+            remove(fragment.path)
+        unnamed = [path for path in data_paths(split) if path.relative_to(split).as_posix() not in named]
         begun = entries(split, MANIFEST, BEGUN, DirEntry.is_file)
-        dead = [path for path in unnamed if begun_path(path) in begun]
+        over = begun.keys()
+        if is_remote(split):
+            over = ended(split, begun, {fragment.path for fragment in manifest.counting})
+        dead = [path for path in unnamed if begun_path(path) in over]
         for path in dead:
-            _remove(path)
+            remove_data(path)
         stuck = {begun_path(path) for path in dead if path.exists()}
-        for path in begun.keys() - stuck:
-            path.unlink(missing_ok=True)
-        for path in entries(split, "", JOB_BEGUN, DirEntry.is_file):
-            path.unlink()
-    if kept := sorted(set(unnamed) - set(dead)):
+        for path in [*(over - stuck), *entries(split, "", JOB_BEGUN, DirEntry.is_file)]:
+            remove(path)
+    if kept := sorted(path for path in set(unnamed) - set(dead) if begun_path(path) not in begun):
         more = f" and {len(kept) - 1} more like it" if kept[1:] else ""
         say(f"No fragment names {kept[0]}{more}: delete what belongs to no fragment that you keep elsewhere.")
     return manifest
@@ -55,21 +58,13 @@ def disown(data: Iterable[Path]) -> None:
     """
     marks = [begun_path(path) for path in data]
     for mark in marks:
-        mark.touch()
-    for folder in {mark.parent for mark in marks}:
+        put(mark, OVER) if is_remote(mark) else mark.touch()
+    for folder in {mark.parent for mark in marks if not is_remote(mark)}:
         flush_entry(folder)
 
 
 def drop(shard: Path) -> None:
     """Remove a shard that `disown` was told of. What cannot go now is left to `clean`."""
-    _remove(shard)
+    remove_data(shard)
     if not shard.exists():
-        begun_path(shard).unlink(missing_ok=True)
-
-
-def _remove(data: Path) -> None:
-    """A shard or experts, as far as they go now: files that are open stay on NFS, and the next run tries again."""
-    if data.is_dir():
-        shutil.rmtree(data, ignore_errors=True)
-    else:
-        data.unlink(missing_ok=True)
+        remove(begun_path(shard))

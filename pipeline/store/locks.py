@@ -1,4 +1,5 @@
-"""Locks between processes, held by open files: the system frees them when a process dies, however it dies.
+"""Locks between processes, held by open files: the system frees them when a process dies, however it dies. Where a
+split is in an object store, which has no locks, `leases` and `publish` do what they do.
 
 Lock files are opened for reading and writing: NFS makes these locks out of others, and takes a shared one only of a
 file that may be read, an exclusive one only of a file that may be written. Whoever takes one gets LockRefused where
@@ -14,6 +15,9 @@ from typing import IO
 
 from pipeline.errors import UserError
 from pipeline.store.layout import COMMIT_LOCK, WRITER_LOCK
+from pipeline.store.leases import is_leased, leased
+from pipeline.store.publish import publishing
+from pipeline.store.remote import is_remote
 
 PATIENCE = 1.0  # s; `is_written` holds the writer's lock for a moment
 NOTICE = 2.0  # s of waiting after which people are told for what
@@ -25,12 +29,17 @@ class LockRefused(UserError):
 
 
 @contextmanager
-def only_writer(split: Path) -> Iterator[None]:
-    """Held by the one `levelproof generate` that may write to a split.
+def only_writer(split: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Held by the one `levelproof generate` that may write to a split; `say` is told what is waited for.
 
     Raises:
         UserError: another one is at work.
+        LeaseLost: another one is, by now.
     """
+    if is_remote(split):
+        with leased(split, say):
+            yield
+        return
     with (split / WRITER_LOCK).open("a+") as file:
         if not _taken_within(PATIENCE, file):
             raise UserError(f"Another `levelproof generate` is writing to {split}: wait for it, or stop it first.")
@@ -39,7 +48,15 @@ def only_writer(split: Path) -> Iterator[None]:
 
 @contextmanager
 def committing(split: Path) -> Iterator[Path]:
-    """Held while a unit writes its shard and its fragment, to the folder that it gives; many units may at once."""
+    """Held while a unit writes its shard and its fragment, to the folder that it gives; many units may at once.
+
+    Raises:
+        LeaseLost, UserError, StoreFailure: as `publishing`, where the split is in a store.
+    """
+    if is_remote(split):
+        with publishing(split) as folder:
+            yield folder
+        return
     with (split / COMMIT_LOCK).open("a+") as file:
         _take(file, fcntl.LOCK_SH)
         yield split
@@ -49,8 +66,11 @@ def committing(split: Path) -> Iterator[Path]:
 def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
     """Waits until no unit is between its shard and its fragment, such as one of a killed run that is still ending.
 
-    `say` is told what is waited for, when that takes long.
+    `say` is told what is waited for, when that takes long. In a store nobody is waited for (`publish.ended`).
     """
+    if is_remote(split):
+        yield
+        return
     path = split / COMMIT_LOCK
     with path.open("a+") as file:
         if not _taken_within(NOTICE, file):
@@ -64,6 +84,8 @@ def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 def is_written(split: Path) -> bool:
     """Whether a `levelproof generate` is at work on this split now; writes nothing, and needs to read only."""
+    if is_remote(split):
+        return is_leased(split)
     try:
         with (split / WRITER_LOCK).open() as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

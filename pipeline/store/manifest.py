@@ -20,7 +20,7 @@ from configs.convert import flat
 from configs.schema import KEYS_EVERY, Density, hash_of, stored_as
 from pipeline.errors import Failure, UserError
 from pipeline.store.bounds import CAREFULLY, require_modest
-from pipeline.store.checksums import digests_of, with_own
+from pipeline.store.checksums import digests_below, with_own
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
 from pipeline.store.remote import bytes_of, is_remote, mended
@@ -81,20 +81,24 @@ def write_fragment(
     config: Mapping[str, Any],
     sealed: bool = False,
     densities: Iterable[str] = FULL,
+    elsewhere: Mapping[str, dict[str, str]] | None = None,
 ) -> None:
     """Commit a unit, or many that are sealed: write their rows to the attempt's fragment, durably and in one step.
+
+    `elsewhere` has the digests of shards and checkpoints that are not beside it.
 
     Raises:
         OSError: the disk refuses; no fragment is there then, or the one that was there before.
     """
     is_table = isinstance(rows, pa.Table)
     table: Any = rows if is_table else pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS)
+    names = named_by([table], "shard") | named_by([table], "experts")
     metadata = {
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
         HASH_KEY: config_hash.encode(),
         CONFIG_KEY: json.dumps(config, sort_keys=True).encode(),
         DENSITIES_KEY: json.dumps(sorted(densities)).encode(),
-        DIGESTS_KEY: json.dumps(_digests(attempt.fragment.parent.parent, table)).encode(),
+        DIGESTS_KEY: json.dumps(digests_below(attempt.fragment.parent.parent, names, elsewhere or {})).encode(),
     }
     metadata |= {SEALED_KEY: b"1"} if sealed else {}
     table = table.replace_schema_metadata(metadata)
@@ -104,12 +108,6 @@ def write_fragment(
     flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
     flush_entry(attempt.fragment.parent)  # the new name itself
-
-
-def _digests(split: Path, table: pa.Table) -> dict[str, dict[str, str]]:
-    """Of the files of the shards and checkpoints that these rows name, as they are on the disk now."""
-    names = sorted(name for column in DATA_COLUMNS for name in table.column(column).unique().to_pylist() if name)
-    return {name: digests_of(split / name) for name in names if (split / name).exists()}
 
 
 def fragment_paths(split: Path) -> list[Path]:
@@ -305,7 +303,7 @@ def _parts(
             found |= {one: part for one, part in zip(new, parts, strict=True) if part}
             if look and all(part and not part[0].sealed for part in parts):
                 latest = {path: part for (path, _), part in found.items()}  # of those that had one name in turn
-                return [latest[path] for path in sorted(latest)]
+                return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # others are fences
     raise Failure(f"The fragments of {split} change faster than they can be read: try again when they are at rest.")
 
 

@@ -1,7 +1,8 @@
 """Splits in object stores and on web servers, read in pieces through a cache on this machine.
 
-A path whose first part is `s3:`, `gs:`, `https:`, `http:` or `hf:` stands for the URL: `Path("s3://bucket/split")` is
-such a one, whatever becomes of its slashes. So whoever reads a split has a Path, and only this knows where it lies.
+A path whose first part is `s3:`, `gs:`, `az:`, `https:`, `http:` or `hf:` stands for the URL:
+`Path("s3://bucket/split")` is such a one, whatever becomes of its slashes. So whoever reads a split has a Path, and
+only this knows where it lies.
 """
 
 import os
@@ -25,7 +26,7 @@ from pipeline.store.pieces import PieceCache
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
-BUCKETS, WEB, HUB = ("s3:", "gs:"), ("https:", "http:"), ("hf:",)
+BUCKETS, WEB, HUB = ("s3:", "gs:", "az:"), ("https:", "http:"), ("hf:",)
 INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for servers that do not list
 PIECE = 2**20  # bytes; of 4 MB, random trajectories of 10 kB would fetch four times as much
 MOST_PIECES = 8  # of one request: neighbours are fetched together
@@ -41,15 +42,22 @@ PATIENCE = {"connect_timeout": timedelta(seconds=5), "timeout": timedelta(second
 SIGN_IN = {
     "s3:": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket",
     "gs:": "set GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for a public bucket",
+    "az:": "set AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
     "hf:": "set HF_TOKEN, or run `hf auth login`",
 }
 # In what obstore says of a request that failed:
 STATUS = re.compile(r"status code: (\d{3}[A-Za-z ]*)")
+PASSING = re.compile(r"status code: (408|409|429|5\d\d)")
+NO_BUCKET = "NoSuchBucket"
 CUT_OFF, SILENT = "response body error", "HTTP error"  # of an answer that ends early, and where there is none
 CLOUD = re.compile(r"latest/api/token|computeMetadata")  # where a cloud's machines get credentials
-COPY = {"s3:": "aws s3 sync", "gs:": "gcloud storage rsync -r", "hf:": "hf download"}
+COPY = {"s3:": "aws s3 sync", "gs:": "gcloud storage rsync -r", "az:": "azcopy sync", "hf:": "hf download"}
 
 T = TypeVar("T")
+
+
+class StoreFailure(Failure):
+    """A store does not answer, or refuses."""
 
 
 class Stored(NamedTuple):
@@ -109,14 +117,23 @@ def stored_in(folder: Path) -> dict[Path, Stored]:
         UserError: there is no such bucket, or it may not be read.
         Failure: the store does not answer.
     """
-    store, key = _place(folder)
+    store, key = place(folder)
     if folder.parts[0] in HUB:
         repository, key = hub.split_url(folder.parts[1:])
         found = {name: Stored(*about) for name, about in hub.files_below(repository, key).items()}
     else:
-        listed = _ask(folder, lambda: _obstore().list(store, prefix=key).collect())
+        listed = ask(folder, lambda: obstore_module().list(store, prefix=key).collect())
         found = {entry["path"]: Stored(_tag(entry), entry["size"]) for entry in listed}
     return {folder / name[len(key) + 1 :]: about for name, about in found.items() if name.startswith(f"{key}/")}
+
+
+def names_in(folder: Path) -> list[Path]:
+    """Files and folders in a folder, as the store has them now. Raises as `stored_in`."""
+    store, key = place(folder)
+    found = ask(folder, lambda: obstore_module().list_with_delimiter(store, prefix=key))
+    return [
+        folder / name[len(key) + 1 :] for name in [*found["common_prefixes"], *(of["path"] for of in found["objects"])]
+    ]
 
 
 def fragments_in(folder: Path) -> dict[Path, Stored]:
@@ -131,9 +148,9 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
     if folder.parts[0] not in WEB:
         found = _known[folder] = stored_in(folder)
         return found
-    store, key = _place(folder / INDEX)
+    store, key = place(folder / INDEX)
     try:
-        text = _ask(folder / INDEX, lambda: bytes(_obstore().get(store, key).bytes())).decode(errors="replace")
+        text = ask(folder / INDEX, lambda: bytes(obstore_module().get(store, key).bytes())).decode(errors="replace")
     except FileNotFoundError:
         raise UserError(
             f"There is no split at {as_typed(folder.parent)}, or its server was not told what it has: a split on a web "
@@ -201,16 +218,16 @@ class RemoteFile:
 
     def _fetch(self, run: Sequence[int]) -> bytes:
         """Pieces that are neighbours, in one request."""
-        store, key = _place(self.path)
+        store, key = place(self.path)
         first, last = run[0] * PIECE, min((run[-1] + 1) * PIECE, self.size)
         whole = (first, last) == (0, self.size)  # which servers that know no ranges give, too
         options = {} if whole else {"range": (first, last)}
 
         def request() -> tuple[Any, bytes]:
-            answer = _obstore().get(store, key, options=options)
+            answer = obstore_module().get(store, key, options=options)
             return answer.meta, bytes(answer.bytes())
 
-        about, data = _ask(self.path, request)
+        about, data = ask(self.path, request)
         tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's servers have others
         if (tag, about["size"], len(data)) != (*self._about, last - first):
             _known.pop(_folder_of(self.path), None)
@@ -234,8 +251,8 @@ def _look_up(path: Path) -> Stored:
     if files is None:
         files = _known[folder] = {} if path.parts[0] in WEB else stored_in(folder)
     if path not in files and path.parts[0] in WEB:
-        store, key = _place(path)
-        about = _ask(path, lambda: _obstore().head(store, key))
+        store, key = place(path)
+        about = ask(path, lambda: obstore_module().head(store, key))
         files[path] = Stored(_tag(about), about["size"])
     if path not in files:
         raise FileNotFoundError(as_typed(path))
@@ -258,7 +275,7 @@ def _runs(numbers: Iterable[int]) -> list[list[int]]:
     return runs
 
 
-def _place(path: Path) -> tuple["ObjectStore", str]:
+def place(path: Path) -> tuple["ObjectStore", str]:
     """The store that a path is in, and its key there."""
     _require_own_process()
     if path.parts[0] in HUB:
@@ -274,11 +291,11 @@ def _store(scheme: str, root: Any) -> "ObjectStore":
     url, options = f"{scheme}//{root}", PATIENCE
     if scheme in HUB:
         url, options = hub.resolve_url(root), PATIENCE | hub.sign_in()
-    make = _obstore().store.from_url if scheme in BUCKETS else _obstore().store.HTTPStore
+    make = obstore_module().store.from_url if scheme in BUCKETS else obstore_module().store.HTTPStore
     return make(url, client_options=options, retry_config=RETRIES)
 
 
-def _obstore() -> Any:
+def obstore_module() -> Any:
     try:
         import obstore.exceptions
         import obstore.store
@@ -315,39 +332,44 @@ def _cache_in(folder: Path, most: int) -> PieceCache:
     return PieceCache(folder, most)
 
 
-def _ask(path: Path, request: Callable[[], T]) -> T:
-    """What a request gives; made again where an answer was cut off, which obstore itself seldom does.
+def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:
+    """What a request gives. It may be made again: where an answer was cut off, which obstore itself seldom does, or
+    did not come to a request that obstore does not know to be harmless twice.
 
     Raises:
         FileNotFoundError: the store has no such file.
-        UserError: it has no such bucket, or it may not be read.
-        Failure: it does not answer.
+        UserError: it has no such bucket, or does not let us `what`.
+        StoreFailure: it does not answer.
     """
-    exceptions, end = _obstore().exceptions, time.monotonic() + RETRIES["retry_timeout"].total_seconds()
+    exceptions, end = obstore_module().exceptions, time.monotonic() + RETRIES["retry_timeout"].total_seconds()
     for attempt in count():
         try:
             return request()
-        except FileNotFoundError:
+        except FileNotFoundError as error:
+            if NO_BUCKET in str(error):
+                raise _explained(path, str(error), what) from None
             raise FileNotFoundError(as_typed(path)) from None
         except exceptions.BaseError as error:
             text = str(error)
-            if CUT_OFF not in text or time.monotonic() > end:
-                raise _explained(path, text) from None
+            passing = CUT_OFF in text or SILENT in text or PASSING.search(text)
+            if not passing or CLOUD.search(text) or time.monotonic() > end:
+                raise _explained(path, text, what) from None
             time.sleep(random.uniform(0, min(0.1 * 2**attempt, 5)))
     raise AssertionError("unreachable")
 
 
-def _explained(path: Path, text: str) -> LevelproofError:
+def _explained(path: Path, text: str, what: str) -> LevelproofError:
     """A sentence for what obstore says of a request that failed."""
     url, how = as_typed(path), SIGN_IN.get(path.parts[0], "copy the split to a folder first")
-    if "NoSuchBucket" in text:
+    if NO_BUCKET in text:
         return UserError(f"There is no bucket {path.parts[1]!r}: check {url}.")
     if CLOUD.search(text):
-        return UserError(f"There are no credentials to read {url} with: {how}.")
+        return UserError(f"There are no credentials to {what} {url} with: {how}.")
     if "Range request not supported" in text:
-        return Failure(f"The server of {url} gives no parts of files: copy the split to a folder first.")
+        return StoreFailure(f"The server of {url} gives no parts of files: copy the split to a folder first.")
     found = STATUS.search(text)
     said = found[1].strip() if found else "it does not answer" if SILENT in text else text.splitlines()[0]
     if said.startswith(("401", "403")):
-        return UserError(f"The store does not let you read {url} ({said}): {how}.")
-    return Failure(f"Cannot read {url} ({said}): check the network and the URL, and try again.")
+        return UserError(f"The store does not let you {what} {url} ({said}): {how}.")
+    then = "run the same command again; what is committed stays" if what == "write" else "try again"
+    return StoreFailure(f"Cannot {what} {url} ({said}): check the network and the URL, and {then}.")

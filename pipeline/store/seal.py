@@ -4,9 +4,9 @@ The new data first, then the new fragment, which counts before those that it was
 process that dies in between leaves what `leftovers.clean` removes. Knows nothing of who seals, and when.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -16,18 +16,31 @@ import pyarrow as pa
 
 from configs.schema import Density, stored_as
 from pipeline.store.convert import convert
-from pipeline.store.layout import SHARDS, Attempt, begun_path, data_path, fragment_of, new_attempt, unit_name
+from pipeline.store.files import remove
+from pipeline.store.layout import (
+    SHARDS,
+    Attempt,
+    begun_path,
+    data_path,
+    fragment_of,
+    fragment_path,
+    new_attempt,
+    unit_name,
+)
 from pipeline.store.leftovers import disown, drop
 from pipeline.store.manifest import (
     THREADS,
     Fragment,
     begin_fragment,
     each_once,
+    fragment_paths,
     named_by,
     read_fragment,
     write_fragment,
 )
 from pipeline.store.merge import Place, merge_shards
+from pipeline.store.publish import publishing
+from pipeline.store.remote import is_remote
 from pipeline.store.schema import COLUMNS, Encoding
 from pipeline.store.shard import Shard
 
@@ -98,27 +111,36 @@ def seal(
     """
 
     paths = {piece.path for piece in pieces}
+    if is_remote(split):
+        fragment_paths(split)  # what was known of its files is forgotten
     parts = _read(paths, moved)
     table, about = each_once(parts)[0], parts[0][0]
     shards = {name: data_path(split, name) for name in named_by([of for _, of in parts], "shard")}
     replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
+    elsewhere = {name: files for of, _ in parts for name, files in of.digests.items()} if is_remote(split) else None
     places, between = _places(table, shards), list[Path]()
     densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(of.densities for of, _ in parts))
     first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
     unit, count = unit_name(first, last), 1 if density else len(places)
-    with _attempted(split, unit, max(count, 1), replaced, between) as attempts:
+    with _written_to(split, paths) as folder, _attempted(folder, unit, max(count, 1), replaced, between) as attempts:
         if density:
-            places = _converted(places, density, lambda: _another(split, unit, between), converted)
+            places = _converted(places, density, lambda: _another(folder, unit, between), converted)
         merged = dict(zip((attempt.shard for attempt in attempts), places.values(), strict=False))
         for shard, of in merged.items():
             merge_shards(shard, of, moved, rows_a_file)
         disown(replaced)
-        write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities)
-    for path in paths - {attempts[0].fragment}:
-        path.unlink(missing_ok=True)
+        write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, elsewhere)
+    sealed = fragment_path(split, unit)
+    for path in paths - {sealed}:
+        remove(path)
     for shard in replaced:
         drop(shard)
-    return Piece(attempts[0].fragment, table.num_rows, True)
+    return Piece(sealed, table.num_rows, True)
+
+
+def _written_to(split: Path, replaced: Collection[Path]) -> AbstractContextManager[Path]:
+    """The folder in which the new fragment and its shards are made."""
+    return publishing(split, replaced) if is_remote(split) else nullcontext(split)
 
 
 def _read(paths: Iterable[Path], moved: Callable[[int], None]) -> list[tuple[Fragment, pa.Table]]:
@@ -158,7 +180,7 @@ def _attempted(
             for attempt in attempts:
                 drop(attempt.shard)
             for mark in [*(attempt.begun for attempt in attempts), *map(begun_path, replaced)]:
-                mark.unlink(missing_ok=True)
+                remove(mark)
         raise
     finally:
         for shard in between:

@@ -1,6 +1,7 @@
 """A split opened for writing: its folders, its lock and its configuration."""
 
 import os
+import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,8 @@ from pipeline.store.layout import FOLDERS, JOB, split_path
 from pipeline.store.leftovers import clean
 from pipeline.store.locks import committing, only_writer
 from pipeline.store.manifest import Manifest, differences, told
-from pipeline.store.remote import require_folder
+from pipeline.store.objects import require_conditions
+from pipeline.store.remote import is_remote
 
 
 @contextmanager
@@ -48,21 +50,26 @@ def taken(split: Path, say: Callable[[str], None]) -> Iterator[Manifest]:
         UserError: it cannot be written or locked, or is being written.
         Failure: a fragment is damaged.
     """
-    with locked(split):
+    with locked(split, say):
         yield clean(split, say)
 
 
 @contextmanager
-def locked(split: Path) -> Iterator[None]:
+def locked(split: Path, say: Callable[[str], None]) -> Iterator[None]:
     """The split for this process alone to write to.
 
     Raises:
         UserError: it cannot be written or locked, or is being written.
+        StoreFailure, LeaseLost: its store does not answer, or has another writer by now.
     """
-    require_folder(split, "write to it")
+    if is_remote(split):
+        require_conditions(split / f".{JOB}.{secrets.randbits(60)}")
+        with only_writer(split, say):
+            yield
+        return
     _make_writable(split)
     _require_own_folders(split)
-    with only_writer(split):
+    with only_writer(split, say):
         with committing(split):
             pass  # as workers do: a file system that refuses their lock is named before anything trains
         yield

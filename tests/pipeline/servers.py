@@ -7,13 +7,13 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from email.utils import formatdate
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
+from threading import Lock, Thread
 from typing import NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
 
@@ -22,6 +22,7 @@ import pytest
 HOST = "127.0.0.1"
 PATIENCE = 60  # s
 PAGE = 10  # keys of a page of S3's lists
+SLOW = 1.0  # s
 
 
 class Answer(NamedTuple):
@@ -30,7 +31,7 @@ class Answer(NamedTuple):
     body: bytes
 
 
-Answers = Callable[[str, str, dict[str, str]], Answer]  # of a method, a path and the request's headers
+Answers = Callable[[str, str, dict[str, str], bytes], Answer]  # of a method, a path, the request's headers and body
 
 
 class Server:
@@ -39,6 +40,7 @@ class Server:
     def __init__(self, answers: Answers) -> None:
         self.log: list[str] = []  # "GET /path bytes=0-99"
         self.count, self.every, self.spoiled = 0, 0, "busy"
+        self.meanwhile: Callable[[int], object] = lambda _: None  # is told the number of each request
         server = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -47,12 +49,20 @@ class Server:
             def answer(self) -> None:
                 server.count += 1
                 server.log.append(f"{self.command} {self.path} {self.headers.get('Range', '')}".strip())
-                spoiled = bool(server.every) and server.count % server.every == 0
-                if spoiled and server.spoiled == "busy":
+                server.meanwhile(server.count)
+                spoiled = server.spoiled if server.every and server.count % server.every == 0 else ""
+                headers = {name.lower(): x for name, x in self.headers.items()}
+                body = self.rfile.read(int(headers.get("content-length", 0)))
+                if spoiled == "busy":
                     self.give(Answer(503, {}, b"<Error><Code>SlowDown</Code></Error>"))
                     return
-                given = answers(self.command, self.path, {name.lower(): x for name, x in self.headers.items()})
-                self.give(given, cut_off=spoiled)
+                if spoiled == "slow":
+                    time.sleep(SLOW)
+                given = answers(self.command, self.path, headers, body) if spoiled != "gone" else None
+                if given is None or spoiled == "lost":  # the connection, before or after it was done
+                    self.close_connection = True
+                    return
+                self.give(given, cut_off=spoiled == "cut")
 
             def give(self, given: Answer, cut_off: bool = False) -> None:
                 self.send_response(given.status)
@@ -64,9 +74,13 @@ class Server:
                 if cut_off:
                     self.close_connection = True
 
-            do_GET = do_HEAD = answer  # noqa: N815
+            do_GET = do_HEAD = do_PUT = do_DELETE = do_POST = answer  # noqa: N815
 
-            def log_message(self, *_: object) -> None:
+            def handle(self) -> None:
+                with suppress(ConnectionError):  # who asked is gone
+                    super().handle()
+
+            def log_message(self, *_: object) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
                 """Not on the terminal."""
 
         self._server = ThreadingHTTPServer((HOST, 0), Handler)
@@ -75,7 +89,8 @@ class Server:
         Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
 
     def spoil(self, every: int, how: str = "busy") -> None:
-        """Answer every so many requests with "busy", or cut answers off ("cut")."""
+        """Of every so many requests: "busy"; cut answers off ("cut"); be "slow"; do it and lose the connection
+        ("lost"); or be "gone"."""
         self.every, self.spoiled = every, how
 
     def close(self) -> None:
@@ -95,12 +110,13 @@ def serving(answers: Answers) -> Iterator[Server]:
 def files_of(folder: Path) -> Answers:
     """A web server that gives the files below a folder, or parts of them."""
 
-    def answers(_: str, path: str, headers: dict[str, str]) -> Answer:
+    def answers(_: str, path: str, headers: dict[str, str], body: bytes = b"") -> Answer:
         file = folder / unquote(urlsplit(path).path.lstrip("/"))
         if not file.is_file():
             return Answer(404, {}, b"")
         data = file.read_bytes()
         told = {"ETag": f'"{tag_of(file)}"', "Last-Modified": formatdate(file.stat().st_mtime, usegmt=True)}
+        told["x-goog-generation"] = str(file.stat().st_mtime_ns)
         if asked := re.fullmatch(r"bytes=(\d+)-(\d+)", headers.get("range", "")):
             first, last = int(asked[1]), min(int(asked[2]), len(data) - 1)
             told["Content-Range"] = f"bytes {first}-{last}/{len(data)}"
@@ -111,31 +127,70 @@ def files_of(folder: Path) -> Answers:
 
 
 def bucket_of(folder: Path) -> Answers:
-    """As much of S3 as readers ask for: the folder's entries are buckets, and keys are listed in pages."""
-    files = files_of(folder)
+    """As much of S3 as levelproof asks for: the folder's entries are buckets, and keys are listed in pages."""
+    files, one_at_a_time = files_of(folder), Lock()
 
-    def answers(method: str, path: str, headers: dict[str, str]) -> Answer:
+    def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        with one_at_a_time:
+            return answer(method, path, headers, body)
+
+    def answer(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
         asked = urlsplit(path)
-        query = {name: values[0] for name, values in parse_qs(asked.query).items()}
+        query = {name: values[0] for name, values in parse_qs(asked.query, keep_blank_values=True).items()}
         bucket = folder / asked.path.strip("/").partition("/")[0]
         if not bucket.is_dir():
             return Answer(404, {}, b"<Error><Code>NoSuchBucket</Code></Error>")
+        if method in ("PUT", "POST", "DELETE"):
+            return _changed(method, folder / unquote(asked.path.lstrip("/")), headers, body, folder / ".new")
         if "list-type" not in query:
-            return files(method, path, headers)
+            return files(method, path, headers, body)
         below = sorted(file.relative_to(bucket).as_posix() for file in bucket.rglob("*") if file.is_file())
         below = [key for key in below if key.startswith(query.get("prefix", ""))]
+        if query.get("delimiter"):
+            at = len(query.get("prefix", ""))
+            folders = sorted({key[: key.index("/", at) + 1] for key in below if "/" in key[at:]})
+            inside = [key for key in below if "/" not in key[at:]]
+            given = "".join(f"<CommonPrefixes><Prefix>{name}</Prefix></CommonPrefixes>" for name in folders)
+            return Answer(200, {}, f"<ListBucketResult>{given}{_contents(bucket, inside)}</ListBucketResult>".encode())
         first = int(query.get("continuation-token", 0))
-        listed = "".join(
-            f"<Contents><Key>{key}</Key><LastModified>2026-01-01T00:00:00.000Z</LastModified>"
-            f"<ETag>&quot;{tag_of(bucket / key)}&quot;</ETag>"
-            f"<Size>{(bucket / key).stat().st_size}</Size></Contents>"
-            for key in below[first : first + PAGE]
-        )
+        listed = _contents(bucket, below[first : first + PAGE])
         if first + PAGE < len(below):
             listed += f"<NextContinuationToken>{first + PAGE}</NextContinuationToken>"
         return Answer(200, {}, f"<ListBucketResult>{listed}</ListBucketResult>".encode())
 
     return answers
+
+
+def _contents(bucket: Path, keys: Iterable[str]) -> str:
+    return "".join(
+        f"<Contents><Key>{key}</Key><LastModified>2026-01-01T00:00:00.000Z</LastModified>"
+        f"<ETag>&quot;{tag_of(bucket / key)}&quot;</ETag>"
+        f"<Size>{(bucket / key).stat().st_size}</Size></Contents>"
+        for key in keys
+    )
+
+
+def _changed(method: str, file: Path, headers: dict[str, str], body: bytes, new: Path) -> Answer:
+    """PUT with its conditions, DELETE of one key, and POST of keys to delete."""
+    if method == "POST":
+        keys = [key.decode() for key in re.findall(rb"<Key>(.*?)</Key>", body)]
+        for key in keys:
+            (file / key).unlink(missing_ok=True)
+        told = "".join(f"<Deleted><Key>{key}</Key></Deleted>" for key in keys)
+        return Answer(200, {}, f"<DeleteResult>{told}</DeleteResult>".encode())
+    if method == "DELETE":
+        file.unlink(missing_ok=True)
+        return Answer(204, {}, b"")
+    wanted, generation = headers.get("if-match", "").strip('"'), headers.get("x-goog-if-generation-match")  # Google's
+    if wanted and not file.exists():
+        return Answer(404, {}, b"<Error><Code>NoSuchKey</Code></Error>")
+    other = generation is not None and generation != str(file.stat().st_mtime_ns if file.exists() else 0)
+    if other or (wanted and wanted != tag_of(file)) or ("if-none-match" in headers and file.exists()):
+        return Answer(412, {}, b"<Error><Code>PreconditionFailed</Code></Error>")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    new.write_bytes(body)
+    new.replace(file)
+    return Answer(200, {"ETag": f'"{tag_of(file)}"', "x-goog-generation": str(file.stat().st_mtime_ns)}, b"")
 
 
 def tag_of(file: Path) -> str:
@@ -148,9 +203,9 @@ def hub_of(folder: Path, dataset: str, token: str, page: int) -> Answers:
     resolved, listed = f"/datasets/{dataset}/resolve/main/", f"/api/datasets/{dataset}/tree/main/"
     files = files_of(folder)
 
-    def answers(method: str, path: str, headers: dict[str, str]) -> Answer:
+    def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
         if path.startswith("/elsewhere/"):
-            return files(method, path.removeprefix("/elsewhere"), headers)
+            return files(method, path.removeprefix("/elsewhere"), headers, body)
         if headers.get("authorization") != f"Bearer {token}":
             return Answer(401, {}, b"{}")
         if path.startswith(resolved):
@@ -178,10 +233,10 @@ def hub_of(folder: Path, dataset: str, token: str, page: int) -> Answers:
 def before(host: str, port: int) -> Answers:
     """A server that asks another one."""
 
-    def answers(method: str, path: str, headers: dict[str, str]) -> Answer:
+    def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
         connection = HTTPConnection(host, port, timeout=PATIENCE)
         try:
-            connection.request(method, path, headers=headers)
+            connection.request(method, path, body, headers)
             given = connection.getresponse()
             kept = {name: x for name, x in given.getheaders() if name.lower() in ("etag", "last-modified")}
             kept |= {name: x for name, x in given.getheaders() if name.lower() in ("content-range", "content-length")}

@@ -289,7 +289,7 @@ def test_commands_say_the_same_of_a_split_that_is_sealed_and_it_grows(
 def test_what_cannot_be_sealed_is_refused(tmp_path: Path, split: Path) -> None:
     assert_refused(here(["seal", "data/1k/s"], tmp_path), 2, "no split at data/1k/s")
     assert_refused(here(["seal", "data/5k/s", "--rows", "0"], tmp_path), 2, "--rows a number from 1")
-    with only_writer(split):
+    with only_writer(split, print):
         assert_refused(here(["seal", "data/5k/s"], tmp_path), 2, "Another", "is writing to data/5k/s")
     shard = split / sorted(read_manifest(split).shards)[0]
     (shard / "act/c/0/0/0").write_bytes(b"x")

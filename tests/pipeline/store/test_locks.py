@@ -36,7 +36,7 @@ HOLDER = """
 import fcntl, pathlib, sys
 fcntl.flock = fcntl.lockf
 from pipeline.store import locks
-with getattr(locks, sys.argv[1])(pathlib.Path(sys.argv[2])):
+with getattr(locks, sys.argv[1])(*[pathlib.Path(sys.argv[2]), print][: 1 + (sys.argv[1] == "only_writer")]):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -57,10 +57,10 @@ def test_locks_exclude_on_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(locks, "NOTICE", 0.1)
     with held_elsewhere("only_writer", tmp_path):
         assert is_written(tmp_path)
-        with pytest.raises(UserError, match="Another `levelproof generate`"), only_writer(tmp_path):
+        with pytest.raises(UserError, match="Another `levelproof generate`"), only_writer(tmp_path, print):
             pass
     assert not is_written(tmp_path)
-    with only_writer(tmp_path):
+    with only_writer(tmp_path, print):
         pass
     said: list[str] = []
     with held_elsewhere("committing", tmp_path) as worker:

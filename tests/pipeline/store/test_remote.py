@@ -295,7 +295,7 @@ def test_who_has_a_split_open_that_is_sealed_goes_on(
 
 
 def test_a_server_that_lies_about_sizes_is_one_sentence() -> None:
-    def answers(method: str, path: str, headers: dict[str, str]) -> Answer:
+    def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
         if path.endswith("index.txt"):
             return Answer(200, {}, b"000000000000-000000000001.parquet\n../../x.parquet\n")
         return Answer(200, {"Content-Length": str(2**60)} if method == "HEAD" else {}, b"")
@@ -378,15 +378,18 @@ def test_commands_that_read_take_urls_and_others_say_what_they_need(
     assert there.pop("split") == "s3://bucket/data/s"
     assert here.pop("split") == str(split)
     assert there == here
-    for words in (["verify"], ["status"], ["seal"], ["card"]):
-        assert_refused(command([*words, "s3://bucket/data/s"], tmp_path), 2, "copy it with `aws s3 sync` first")
+    status = [command(["status", str(path)], tmp_path).stdout for path in (S3, split)]
+    assert status[0] == status[1].replace(str(split), "s3://bucket/data/s")
+    for words in (["verify", "--repair"], ["card"]):
+        refused = command([words[0], "s3://bucket/data/s", *words[1:]], tmp_path)
+        assert_refused(refused, 2, "copy it with `aws s3 sync` first")
 
 
 def test_a_forked_process_is_told_how_to_start(tmp_path: Path) -> None:
     """Its threads would not be there: it would wait forever, and so would the process that it is of."""
     code = (
         "import os\nfrom pathlib import Path\nfrom pipeline.store import remote\n"
-        "remote._place(Path('s3://bucket/data'))\n"
+        "remote.place(Path('s3://bucket/data'))\n"
         "child = os.fork()\n"
         "try:\n    remote.bytes_of(Path('s3://bucket/data')) if not child else os.waitpid(child, 0)\n"
         "except Exception as error:\n    print(error, flush=True)\n    os._exit(1)\n"

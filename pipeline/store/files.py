@@ -1,0 +1,45 @@
+"""Single files of a split, in a folder or in a store: written in one step, and removed."""
+
+import os
+import shutil
+from pathlib import Path
+
+from pipeline.store import objects
+from pipeline.store.remote import is_remote, stored_in
+
+
+def write(path: Path, data: bytes) -> None:
+    """A file, in place of what was there.
+
+    Raises:
+        OSError: the disk refuses.
+        UserError, StoreFailure: the store does.
+    """
+    if is_remote(path):
+        objects.put(path, data)
+        return
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_bytes(data)
+    temporary.replace(path)
+
+
+def remove(path: Path) -> None:
+    """A file, if it is there. Raises as `write`."""
+    if is_remote(path):
+        objects.remove([path])
+    else:
+        path.unlink(missing_ok=True)
+
+
+def remove_data(path: Path) -> None:
+    """A shard or experts, as far as they go now: files that are open stay on NFS, and the next run tries again.
+
+    Raises:
+        UserError, StoreFailure: the store refuses.
+    """
+    if is_remote(path):
+        objects.remove(stored_in(path) if path.suffix == ".zarr" else [path])
+    elif path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,186 @@
+"""The writer of a split in an object store: it renews a lease, and who finds that silent for long enough takes it.
+
+No clock is compared with another: whoever waits measures by its own. And no time has to be right for a split to stay
+whole: a writer that was only slow finds its lease taken, and so do its workers, before they commit anything.
+"""
+
+import json
+import os
+import secrets
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import Failure, LevelproofError, UserError
+from pipeline.store.layout import WRITER_LOCK
+from pipeline.store.objects import Version, get, put_if
+from pipeline.store.remote import as_typed, is_remote
+
+SILENCE = 60.0  # s without a renewal after which a writer counts as dead
+RENEWAL = 5.0  # s between renewals
+NOTICE = 2.0  # s of waiting after which people are told for what
+POLL = 0.5  # s between two looks
+
+_served: dict[Path, str] = {}  # the writer of each split for whom this process works
+
+
+class LeaseLost(Failure):
+    """Another writer has taken a split over."""
+
+    def __init__(self, split: Path) -> None:
+        super().__init__(
+            f"Another command has taken over {as_typed(split)}, because this one was silent for {SILENCE:.0f} s: "
+            "nothing more of this one is committed there."
+        )
+
+
+class Lease:
+    """Held until it is released, or taken by another writer."""
+
+    def __init__(self, split: Path, say: Callable[[str], None]) -> None:
+        """Wait until nobody holds it, and take it.
+
+        Raises:
+            UserError: somebody holds it and is at work.
+            StoreFailure: the store does not answer.
+        """
+        self.token, self.lost = secrets.token_hex(8), False
+        self._split, self._path, self._renewals = split, split / WRITER_LOCK, 0
+        self._version, self._over = _taken(self._path, self._text(), say), threading.Event()
+        self._thread = threading.Thread(target=self._keep, daemon=True)
+        self._thread.start()
+
+    def release(self) -> None:
+        """Let the next one have it at once."""
+        self._over.set()
+        self._thread.join()
+        if not self.lost:
+            with suppress(LevelproofError):
+                put_if(self._path, b"{}", self._version)
+
+    def _keep(self) -> None:
+        while not self._over.wait(RENEWAL):
+            self._renewals += 1
+            with suppress(LevelproofError):  # a store that is gone is told by who has something to write
+                version = put_if(self._path, self._text(), self._version)
+                if version is None:
+                    self.lost = True
+                    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+                    return
+                self._version = version
+
+    def _text(self) -> bytes:
+        about = {"writer": self.token, "host": _here(), "pid": os.getpid(), "renewals": self._renewals}
+        return json.dumps(about).encode()
+
+
+@contextmanager
+def leased(split: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """The split for this process, and those that work for it, to write to.
+
+    Raises:
+        UserError, StoreFailure: as `Lease`.
+        LeaseLost: another one has it now.
+    """
+    lease = Lease(split, say)
+    _served[split] = lease.token
+    try:
+        yield
+    except KeyboardInterrupt:
+        if lease.lost:
+            raise LeaseLost(split) from None
+        raise
+    finally:
+        lease.release()
+        del _served[split]
+
+
+def serve(split: Path) -> None:
+    """Work from now on for whoever writes to a split now, if it is in a store."""
+    if is_remote(split) and split not in _served:
+        _served[split] = _holder(split / WRITER_LOCK).get("writer", "")
+
+
+def require_served(split: Path) -> None:
+    """Raises LeaseLost where the writer for whom this process works is not that of the split any more."""
+    served = _served.get(split)
+    if served is not None and _holder(split / WRITER_LOCK).get("writer") != served:
+        raise LeaseLost(split)
+
+
+def is_leased(split: Path) -> bool:
+    """Whether a writer has renewed its lease a short while ago."""
+    try:
+        found = get(split / WRITER_LOCK)
+    except FileNotFoundError:
+        return False
+    return "writer" in _said(found.data) and time.time() - found.written.timestamp() < SILENCE
+
+
+def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
+    begun = since = time.monotonic()
+    before: tuple[str, Version | None] | None = None
+    while True:
+        try:
+            found = get(path)
+            holder, version = _said(found.data), found.version
+        except FileNotFoundError:
+            holder, version = {}, None
+        writer, now = str(holder.get("writer", "")), time.monotonic()
+        if before and before != (writer, version):
+            if writer and before[0] == writer:
+                raise UserError(
+                    f"Another `levelproof generate` is writing to {as_typed(path.parent)}: wait for it, or stop it."
+                )
+            since = now
+        before = writer, version
+        if not writer or now - since > SILENCE or _died_here(holder):
+            if mine := put_if(path, text, version):
+                return mine
+        elif now - begun > NOTICE:
+            say(
+                f"Waiting whether process {holder.get('pid')} on {holder.get('host')} still writes to "
+                f"{as_typed(path.parent)}: after {SILENCE:.0f} s of silence it does not."
+            )
+            begun = float("inf")
+        time.sleep(POLL)
+
+
+def _holder(path: Path) -> dict[str, Any]:
+    try:
+        return _said(get(path).data)
+    except FileNotFoundError:
+        return {}
+
+
+def _said(data: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(data)
+    except ValueError:
+        found = None
+    return found if isinstance(found, dict) else {"writer": "unknown"}
+
+
+def _here() -> str:
+    """Where a process's number means this process: containers of one machine may share its name."""
+    space = Path("/proc/self/ns/pid")
+    return f"{socket.gethostname()} {os.readlink(space) if space.exists() else ''}".strip()
+
+
+def _died_here(holder: dict[str, Any]) -> bool:
+    """Whether it was a process of this machine, and is gone."""
+    pid = holder.get("pid")
+    if holder.get("host") != _here() or type(pid) is not int or pid == os.getpid():
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, OverflowError):
+        pass
+    return False

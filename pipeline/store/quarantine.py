@@ -1,0 +1,28 @@
+"""Why units were given up: a note for each, until it is committed."""
+
+from pathlib import Path
+
+from pipeline.store.files import write
+from pipeline.store.layout import QUARANTINE, quarantine_path
+from pipeline.store.remote import BUCKETS, is_remote, names_in
+
+
+def give_up(split: Path, unit: str, reason: str) -> Path:
+    """Note why; where. Raises as `files.write`."""
+    note = quarantine_path(split, unit)
+    if not is_remote(split):
+        note.parent.mkdir(exist_ok=True)
+    write(note, reason.encode())
+    return note
+
+
+def given_up(split: Path) -> list[Path]:
+    """The notes of a split.
+
+    Raises:
+        UserError, StoreFailure: the store refuses.
+    """
+    folder = split / QUARANTINE
+    if not is_remote(split):
+        return sorted(folder.glob("*.txt"))
+    return sorted(names_in(folder)) if split.parts[0] in BUCKETS else []

@@ -1,0 +1,62 @@
+"""A job without training: `python -m tests.pipeline.driver OUT` commits units of random bits, as `generate` does."""
+
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+from configs.schema import JobConfig
+from experts.labels import Label
+from experts.train import UnitResult
+from pipeline.jobs.schedule import WorkUnit, plan_units
+from pipeline.jobs.unit import commit
+from pipeline.store.fields import same_bits
+from pipeline.store.job_note import note_job
+from pipeline.store.manifest import Manifest, read_manifest, require_manifest
+from pipeline.store.shard import Shard
+from pipeline.store.split import writing
+from tests.pipeline.made import made_job, made_result
+
+LEVELS, UNIT = 6, 2
+SPLIT = Path("128k/s")  # below OUT
+
+
+def drive(out: str, say: Callable[[str], None] = print) -> None:
+    """Commit what is missing."""
+    job = job_of(out)
+    with writing(job, say) as (split, manifest):
+        note_job(split, job, ["levelproof", "generate"], [(0, LEVELS - 1)])
+        for unit in plan_units(range(LEVELS), manifest.level_ids, UNIT):
+            commit_made(split, unit)
+
+
+@cache
+def job_of(out: str) -> JobConfig:
+    return made_job(out, "size=s", f"levels={LEVELS}", f"unit={UNIT}")
+
+
+@cache
+def result_of(level_ids: tuple[int, ...]) -> UnitResult:
+    """Random bits, the same each time."""
+    return made_result([*level_ids], [[Label.SOLVED, Label.UNSOLVED][i % 2] for i in level_ids])
+
+
+def commit_made(split: Path, unit: WorkUnit) -> None:
+    """As the worker does that has this unit."""
+    commit(job_of("data"), split, unit, result_of(tuple(unit.level_ids)))
+
+
+def require_same_content(split: Path, other: Path) -> Manifest:
+    """Every row, but for where its witness is, and every field of every witness."""
+    manifests = require_manifest(split), read_manifest(other)
+    rows, others = (manifest.table.to_pylist() for manifest in manifests)
+    for row, of in zip(rows, others, strict=True):
+        assert row | {"shard": bool(row["shard"]), "row": 0} == of | {"shard": bool(of["shard"]), "row": 0}
+        if row["shard"]:
+            one, two = (Shard(at / it["shard"]).read([it["row"]]) for at, it in ((split, row), (other, of)))
+            assert all(same_bits(one[name], two[name]).all() for name in two)
+    return manifests[0]
+
+
+if __name__ == "__main__":
+    drive(sys.argv[1])

@@ -1,0 +1,380 @@
+"""A split written to an object store: the same as in a folder, whatever the store, the writers and the workers do."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import Failure, UserError
+from pipeline.jobs.schedule import WorkUnit
+from pipeline.store import leases, remote
+from pipeline.store.layout import FRAGMENT, data_paths, new_attempt, unit_name
+from pipeline.store.leases import Lease, LeaseLost
+from pipeline.store.leftovers import clean
+from pipeline.store.locks import is_written
+from pipeline.store.manifest import read_manifest
+from pipeline.store.objects import put, remove
+from pipeline.store.publish import ended
+from tests.pipeline.command import ROOT, TINY, run
+from tests.pipeline.command import here as command
+from tests.pipeline.driver import LEVELS, SPLIT, UNIT, commit_made, drive, require_same_content
+from tests.pipeline.servers import Server, bucket_of, s3_process, serving
+from tests.pipeline.servers import before as before_it
+
+OUT = "s3://bucket/data"
+THERE = Path(OUT) / SPLIT
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same job in a folder."""
+    out = tmp_path_factory.mktemp("here")
+    drive(str(out))
+    return out / SPLIT
+
+
+@pytest.fixture(params=["little", pytest.param("moto", marks=pytest.mark.campaign)])
+def server(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moto: Any
+) -> Iterator[Server]:
+    """A store with an empty bucket, a process without patience, and nothing known of any store."""
+    monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=2))
+    monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
+    monkeypatch.setattr(leases, "POLL", 0.02)
+    (tmp_path / "s3/bucket").mkdir(parents=True)
+    answers = bucket_of(tmp_path / "s3") if request.param == "little" else before_it(*moto())
+    with serving(answers) as server:
+        for name in [name for name in os.environ if name.startswith("AWS_")]:
+            monkeypatch.delenv(name)
+        known = {"ACCESS_KEY_ID": "any", "SECRET_ACCESS_KEY": "any", "REGION": "us-east-1", "ENDPOINT_URL": server.url}
+        for name, value in known.items():
+            monkeypatch.setenv(f"AWS_{name}", value)
+        forget()
+        yield server
+    forget()
+
+
+@pytest.fixture
+def moto() -> Iterator[Any]:
+    """Starts a process that serves S3, if it is called."""
+    with ExitStack() as stack:
+        yield lambda: stack.enter_context(s3_process())
+
+
+def empty() -> None:
+    remove(remote.stored_in(THERE))
+    forget()
+
+
+def forget() -> None:
+    remote._known.clear()
+    remote._store.cache_clear()
+    remote._cache_in.cache_clear()
+    leases._served.clear()
+
+
+def require_whole(here: Path) -> None:
+    """All is there, and nothing else."""
+    manifest = require_same_content(THERE, here)
+    left = {path.relative_to(THERE).as_posix() for path in remote.stored_in(THERE)}
+    fragments = {name for name in left if FRAGMENT.fullmatch(name)}
+    assert len(fragments) == LEVELS // UNIT
+    assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
+    rest = {name for name in left - fragments if not name.startswith("shards/")}
+    assert rest == {"job.json", ".writer.lock"}
+
+
+@pytest.mark.parametrize(
+    ("every", "how"),
+    [(0, ""), (3, "busy"), (4, "lost"), pytest.param(4, "cut", marks=pytest.mark.campaign)],
+)
+def test_a_store_gets_what_a_folder_gets(server: Server, here: Path, every: int, how: str) -> None:
+    server.spoil(every, how)
+    drive(OUT)
+    server.spoil(0)
+    require_whole(here)
+    count = server.count
+    drive(OUT)
+    assert not [line for line in server.log[count:] if line.startswith("PUT") and "/shards/" in line]
+
+
+def test_a_store_that_is_slow_is_asked_again(server: Server, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(remote.PATIENCE, "timeout", timedelta(seconds=0.5))
+    forget()
+    server.spoil(9, "slow")
+    drive(OUT)
+    server.spoil(0)
+    require_whole(here)
+
+
+def dies_at(server: Server, request: int) -> None:
+    """The store is gone from this request on."""
+    begun = server.count
+    server.meanwhile = lambda count: server.spoil(1, "gone") if count - begun >= request else None
+
+
+def requests_of_a_run(server: Server) -> int:
+    before = server.count
+    drive(OUT)
+    server.meanwhile = lambda _: None
+    count = server.count - before
+    remote.obstore_module().delete(remote.place(THERE)[0], [remote.place(path)[1] for path in remote.stored_in(THERE)])
+    forget()
+    return count
+
+
+@pytest.mark.parametrize("some", [3, pytest.param(25, marks=pytest.mark.campaign)])
+def test_a_store_that_is_gone_is_one_sentence_and_the_same_command_goes_on(
+    server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, some: int
+) -> None:
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    monkeypatch.setattr(leases, "SILENCE", 0.1)
+    requests = requests_of_a_run(server)
+    for request in sorted(random.Random(some).sample(range(1, requests), some)):
+        dies_at(server, request)
+        with pytest.raises(Failure, match=r"^Cannot (read|write) s3://bucket/data.* \(it does not answer\)"):
+            drive(OUT)
+        server.meanwhile = lambda _: None
+        server.spoil(0)
+        forget()
+        drive(OUT)
+        require_whole(here)
+        empty()
+
+
+@pytest.mark.campaign
+def test_a_driver_killed_at_any_request(server: Server, here: Path) -> None:
+    requests = requests_of_a_run(server)
+    for request in sorted(random.Random(0).sample(range(1, requests), 12)):
+        begun = server.count
+        words = [sys.executable, "-m", "tests.pipeline.driver", OUT]
+        with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+            server.meanwhile = lambda count: process.kill() if count - begun == request else None  # noqa: B023
+        server.meanwhile = lambda _: None
+        assert process.returncode == -signal.SIGKILL
+        forget()
+        drive(OUT)
+        require_whole(here)
+        empty()
+
+
+def taken_over(split: Path) -> Lease:
+    """By another writer, which cleans up as it does in a process of its own."""
+    lease = Lease(split, print)
+    clean(split, print)
+    return lease
+
+
+STEPS = {  # requests of an attempt
+    "mark": "begun",
+    "look": ".parquet",
+    "lease": ".writer.lock",
+    "data": "/shards/",
+    "fragment": "PUT /bucket/data/128k/s/manifest/0",
+    "end": "POST",
+}
+
+
+@pytest.mark.parametrize(
+    "step",
+    ["look", "fragment", *(pytest.param(x, marks=pytest.mark.campaign) for x in ("mark", "lease", "data", "end"))],
+)
+def test_a_worker_whose_writer_is_replaced_meanwhile_commits_before_or_never(
+    server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """Paused before any of its requests until another writer has taken over and cleaned up."""
+    monkeypatch.setattr(leases, "RENEWAL", 1000.0)
+    monkeypatch.setattr(leases, "SILENCE", -1.0)
+    with leases.leased(THERE, print):
+        mine, theirs = leases._served[THERE], list[Lease]()
+
+        def meanwhile(count: int) -> None:
+            if STEPS[step] in server.log[count - 1]:
+                server.meanwhile = lambda _: None
+                theirs.append(taken_over(THERE))
+
+        server.meanwhile = meanwhile
+        if step == "end":
+            commit_made(THERE, WorkUnit((0, 1)))
+        else:
+            with pytest.raises(LeaseLost, match="has taken over s3://bucket/data/128k/s"):
+                commit_made(THERE, WorkUnit((0, 1)))
+            assert not len(read_manifest(THERE).level_ids)
+        leases._served[THERE] = theirs[0].token
+        commit_made(THERE, WorkUnit((0, 1)))
+        leases._served[THERE] = mine
+        with pytest.raises(LeaseLost):
+            commit_made(THERE, WorkUnit((2, 3)))
+        theirs[0].release()
+    drive(OUT)
+    require_whole(here)
+
+
+def test_a_sealed_split_is_as_before(server: Server, here: Path, tmp_path: Path) -> None:
+    drive(OUT)
+    done = command(["seal", str(THERE)], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "3 fragments were merged into 1" in done.stdout
+    assert_sealed(here)
+
+
+@pytest.mark.campaign
+def test_a_store_that_is_gone_while_a_split_is_sealed(
+    server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    monkeypatch.setattr(leases, "SILENCE", 0.1)
+    drive(OUT)
+    count = server.count
+    assert command(["seal", str(THERE)], tmp_path).returncode == 0
+    for request in sorted(random.Random(0).sample(range(1, server.count - count), 12)):
+        server.meanwhile = lambda _: None
+        server.spoil(0)
+        empty()
+        drive(OUT)
+        dies_at(server, request)
+        command(["seal", str(THERE)], tmp_path)
+        server.meanwhile = lambda _: None
+        server.spoil(0)
+        forget()
+        require_same_content(THERE, here)
+        assert command(["seal", str(THERE)], tmp_path).returncode == 0
+        assert_sealed(here)
+
+
+def assert_sealed(here: Path) -> None:
+    manifest = require_same_content(THERE, here)
+    assert [fragment.sealed for fragment in manifest.fragments] == [True]
+    assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
+    assert not [path for path in remote.stored_in(THERE) if path.suffix == ".begun"]
+
+
+def test_of_two_attempts_at_a_unit_one_is_committed(server: Server) -> None:
+    with ThreadPoolExecutor() as threads:
+        for ended in [threads.submit(commit_made, THERE, WorkUnit((0, 1))) for _ in range(3)]:
+            ended.result()
+    manifest = read_manifest(THERE)
+    assert manifest.level_ids.tolist() == [0, 1]
+    assert not [name for name in remote.stored_in(THERE) if name.suffix == ".begun"]
+    assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
+
+
+def test_levels_that_an_attempt_of_which_nobody_has_heard_has_committed_are_left_out(
+    server: Server, here: Path
+) -> None:
+    """It gave some of its levels back, and its word of that was lost: the unit was handed out again as it had been."""
+    commit_made(THERE, WorkUnit((0, 3)))
+    commit_made(THERE, WorkUnit((0, 1, 2, 3)))
+    commit_made(THERE, WorkUnit((0, 1, 2, 3)))
+    manifest = read_manifest(THERE)
+    assert [fragment.path.stem for fragment in manifest.fragments] == [unit_name(0, 3), unit_name(1, 2)]
+    assert manifest.level_ids.tolist() == [0, 1, 2, 3]
+    assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
+
+
+def test_a_second_writer_is_refused_while_the_first_renews_its_lease(
+    server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(leases, "RENEWAL", 0.05)
+    with leases.leased(THERE, print):
+        assert is_written(THERE)
+        with pytest.raises(UserError, match=r"Another `levelproof generate` is writing to s3://bucket/data/128k/s"):
+            drive(OUT)
+    assert not is_written(THERE)
+    drive(OUT)
+    facts = json.loads(command(["status", str(THERE), "--json"], tmp_path).stdout)
+    assert (facts["split"], facts["wanted"], facts["done"], facts["running"]) == (
+        f"{OUT}/{SPLIT}",
+        LEVELS,
+        LEVELS,
+        False,
+    )
+
+
+def test_a_writer_that_is_silent_is_waited_for_and_replaced_and_notices(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(leases, "SILENCE", 0.3)
+    monkeypatch.setattr(leases, "NOTICE", 0.1)
+    monkeypatch.setattr(leases, "RENEWAL", 2.0)
+    said, theirs = list[str](), list[Lease]()
+    with pytest.raises(LeaseLost), leases.leased(THERE, print):  # noqa: PT012
+        theirs.append(Lease(THERE, said.append))
+        time.sleep(30)  # is interrupted
+    theirs[0].release()
+    (sentence,) = said
+    assert "still writes to s3://bucket/data/128k/s: after 0 s" in sentence
+
+
+def test_google_s_store_gets_what_a_folder_gets(
+    server: Server, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    account = {"client_email": "", "private_key": "", "private_key_id": "", "disable_oauth": True}
+    (tmp_path / "account.json").write_text(json.dumps(account | {"gcs_base_url": server.url}))
+    monkeypatch.setenv("GOOGLE_SERVICE_ACCOUNT", str(tmp_path / "account.json"))
+    drive("gs://bucket/data")
+    require_same_content(Path("gs://bucket/data") / SPLIT, here)
+
+
+@pytest.mark.parametrize("out", ["https://host/data", "hf://datasets/me/data"])
+def test_what_is_no_store_is_refused(out: str) -> None:
+    with pytest.raises(UserError, match=rf"Nothing can be written to {out}/128k/s: give a folder, or a URL of s3"):
+        drive(out)
+
+
+def test_a_store_that_heeds_no_conditions_is_refused(server: Server, tmp_path: Path) -> None:
+    heeding = bucket_of(tmp_path / "s3")
+    careless = lambda method, path, headers, body: heeding(
+        method, path, {name: x for name, x in headers.items() if not name.startswith("if-")}, body
+    )
+    with serving(careless) as other, pytest.MonkeyPatch.context() as patched:
+        patched.setenv("AWS_ENDPOINT_URL", other.url)
+        forget()
+        with pytest.raises(UserError, match="does not heed the conditions"):
+            drive(OUT)
+
+
+def test_a_fence_is_nothing_to_readers_and_the_next_unit_takes_its_place(server: Server, here: Path) -> None:
+    mark = new_attempt(THERE, unit_name(0, 1)).begun
+    put(mark, b"")
+    assert ended(THERE, [mark], []) == {mark}
+    assert ended(THERE, [mark], []) == {mark}  # another fence
+    assert not read_manifest(THERE).fragments
+    commit_made(THERE, WorkUnit((0, 1)))
+    assert ended(THERE, [mark], []) == set()
+    assert read_manifest(THERE).level_ids.tolist() == [0, 1]
+    drive(OUT)
+    require_whole(here)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("words", [["executor=inline"], ["workers=1"]], ids=["inline", "Ray"])
+def test_generate_into_a_store_is_generate_into_a_folder(server: Server, tmp_path: Path, words: list[str]) -> None:
+    generate = ["generate", *TINY, "keep_experts=true"]
+    assert command([*generate, "executor=inline"], tmp_path).returncode == 0
+    done = run([*generate, f"out={OUT}", *words], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert f"levelproof inspect {OUT}/5k/s" in done.stdout
+    split = Path(OUT) / "5k/s"
+    rows = (read_manifest(path).table.to_pylist() for path in (split, tmp_path / "data/5k/s"))
+    for there, here in zip(*rows, strict=True):
+        names = {name: bool(here[name]) for name in ("shard", "experts")}
+        assert {name: bool(there[name]) for name in names} == names
+        names |= {"seconds": None}
+        assert there | names == here | names
+    verified = command(["verify", str(split)], tmp_path)
+    assert verified.returncode == 0, verified.stdout
+    assert "0 problems" in verified.stdout
