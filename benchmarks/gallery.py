@@ -28,7 +28,7 @@ from levelgen.level import ACTIONS, size_of
 from levelgen.sampling.sampler import sample_levels
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
-from pipeline.look.gallery.gallery import ABOUT, gallery
+from pipeline.look.gallery.gallery import gallery
 from pipeline.runtime import prepare_jax
 from pipeline.store.layout import split_path
 
@@ -123,7 +123,7 @@ def fits(of: Mapping[str, Any]) -> bool:
 
 def rows(results: list[dict[str, Any]]) -> list[list[str]]:
     lines = {
-        "seconds to write": ("written", "{:.0f}"),
+        "core-seconds to write": ("written", "{:.0f}"),
         "megabytes": ("megabytes", "{:.0f}"),
         "seconds to the first levels drawn": ("first", "{:.2f}"),
         "seconds to all columns": ("columns", "{:.2f}"),
@@ -135,11 +135,10 @@ def rows(results: list[dict[str, Any]]) -> list[list[str]]:
         "memory after the whole page, MB": ("memory_after", "{:.1f}"),
         "memory after the whole page twice, MB": ("memory_again", "{:.1f}"),
     }
-    told = lambda of, name, form: "-" if of[name] is None else form.format(of[name])
-    return [[words, *(told(of, *line) for of in results)] for words, line in lines.items()]
+    return [[words, *(form.format(of[name]) for of in results)] for words, (name, form) in lines.items()]
 
 
-def measured(chromium: Any, site: Path, written: float | None) -> dict[str, Any]:
+def measured(chromium: Any, site: Path, written: float) -> dict[str, Any]:
     """What a browser takes for one gallery."""
     context = chromium.new_context(viewport=VIEW)
     page = context.new_page()
@@ -189,15 +188,15 @@ def _memory(context: Any, page: Any) -> float:
     return used
 
 
-def made_gallery(folder: Path, size: str, levels: int) -> tuple[Path, float | None]:
-    """A gallery of so many levels, and the seconds it took to write; None: it was there."""
-    site = folder / f"gallery-{size}-{levels}"
-    if (site / ABOUT).is_file():
-        return site, None
-    split = made_split(folder / str(levels), size, levels)
-    start = time.perf_counter()
-    gallery(split, site, None, levels)
-    return site, time.perf_counter() - start
+def made_gallery(folder: Path, size: str, levels: int) -> tuple[Path, float]:
+    """A gallery of so many levels, and the core-seconds that it took to write, whenever that was."""
+    site, took = folder / f"gallery-{size}-{levels}", folder / f"gallery-{size}-{levels}.txt"
+    if not took.is_file():
+        split = made_split(folder / str(levels), size, levels)
+        start = time.process_time()
+        gallery(split, site, None, levels)
+        took.write_text(str(time.process_time() - start))
+    return site, float(took.read_text())
 
 
 def made_split(folder: Path, size: str, levels: int) -> Path:

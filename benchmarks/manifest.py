@@ -26,6 +26,7 @@ from benchmarks import oracle
 from benchmarks.report import Report, Table
 from configs.compose import compose_job
 from configs.numbers import parse_count
+from experts.steps import Seconds
 from pipeline.store.layout import new_attempt, split_path, unit_name
 from pipeline.store.manifest import begin_fragment, write_fragment
 from pipeline.store.merge import FILE_BYTES
@@ -138,6 +139,7 @@ def rows(base: pa.Table, ids: np.ndarray, shard: str, config_hash: str, rng: np.
         "shard": [shard if has else None for has in solved],
         "row": np.where(solved, np.cumsum(solved) - 1, 0),
         "config_hash": [config_hash] * count,
+        "seconds": pa.StructArray.from_arrays([pa.array(rng.random(count))] * len(Seconds._fields), Seconds._fields),
         "command": [f"levelproof generate size=s budget=128k first_level={i} levels=1" for i in ids],
     }
     columns = {

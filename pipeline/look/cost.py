@@ -35,7 +35,7 @@ def cost_of(rows: pa.Table) -> dict[str, Any] | None:
 def seconds_of(rows: pa.Table) -> Float[np.ndarray, " row"]:
     """Of each row, all stages; NaN: nobody has counted."""
     stages = [pc.struct_field(rows.column("seconds"), stage).to_numpy() for stage in Seconds._fields]  # pyright: ignore[reportAttributeAccessIssue]
-    return np.sum(stages, axis=0, dtype=np.float64)
+    return np.stack(stages).astype(np.float64).sum(0)
 
 
 def cost_told(cost: dict[str, Any]) -> str:

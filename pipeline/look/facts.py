@@ -68,6 +68,8 @@ def _reasons(kinds: Mapping[str, int]) -> list[str]:
 
 def _by_things(found: Mapping[str, Any] | None) -> dict[str, str | None]:
     """The share of levels that are solved, by how many of each kind of thing they have."""
+    if found and found["problem"]:
+        return {"what levels are made of": found["problem"]}
     if not found or not found["levels"]:
         return {}
     sample = f" (of {found['levels']:,} that were looked at)" if found["looked_at"] < found["of"] else ""

@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from configs.schema import from_files
 from experts.labels import TRAINED, Label
+from pipeline.errors import Failure, UserError
 from pipeline.look.figures import Share
 from pipeline.look.things import things_of
 from pipeline.read.levels import COLUMNS, levels_of
@@ -22,7 +23,7 @@ SAMPLED, READ = 4096, 256  # levels that are looked at: made again from their id
 def solved_by_things(manifest: Manifest, ids: np.ndarray) -> dict[str, Any]:
     """For each kind of thing and each count of it: how many levels that could use an expert have it, and are solved.
 
-    `ids` are ascending; of many, SAMPLED are looked at, spread evenly.
+    `ids` are ascending; of many, SAMPLED are looked at, spread evenly. Levels that cannot be read are a `problem`.
     """
     read = from_files(manifest.config or {})
     most = min(READ if read else SAMPLED, len(ids))
@@ -30,14 +31,18 @@ def solved_by_things(manifest: Manifest, ids: np.ndarray) -> dict[str, Any]:
     rows = require_manifest(manifest.split, COLUMNS, chosen).table
     tried = np.isin(rows["label"].to_pylist(), [label.value for label in TRAINED])
     rows = rows.filter(pa.array(tried))
-    found: dict[str, Any] = {"levels": rows.num_rows, "looked_at": most, "of": len(ids)}
+    found: dict[str, Any] = {"levels": rows.num_rows, "looked_at": most, "of": len(ids), "problem": None}
     if not rows.num_rows:
         return found
     if not read:  # no shard is read where an id makes the level
         at = rows.schema.get_field_index("shard")
         rows = rows.set_column(at, "shard", pa.nulls(rows.num_rows, pa.string()))
     solved = np.array([label == Label.SOLVED for label in rows["label"].to_pylist()])
-    for name, counts in things_of(levels_of(manifest, rows)).items():
+    try:
+        levels = levels_of(manifest, rows)
+    except (Failure, UserError) as error:  # the manifest has the other answers
+        return found | {"levels": 0, "problem": str(error)}
+    for name, counts in things_of(levels).items():
         found[name] = {
             str(count): as_json(Share(int(solved[counts == count].sum()), int((counts == count).sum())))
             for count in np.unique(counts)

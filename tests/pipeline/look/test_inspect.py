@@ -17,7 +17,7 @@ from rich.console import Console
 from experts.labels import Label, unsolved_reason
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
-from pipeline.errors import UserError
+from pipeline.errors import Failure, UserError
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
 from pipeline.look import rows as rows_module
@@ -152,6 +152,17 @@ def test_shares_by_what_levels_are_made_of(split: Path, monkeypatch: pytest.Monk
     for name, counts in things_of(levels).items():
         assert set(found[name]) <= {str(count) for count in counts}
         assert sum(of["tried"] for of in found[name].values()) == 4
+
+
+def test_a_level_file_that_is_gone_leaves_the_other_answers(
+    split: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def gone(*_: object) -> None:
+        raise Failure("the file is gone")
+
+    monkeypatch.setattr(shares, "levels_of", gone)
+    inspect(split, Asked(limit=0), as_json=False)
+    assert "what levels are made of:         the file is gone\n" in capsys.readouterr().out
 
 
 def test_a_terminal_is_not_wider_than_it_is(split: Path) -> None:
