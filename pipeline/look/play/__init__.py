@@ -1,0 +1,1 @@
+"""A person takes the controls: the server behind `levelproof play` and its page."""

@@ -1,0 +1,169 @@
+// Edits with the pointer and with buttons; the server makes them, so that a level is always one that the engine takes.
+"use strict";
+
+(function () {
+  const at = (id) => document.getElementById(id);
+  const NEAR = 0.14; // m, from a joint or thruster that a click means
+  const TURN = Math.PI / 12; // rad, of a click
+  const GROW = 1.15; // times as large by a click
+  const TOOLS = {
+    select: ["Select", "Click a body, joint or thruster. Drag a body to move it, with all that is joined to it."],
+    rectangle: ["Rectangle", "Click where its centre should be."],
+    triangle: ["Triangle", "Click where its centre should be."],
+    circle: ["Circle", "Click where its centre should be."],
+    joint: ["Motor joint", "Click where two bodies overlap."],
+    fixed: ["Fixed joint", "Click where two bodies overlap."],
+    thruster: ["Thruster", "Press on a body, drag to where it should push, and let go."],
+  };
+
+  class Editor {
+    constructor(link, stage, changed) {
+      Object.assign(this, { link, stage, changed, tool: "select", drag: null });
+      const buttons = Object.entries(TOOLS).map(([tool, [words]]) => this.button(words, () => this.take(tool), { role: "radio", "data-tool": tool }));
+      at("tools").replaceChildren(...buttons);
+      at("undo").addEventListener("click", () => this.change("undo"));
+      at("redo").addEventListener("click", () => this.change("redo"));
+      stage.canvas.addEventListener("pointerdown", (event) => this.down(event));
+      stage.canvas.addEventListener("pointermove", (event) => this.moved(event));
+      stage.canvas.addEventListener("pointerup", (event) => this.up(event));
+      addEventListener("keydown", (event) => this.key(event));
+      this.take("select");
+    }
+
+    button(words, deed, attributes = {}) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = words;
+      for (const [name, value] of Object.entries(attributes)) button.setAttribute(name, value);
+      button.addEventListener("click", deed);
+      return button;
+    }
+
+    take(tool) {
+      this.tool = tool;
+      for (const button of at("tools").children) button.setAttribute("aria-checked", button.dataset.tool === tool);
+      at("hint").textContent = TOOLS[tool][1];
+    }
+
+    // A level as the server describes it, after an edit or from a file.
+    open(level) {
+      this.level = level;
+      at("undo").disabled = !level.undo;
+      at("redo").disabled = !level.redo;
+      if (this.stage.selected && !this.stage.pointOf(this.stage.selected)) this.stage.selected = null;
+      this.tell();
+    }
+
+    async change(ask, words) {
+      try {
+        this.changed(await this.link.ask(ask, words));
+        levelproof.problem("");
+      } catch (error) {
+        levelproof.problem(error.message);
+        this.stage.show(this.stage.world.start, null);
+      }
+    }
+
+    edit(name, ...words) {
+      return this.change("edit", { name, with: words });
+    }
+
+    async down(event) {
+      const [x, y] = this.stage.metres(event);
+      this.stage.canvas.setPointerCapture(event.pointerId);
+      this.stage.show(this.stage.world.start, null); // edits are of the start
+      if (this.tool === "thruster") this.drag = { from: [x, y] };
+      else if (this.tool === "joint" || this.tool === "fixed") await this.edit("add_joint", x, y, this.tool === "fixed");
+      else if (this.tool !== "select") {
+        await this.edit("add_body", this.tool, x, y);
+        this.take("select");
+      } else await this.pick(x, y);
+    }
+
+    // Selects what is at a point: a joint or thruster that is near, else the uppermost body.
+    async pick(x, y) {
+      for (const kind of ["thruster", "joint"]) {
+        const things = kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters;
+        for (let index = 0; index < things.length; index++) {
+          const point = this.stage.pointOf({ kind, index });
+          if (Math.hypot(point[0] - x, point[1] - y) < NEAR) return this.select({ kind, index });
+        }
+      }
+      this.drag = { from: [x, y] };
+      const { bodies } = await this.link.ask("at", { x, y });
+      const index = this.level.bodies.indexOf(bodies[0]);
+      this.select(index < 0 ? null : { kind: "body", index });
+      if (this.drag && index >= 0 && bodies[0] >= 4) {
+        this.drag.index = index;
+        this.drag.start = this.stage.pointOf({ kind: "body", index });
+      }
+    }
+
+    moved(event) {
+      if (!this.drag || this.drag.index === undefined) return;
+      const [x, y] = this.stage.metres(event);
+      const places = Array.from(this.stage.world.start);
+      places[3 * this.drag.index] = this.drag.start[0] + x - this.drag.from[0];
+      places[3 * this.drag.index + 1] = this.drag.start[1] + y - this.drag.from[1];
+      this.stage.show(places, null);
+    }
+
+    async up(event) {
+      const drag = this.drag;
+      this.drag = null;
+      if (!drag) return;
+      const [x, y] = this.stage.metres(event);
+      const [dx, dy] = [x - drag.from[0], y - drag.from[1]];
+      const far = Math.hypot(dx, dy) > 0.02;
+      if (this.tool === "thruster") await this.edit("add_thruster", ...drag.from, far ? Math.atan2(dy, dx) : Math.PI / 2);
+      else if (far && drag.index !== undefined) await this.edit("move", this.level.bodies[drag.index], drag.start[0] + dx, drag.start[1] + dy);
+    }
+
+    select(thing) {
+      this.stage.selected = thing;
+      this.stage.draw();
+      this.tell();
+    }
+
+    // The selected thing, and buttons for what can be done with it.
+    tell() {
+      const thing = this.stage.selected;
+      at("selected").hidden = !thing;
+      if (!thing) return;
+      const { kind, index } = thing;
+      const number = this.level[{ body: "bodies", joint: "joints", thruster: "thrusters" }[kind]][index];
+      const remove = this.button("Delete", () => { this.stage.selected = null; this.edit("delete", kind, number); });
+      if (kind !== "body") {
+        const { binding, fixed } = (kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters)[index];
+        at("what").textContent = fixed ? "Fixed joint" : `${kind === "joint" ? "Motor" : "Thruster"}, obeys ${levelproof.entryName(binding)}`;
+        const next = (kind === "joint" ? binding : binding - 4) + 1;
+        at("deeds").replaceChildren(...(fixed ? [] : [this.button("Next control", () => this.edit("bind", kind, number, next))]), remove);
+        return;
+      }
+      const [role, fixed] = [this.stage.world.bodies[index].role, this.level.fixed[index]];
+      const scenery = number < 4;
+      at("what").textContent = `${role[0].toUpperCase()}${role.slice(1)} body${fixed ? ", cannot move" : ""}`;
+      const roles = this.level.roles.map((name, value) =>
+        this.button(name, () => this.edit("set_role", number, value), { "aria-pressed": name === role }));
+      at("deeds").replaceChildren(...roles, ...(scenery ? [] : [
+        this.button(fixed ? "Let it move" : "Fix it", () => this.edit("fix", number, !fixed)),
+        this.button("Turn ↺", () => this.edit("turn", number, TURN)),
+        this.button("Turn ↻", () => this.edit("turn", number, -TURN)),
+        this.button("Larger", () => this.edit("resize", number, GROW)),
+        this.button("Smaller", () => this.edit("resize", number, 1 / GROW)),
+        remove,
+      ]));
+    }
+
+    key(event) {
+      if (/^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+      const undoes = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z";
+      if (undoes) this.change(event.shiftKey ? "redo" : "undo");
+      else if (event.key === "Delete" && this.stage.selected) [...at("deeds").children].at(-1).click();
+      else return;
+      event.preventDefault();
+    }
+  }
+
+  levelproof.Editor = Editor;
+})();

@@ -1,0 +1,69 @@
+// Puts the page together.
+"use strict";
+
+(function () {
+  const { Link, Stage, Player, Editor, Expert } = window.levelproof;
+  const at = (id) => document.getElementById(id);
+  const stage = new Stage(at("stage"));
+  const link = new Link((message) => expert.told(message));
+
+  // Every part sees a level that is new or has changed.
+  function opened(level) {
+    stage.open(level);
+    player.open(level);
+    editor.open(level);
+  }
+
+  const player = new Player(link, stage);
+  const editor = new Editor(link, stage, opened);
+  const expert = new Expert(link, stage, (film) => {
+    at("watch").disabled = at("save-witness").disabled = false;
+    player.film(film);
+  });
+
+  async function asked(name, words) {
+    try {
+      opened(await link.ask(name, words));
+      levelproof.problem("");
+    } catch (error) {
+      levelproof.problem(error.message);
+    }
+  }
+
+  async function saved(witness) {
+    try {
+      const { document: level } = await link.ask("save");
+      if (!witness) delete level.witness;
+      const link_ = Object.assign(document.createElement("a"), {
+        href: URL.createObjectURL(new Blob([JSON.stringify(level)], { type: "application/json" })),
+        download: witness ? "witness.json" : "level.json",
+      });
+      link_.click();
+      setTimeout(() => URL.revokeObjectURL(link_.href), 10000);
+    } catch (error) {
+      levelproof.problem(error.message);
+    }
+  }
+
+  at("open").addEventListener("change", async (event) => {
+    const [file] = event.target.files;
+    if (!file) return;
+    try {
+      await asked("load", { document: JSON.parse(await file.text()) });
+    } catch {
+      levelproof.problem(`${file.name} is no level file: it is not JSON.`);
+    }
+    event.target.value = "";
+  });
+  at("new").addEventListener("change", async () => {
+    if (at("new").value) await asked("empty", { size: at("new").value });
+    at("new").value = "";
+  });
+  at("save").addEventListener("click", () => saved(false));
+  at("save-witness").addEventListener("click", () => saved(true));
+
+  link.ask("level").then((level) => {
+    at("new").replaceChildren(new Option("…", ""), ...level.sizes.map((size) => new Option(`size ${size}`, size)));
+    opened(level);
+  }).catch((error) => levelproof.problem(error.message));
+})();

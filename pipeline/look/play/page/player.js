@@ -1,0 +1,178 @@
+// Hands on the controls: keys and pads to actions, env steps of the engine at their own pace, slower if wished.
+"use strict";
+
+(function () {
+  const { liveEntries, entryName } = window.levelproof;
+  const at = (id) => document.getElementById(id);
+  // As in the reference's editor, and letters for the motors that it has no keys for: entry of the action, its value.
+  const KEYS = {
+    ArrowLeft: [0, 1], ArrowRight: [0, 2], ArrowUp: [1, 1], ArrowDown: [1, 2],
+    a: [2, 1], d: [2, 2], w: [3, 1], s: [3, 2], 1: [4, 1], 2: [5, 1],
+  };
+  const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowUp: "↑", ArrowDown: "↓", a: "A", d: "D", w: "W", s: "S" };
+
+  class Player {
+    constructor(link, stage, changed) {
+      Object.assign(this, { link, stage, changed, playing: false, held: new Set(), busy: false });
+      at("play").addEventListener("click", () => this.play(!this.playing));
+      at("step").addEventListener("click", () => { this.play(false); this.step(); });
+      at("restart").addEventListener("click", () => this.restart());
+      at("watch").addEventListener("click", () => this.watch());
+      addEventListener("keydown", (event) => this.key(event, true));
+      addEventListener("keyup", (event) => this.key(event, false));
+      addEventListener("blur", () => this.held.clear());
+    }
+
+    open(level) {
+      this.play(false);
+      this.level = level;
+      this.ended = false;
+      this.pads();
+      this.clock(0);
+      this.say("");
+      at("watch").disabled = at("save-witness").disabled = !level.witness;
+    }
+
+    // A button for each key that something obeys.
+    pads() {
+      const live = liveEntries(this.stage.world);
+      const keys = Object.entries(KEYS).filter(([, [entry]]) => live.includes(entry)).sort((a, b) => a[1][0] - b[1][0]);
+      this.buttons = new Map();
+      at("pads").replaceChildren(...keys.map(([key, [entry, value]]) => {
+        const button = document.createElement("button");
+        const does = entry < 4 ? ["", "forward", "back"][value] : "on";
+        button.type = "button";
+        button.style.setProperty("--colour", `var(--binding-${entry})`);
+        button.textContent = `${NAMES[key] || key} ${entryName(entry)} ${does}`;
+        button.addEventListener("pointerdown", (event) => { button.setPointerCapture(event.pointerId); this.press(key); });
+        for (const end of ["pointerup", "pointercancel"]) button.addEventListener(end, () => this.release(key));
+        this.buttons.set(key, button);
+        return button;
+      }));
+      if (!keys.length) at("pads").textContent = "Nothing acts in this level: give it a motor or a thruster.";
+    }
+
+    key(event, down) {
+      if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+      const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+      if (this.buttons && this.buttons.has(key)) {
+        event.preventDefault();
+        if (!down) this.release(key);
+        else if (!event.repeat) this.press(key);
+      } else if (down && key === "r") this.restart();
+      else if (down && key === " " && event.target.tagName !== "BUTTON") {
+        event.preventDefault();
+        this.play(!this.playing);
+      }
+    }
+
+    press(key) {
+      this.held.add(key);
+      this.buttons.get(key).classList.add("lit");
+      if (!this.playing && !this.ended) this.play(true);
+    }
+
+    release(key) {
+      this.held.delete(key);
+      if (this.buttons.has(key)) this.buttons.get(key).classList.remove("lit");
+    }
+
+    action() {
+      const action = [0, 0, 0, 0, 0, 0];
+      for (const key of this.held) action[KEYS[key][0]] = KEYS[key][1];
+      return action;
+    }
+
+    async play(playing) {
+      if (playing && this.ended) await this.restart();
+      if (playing === this.playing) return;
+      this.playing = playing;
+      at("play").textContent = playing ? "Pause" : "Play";
+      if (!playing) return;
+      this.watching = null;
+      let due = performance.now();
+      const frame = async (now) => {
+        if (!this.playing) return;
+        const pace = (1000 * this.level.seconds) / Number(at("speed").value);
+        if (now >= due && !this.busy) {
+          due = Math.max(due + pace, now - pace);
+          await this.step();
+        }
+        requestAnimationFrame(frame);
+      };
+      requestAnimationFrame(frame);
+    }
+
+    async step() {
+      if (this.busy) return;
+      if (this.ended) await this.restart();
+      this.busy = true;
+      try {
+        const action = this.action();
+        const moment = await this.link.ask("step", { action });
+        this.stage.show(moment.places, action);
+        this.clock(moment.timestep);
+        if (moment.done) this.end(moment);
+      } catch (error) {
+        this.play(false);
+        levelproof.problem(error.message);
+      } finally {
+        this.busy = false;
+      }
+    }
+
+    end(moment) {
+      this.play(false);
+      this.ended = true;
+      const over = moment.timestep >= this.level.steps ? "The time is over." : "Green has touched red.";
+      this.say(moment.goal ? `Solved in ${moment.timestep} steps: save it below.` : over, moment.goal);
+      if (moment.goal) at("watch").disabled = at("save-witness").disabled = false;
+    }
+
+    async restart() {
+      this.ended = false;
+      this.watching = null;
+      const moment = await this.link.ask("restart");
+      this.stage.show(moment.places, null);
+      this.clock(0);
+      this.say("");
+    }
+
+    // The witness, step by step.
+    async watch() {
+      this.film(await this.link.ask("play"));
+    }
+
+    film(film) {
+      this.play(false);
+      this.ended = true;
+      this.watching = film;
+      let before = performance.now();
+      let time = 0;
+      const frame = (now) => {
+        if (this.watching !== film) return;
+        time += ((now - before) / 1000 / this.level.seconds) * Number(at("speed").value);
+        before = now;
+        const step = Math.min(Math.floor(time), film.places.length - 1);
+        this.stage.show(film.places[step], film.actions[step] || null);
+        this.clock(step);
+        if (step === film.places.length - 1) {
+          this.watching = null;
+          this.say(`The witness reaches the goal in ${film.actions.length} steps.`, true);
+        } else requestAnimationFrame(frame);
+      };
+      requestAnimationFrame(frame);
+    }
+
+    clock(step) {
+      at("clock").textContent = `step ${step} of ${this.level.steps} · ${(step * this.level.seconds).toFixed(1)} s`;
+    }
+
+    say(words, goal = false) {
+      at("outcome").textContent = words;
+      at("outcome").dataset.goal = goal;
+    }
+  }
+
+  levelproof.Player = Player;
+})();

@@ -1,0 +1,80 @@
+// The canvas: the world as it is now, the pointer in metres, and what is selected.
+"use strict";
+
+(function () {
+  const { drawWorld, coloursOf, worldOf } = window.levelproof;
+  const SIDE = 5; // m, of the world
+  const BORDER = 0.08; // m, of the walls that show: as draw.js has them
+  const PIXELS = 1200; // most, of the canvas
+
+  class Stage {
+    constructor(canvas) {
+      this.canvas = canvas;
+      this.world = null;
+      this.places = null;
+      this.action = null;
+      this.selected = null;
+      this.colours = coloursOf();
+      new ResizeObserver(() => this.fit()).observe(canvas);
+      matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+        this.colours = coloursOf();
+        this.draw();
+      });
+    }
+
+    // Shows a level as the server describes it.
+    open(level) {
+      this.level = level;
+      this.world = worldOf(level.world);
+      this.show(this.world.start, null);
+    }
+
+    show(places, action) {
+      this.places = places;
+      this.action = action;
+      this.draw();
+    }
+
+    fit() {
+      const pixels = Math.min(PIXELS, Math.round(this.canvas.clientWidth * devicePixelRatio));
+      if (!pixels) return;
+      if (this.canvas.width !== pixels) this.canvas.width = this.canvas.height = pixels;
+      this.draw();
+    }
+
+    draw() {
+      if (!this.world || !this.canvas.width) return;
+      drawWorld(this.canvas, this.world, this.colours, { places: this.places, action: this.action });
+      const point = this.selected && this.pointOf(this.selected);
+      if (!point) return;
+      const context = this.canvas.getContext("2d");
+      context.beginPath();
+      context.arc(point[0], point[1], this.selected.kind === "body" ? 0.12 : 0.16, 0, 2 * Math.PI);
+      context.strokeStyle = this.colours.ink;
+      context.lineWidth = 0.035;
+      context.setLineDash([0.07, 0.05]);
+      context.stroke();
+      context.setLineDash([]);
+    }
+
+    // Where a body, a joint or a thruster is, m; `index` counts what is drawn.
+    pointOf({ kind, index }) {
+      const places = this.places || this.world.start;
+      if (kind === "body") return index < this.world.bodies.length ? [places[3 * index], places[3 * index + 1]] : null;
+      const thing = (kind === "joint" ? this.world.joints : this.world.thrusters)[index];
+      if (!thing) return null;
+      const [x, y] = thing.anchor || thing.position;
+      const [cos, sin] = [Math.cos(places[3 * thing.body + 2]), Math.sin(places[3 * thing.body + 2])];
+      return [places[3 * thing.body] + x * cos - y * sin, places[3 * thing.body + 1] + x * sin + y * cos];
+    }
+
+    // A pointer's position in the world, m.
+    metres(event) {
+      const box = this.canvas.getBoundingClientRect();
+      const scale = (SIDE + 2 * BORDER) / box.width;
+      return [(event.clientX - box.left) * scale - BORDER, SIDE + BORDER - (event.clientY - box.top) * scale];
+    }
+  }
+
+  levelproof.Stage = Stage;
+})();

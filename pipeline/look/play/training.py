@@ -1,0 +1,75 @@
+"""An expert trained for the one level of a page, told about while it trains."""
+
+from collections.abc import Callable, Iterator
+from threading import Event
+from time import monotonic
+from typing import Any
+
+import jax
+import numpy as np
+
+from experts.attempts import attempts
+from experts.labels import WITNESSED
+from experts.pool import Pool
+from experts.procedure import Procedure
+from experts.train import TrainingRun
+from levelgen.files.level_file import LevelFile
+from levelgen.identity.content import content_hashes, level_id_for
+
+ATTEMPTS = 12  # that a page shows at once
+SHOWN_STEPS = 128  # env steps of each
+BETWEEN = 0.8  # s between attempts that are shown
+Message = dict[str, Any]
+Places = Callable[[np.ndarray, np.ndarray], list[list[float]]]  # of positions [time, body, 2], rotations [time, body]
+
+
+def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event, places: Places) -> Iterator[Message]:
+    """Label a level as `generate` labels level files, and tell how far it is; the last message has the verdict.
+
+    Args:
+        file: the level and its rules.
+        procedure: how it is labelled.
+        budget: env steps of its expert.
+        stop: set: end before the label is known.
+        places: what a page takes for where bodies are.
+    """
+    yield {"stage": "compiling", "budget": budget}
+    pool, shown = Pool(budget, procedure, file.rules), monotonic()
+    level_id = level_id_for(content_hashes(file.level)[0])
+    run = TrainingRun(pool, file.level, np.array([level_id]))
+    while not stop.is_set():
+        if run.submission is None:
+            run.look()
+            yield {"stage": "searching", "env_steps": run.totals().env_steps}
+            continue
+        if pool.step() or not run.submission.under_way:
+            yield verdict_of(run)
+            return
+        curve = run.submission.curves[0]
+        yield {"stage": "training", "env_steps": run.totals().env_steps, "curve": np.nan_to_num(curve).tolist()}
+        expert = pool.expert(run.submission, 0)
+        if expert is not None and monotonic() - shown > BETWEEN:
+            shown, key = monotonic(), jax.random.key(len(curve))
+            params = expert.training.train_state.params
+            seen = attempts(file.level, params, key, procedure.expert, file.rules, ATTEMPTS, SHOWN_STEPS)
+            seen = jax.device_get(seen)
+            each = [places(seen.position[..., i], seen.rotation[..., i]) for i in range(ATTEMPTS)]
+            yield {"attempts": each, "goals": seen.goal.tolist()}
+    yield {"stage": "stopped"}
+
+
+def verdict_of(run: TrainingRun) -> Message:
+    """What a page is told of a label; `witness` are actions [step, 6], or None."""
+    env_steps = run.totals().env_steps
+    result = run.finish()
+    (verdict,) = result.verdicts
+    solved = verdict.label in WITNESSED
+    return {
+        "stage": "done",
+        "label": str(verdict.label),
+        "reason": verdict.label_reason,
+        "source": verdict.witness and str(verdict.witness),
+        "success_rate": float(np.nan_to_num(verdict.success_rate)),
+        "env_steps": env_steps,
+        "witness": result.record.action[: verdict.steps_to_goal, :, 0] if solved else None,
+    }

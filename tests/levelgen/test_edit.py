@@ -1,0 +1,142 @@
+"""Edits of levels: what is joined stays joined, and the engine and level files take what comes of any of them."""
+
+import math
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from levelgen.edit import (
+    EDITS,
+    EditError,
+    add_body,
+    add_joint,
+    add_thruster,
+    bodies_at,
+    delete,
+    fix,
+    move,
+    one_of,
+    resize,
+    set_role,
+    turn,
+)
+from levelgen.files.level_file import LevelFile, from_document, to_document
+from levelgen.level import SIZES, Level, Role
+from levelgen.sampling.sampler import sample_levels
+from levelgen.sampling.scenery import empty_level
+from levelgen.task.rules import TaskParams
+
+M = SIZES["m"]
+FIRST = 4  # the first polygon that is not scenery
+
+
+def empty() -> Level:
+    return empty_level(M, 1)
+
+
+def joined() -> Level:
+    """A circle on the corner of a rectangle, with a motor, and a thruster on the rectangle."""
+    level = add_body(add_body(empty(), "rectangle", 2.0, 2.0), "circle", 2.2, 2.2)
+    return add_thruster(add_joint(level, 2.2, 2.2), 1.9, 1.9, math.pi / 2)
+
+
+def gap(level: Level) -> float:
+    """m between the ends of the first joint."""
+    one, ends = one_of(level), []
+    model = one.model
+    for bodies, anchors in ((model.joint_a, model.joint_anchor_a), (model.joint_b, model.joint_anchor_b)):
+        angle = one.state.rotation[bodies[0]]
+        turned = np.array(((np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle)))) @ anchors[0]
+        ends.append(one.state.position[bodies[0]] + turned)
+    return float(np.abs(ends[0] - ends[1]).max())
+
+
+def test_a_new_body_has_the_mass_of_its_shape() -> None:
+    one = one_of(add_body(add_body(empty(), "rectangle", 1, 2), "circle", 3, 2))
+    assert one.model.inverse_mass[FIRST] == pytest.approx(1 / 0.25)
+    assert one.model.inverse_mass[M.polygons] == pytest.approx(1 / (math.pi * 0.25**2))
+    assert one.state.position[FIRST].tolist() == [1, 2]
+
+
+def test_what_is_joined_moves_turns_and_is_resized_together() -> None:
+    level = joined()
+    assert not one_of(level).model.collides[FIRST, M.polygons]
+    for after in (
+        move(level, FIRST, 3, 3),
+        turn(level, M.polygons, 1.0),
+        resize(level, FIRST, 1.5),
+        resize(level, M.polygons, 0.5),
+    ):
+        assert gap(after) < 1e-5
+    assert one_of(moved).state.position[M.polygons] == pytest.approx([3.2, 3.2])
+
+
+def test_deleting_a_body_deletes_what_is_on_it() -> None:
+    one = one_of(delete(joined(), "body", FIRST))
+    assert not one.model.joint_active.any()
+    assert not one.model.thruster_active.any()
+    assert one.model.collides[FIRST, M.polygons]
+
+
+def test_roles_fixing_and_picking() -> None:
+    level = fix(set_role(joined(), FIRST, Role.GREEN), FIRST, True)
+    one = one_of(level)
+    assert one.role[FIRST] == Role.GREEN
+    assert one.model.inverse_mass[FIRST] == 0
+    assert bodies_at(level, 2.2, 2.2) == [M.polygons, FIRST]  # what cannot move is drawn first
+    assert one_of(fix(level, FIRST, False)).model.inverse_mass[FIRST] == pytest.approx(4)
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (lambda: move(empty(), 0, 1, 1), "scenery"),
+        (lambda: move(empty(), FIRST, 1, 1), "no body 4"),
+        (lambda: add_joint(empty(), 1, 1), "two bodies"),
+        (lambda: add_thruster(empty(), 1, 1, 0), "on one"),
+        (lambda: resize(joined(), FIRST, 100), "reaches"),
+        (lambda: move(joined(), FIRST, 100, 1), "outside"),
+        (lambda: add_body(add_body(add_body(empty(), "rectangle", 1, 1), "triangle", 1, 1), "triangle", 1, 1), "room"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_one_sentence(edit, words: str) -> None:
+    with pytest.raises(EditError, match=words) as error:
+        edit()
+    assert str(error.value).endswith(".")
+
+
+number = st.floats(-1, 6)
+index = st.integers(0, 12)
+ANY = st.one_of(
+    st.tuples(st.just("add_body"), st.sampled_from(["circle", "rectangle", "triangle"]), number, number),
+    st.tuples(st.just("move"), index, number, number),
+    st.tuples(st.just("turn"), index, number),
+    st.tuples(st.just("resize"), index, st.floats(0.1, 3)),
+    st.tuples(st.just("set_role"), index, st.integers(0, 3)),
+    st.tuples(st.just("fix"), index, st.booleans()),
+    st.tuples(st.just("add_joint"), number, number, st.booleans()),
+    st.tuples(st.just("add_thruster"), number, number, number),
+    st.tuples(st.just("bind"), st.sampled_from(["joint", "thruster"]), index, index),
+    st.tuples(st.just("delete"), st.sampled_from(["body", "joint", "thruster"]), index),
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 50), st.lists(ANY, max_size=8))
+def test_a_level_file_takes_what_comes_of_any_edits(level_id: int, edits: list) -> None:
+    level = one_level(level_id)
+    for name, *words in edits:
+        with suppress(EditError):
+            level = EDITS[name](level, *words)
+    back = from_document(to_document(LevelFile(level, TaskParams()))).level
+    assert np.array_equal(np.asarray(back.model.collides), np.asarray(level.model.collides))
+    assert np.array_equal(np.asarray(back.state.position), np.asarray(level.state.position))
+
+
+def one_level(level_id: int) -> Level:
+    import jax
+
+    return jax.tree.map(np.asarray, sample_levels([level_id], M))
