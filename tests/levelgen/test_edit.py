@@ -64,12 +64,8 @@ def test_a_new_body_has_the_mass_of_its_shape() -> None:
 def test_what_is_joined_moves_turns_and_is_resized_together() -> None:
     level = joined()
     assert not one_of(level).model.collides[FIRST, M.polygons]
-    for after in (
-        move(level, FIRST, 3, 3),
-        turn(level, M.polygons, 1.0),
-        resize(level, FIRST, 1.5),
-        resize(level, M.polygons, 0.5),
-    ):
+    moved, turned = move(level, FIRST, 3, 3), turn(level, M.polygons, 1.0)
+    for after in (moved, turned, resize(level, FIRST, 1.5), resize(level, M.polygons, 0.5)):
         assert gap(after) < 1e-5
     assert one_of(moved).state.position[M.polygons] == pytest.approx([3.2, 3.2])
 

@@ -16,7 +16,7 @@ from levelgen.files.level_file import LevelFile
 from pipeline.errors import UserError
 from pipeline.look.play.server import HOST, serving
 from pipeline.look.play.session import empty_file, witness_in
-from pipeline.read.levels import find_level, is_level_file, level_file, level_of, rules_of
+from pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of
 from pipeline.read.rows import read_row
 from pipeline.runtime import prepare_jax
 
@@ -59,7 +59,7 @@ def level_to_play(source: Path | None, level_id: int | None, size: str) -> tuple
     if level_id is None:
         raise UserError(f"Which level of {source}? Add its id, as `levelproof inspect {source}` shows them.")
     manifest, row = find_level(source, level_id)
-    level = jax.tree.map(np.asarray, level_of(manifest, row))
+    level = jax.tree.map(np.asarray, levels_of(manifest, manifest.table))
     file = LevelFile(level, rules_of(manifest))
     if not row["shard"]:
         return file, None
