@@ -28,6 +28,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "observation": ("benchmarks.observation", "what the symbolic-flat observation costs beside the step"),
     "families": ("benchmarks.families", "how many levels of each distribution need no expert, and a sheet of each"),
     "portability": ("benchmarks.portability", "how many witnesses reach the goal in the reference"),
+    "polish": ("benchmarks.polish", "how short search around a witness makes it, and how far masters are from that"),
     "handmade": ("benchmarks.handmade", "what it takes to label the reference's 74 handmade levels, one by one"),
     "storage": ("benchmarks.storage", "bytes per transition of each density, and trajectories/s written and read"),
     "plan": ("benchmarks.plan", "what `levelproof plan` says of a job, against the job itself"),

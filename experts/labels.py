@@ -23,7 +23,7 @@ class Source(StrEnum):
     SAMPLED = "sampled"  # actions sampled from the expert's policy in its evaluation
     EXPLORATION = "exploration"  # actions of an episode of training
     SCOUT = "scout"  # persistent random play before training
-    SEARCH = "search"  # exploration from archived states, before training
+    SEARCH = "search"  # exploration from archived states, before training, or around another witness
     NOTHING = "nothing"  # a trivial level's
     IMPORT = "import"  # of another program's data
 

@@ -15,11 +15,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from experts.config import RECORD_STEPS
 from experts.judge import Witness
-from experts.rollout import repeat
+from experts.search.play import Arena, Walk, act, arena, fresh_walk
 from experts.witness import at_once, blocks, take
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
-from levelgen.task import rules as task
 from levelgen.task.rules import TaskParams
 from physics.types import State
 
@@ -89,35 +88,41 @@ def _survival(
     replays: int,
     rules: TaskParams,
 ) -> Float[Array, " level"]:
-    lanes = repeat(levels, replays)
-    action = jnp.repeat(action, replays, -1)
-    last = jnp.repeat(jnp.minimum(steps + LATE, RECORD_STEPS), replays) - 1
-
-    def act(carry):
-        t, now, over, reached = carry
-        now, outcome = task.advance(lanes, now, action[t].astype(jnp.int32), rules)
-        return t + 1, now, over | outcome.done | (t == last), reached | (outcome.goal & ~over)
-
-    no = jnp.zeros(len(last), bool)
-    start = replace(task.reset(lanes), state=moved(lanes, level_ids, replays))
-    reached = jax.lax.while_loop(lambda carry: ~carry[2].all(), act, (jnp.int32(0), start, no, no))[3]
+    ring = arena(levels, replays, (1.0,))
+    start = fresh_walk(ring.lanes)._replace(state=moved(ring.lanes, level_ids, replays))
+    reached = survivors(ring, start, jnp.repeat(action, replays, -1), jnp.repeat(steps, replays), rules)
     return reached.reshape(-1, replays).mean(-1)
 
 
-def moved(lanes: Level, level_ids: Int[Array, " level"], replays: int) -> State:
+def survivors(
+    ring: Arena, start: Walk, action: Int[Array, "256 6 lane"], steps: Int[Array, " lane"], rules: TaskParams
+) -> Bool[Array, " lane"]:
+    """Whether each lane reaches the goal, at most LATE env steps later than after `steps`; 0: it does not play."""
+    last = jnp.where(steps > 0, jnp.minimum(steps + LATE, RECORD_STEPS), 0)
+
+    def step(walk: Walk) -> Walk:
+        walk = act(ring, walk, action[walk.timestep[0]].astype(jnp.int32), rules)
+        return walk._replace(ended=walk.ended | (walk.timestep >= last))
+
+    going = lambda walk: ~walk.ended.all()
+    return jax.lax.while_loop(going, step, start._replace(ended=last == 0)).reached > 0
+
+
+def moved(lanes: Level, level_ids: Int[Array, " level"], replays: int, number: Int[Array, ""] | int = 0) -> State:
     """First states: every number of a body that can move is one unit in the last place less or more, or as it was.
 
     Args:
         lanes: `replays` of each level, level by level.
         level_ids: of the levels.
         replays: of each level.
+        number: of these states, of a level.
     """
     state, model = lanes.state, lanes.model
     movable = model.active & ((model.inverse_mass > 0) | (model.inverse_inertia > 0))
 
-    def move(number: int, x: Array, these: Bool[Array, "..."]) -> Array:
+    def move(field: int, x: Array, these: Bool[Array, "..."]) -> Array:
         def draw(level_id):
-            key = jax.random.fold_in(key_for(level_id, Stream.PORTABILITY), number)
+            key = jax.random.fold_in(key_for(level_id, Stream.PORTABILITY), 4 * number + field)
             return jax.random.randint(key, (*x.shape[:-1], replays), -1, 2)
 
         by = jnp.moveaxis(jax.vmap(draw)(level_ids), 0, -2).reshape(x.shape)

@@ -15,6 +15,7 @@ from experts.labels import WITNESSED, Source, Verdict
 from experts.ledger import Ledger, lap
 from experts.pool import NOTHING_BEGUN, Pool, Submission, Totals
 from experts.portability import choose
+from experts.rework import rework
 from experts.steps import EnvSteps
 from experts.success import Success
 from experts.witness import Record, replay, take
@@ -143,6 +144,7 @@ class TrainingRun:
         for i, of in zip(left, trained, strict=True):
             candidates[i] = of.candidates
         chosen = choose(levels, level_ids, candidates, config.replays, rules)
+        chosen, reworked = rework(levels, level_ids, chosen, self.pool.procedure, rules)
         for i, witness in enumerate(chosen):
             if witness is not None:
                 actions[..., i] = witness.action
@@ -150,7 +152,7 @@ class TrainingRun:
         witnesses = [chosen[i] for i in left]
         judged = judge(trained, witnesses, take(record, left), self.pool.updates, config, failed[left])
         verdicts = {
-            i: with_looks(verdict, found, at)
+            i: with_looks(verdict, found, at, int(reworked[i]))
             for i, verdict, at in zip(left.tolist(), judged, asked.tolist(), strict=True)
         }
         shares = [None if witness is None else witness.portability for witness in chosen]
@@ -168,13 +170,13 @@ class TrainingRun:
         return take(self.levels, indices), self.level_ids[indices]
 
 
-def with_looks(verdict: Verdict, found: Found, index: int) -> Verdict:
-    """The verdict with what was done before training."""
+def with_looks(verdict: Verdict, found: Found, index: int, reworked: int) -> Verdict:
+    """The verdict with what was done before training, and the env steps of search around its witness."""
     searched = int(found.search_steps[index])
     return replace(
         verdict,
         scout_steps=int(found.scout_steps[index]),
-        search_steps=searched,
+        search_steps=searched + reworked,
         cells=int(found.cells[index]) if searched else None,
         still_grew=bool(found.still_grew[index]) if searched else None,
     )

@@ -30,11 +30,16 @@ class SearchConfig:
     velocity_seconds: float = 0.3  # s; metres for each metre a second
     # a success
     trials: int = 4  # rounds of attempts to make it shorter, one a lane; the first also verifies it
+    # a witness
+    polish: int = 0  # env steps of search around it for a shorter one, rounded up to whole rounds; 0: none
+    steady: int = 16  # rounds of search around one that few replays survive, for one that more do; 0: none
     # machine
     rounds: int = 8  # between looks of the host
 
     def __post_init__(self) -> None:
         require(self, ("env_steps",), 0, MOST_COUNTED)
+        require(self, ("polish",), 0, MOST_COUNTED // 2)
+        require(self, ("steady",), 0)
         require(self, ("lanes", "segment", "stretch", "trials", "rounds"), 1)
         require(self, ("entries",), 1, MOST_ENTRIES)
         require(self, ("nearer", "anew"), 0, 1)

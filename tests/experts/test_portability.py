@@ -131,7 +131,9 @@ def test_a_level_with_two_ways_has_the_portable_one(levels: Level, witnesses: li
 
 
 def labelled(levels: Level, replays: int) -> UnitResult:
-    procedure = Procedure(ONCE, SearchConfig(env_steps=0), ExpertConfig(replays=replays), StopConfig(rule=Rule.NONE))
+    procedure = Procedure(
+        ONCE, SearchConfig(env_steps=0, steady=0), ExpertConfig(replays=replays), StopConfig(rule=Rule.NONE)
+    )
     return label(levels, IDS, 4096, procedure)
 
 

@@ -1,0 +1,136 @@
+"""What polish gives: steps to the goal of witnesses before and after, and of experts that master their levels."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from benchmarks.alone import label
+from benchmarks.oracle import tell
+from benchmarks.report import Report, Table
+from configs.compose import compose_job
+from experts.judge import Witness
+from experts.labels import BY_EXPERT, Label
+from experts.procedure import Procedure
+from experts.rework import rework
+from experts.train import UnitResult
+from experts.witness import take
+from levelgen.level import SIZES, Level
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import DEFAULT_RULES
+from pipeline.runtime import prepare_jax
+
+FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
+LEVELS = {"s": 64, "m": 64, "l": 32}
+BUDGET = 256_000  # env steps of an expert
+POLISH = (16_384, 65_536, 262_144)  # env steps of a witness
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Env steps to the goal, of levels that both procedures solve, the masters by an expert's own witness."""
+
+    default: Int[np.ndarray, " level"]
+    polished: Int[np.ndarray, "budget level"]
+    masters: Int[np.ndarray, " level"]
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
+    parser.add_argument("--levels", type=int, help="ids of each size (default: 64 of s and m, 32 of l)")
+    parser.add_argument("--first", type=int, default=FIRST, help=f"level id (default: {FIRST:,})")
+
+
+def run(given: argparse.Namespace) -> Report:
+    prepare_jax()
+    found = {size: lengths(size, given.first, given.levels or LEVELS[size]) for size in given.size}
+    budgets = [f"{budget:,}" for budget in POLISH]
+    return Report(
+        title="Polished witnesses",
+        results=[{"size": size} | summary(of) for size, of in found.items()],
+        tables=[
+            Table(
+                ("size", "levels", "default", *(f"polished, {budget}" for budget in budgets), "masters"),
+                [[size, str(len(of.default)), *(f"{x:.1f}" for x in means(of))] for size, of in found.items()],
+                "Mean steps to the goal",
+            ),
+            Table(
+                ("size", "longer than polished, mean", "median", "as short or shorter"),
+                [
+                    [size, f"{excess.mean():.0%}", f"{np.median(excess):.0%}", f"{(excess <= 0).mean():.0%}"]
+                    for size, of in found.items()
+                    for excess in [masters_excess(of)]
+                ],
+                f"Masters, against witnesses polished for {budgets[-1]} env steps",
+            ),
+        ],
+        notes=[
+            f"Levels from id {given.first:,} on, experts of {BUDGET:,} env steps; counted are levels that the default "
+            "procedure solves and on which `procedure=masters` has a witness of its expert's own. *Polished*: the "
+            "default's witnesses after so many env steps of `search.polish` each, the shortest whatever its "
+            "portability.",
+        ],
+    )
+
+
+def lengths(size: str, first: int, count: int) -> Lengths:
+    """Of so many levels of a size."""
+    ids = np.arange(first, first + count, dtype=np.int32)
+    levels = jax.tree.map(np.asarray, sample_levels(ids, SIZES[size]))
+    default, masters = (
+        label(levels, ids, BUDGET, compose_job([f"procedure={name}"]).procedure, DEFAULT_RULES)
+        for name in ("default", "masters")
+    )
+    both = [
+        i
+        for i, (one, other) in enumerate(zip(default.verdicts, masters.verdicts, strict=True))
+        if one.label is Label.SOLVED and other.witness in BY_EXPERT
+    ]
+    tell(f"{size}: {len(both)} of {count} levels count.")
+    witnesses, at = [witness_of(default, i) for i in both], np.array(both, int)
+    polished = [steps_of(polish(take(levels, at), ids[at], witnesses, env_steps)) for env_steps in POLISH]
+    return Lengths(steps_of(witnesses), np.array(polished), steps_of([witness_of(masters, i) for i in both]))
+
+
+def polish(levels: Level, level_ids: Int[np.ndarray, " level"], witnesses: Sequence[Witness], env_steps: int) -> list:
+    """The shortest of each level."""
+    procedure = Procedure()
+    only = replace(
+        procedure, search=replace(procedure.search, polish=env_steps), expert=replace(procedure.expert, replays=0)
+    )
+    return rework(levels, level_ids, witnesses, only, DEFAULT_RULES)[0]
+
+
+def witness_of(result: UnitResult, index: int) -> Witness:
+    verdict = result.verdicts[index]
+    assert verdict.witness is not None
+    assert verdict.steps_to_goal is not None
+    return Witness(np.asarray(result.record.action)[..., index], verdict.witness, verdict.steps_to_goal)
+
+
+def steps_of(witnesses: Sequence[Witness]) -> Int[np.ndarray, " level"]:
+    return np.array([witness.steps for witness in witnesses], int)
+
+
+def means(of: Lengths) -> list[float]:
+    return [float(x.mean()) for x in (of.default, *of.polished, of.masters)]
+
+
+def masters_excess(of: Lengths) -> Float[np.ndarray, " level"]:
+    """By which share masters take longer than the most polished witness."""
+    return of.masters / of.polished[-1] - 1
+
+
+def summary(of: Lengths) -> dict:
+    """Of one size, as JSON has it."""
+    default, *polished, masters = means(of)
+    return {
+        "levels": len(of.default),
+        "default": default,
+        "polished": dict(zip(map(str, POLISH), polished, strict=True)),
+        "masters": masters,
+        "masters_excess": float(masters_excess(of).mean()),
+    }

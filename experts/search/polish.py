@@ -1,0 +1,125 @@
+"""A witness polished: search around it for a shorter one, until its env steps are used up.
+
+In every round each lane plays the shortest success so far with some of it changed: a stretch left out, held or drawn
+anew. The one that reaches the goal first is the next round's; of equals the one that comes nearer a step before, which
+is how a way becomes a step shorter.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from experts.config import RECORD_STEPS
+from experts.search.play import CODES, Arena, act, arena, decode, fresh_walk
+from experts.search.shorten import Shortened, drawn, edited
+from experts.success import Success
+from levelgen.identity.keys import Stream, key_for
+from levelgen.level import ACTIONS, Level
+from levelgen.task.actions import action_mask
+from levelgen.task.rules import TaskParams, goal_distance
+
+LANES = 16  # of a level: few, so that there are many rounds
+
+
+class Polishing(NamedTuple):
+    """Levels under polish, level first."""
+
+    success: Success
+    near: Float[Array, " level"]  # m, of green and blue, one env step before the goal; infinity: not known
+    env_steps: Int[Array, " level"]  # of all lanes
+    number: Int[Array, ""]  # of the round
+
+
+@partial(jax.jit, static_argnames=("env_steps", "rules"))
+def polish(
+    levels: Level, level_ids: Int[Array, " level"], success: Success, env_steps: int, rules: TaskParams
+) -> Shortened:
+    """Look for shorter successes until every level has had so many env steps, rounded up to whole rounds.
+
+    Args:
+        levels: lane axis last.
+        level_ids: their ids, the seeds of all randomness.
+        success: of each level, level first; it replays. Length 0: there is none, and no env step is made.
+        env_steps: of a level, all lanes together.
+        rules: of the task.
+    """
+    ring = arena(levels, LANES, (1.0,))
+    keys = jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, Stream.SEARCH), 2))(level_ids)
+    count = len(level_ids)
+    level, live = jnp.arange(count), action_mask(levels).T
+
+    def active(now: Polishing) -> Bool[Array, " level"]:
+        return (now.success.length > 1) & (now.env_steps < env_steps)
+
+    def one(now: Polishing) -> Polishing:
+        best, goes = now.success, active(now)
+        bits = jax.vmap(lambda key: jax.random.bits(jax.random.fold_in(key, now.number), (10, LANES)))(keys)
+        action = jax.vmap(varied)(best.action, best.length, bits, live)
+        length, near = replayed(ring, action, jnp.where(goes, best.length, 0), rules)
+        least = length == length.min(-1, keepdims=True)
+        lane = jnp.argmin(jnp.where(least, near, jnp.inf), axis=-1)
+        length, near = length[level, lane], near[level, lane]
+        sooner = length < best.length
+        better = goes & (sooner | ((length == best.length) & (near < now.near)))
+        return Polishing(
+            Success(
+                jnp.where(better[:, None, None], action[level, lane], best.action),
+                jnp.where(better, length, best.length),
+            ),
+            jnp.where(better, jnp.where(sooner, jnp.inf, near), now.near),
+            now.env_steps + jnp.where(goes, LANES * best.length, 0),
+            now.number + 1,
+        )
+
+    none = jnp.zeros(count, jnp.int32)
+    start = Polishing(success, jnp.full(count, jnp.inf, jnp.float32), none, jnp.int32(0))
+    end = jax.lax.while_loop(lambda now: active(now).any(), one, start)
+    action = jnp.where((jnp.arange(RECORD_STEPS) < end.success.length[:, None])[:, :, None], end.success.action, 0)
+    return Shortened(Success(action, end.success.length), end.env_steps)
+
+
+def varied(
+    action: Int[Array, "256 6"], length: Int[Array, ""], bits: UInt32[Array, "10 lane"], live: Bool[Array, "6"]
+) -> Int[Array, "lane 256 6"]:
+    """The actions of each lane: half have a stretch drawn anew, three quarters one left out or held.
+
+    Only `live` entries are drawn, those that have an effect.
+    """
+    below = lambda bits, bound: (bits % jnp.maximum(bound, 1).astype(jnp.uint32)).astype(jnp.int32)
+    edit = drawn(bits[:6], length)
+    redraws, edits = bits[6] >> 31 == 1, (bits[6] >> 29) % 4 > 0
+    edit = jax.tree.map(lambda x: jnp.where(edits | ~redraws, x, 0), edit)
+    cut = edited(action, length, edit)
+    first = below(bits[7], length)
+    steps = jnp.maximum(length >> below(bits[8], jnp.int32(7)), 1)
+    fresh = decode((bits[9] % CODES).astype(jnp.uint16)).T  # [lane, 6]
+    which = ((bits[6][:, None] >> jnp.arange(ACTIONS, dtype=jnp.uint32)) & 1 == 1) & live
+    step = jnp.arange(RECORD_STEPS)
+    inside = (step >= first[:, None]) & (step < (first + steps)[:, None]) & redraws[:, None]
+    return jnp.where(inside[:, :, None] & which[:, None], fresh[:, None], cut).astype(action.dtype)
+
+
+def replayed(
+    ring: Arena, action: Int[Array, "level lane 256 6"], most: Int[Array, " level"], rules: TaskParams
+) -> tuple[Int[Array, "level lane"], Float[Array, "level lane"]]:
+    """Env steps until the goal, RECORD_STEPS + 1 where it is not reached within `most`.
+
+    Also returns how far green and blue were apart a step before `most`, m, where it is reached just then.
+    """
+    count, lanes = action.shape[:2]
+    by_step = jnp.moveaxis(action.reshape(count * lanes, RECORD_STEPS, ACTIONS), 0, -1).astype(jnp.int32)
+    last = jnp.repeat(most, lanes)
+
+    def step(carry):
+        walk, near = carry
+        walk = act(ring, walk, by_step[walk.timestep[0]], rules)
+        return walk, jnp.where(walk.timestep == last - 1, goal_distance(ring.lanes, walk.state), near)
+
+    going = lambda carry: (carry[0].timestep[0] < most.max()) & ~carry[0].ended.all()
+    walk, near = jax.lax.while_loop(going, step, (fresh_walk(ring.lanes), jnp.zeros(count * lanes)))
+    reached = walk.reached.reshape(count, lanes)
+    length = jnp.where((reached > 0) & (reached <= most[:, None]), reached, RECORD_STEPS + 1)
+    return length, jnp.where(length == most[:, None], near.reshape(count, lanes), 0.0)

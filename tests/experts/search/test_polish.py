@@ -1,0 +1,114 @@
+"""Polishing: a success becomes as short as it can be where that is known, and depends on nothing but its level."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.alone import label
+from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from experts.labels import Source
+from experts.procedure import Procedure
+from experts.search.config import SearchConfig
+from experts.search.polish import LANES, polish
+from experts.search.shorten import Shortened
+from experts.success import Success
+from experts.witness import replay, steps_to_goal, take
+from levelgen.level import ACTIONS, MOTOR_BINDINGS, Level, Role
+from levelgen.task.rules import DEFAULT_RULES
+from tests.experts.search.worlds import world
+
+WIDTH = 4
+IDS = np.arange(WIDTH, dtype=np.int32)
+ENV_STEPS = 60_000
+RIGHT = MOTOR_BINDINGS  # entry of the action that the first thruster obeys
+IDLE, WASTED = 40, 20  # env steps of the success that is given
+
+
+@cache
+def levels() -> Level:
+    """A ball on a line without friction, which one thruster pushes to the goal and another one away from it."""
+    level = world(bars=[((2.5, 0.2), (2.5, 0.1), 0.0)] * 2, bar_role=Role.PLAIN, ball=(1.0, 2.5), goal=(4.0, 2.5),
+                  angles=(0.0, np.pi), thrust=0.4)  # fmt: skip
+    level.model.gravity[:] = 0
+    level.model.friction[:] = 0
+    return take(level, np.zeros(WIDTH, int))
+
+
+def constant(entry: int, choice: int) -> np.ndarray:
+    action = np.zeros((256, ACTIONS), np.int8)
+    action[:, entry] = choice
+    return action
+
+
+@cache
+def shortest() -> tuple[np.ndarray, int]:
+    """Nothing is sooner there than what pushes all the time."""
+    ways = [constant(entry, 1) for entry in (RIGHT, RIGHT + 1)]
+    record = replay(take(levels(), np.zeros(2, int)), np.stack(ways, -1))
+    steps = np.where(record.goal.any(0), steps_to_goal(record.goal), 257)
+    return ways[int(steps.argmin())], int(steps.min())
+
+
+@cache
+def given() -> Success:
+    """Waits, then pushes."""
+    action, steps = shortest()
+    late = np.concatenate([np.zeros((IDLE, ACTIONS), np.int8), action[:-IDLE]])
+    late[IDLE + steps :] = 0
+    return Success(np.stack([late] * WIDTH), np.full(WIDTH, IDLE + steps, np.int32))  # pyright: ignore
+
+
+@cache
+def polished() -> Shortened:
+    return jax.device_get(polish(levels(), IDS, given(), ENV_STEPS, DEFAULT_RULES))
+
+
+def test_the_shortest_way_is_found() -> None:
+    success, length = polished().success
+    np.testing.assert_array_equal(length, shortest()[1])
+    record = replay(levels(), np.moveaxis(success, 0, -1))
+    np.testing.assert_array_equal(steps_to_goal(record.done), length)
+    assert record.goal[length[0] - 1].all()
+    assert not success[:, length[0] :].any()
+
+
+def test_a_level_depends_on_nothing_but_its_id() -> None:
+    at = np.array([2, 0, 0, 3])
+    again = polish(levels(), IDS[at], given(), ENV_STEPS, DEFAULT_RULES)
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(again), jax.tree.map(lambda x: x[at], polished()))
+
+
+def test_env_steps_end_it() -> None:
+    steps = polished().env_steps
+    assert (steps >= ENV_STEPS).all()
+    assert (steps < ENV_STEPS + LANES * 256).all()
+    none = Success(given().action, np.array([0, *given().length[1:]], np.int32))  # pyright: ignore
+    few = polish(levels(), IDS, none, ENV_STEPS, DEFAULT_RULES)
+    assert few.env_steps[0] == 0
+    assert few.success.length[0] == 0
+    np.testing.assert_array_equal(few.success.length[1:], polished().success.length[1:])
+
+
+def test_a_witness_is_polished_and_every_env_step_counted() -> None:
+    some = np.array([0, 1])
+    looks = SearchConfig(env_steps=0, steady=0)
+    procedure = Procedure(ScoutConfig(rounds=1), looks, ExpertConfig(replays=4), StopConfig(rule=Rule.NONE))
+    rough = label(take(levels(), some), IDS[some], 2048, procedure)
+    asked = replace(procedure, search=replace(looks, polish=ENV_STEPS))
+    result = label(take(levels(), some), IDS[some], 2048, asked)
+    for one, other in zip(rough.verdicts, result.verdicts, strict=True):
+        assert (one.witness, one.search_steps) == (Source.SCOUT, 0)
+        assert other.search_steps >= ENV_STEPS
+        assert other.steps_to_goal == shortest()[1] < one.steps_to_goal
+        assert other.witness is Source.SEARCH
+        assert (other.scout_steps, other.cells, other.portability) == (one.scout_steps, None, 1)
+    assert result.spent.searched == sum(verdict.search_steps for verdict in result.verdicts)
+
+
+def test_settings_that_cannot_be() -> None:
+    for wrong in ({"polish": -1}, {"polish": 2**31}, {"steady": -1}):
+        with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
+            SearchConfig(**wrong)
