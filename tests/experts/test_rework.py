@@ -59,8 +59,10 @@ def test_a_fragile_witness_becomes_steady_and_no_other_is_touched() -> None:
     np.testing.assert_array_equal(again.action, better.action)
     assert (again.steps, again.portability, steps[0]) == (better.steps, better.portability, env_steps[FRAGILE])
 
-    verdicts = label(levels(), IDS, 4096, PROCEDURE).verdicts
+    result = label(levels(), IDS, 4096, PROCEDURE)
+    verdicts = result.verdicts
     assert [of.search_steps for of in verdicts] == env_steps.tolist()
+    assert result.spent.searched == env_steps.sum()
     assert (verdicts[FRAGILE].witness, verdicts[FRAGILE].portability) == (Source.SEARCH, better.portability)
     assert verdicts[FRAGILE].cells is None, "nobody searched before"
 

@@ -1,26 +1,26 @@
 """Polishing: a success becomes as short as it can be where that is known, and depends on nothing but its level."""
 
-from dataclasses import replace
 from functools import cache
 
 import jax
 import numpy as np
 import pytest
 
-from benchmarks.alone import label
-from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from experts.config import ExpertConfig
+from experts.judge import repeating
 from experts.labels import Source
 from experts.procedure import Procedure
+from experts.rework import IN_CACHE, rework
 from experts.search.config import SearchConfig
 from experts.search.polish import LANES, polish
 from experts.search.shorten import Shortened
 from experts.success import Success
-from experts.witness import replay, steps_to_goal, take
+from experts.witness import at_once, replay, steps_to_goal, take
 from levelgen.level import ACTIONS, MOTOR_BINDINGS, Level, Role
 from levelgen.task.rules import DEFAULT_RULES
 from tests.experts.search.worlds import world
 
-WIDTH = 4
+WIDTH = at_once(LANES, IN_CACHE)  # levels that one program polishes
 IDS = np.arange(WIDTH, dtype=np.int32)
 ENV_STEPS = 60_000
 RIGHT = MOTOR_BINDINGS  # entry of the action that the first thruster obeys
@@ -76,7 +76,7 @@ def test_the_shortest_way_is_found() -> None:
 
 
 def test_a_level_depends_on_nothing_but_its_id() -> None:
-    at = np.array([2, 0, 0, 3])
+    at = np.array([2, 0, 0, *range(WIDTH - 3)])
     again = polish(levels(), IDS[at], given(), ENV_STEPS, DEFAULT_RULES)
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(again), jax.tree.map(lambda x: x[at], polished()))
 
@@ -92,20 +92,20 @@ def test_env_steps_end_it() -> None:
     np.testing.assert_array_equal(few.success.length[1:], polished().success.length[1:])
 
 
-def test_a_witness_is_polished_and_every_env_step_counted() -> None:
-    some = np.array([0, 1])
-    looks = SearchConfig(env_steps=0, steady=0)
-    procedure = Procedure(ScoutConfig(rounds=1), looks, ExpertConfig(replays=4), StopConfig(rule=Rule.NONE))
-    rough = label(take(levels(), some), IDS[some], 2048, procedure)
-    asked = replace(procedure, search=replace(looks, polish=ENV_STEPS))
-    result = label(take(levels(), some), IDS[some], 2048, asked)
-    for one, other in zip(rough.verdicts, result.verdicts, strict=True):
-        assert (one.witness, one.search_steps) == (Source.SCOUT, 0)
-        assert other.search_steps >= ENV_STEPS
-        assert other.steps_to_goal == shortest()[1] < one.steps_to_goal
-        assert other.witness is Source.SEARCH
-        assert (other.scout_steps, other.cells, other.portability) == (one.scout_steps, None, 1)
-    assert result.spent.searched == sum(verdict.search_steps for verdict in result.verdicts)
+def test_a_witness_is_polished() -> None:
+    """And one that does nothing stays."""
+    asked = SearchConfig(polish=ENV_STEPS, steady=0)
+    procedure = Procedure(search=asked, expert=ExpertConfig(replays=0))
+    rough = [of for pair in zip(*given(), strict=True) for of in repeating(Success(*pair), Source.SAMPLED)]
+    rough[0] = rough[0]._replace(source=Source.NOTHING)
+    found, env_steps = rework(levels(), IDS, [*rough[:-1], None], procedure, DEFAULT_RULES)
+    assert found[0] is rough[0]
+    assert found[-1] is None
+    assert env_steps.tolist() == [0, *polished().env_steps[1:-1], 0]
+    for i, of in enumerate(found[1:-1], 1):
+        assert of is not None
+        assert (of.steps, of.source) == (shortest()[1], Source.SEARCH)
+        np.testing.assert_array_equal(of.action[: of.steps], polished().success.action[i, : of.steps])
 
 
 def test_settings_that_cannot_be() -> None:
