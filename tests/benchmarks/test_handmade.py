@@ -5,8 +5,9 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
-from benchmarks.handmade import KINDS, labelled, totals
+from benchmarks.handmade import KINDS, PIXELS, labelled, totals, write_sheet
 from configs.compose import compose_job
 from levelgen.files.level_file import LevelFile, write_level_file
 from levelgen.level import SIZES
@@ -23,7 +24,10 @@ def test_each_level_has_its_row_and_each_size_its_sum(tmp_path: Path) -> None:
         level = jax.tree.map(np.asarray, sample_levels([level_id], SIZES["s"]))
         write_level_file(LevelFile(level, TaskParams()), tmp_path / f"{name}.json")
     job = compose_job([f"level_files={tmp_path}", "procedure=label", "budget=5k"])
-    results = labelled(job, levels_below(tmp_path, job).levels["s"])
+    results, pictures = labelled(job, levels_below(tmp_path, job).levels["s"])
+    write_sheet(pictures, tmp_path / "sheet.png")
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        assert sheet.width == PIXELS, "of the one that has a witness"
     assert {of["level"]: of["label"] for of in results} == {"falls": "trivial", "hopeless": "unsolvable"}
     assert all(of[kind] == 0 for of in results for kind in KINDS)
     ((size, levels, with_witness, _, *sums),) = totals(results)
