@@ -13,6 +13,7 @@ from typing import Any
 from benchmarks import oracle
 from benchmarks.report import Report, Table
 from experts.labels import Label
+from pipeline.errors import Failure
 from pipeline.look.cost import READ, cost_of
 from pipeline.store.manifest import read_manifest
 from pipeline.store.shard import stored_bytes
@@ -78,11 +79,14 @@ def row(of: Mapping[str, Any]) -> Sequence[str]:
     about = lambda value: f"{value:,.0f}" if value >= 1000 else f"{value:,.3g}"
     names = {"wall": "wall time, s", "hours": "core- or GPU-hours", "seconds_per_solved": "seconds a solved level"}
     interval = f"{about(of['low'])} to {about(of['high'])}" if of["low"] < of["high"] else "-"
-    name = names.get(of["what"], of["what"])
+    name = names.get(str(of["what"]), str(of["what"]))
     return [name, about(of["expected"]), interval, about(of["measured"]), f"{of['ratio']:.2f}"]
 
 
 def _levelproof(*words: str) -> str:
     oracle.tell(f"levelproof {' '.join(words)}")
     command, environment = [sys.executable, "-m", "levelproof", *words], dict(oracle.our_environment())
-    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment).stdout
+    done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True, env=environment)
+    if done.returncode:
+        raise Failure(f"`levelproof {' '.join(words)}` ended with exit code {done.returncode}: it has said why above.")
+    return done.stdout

@@ -32,10 +32,11 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from configs.schema import JobConfig
 from pipeline.errors import Failure, UserError
 from pipeline.jobs.likeness import Program, program_of, unlike
-from pipeline.jobs.progress import STOPPING, Board, Tally, duration
+from pipeline.jobs.progress import STOPPING, Board, Tally
 from pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, Settle, UnitOutcome, levels_text
 from pipeline.runtime import GRACE, own_core, own_cores, prepare_jax, stoppable
 from pipeline.store.remote import absolute, as_typed
+from pipeline.words import duration
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s after which people see progress, whether a worker has reported or not

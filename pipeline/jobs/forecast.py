@@ -19,7 +19,7 @@ LIKELY = 0.9  # of an interval
 SHARDS_OWN, OTHERS = 1, 1  # zarr.json of a shard; job.json of a split
 
 
-class Stored(NamedTuple):
+class PerWitness(NamedTuple):
     """What a witness takes in one density."""
 
     bytes: float
@@ -39,7 +39,7 @@ class Sample:
     solved: Bool[np.ndarray, " level"]
     witnessed: Bool[np.ndarray, " level"]
     row_bytes: float  # of the manifest
-    stored: dict[str, Stored]  # by density
+    stored: dict[str, PerWitness]  # by density
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def _guess(draws: Float[np.ndarray, " draw"], expected: float) -> Guess:
     return Guess(float(expected), float(low), float(high))
 
 
-def _files(levels: int, witnesses: float, of: Stored) -> int:
+def _files(levels: int, witnesses: float, of: PerWitness) -> int:
     """Of a split that is sealed."""
     fragments = math.ceil(levels / ROWS)
     rows = math.ceil(witnesses / fragments)  # of a shard

@@ -13,6 +13,7 @@ from configs.schema import JobConfig
 from experts.labels import Label
 from experts.steps import EnvSteps
 from pipeline.errors import Exit, Failure
+from pipeline.jobs.events import Events, telling
 from pipeline.jobs.progress import Board, Tally, say
 from pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, plan_units
 from pipeline.jobs.seal import Sealer, sealing
@@ -63,8 +64,12 @@ def generate(
             each = f"{len(wanted)} levels of size {job.size}, {job.budget} env steps each"
             board.say(f"{each}, into {as_typed(split)}{there}")
             try:
-                with board.shown(), sealing(split, manifest.counting, board.say) as sealer:
-                    _work(job, split, scheduler, board, sealer)
+                with (
+                    board.shown(),
+                    sealing(split, manifest.counting, board.say) as sealer,
+                    telling(split, board, scheduler, shlex.join(command)) as events,
+                ):
+                    _work(job, split, scheduler, board, sealer, events)
             except KeyboardInterrupt:
                 board.say(
                     f"Stopped: {board.tally.done} of {len(wanted)} levels are committed; the same command goes on."
@@ -79,7 +84,7 @@ def generate(
     return Exit.QUARANTINED if scheduler.quarantined else Exit.DONE
 
 
-def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, sealer: Sealer) -> None:
+def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, sealer: Sealer, events: Events) -> None:
     notes = set(quarantine.given_up(split))
 
     def settle(outcomes: Sequence[UnitOutcome]) -> None:
@@ -89,14 +94,17 @@ def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, seale
             unit = outcome.unit
             board.ended(unit, outcome.summary)
             if outcome.fatal:
+                events.ended(outcome)
                 raise Failure(outcome.fatal)
             note = quarantine_path(split, unit.name)
             if outcome.summary:
+                events.ended(outcome)
                 sealer.committed(unit)
                 if note in notes:
                     remove(note)
                 continue
             last = scheduler.failed(unit)
+            events.ended(outcome, last)
             failed.setdefault((outcome.reason.strip().splitlines()[-1], last), []).append(unit)
             if last:
                 reason = f"Failed {scheduler.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n"

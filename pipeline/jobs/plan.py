@@ -20,15 +20,16 @@ from configs.schema import MOST_FRAME_SKIP, JobConfig
 from experts.labels import WITNESSED, Label
 from experts.steps import Seconds
 from pipeline.errors import Failure, UserError
-from pipeline.jobs.forecast import LIKELY, Forecast, Sample, Stored, forecast
+from pipeline.jobs.forecast import LIKELY, Forecast, PerWitness, Sample, forecast
 from pipeline.jobs.generate import generate
-from pipeline.jobs.progress import duration, say
+from pipeline.jobs.progress import say
 from pipeline.read.rows import read_rows
 from pipeline.runtime import own_cores, prepare_jax
 from pipeline.store.layout import split_path
 from pipeline.store.manifest import read_manifest
 from pipeline.store.schema import Encoding
 from pipeline.store.shard import stored_bytes, write_shard
+from pipeline.words import duration
 
 SECONDS = 60.0  # of making levels, about
 MOST = 4096  # levels
@@ -134,7 +135,7 @@ def _row_bytes(table: pa.Table) -> float:
     return whole.getvalue().size / table.num_rows
 
 
-def _stored(job: JobConfig, split: Path, table: pa.Table, folder: Path) -> dict[str, Stored]:
+def _stored(job: JobConfig, split: Path, table: pa.Table, folder: Path) -> dict[str, PerWitness]:
     """What witnesses take in each density; nothing where there are none."""
     rows = table.filter(table.column("shard").is_valid())[:STORED]
     if not rows.num_rows:
@@ -144,7 +145,7 @@ def _stored(job: JobConfig, split: Path, table: pa.Table, folder: Path) -> dict[
     for density in ("full",) if job.task.frame_skip > MOST_FRAME_SKIP else ("full", "resume", "witness"):
         path = folder / f"{density}.zarr"
         write_shard(path, ids, arrays, Encoding(density, job.key_every, job.task))
-        found[density] = Stored(stored_bytes(path) / len(ids), sum(entry.is_dir() for entry in path.iterdir()))
+        found[density] = PerWitness(stored_bytes(path) / len(ids), sum(entry.is_dir() for entry in path.iterdir()))
     return found
 
 

@@ -10,6 +10,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from experts.steps import EnvSteps
 from pipeline.jobs.schedule import Round, Summary, WorkUnit
+from pipeline.words import duration
 
 LINE_EVERY = 30.0  # s between plain lines
 LINE_AFTER = 2.0  # s between one and the next commit that is told; the last commit always is
@@ -93,6 +94,7 @@ class Board:
         self._pace = Progress(get_time=clock, speed_estimate_period=PACE_OVER, disable=True)
         self._steps = self._pace.add_task("env steps", total=None)
         self._levels = self._pace.add_task("levels", total=tally.levels, completed=tally.done)
+        self.watchers: list[Callable[[float, float | None], None]] = []  # told env steps/s and s to go, at every look
 
     def shown(self) -> AbstractContextManager[object]:
         return self._bar if self._console.is_terminal else nullcontext()
@@ -103,6 +105,8 @@ class Board:
         if self.tally.steps != steps.completed:
             self._pace.update(self._steps, completed=self.tally.steps)
             self._pace.update(self._levels, completed=self.tally.share * self.tally.levels)
+        for watcher in self.watchers:
+            watcher(steps.speed or 0.0, levels.time_remaining)
         text, now = self.tally.text(steps.speed or 0.0, levels.time_remaining), time.monotonic()
         if self._console.is_terminal:
             self._bar.update(self._task, completed=self.tally.share, description=text)
@@ -118,10 +122,3 @@ class Board:
         self.tally.ended(unit, summary)
         if summary:
             self.refresh(0.0 if self.tally.done == self.tally.levels else LINE_AFTER)
-
-
-def duration(seconds: float) -> str:
-    """`45 s`, `3 min`, `2.5 h`."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

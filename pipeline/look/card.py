@@ -63,7 +63,7 @@ def card(splits: Sequence[Path], out: Path | None, wishes: Wishes) -> None:
     print(f"{out}: the card of {', '.join(paths)}, with {PREVIEW}/ and {FIGURES}/ beside it.")
     if not wishes.license:
         print("It names no licence: choose one with --license, such as cc-by-4.0 or mit.")
-    excluded = '--exclude "*.lock" --exclude "*/job.json" --exclude "*/.*"'
+    excluded = '--exclude "*.lock" --exclude "*/job.json" --exclude "*/events/*" --exclude "*/.*"'
     print(f"Next:  hf upload {wishes.repo or 'USER/NAME'} {folder} . --repo-type dataset {excluded}")
 
 

@@ -13,6 +13,7 @@ from pipeline.store.remote import BUCKETS, fragments_in, is_remote, names_in
 
 FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE = "manifest", "shards", "experts", "quarantine"
 WRITER_LOCK, COMMIT_LOCK, JOB = ".writer.lock", ".commit.lock", "job.json"
+EVENTS = "events"  # of runs; nothing else reads them
 DIGITS = 12  # of a level id in file names, so that names sort as ids do
 UNIT = rf"([0-9]{{{DIGITS}}})-([0-9]{{{DIGITS}}})"
 ATTEMPT = rf"{UNIT}-[0-9a-f]{{8}}"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from configs.schema import JobConfig
 from pipeline.errors import UserError
-from pipeline.store.layout import FOLDERS, JOB, split_path
+from pipeline.store.layout import EVENTS, FOLDERS, JOB, split_path
 from pipeline.store.leftovers import clean
 from pipeline.store.locks import committing, only_writer
 from pipeline.store.manifest import Manifest, differences, told
@@ -89,7 +89,7 @@ def _make_writable(split: Path) -> None:
 
 def _require_own_folders(split: Path) -> None:
     """Refuse links: what is removed from a split is looked for in these folders."""
-    for path in (split / name for name in FOLDERS):
+    for path in (split / name for name in (*FOLDERS, EVENTS)):
         if path.is_symlink() or (path.exists() and not path.is_dir()):
             what = "a link" if path.is_symlink() else "no folder"
             raise UserError(

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from experts.labels import Label
-from pipeline.jobs.forecast import Sample, Stored, forecast
+from pipeline.jobs.forecast import PerWitness, Sample, forecast
 from pipeline.jobs.seal import seal_split
 from pipeline.store.merge import FILE_BYTES
 from pipeline.store.seal import ROWS
@@ -17,7 +17,7 @@ from tests.pipeline.made import made_split
 
 def sample(busy: np.ndarray, solved: np.ndarray, **changes: object) -> Sample:
     of = {"device": "core", "workers": 2, "wall": 60.0, "once": 5.0, "compiling": 20.0, "row_bytes": 200.0}
-    stored = {"full": Stored(10_000.0, 5)}
+    stored = {"full": PerWitness(10_000.0, 5)}
     return Sample(**(of | {"busy": busy, "solved": solved, "witnessed": solved, "stored": stored} | changes))  # pyright: ignore[reportArgumentType]
 
 
@@ -50,7 +50,7 @@ def test_files_are_those_that_sealing_makes(tmp_path: Path) -> None:
     split = made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]] * 4)
     seal_split(split, None, Console(quiet=True))
     (shard,) = (split / "shards").iterdir()
-    stored = Stored(stored_bytes(shard) / 4, sum(entry.is_dir() for entry in shard.iterdir()))
+    stored = PerWitness(stored_bytes(shard) / 4, sum(entry.is_dir() for entry in shard.iterdir()))
     solved = np.tile([True, False], 4)
     of = forecast(sample(np.ones(8), solved, stored={"full": stored}), 8, 2)
     files = [path for path in split.rglob("[!.]*") if path.is_file()]

@@ -6,8 +6,9 @@ import pytest
 from rich.console import Console
 
 from experts.steps import EnvSteps
-from pipeline.jobs.progress import Board, Tally, duration
+from pipeline.jobs.progress import Board, Tally
 from pipeline.jobs.schedule import Summary, WorkUnit
+from pipeline.words import duration
 
 UNIT = WorkUnit(tuple(range(16)))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.store.events import events_of, runs_in
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard
@@ -30,6 +31,10 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = here([*COMMAND, "executor=inline"], folder)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
+    (run,) = runs_in(folder / SPLIT)
+    told = events_of(run)
+    assert [told[0]["event"], told[-1]["event"], told[-1]["how"]] == ["started", "ended", "done"]
+    assert sum(of["levels"] for of in told if of["event"] == "committed") == told[-1]["done"] == told[0]["levels"]
     return folder / SPLIT
 
 

@@ -19,6 +19,7 @@ import pytest
 from pipeline.errors import Failure, UserError
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.store import leases, remote
+from pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
 from pipeline.store.layout import FRAGMENT, data_paths, new_attempt, unit_name
 from pipeline.store.leases import Lease, LeaseLost
 from pipeline.store.leftovers import clean
@@ -378,3 +379,9 @@ def test_generate_into_a_store_is_generate_into_a_folder(server: Server, tmp_pat
     verified = command(["verify", str(split)], tmp_path)
     assert verified.returncode == 0, verified.stdout
     assert "0 problems" in verified.stdout
+
+
+def test_events_of_runs_lie_in_the_store_and_the_oldest_make_room(server: Server) -> None:
+    for number in range(KEPT + 1):
+        tell(new_run(THERE), [{"time": float(number), "event": "started"}])
+    assert sorted(of["time"] for run in runs_in(THERE) for of in events_of(run)) == list(range(1, KEPT + 1))

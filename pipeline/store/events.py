@@ -1,0 +1,73 @@
+"""What happened in a run, as JSON lines in one small file of its own below the split's `events/`.
+
+It tells whoever watches; no commit rests on it and nothing that is read of a split does, so it may be deleted.
+"""
+
+import json
+import re
+import secrets
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from os import DirEntry
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import LevelproofError
+from pipeline.store.files import remove, write
+from pipeline.store.layout import EVENTS, entries
+from pipeline.store.objects import get
+from pipeline.store.remote import is_remote
+
+RUN = re.compile(rf"{EVENTS}/[0-9]{{8}}T[0-9]{{12}}-[0-9a-f]{{8}}\.jsonl")
+HALF = re.compile(rf"{EVENTS}/\.[0-9]{{8}}T[0-9]{{12}}-[0-9a-f]{{8}}\.jsonl\.[0-9]+")  # what a run that died wrote
+KEPT = 20  # runs of a split
+MOST_BYTES = 2**22  # of a file; one of ours is a tenth of that
+
+Event = Mapping[str, Any]  # `time` in s since 1970, `event`, and what belongs to it
+
+
+def new_run(split: Path) -> Path:
+    """Where a run that begins now tells its events. Names sort as runs began; the oldest runs make room.
+
+    Raises:
+        OSError: the disk refuses.
+        UserError, StoreFailure: the store does.
+    """
+    if not is_remote(split):
+        (split / EVENTS).mkdir(exist_ok=True)
+    for path in [*runs_in(split)[: 1 - KEPT], *entries(split, EVENTS, HALF, DirEntry.is_file)]:
+        remove(path)
+    return split / EVENTS / f"{datetime.now(UTC):%Y%m%dT%H%M%S%f}-{secrets.token_hex(4)}.jsonl"
+
+
+def runs_in(split: Path) -> list[Path]:
+    """The runs of a split that have told something, the latest last."""
+    return sorted(entries(split, EVENTS, RUN, DirEntry.is_file))
+
+
+def tell(path: Path, events: Sequence[Event]) -> None:
+    """Replace a run's file as a whole. A disk or store that refuses is no reason to end the run."""
+    with suppress(OSError, LevelproofError):
+        write(path, "".join(json.dumps(event) + "\n" for event in events).encode())
+
+
+def events_of(path: Path) -> list[dict[str, Any]]:
+    """A run's events; lines that are none are left out, and so is a file that no run can have written.
+
+    Raises:
+        UserError, StoreFailure: the store refuses.
+    """
+    try:
+        if not is_remote(path) and path.stat().st_size > MOST_BYTES:
+            return []
+        data = get(path).data if is_remote(path) else path.read_bytes()
+    except OSError:
+        return []
+    found = []
+    for line in data[:MOST_BYTES].decode(errors="replace").splitlines():
+        with suppress(ValueError, RecursionError):
+            event = json.loads(line)
+            if isinstance(event, dict) and isinstance(event.get("time"), float) and isinstance(event.get("event"), str):
+                found.append(event)
+    return found

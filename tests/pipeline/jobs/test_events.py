@@ -1,0 +1,41 @@
+"""What a run tells of itself is bounded, and adds up."""
+
+import json
+
+import pytest
+
+from experts.steps import EnvSteps, Seconds
+from pipeline.jobs import events as events_file
+from pipeline.jobs.events import MOST, Events
+from pipeline.jobs.progress import Tally
+from pipeline.jobs.schedule import Order, Scheduler, Summary, UnitOutcome, WorkUnit
+
+
+def test_the_latest_events_and_the_state_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events_file, "EVERY", 0.0)
+    told: list[list] = []
+    units = [WorkUnit(range(2 * i, 2 * i + 2)) for i in range(3 * MOST)]
+    tally, scheduler = Tally(len(units) * 2, 0, 0), Scheduler(iter(units), len(units) * 2, 2)
+    scheduler.join("here", 0.0)
+    assert isinstance(scheduler.order("here", 0.0), Order)
+    events = Events(tally, scheduler, "levelproof generate", lambda of: told.append(list(of)))
+    for unit in units:
+        tally.ended(unit, summary := Summary(2, 1, EnvSteps(trained=100), Seconds(training=0.5)))
+        events.ended(UnitOutcome(unit, summary))
+    events.ended(UnitOutcome(units[0], reason="Traceback\n\nValueError: of this one\n"))
+    events.ended(UnitOutcome(units[0], reason="ValueError: again"), given_up=True)
+    events.look(1234.4, 60.2)
+    (began, *latest, state) = told[-1]
+    assert (began["event"], began["command"], len(latest)) == ("started", "levelproof generate", MOST)
+    assert latest[0]["unit"] == units[-MOST + 2].name
+    assert latest[0]["seconds"]["training"] == 0.5
+    assert [(of["event"], of["cause"]) for of in latest[-2:]] == [
+        ("failed", "ValueError: of this one"),
+        ("quarantined", "ValueError: again"),
+    ]
+    assert (state["event"], state["done"], state["solved"]) == ("progress", 6 * MOST, 3 * MOST)
+    assert (state["rate"], state["left"], state["failures"], state["env_steps"]) == (1234, 60, 2, 300 * MOST)
+    assert state["workers"]["here"]["count"] == 1
+    assert sum(len(json.dumps(event)) for event in told[-1]) < 2**20
+    events.over("stopped")
+    assert (told[-1][-1]["event"], told[-1][-1]["how"]) == ("ended", "stopped")

@@ -1,0 +1,64 @@
+"""A run is watched from its split alone, until it ends."""
+
+import json
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from experts.labels import Label
+from pipeline.look.watch import now, shown, watch
+from pipeline.store.events import new_run, tell
+from pipeline.store.locks import only_writer
+from tests.pipeline.command import assert_refused, here
+from tests.pipeline.made import made_split
+
+STATE = {"levels": 8, "done": 4, "solved": 3, "env_steps": 100, "rate": 12, "left": 7, "failures": 1, "quarantined": 0}
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    return made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]])
+
+
+def state(event: str, age: float = 0.0, **changes: object) -> dict:
+    workers = {"a machine": {"count": 2, "silent": 1.5}}
+    return {"time": time.time() - age, "event": event, "workers": workers, **STATE, **changes}
+
+
+def test_each_look_is_a_line_until_the_run_ends(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = new_run(split)
+    failed = {"time": time.time(), "event": "failed", "unit": "0-1", "cause": "of this one"}
+    tell(run, [failed, state("progress")])
+    timer = threading.Timer(0.5, lambda: tell(run, [failed, state("ended", done=8)]))
+    with only_writer(split, print):
+        timer.start()
+        watch(split, True, Console(), every=0.1)
+    facts = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [of["running"] for of in facts] == [True] * (len(facts) - 1) + [False]
+    assert len(facts) > 1
+    assert (facts[0]["solved_share"], facts[0]["failed"], facts[0]["rate"]) == (0.75, ["0-1: of this one"], 12)
+    assert facts[-1]["done"] == 8
+
+
+def test_a_run_that_died_is_not_at_work_and_a_silent_one_is_told(split: Path) -> None:
+    tell(new_run(split), [state("progress", age=600.0)])
+    assert not now(split)["running"]
+    with only_writer(split, print):
+        facts = now(split)
+        assert facts["running"]
+        console = Console(width=200)
+        with console.capture() as captured:
+            console.print(shown(facts))
+    text = captured.get()
+    assert "4 of 8 committed, 75.0% of them solved" in text
+    assert "told 10 min ago" in text
+    assert "2, the most silent for 10 min" in text
+
+
+def test_where_nothing_is_told_a_sentence_says_so(split: Path) -> None:
+    assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has told anything")
+    tell(new_run(split), [{"time": 1.0, "event": "progress"}])  # damaged
+    assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has told anything")

@@ -1,0 +1,50 @@
+"""Files of events: few, replaced as a whole, and harmless whatever is in them."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
+from pipeline.store.layout import EVENTS
+from pipeline.store.split import locked
+
+
+def test_a_run_s_file_is_replaced_and_old_runs_make_room(tmp_path: Path) -> None:
+    (tmp_path / EVENTS).mkdir()
+    foreign = tmp_path / EVENTS / "mine.txt"
+    foreign.touch()
+    for path in (new_run(tmp_path) for _ in range(KEPT + 4)):
+        tell(path, [])
+    path = new_run(tmp_path)
+    tell(path, [{"time": 1.0, "event": "started"}])
+    tell(path, [{"time": 1.0, "event": "started"}, {"time": 2.0, "event": "ended"}])
+    (tmp_path / EVENTS / f".{path.name}.123").touch()  # of one that died
+    last = new_run(tmp_path)
+    tell(last, [])
+    assert [of["event"] for of in events_of(path)] == ["started", "ended"]
+    assert len(runs_in(tmp_path)) == KEPT
+    assert {entry.name for entry in (tmp_path / EVENTS).iterdir()} == {
+        "mine.txt",
+        *(of.name for of in runs_in(tmp_path)),
+    }
+
+
+def test_a_disk_that_refuses_ends_no_run(tmp_path: Path) -> None:
+    tell(tmp_path / "gone" / "run.jsonl", [{"time": 1.0, "event": "started"}])
+
+
+def test_what_is_no_event_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "run.jsonl"
+    deep = "[" * 100_000
+    path.write_bytes(b'\xff\n{"time": 1.0, "event": "progress"}\n{"time": "now", "event": 3}\n3\n' + deep.encode())
+    assert [of["event"] for of in events_of(path)] == ["progress"]
+    path.write_bytes(b"x" * 2**23)
+    assert events_of(path) == events_of(tmp_path / "none") == []
+
+
+def test_a_link_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "split").mkdir()
+    (tmp_path / "split" / EVENTS).symlink_to(tmp_path)
+    with pytest.raises(UserError, match="is a link"), locked(tmp_path / "split", print):
+        pass
