@@ -35,6 +35,8 @@ def typed(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     Raises:
         ConfigError: an unknown key, a value of the wrong type, or one that the dataclass refuses.
     """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{path or 'the whole'} is {values!r}, but it is a group of settings.")
     try:
         return CONVERTER.structure(values, cls)
     except BaseValidationError as error:

@@ -3,6 +3,8 @@
 import re
 from enum import IntEnum
 
+from configs.errors import readable
+
 
 class Exit(IntEnum):
     """Exit codes of `levelproof`."""
@@ -21,7 +23,7 @@ class LevelproofError(Exception):
 
     def __str__(self) -> str:
         """With URLs as they were typed: a Path makes `s3:/` of `s3://`."""
-        return re.sub(r"\b(s3|gs|az|https?|hf):/(?=[^/])", r"\1://", super().__str__())
+        return re.sub(r"\b(s3|gs|az|https?|hf):/(?=[^/])", r"\1://", readable(super().__str__()))
 
 
 class UserError(LevelproofError):

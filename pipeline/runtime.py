@@ -16,6 +16,7 @@ from pathlib import Path
 from loky import cpu_count
 
 from pipeline.compiled import remove_damaged
+from pipeline.owned import own_folder
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
 # One process per core, each with one thread, is twice as fast as one process with XLA's own threads; and a sum
@@ -35,16 +36,26 @@ MIN_COMPILE_SECONDS = 0.2  # what compiles faster is not worth a file
 
 
 def cache_folder() -> Path:
-    """Where compiled code is kept: LEVELPROOF_CACHE_DIR, else the user's cache folder."""
+    """Where compiled code is kept: LEVELPROOF_CACHE_DIR, else the user's cache folder.
+
+    Raises:
+        UserError: other users can write to it; JAX executes what it finds there.
+    """
     if chosen := os.environ.get(CACHE_VARIABLE):
-        return Path(chosen).expanduser()
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "levelproof"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "levelproof"
+        path = Path(chosen).expanduser()
+    elif sys.platform == "darwin":
+        path = Path.home() / "Library" / "Caches" / "levelproof"
+    else:
+        path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "levelproof"
+    return own_folder(path, f"delete it, or have {CACHE_VARIABLE} name a folder of your own")
 
 
 def prepare_jax(core: int | None = None) -> None:
-    """Set this process up to run work units, on one CPU core or, with None, where the system likes."""
+    """Set this process up to run work units, on one CPU core or, with None, where the system likes.
+
+    Raises:
+        UserError: as `cache_folder`.
+    """
     flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = " ".join([flags, *(flag for flag in XLA_FLAGS if flag not in flags)]).strip()
     os.environ.update(dict.fromkeys(THREADS, "1"))
@@ -53,7 +64,7 @@ def prepare_jax(core: int | None = None) -> None:
             os.sched_setaffinity(int(thread), {core})
     import jax  # reads the environment above
 
-    programs = cache_folder() / "jax"
+    programs = own_folder(cache_folder() / "jax", "delete it")
     remove_damaged(programs)
     jax.config.update("jax_compilation_cache_dir", str(programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)

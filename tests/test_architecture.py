@@ -26,7 +26,7 @@ MAY_IMPORT = {
     "levelgen": ("levelgen", "physics"),
     "experts": ("levelgen", "physics"),
     "configs": ("experts", "levelgen", "physics"),
-    "pipeline": (),  # errors, runtime, version
+    "pipeline": ("configs",),  # errors, owned, runtime, version
     "pipeline.store": ("pipeline", "configs", "experts", "levelgen", "physics"),
     "pipeline.read": ("pipeline.store", "pipeline", "configs", "experts", "levelgen", "physics"),
     "pipeline.look": ("pipeline.read", "pipeline.store", "pipeline", "configs", "experts", "levelgen", "physics"),

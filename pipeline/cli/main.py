@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from configs.errors import ConfigError
+from configs.errors import ConfigError, readable
 from pipeline.cli import (
     card,
     diff,
@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _refuse(sentence: str, code: int) -> int:
     end = "" if sentence.endswith((".", ")")) else "."
-    print(f"Error: {sentence}{end}", file=sys.stderr)
+    print(f"Error: {readable(sentence)}{end}", file=sys.stderr)
     return code
 
 

@@ -330,6 +330,7 @@ def connected() -> Iterator[threading.Event]:
     Raises:
         UserError: there is none at RAY_ADDRESS.
     """
+    ray._private.ray_constants.ENABLE_RAY_CLUSTER = _existing()  # otherwise Ray listens on loopback
     if _existing():
         _require_reachable(os.environ["RAY_ADDRESS"])
         settings: dict[str, Any] = {}

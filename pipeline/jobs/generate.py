@@ -17,6 +17,7 @@ from pipeline.jobs.events import Events, telling
 from pipeline.jobs.progress import Board, Tally, say
 from pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, plan_units
 from pipeline.jobs.seal import Sealer, sealing
+from pipeline.runtime import cache_folder
 from pipeline.store import quarantine
 from pipeline.store.checkpoints import require_same_experts
 from pipeline.store.files import remove
@@ -43,9 +44,11 @@ def generate(
     `origins` say where they are, if their ids do not make them; `repaired` is the split, where they are made again.
 
     Raises:
-        UserError, Failure: see `store.split.writing` and `store.checkpoints.require_same_experts`; or the disk refuses.
+        UserError, Failure: see `runtime.cache_folder`, `store.split.writing` and
+            `store.checkpoints.require_same_experts`; or the disk refuses.
         KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; what is committed stays.
     """
+    cache_folder()  # where workers refuse it, Ray makes many lines of the sentence
     require_same_experts(job)
     with writing(job, partial(say, console), repaired) as (split, manifest):
         asked = origins or (job.level_ids if level_ids is None else level_ids)

@@ -31,7 +31,7 @@ from pipeline.runtime import interruptible, prepare_jax
 from pipeline.store.disk import REFUSALS
 from pipeline.store.job_note import note_job
 from pipeline.store.manifest import Manifest, read_manifest
-from pipeline.store.origins import Origin, RecordPlace
+from pipeline.store.origins import Origin, RecordPlace, can_be_noted
 from pipeline.store.remote import require_folder
 from pipeline.store.runs import runs
 from pipeline.store.split import writing
@@ -57,6 +57,8 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
         Failure: a chunk is damaged, or the disk refuses; what is committed stays.
     """
     require_folder(out, "import to it")
+    if not can_be_noted(str(folder.absolute())):
+        raise UserError(f"Cannot import {folder}: no terminal shows its name, so give it another one.")
     try:
         found = open_folder(folder.expanduser().absolute())
     except FormatError as error:

@@ -19,7 +19,7 @@ from pipeline.read.kinetix.folder import open_folder, read_trajectories
 from pipeline.read.kinetix.zarr2 import FormatError
 from pipeline.read.rows import read_row
 from pipeline.store.fields import tree_of
-from pipeline.store.origins import Origin, place_of
+from pipeline.store.origins import Origin, can_be_noted, place_of
 
 
 class LevelUnseen(Failure):
@@ -67,6 +67,8 @@ def levels_below(folder: Path, job: JobConfig) -> Listing:
 
 def _usable(path: Path, job: JobConfig) -> Origin:
     """Raises LevelFileError where a file has no level, or one that the job cannot have."""
+    if not can_be_noted(str(path)):
+        raise LevelFileError(f"Cannot use the level file {path}: no terminal shows its name, so give it another one.")
     file = _level_in(path)
     size = name_of(file.level.size)
     try:

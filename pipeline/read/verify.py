@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from rich.console import Console
 
 from configs.convert import typed
@@ -31,6 +30,7 @@ from pipeline.read.findings import Findings
 from pipeline.read.level_files import level_at
 from pipeline.read.pace import Pace
 from pipeline.runtime import prepare_jax
+from pipeline.store.bounds import DAMAGE, bounded
 from pipeline.store.checksums import digests_of, has_own
 from pipeline.store.job_note import JobNote, sound_note
 from pipeline.store.layout import (
@@ -48,7 +48,7 @@ from pipeline.store.layout import (
 from pipeline.store.locks import is_written
 from pipeline.store.manifest import Fragment, differences, fragment_paths, read_fragment, require_manifest, told
 from pipeline.store.origins import origin_of
-from pipeline.store.remote import bytes_of, is_remote
+from pipeline.store.remote import is_remote
 from pipeline.store.runs import runs, told_levels, without
 from pipeline.store.shard import Shard, open_shard
 
@@ -135,10 +135,9 @@ def _note(split: Path, findings: Findings) -> JobNote | None:
 
 
 def _rows_in(path: Path) -> int:
-    try:
-        return pq.read_metadata(pa.BufferReader(bytes_of(path)) if is_remote(path) else path).num_rows
-    except (OSError, pa.ArrowException):
-        return 0
+    with suppress(*DAMAGE), bounded(path) as file:
+        return file.rows
+    return 0
 
 
 def _groups(paths: Sequence[Path], findings: Findings) -> Iterator[list[Part]]:

@@ -1,16 +1,178 @@
-"""How large a fragment may be: looked at in its footer before anything is unpacked."""
+"""Fragments that nobody vouches for: nothing is unpacked before it is known how large it becomes.
 
+What is looked at: how long the footer is, that the columns are those of a fragment, how many rows and groups of rows
+there are, and the headers of the pages that are read. Nothing of these is asked of Arrow: where a footer lies, some of
+its answers end the process. Texts come as dictionaries, so that a short file cannot name a long one a million times,
+and become whole texts where all of them together are small.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-CAREFULLY = {"page_checksum_verification": True, "thrift_string_size_limit": 2**26}
-MOST_ROWS, MOST_GROUPS = 10_000_000, 100_000  # of a fragment
-MOST_FIXED, MOST_A_ROW = 2**26, 2**14  # bytes in memory of a fragment, and of each of its rows: a hundred times theirs
+from pipeline.store.checksums import TAIL
+from pipeline.store.remote import bytes_of, is_remote
+from pipeline.store.schema import COLUMNS, schema_of
+from pipeline.store.thrift import Column, footer_in, pages_in
+
+MOST_FOOTER = 2**24  # bytes; most of them are digests
+MOST_ROWS, MOST_GROUPS = 2**20, 2**9  # of a fragment; a sealed one has 100,000 rows, in groups of 16,384
+FEWEST_BYTES = 8  # of a file for each row: content hashes alone take more, however they are packed
+# Bytes in memory: of what is read at once, for each of its rows, and for a learning curve
+MOST_FIXED, MOST_A_ROW, MOST_A_CURVE = 2**26, 2**12, 2**15
+A_VALUE = 16  # bytes that a value takes besides those of its page
+CURVE = "learning_curve"
+UNSEEN = "content_hash"  # is compared and never shown
+BY = "parquet-cpp-arrow"  # who wrote it: of others' files Arrow reads more than they say
+# What reading bytes that nobody vouches for can raise
+DAMAGE = (OSError, pa.ArrowException, LookupError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError)
+CAREFULLY = {
+    "pre_buffer": False,
+    "page_checksum_verification": True,
+    "thrift_string_size_limit": MOST_FOOTER,
+    "thrift_container_size_limit": MOST_GROUPS,
+}
 
 
-def require_modest(about: pq.FileMetaData) -> None:
-    """Raises ValueError where a small file would become large: pages of nothing are packed ten thousandfold."""
-    groups = [about.row_group(i) for i in range(about.num_row_groups)]
-    if about.num_rows > MOST_ROWS or len(groups) > MOST_GROUPS:
-        raise ValueError("it has more rows than any fragment")
-    if sum(group.total_byte_size for group in groups) > MOST_FIXED + MOST_A_ROW * about.num_rows:
-        raise ValueError("its rows would take more memory than those of any fragment")
+class Bounded:
+    """A parquet file, open for reading; what it is read for are the columns of a fragment."""
+
+    def __init__(self, source: pa.NativeFile) -> None:
+        """Look at its footer.
+
+        Raises:
+            One of DAMAGE: it is none, or larger than any fragment.
+        """
+        self._source, size = source, source.size()
+        source.seek(max(0, size - TAIL))
+        length = int.from_bytes(source.read(4), "little")
+        if length > min(MOST_FOOTER, size - TAIL):
+            raise ValueError("its footer is longer than that of any fragment")
+        source.seek(size - TAIL - length)
+        self.rows, self._groups, made_by = footer_in(source.read(length))
+        if not 0 <= self.rows <= min(MOST_ROWS, size // FEWEST_BYTES) or len(self._groups) > MOST_GROUPS:
+            raise ValueError("it has more rows than any fragment of its size")
+        if min((group.rows for group in self._groups), default=0) < 0 or sum(g.rows for g in self._groups) != self.rows:
+            raise ValueError("its groups have other numbers of rows than all of it")
+        if not made_by.startswith(BY):
+            raise ValueError("it was written by another library")
+        self._file = _open(source, _known(tuple(COLUMNS.names)).texts)  # the same in every version
+        self.metadata: dict[bytes, bytes] = self._file.schema_arrow.metadata or {}
+
+    def read(
+        self,
+        names: Sequence[str],
+        all_names: Sequence[str],
+        level_ids: np.ndarray | None = None,
+        compact: bool = False,
+    ) -> pa.Table:
+        """These columns of the ones that it has to have; with `level_ids`, at least the rows of these levels.
+
+        Raises:
+            One of DAMAGE: it is damaged, or would become too large.
+        """
+        known = _known(tuple(all_names))
+        if not self._file.schema.equals(known.schema) or not self._file.schema_arrow.equals(known.as_read):
+            raise ValueError("it has other columns than a fragment")
+        groups = range(len(self._groups))
+        if level_ids is not None and groups[1:]:
+            there = np.isin(self._read(known, groups, ["level_id"]).column(0).to_numpy(), level_ids)
+            ends = np.cumsum([group.rows for group in self._groups])
+            groups = np.unique(np.searchsorted(ends, np.flatnonzero(there), "right")).tolist()
+        table, wanted = self._read(known, groups, names), schema_of(names, compact)
+        given = {name: table.column(name) for name in names}
+        whole = [name for name, column in given.items() if column.type != wanted.field(name).type]
+        if any(map(_obeyed, (chunk for name in names if name != UNSEEN for chunk in given[name].chunks))):
+            raise ValueError("it has text that no terminal should see")
+        self._require_room(sum(_expanded(chunk) for name in whole for chunk in given[name].chunks), names)
+        columns = {name: column.cast(wanted.field(name).type) for name, column in given.items()}
+        return pa.table(columns, schema=wanted.with_metadata(self.metadata))
+
+    def _read(self, known: "_Known", groups: Sequence[int], names: Sequence[str]) -> pa.Table:
+        chosen = [(i, leaf) for i, leaf in enumerate(known.leaves) if leaf.path.partition(".")[0] in names]
+        wanted = [self._groups[group] for group in groups]
+        columns = [
+            (group.columns[i], group.rows, leaf.max_repetition_level > 0) for group in wanted for i, leaf in chosen
+        ]
+        self._require_room(sum(max(0, column.length) for column, _, _ in columns), names)
+        self._require_room(sum(self._room(*each) for each in columns), names)
+        table = self._file.read_row_groups(groups, list(names), use_threads=False)
+        table.validate(full=True)  # indices into dictionaries, offsets and UTF-8, which others then rely on
+        return table
+
+    def _room(self, column: Column, rows: int, of_lists: bool) -> int:
+        """Bytes that a column of a group takes in memory, but for texts that stand in its dictionary."""
+        if column.first < 0 or not 0 <= column.length <= self._source.size() - column.first:
+            raise ValueError("its footer has a column where there is none")
+        self._source.seek(column.first)
+        found = list(pages_in(self._source.read(column.length)))
+        values = sum(page.values for page in found if not page.is_dictionary)
+        if values != column.values or (values != rows and not of_lists):
+            raise ValueError("it has other numbers of values than its rows")
+        return sum(page.bytes + A_VALUE * page.values for page in found)
+
+    def _require_room(self, wanted: int, names: Sequence[str]) -> None:
+        """Raises ValueError where so many bytes of these columns are more than fragments have."""
+        if wanted > MOST_FIXED + (MOST_A_ROW + MOST_A_CURVE * (CURVE in names)) * self.rows:
+            raise ValueError("its rows would take more memory than those of any fragment")
+
+
+@contextmanager
+def bounded(path: Path) -> Iterator[Bounded]:
+    """A fragment's file, wherever it is.
+
+    Raises: as `Bounded`; FileNotFoundError: it is gone.
+    """
+    with pa.BufferReader(bytes_of(path)) if is_remote(path) else pa.OSFile(str(path)) as source:
+        yield Bounded(source)
+
+
+def _obeyed(column: pa.Array) -> bool:
+    """Whether a text of an array has characters that control terminals."""
+    if pa.types.is_dictionary(column.type):
+        return bool(pc.any(pc.match_substring_regex(column.dictionary, r"\p{Cc}")).as_py())
+    nested = pa.types.is_list(column.type) or pa.types.is_struct(column.type)
+    return nested and any(map(_obeyed, _inside(column)))
+
+
+def _expanded(column: pa.Array) -> int:
+    """Bytes of all texts in an array, each as often as it is named."""
+    if pa.types.is_dictionary(column.type):
+        return pc.sum(pc.binary_length(column.dictionary).take(column.indices)).as_py() or 0
+    nested = pa.types.is_list(column.type) or pa.types.is_struct(column.type)
+    return sum(map(_expanded, _inside(column))) if nested else 0
+
+
+def _inside(column: pa.Array) -> list[pa.Array]:
+    """Of a list its values, of a struct its fields."""
+    return [column.flatten()] if pa.types.is_list(column.type) else column.flatten()
+
+
+class _Known(NamedTuple):
+    """What a file with some columns says of them."""
+
+    schema: pq.ParquetSchema
+    as_read: pa.Schema  # with every text as a dictionary
+    leaves: list[pq.ColumnSchema]
+    texts: list[str]  # the leaves that are, by their paths
+
+
+@cache
+def _known(names: tuple[str, ...]) -> _Known:
+    sink = pa.BufferOutputStream()
+    pq.write_table(schema_of(names).empty_table(), sink)
+    schema = pq.ParquetFile(pa.BufferReader(sink.getvalue())).schema
+    leaves = [schema.column(i) for i in range(len(schema))]
+    texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
+    return _Known(schema, _open(pa.BufferReader(sink.getvalue()), texts).schema_arrow, leaves, texts)
+
+
+def _open(source: pa.NativeFile, texts: list[str]) -> pq.ParquetFile:
+    return pq.ParquetFile(source, read_dictionary=texts, **CAREFULLY)

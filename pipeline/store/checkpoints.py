@@ -2,7 +2,9 @@
 
 import socket
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 from zipfile import ZIP_STORED, ZipFile
 
 import jax
@@ -17,11 +19,14 @@ from experts.success import no_success
 from levelgen.level import size_of
 from levelgen.sampling.scenery import empty_level
 from pipeline.errors import Failure, UserError
+from pipeline.owned import OTHERS, require_own
 from pipeline.store.disk import flush
 from pipeline.store.fields import arrays_of
-from pipeline.store.layout import MANIFEST, data_path
+from pipeline.store.layout import EXPERTS, MANIFEST, data_path
 from pipeline.store.manifest import differences, read_manifest, require_manifest, told
 from pipeline.store.remote import require_folder
+
+COPY = "make a copy of your own of the split that continue_from names, or leave continue_from out"
 
 
 class SourceUnseen(Failure):
@@ -39,8 +44,9 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
     for i, row in enumerate(rows):
         curves[i, : len(row.curve)] = row.curve
     begun = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows))
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
     np.savez(path, allow_pickle=False, level_id=np.array(sorted(experts)), curve=curves, **arrays_of(begun, "begun/"))
+    path.chmod(path.stat().st_mode & ~OTHERS)
     flush(path)
 
 
@@ -48,11 +54,11 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
     """All experts of a checkpoint, by level id.
 
     Raises:
+        UserError: other users can write to it.
         Failure: it is damaged or gone, or of another version of this program.
     """
-    level = empty_level(size_of(job.size), 1)
-    like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), no_success(1), job.expert), level)
-    like = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
+    require_own(path, COPY)
+    like = _like(job)
     try:
         _require_plain(path)
         with np.load(path, allow_pickle=False) as file:  # whole files only: each array has a checksum
@@ -74,6 +80,14 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
         begun = jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves])
         experts[level_id] = Kept(begun, curves[i, : int(begun.training.course.updates)].tolist())
     return experts
+
+
+@lru_cache(maxsize=8)
+def _like(job: JobConfig) -> Any:
+    """What is kept of one expert, with zeros in it and a level axis of length 1."""
+    level = empty_level(size_of(job.size), 1)
+    like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), no_success(1), job.expert), level)
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
 
 
 def _require_plain(path: Path) -> None:
@@ -128,7 +142,7 @@ def require_same_experts(job: JobConfig) -> None:
     """Refuse to take experts from a split whose experts cannot go on with this job.
 
     Raises:
-        UserError: it kept no experts, was made with other settings, or with a larger budget.
+        UserError: it kept no experts, was made with other settings or a larger budget, or others can write to them.
         Failure: it is damaged.
     """
     if not job.continue_from:
@@ -136,6 +150,7 @@ def require_same_experts(job: JobConfig) -> None:
     path = Path(job.continue_from).expanduser()
     require_folder(path, "go on with its experts")
     source = require_manifest(path, ["experts"])
+    require_own(source.split / EXPERTS, COPY)
     if source.table.column("experts").null_count == source.table.num_rows:
         raise UserError(
             f"{source.split} has kept no experts: make it with keep_experts=true, or leave out continue_from."

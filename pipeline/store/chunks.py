@@ -135,7 +135,7 @@ def read_whole(shard: Path, name: str) -> bytes:
         ContentsError, OSError: it is no ordinary file, or cannot be read.
     """
     if is_remote(shard):
-        return bytes_of(shard / name)
+        return bytes_of(shard / name, MOST_METADATA)
     path = ordinary_file(shard, name)
     if path.stat().st_size > MOST_METADATA:
         raise ContentsError(f"its {name} is larger than that of any shard")

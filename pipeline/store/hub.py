@@ -17,6 +17,7 @@ from pipeline.errors import Failure, UserError
 ATTEMPTS = 6
 PAUSE = 0.5  # s before the second attempt, at most; twice that before each further one
 TIMEOUT = 30  # s of one attempt
+MOST_LIST = 2**25  # bytes of a page of a list; the hub's have a thousand files
 NEXT = re.compile(r'<([^<>]+)>; *rel="next"')  # of the header Link: where a long list goes on
 
 
@@ -66,13 +67,13 @@ def files_below(repository: Repository, folder: str) -> dict[str, tuple[str, int
     url = f"{_endpoint()}/api/datasets/{repository.name}/tree/{revision}/{quote(folder)}?recursive=true"
     found: dict[str, tuple[str, int]] = {}
     while url:
-        entries, url = _page(url)
-        found |= {entry["path"]: (entry["oid"], entry["size"]) for entry in entries if entry["type"] == "file"}
+        files, url = _page(url)
+        found |= files
     return found
 
 
-def _page(url: str) -> tuple[list[dict[str, Any]], str]:
-    """Some entries, and where there are more."""
+def _page(url: str) -> tuple[dict[str, tuple[str, int]], str]:
+    """Some files, and where there are more."""
     request, reason = Request(url), ""
     for name, value in sign_in().get("default_headers", {}).items():
         request.add_unredirected_header(name, value)  # for nobody but the hub
@@ -81,10 +82,10 @@ def _page(url: str) -> tuple[list[dict[str, Any]], str]:
             with urlopen(request, timeout=TIMEOUT) as answer:
                 more = NEXT.search(answer.headers.get("Link", ""))
                 follows = more[1] if more and more[1].startswith(f"{_endpoint()}/") else ""
-                return json.loads(answer.read()), follows
+                return _files(answer.read(MOST_LIST)), follows
         except HTTPError as error:
             if error.code == 404:
-                return [], ""
+                return {}, ""
             if error.code in (401, 403):
                 raise UserError(
                     f"There is no dataset at {url}, or not for you: check the URL, and set HF_TOKEN if it needs one."
@@ -92,11 +93,24 @@ def _page(url: str) -> tuple[list[dict[str, Any]], str]:
             if error.code not in (408, 429) and error.code < 500:
                 raise Failure(f"The hub refuses {url} ({error.code} {error.reason}): check the URL.") from None
             reason = str(error.code)
-        except (URLError, OSError, ValueError) as error:
+        except (URLError, OSError, ValueError, RecursionError) as error:
             reason = str(getattr(error, "reason", error))
         if attempt < ATTEMPTS - 1:
             time.sleep(random.uniform(0.5, 1) * PAUSE * 2**attempt)
     raise Failure(f"The hub does not answer at {url} ({reason}): check the network, and try again.")
+
+
+def _files(text: bytes) -> dict[str, tuple[str, int]]:
+    """Of each file in a list of the hub's, its hash and its bytes. ValueError: it is no such list."""
+    entries = json.loads(text)
+    try:
+        files = [entry for entry in entries if entry["type"] == "file"]
+        found = {entry["path"]: (entry["oid"], entry["size"]) for entry in files}
+    except (TypeError, KeyError) as error:
+        raise ValueError("its list of files is none") from error
+    if not all((type(path), type(oid), type(size)) == (str, str, int) for path, (oid, size) in found.items()):
+        raise ValueError("its list of files is none")
+    return found
 
 
 def _endpoint() -> str:

@@ -7,23 +7,21 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from os import DirEntry
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from configs.convert import flat
-from configs.schema import KEYS_EVERY, Density, hash_of, stored_as
 from pipeline.errors import Failure, UserError
-from pipeline.store.bounds import CAREFULLY, require_modest
 from pipeline.store.checksums import digests_below, with_own
 from pipeline.store.disk import flush, flush_entry
+from pipeline.store.fragment import FULL, Fragment, read_fragment
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
-from pipeline.store.remote import bytes_of, is_remote, mended
 from pipeline.store.runs import ascending
 from pipeline.store.schema import (
     COLUMNS,
@@ -32,35 +30,17 @@ from pipeline.store.schema import (
     DIGESTS_KEY,
     HASH_KEY,
     MANIFEST_VERSION,
-    REPETITIVE,
     SEALED_KEY,
     VERSION_KEY,
-    VERSIONS,
-    completed,
     schema_of,
 )
 
-FULL = (stored_as("full"),)
-DENSITIES = {stored_as(density, every) for density in get_args(Density) for every in KEYS_EVERY}
 SHOWN = 6  # differing settings that an error lists
 THREADS = 8  # fragments read at once: a shared folder takes its time for each
 ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
 ROUNDS = 20  # looks at a split that is sealed meanwhile; each takes a moment, and sealing a fragment takes seconds
 Each = Callable[[pa.Table], pa.Table]
 DATA_COLUMNS = ("shard", "experts")  # name what lies beside the manifest
-
-
-@dataclass(frozen=True)
-class Fragment:
-    """What one fragment says, without its rows."""
-
-    path: Path
-    config_hash: str
-    config: dict[str, Any]  # the settings that decide results
-    digests: dict[str, dict[str, str]]  # of the files of each shard and checkpoint that its rows name
-    rows: int
-    sealed: bool
-    densities: frozenset[str]  # how its shards were to be stored (`configs.schema.stored_as`)
 
 
 def begin_fragment(attempt: Attempt) -> None:
@@ -118,83 +98,9 @@ def fragment_paths(split: Path) -> list[Path]:
     return sorted(entries(split, MANIFEST, FRAGMENT, DirEntry.is_file))
 
 
-def read_fragment(
-    path: Path, columns: Sequence[str] | None = None, level_ids: np.ndarray | None = None, compact: bool = False
-) -> tuple[Fragment, pa.Table]:
-    """A fragment and its rows; with `level_ids` (ascending), at least those of these levels.
-
-    `compact`: columns that are repetitive come as dictionaries.
-
-    Raises:
-        FileNotFoundError: it is gone.
-        Failure: it is damaged, or of another version.
-    """
-    try:
-        dictionaries = REPETITIVE if compact else None
-        source = pa.BufferReader(bytes_of(path)) if is_remote(path) else path
-        with pq.ParquetFile(source, read_dictionary=dictionaries, **CAREFULLY) as file:
-            require_modest(file.metadata)
-            metadata = file.schema_arrow.metadata or {}
-            version = metadata.get(VERSION_KEY, b"?").decode()
-            if version not in VERSIONS:
-                raise Failure(
-                    f"The fragment {path} has manifest version {version}, this program reads {MANIFEST_VERSION}: "
-                    "use the levelproof that wrote it."
-                )
-            config, true_hash = _config_in(metadata[CONFIG_KEY])
-            digests, about = json.loads(metadata.get(DIGESTS_KEY, b"{}")), file.metadata
-            if not (isinstance(digests, dict) and all(isinstance(files, dict) for files in digests.values())):
-                raise ValueError("its digests are none")
-            fragment = Fragment(
-                path,
-                metadata[HASH_KEY].decode(),
-                config,
-                digests,
-                about.num_rows,
-                SEALED_KEY in metadata,
-                _densities_in(metadata),
-            )
-            if not file.schema_arrow.equals(schema_of(VERSIONS[version], compact)) or true_hash != fragment.config_hash:
-                raise ValueError("its footer has other columns or another configuration than were written")
-            groups = list(range(about.num_row_groups))
-            if level_ids is not None and groups[1:]:  # of damaged statistics Arrow aborts: not read without need
-                groups = [i for i in groups if _may_have(about.row_group(i), level_ids)]
-            found = file.read_row_groups(groups, None if columns is None else list(columns), use_threads=False)
-    except FileNotFoundError:
-        raise
-    except PermissionError:
-        raise Failure(f"The fragment {path} cannot be read: check its permissions.") from None
-    except (OSError, pa.ArrowException, LookupError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        raise Failure(
-            f"The fragment {path} is damaged ({type(error).__name__}): "
-            + mended(path, f"run `levelproof verify {path.parent.parent} --repair` to make its levels again.")
-        ) from error
-    return fragment, completed(found, columns)
-
-
-def _may_have(group: pq.RowGroupMetaData, level_ids: np.ndarray) -> bool:
-    """Whether any of these levels (ascending ids) may be in a group of rows."""
-    ids = group.column(COLUMNS.names.index("level_id")).statistics
-    return ids is None or not ids.has_min_max or _any_within(level_ids, ids.min, ids.max)
-
-
 def _any_within(ordered: np.ndarray, first: int, last: int) -> bool:
     low, high = np.searchsorted(ordered, [first, last + 1])
     return bool(low < high)
-
-
-def _densities_in(metadata: Mapping[bytes, bytes]) -> frozenset[str]:
-    found = frozenset(json.loads(metadata.get(DENSITIES_KEY, json.dumps(FULL))))
-    if not found <= DENSITIES:
-        raise ValueError("it says that shards are stored as none is")
-    return found
-
-
-@lru_cache(maxsize=8)
-def _config_in(text: bytes) -> tuple[dict[str, Any], str]:
-    """A configuration and its hash: nearly always those of the fragment before."""
-    config = json.loads(text)
-    return config, hash_of(config)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ The id of a level file's level is made of its content hash: it has the same rand
 of a record is its place in the folder.
 """
 
+import os
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -18,6 +19,11 @@ ASKED = ("content_hash", "file", "size", "shard", "row")  # columns that tell a 
 
 
 RECORD = re.compile(r"(.+)/([^/]+)#(0|[1-9][0-9]{0,11})")
+
+
+def can_be_noted(file: str) -> bool:
+    """Whether a row may have this as its `file`: text that can be written, and that no terminal obeys."""
+    return not re.search("[\0-\x1f\x7f-\x9f\ud800-\udfff]", file)
 
 
 class RecordPlace(NamedTuple):
@@ -34,7 +40,7 @@ class RecordPlace(NamedTuple):
 def place_of(file: str) -> RecordPlace | None:
     """The record that a row's `file` names; None: it names a level file."""
     found = RECORD.fullmatch(file)
-    if not found or not (Path(found[1]) / found[2]).is_dir() or Path(file).exists():
+    if not found or not os.path.isdir(f"{found[1]}/{found[2]}") or os.path.exists(file):  # of any text
         return None
     return RecordPlace(Path(found[1]), found[2], int(found[3]))
 
@@ -68,7 +74,7 @@ def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
     """
     rows = read_manifest(split, ASKED, list(level_ids)).table.to_pylist()
     found = {row["level_id"]: origin_of(split, row) for row in rows}
-    gone = [of.file for of in found.values() if not of.shard and not place_of(of.file) and not Path(of.file).is_file()]
+    gone = [of.file for of in found.values() if not of.shard and not place_of(of.file) and not os.path.isfile(of.file)]
     if gone:
         more = f" and {len(gone) - 1} more" if gone[1:] else ""
         raise UserError(

@@ -2,6 +2,7 @@
 
 import os
 import secrets
+import stat
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,7 @@ CHECKSUM = 4  # bytes of a CRC-32C behind each piece: a machine that lost its po
 USED = 60.0  # s; a piece is marked as used once in this time
 LEFT = 0.9  # share of the bound that is left when it was exceeded
 ABANDONED = 3600.0  # s; who writes a piece for longer was killed
+MOST_PIECE = 2**24  # bytes
 PARTS = 16  # the folder is looked through each time that this part of the bound was added
 
 
@@ -33,11 +35,13 @@ class PieceCache:
         """Bytes of a piece; None: it is not there, or was damaged and is not there any more."""
         path = self.folder / name
         try:
-            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        except FileNotFoundError:
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        except OSError:
             return None
         try:
             about = os.fstat(descriptor)
+            if not stat.S_ISREG(about.st_mode) or about.st_size > MOST_PIECE:
+                return None
             if time.time() - about.st_mtime > USED:
                 os.utime(path)
             if name in self._checked:

@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 
 BUCKETS, WEB, HUB = ("s3:", "gs:", "az:"), ("https:", "http:"), ("hf:",)
 INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for servers that do not list
+MOST_INDEX = 2**25  # bytes of it; a name takes 34
 PIECE = 2**20  # bytes; of 4 MB, random trajectories of 10 kB would fetch four times as much
 MOST_PIECES = 8  # of one request: neighbours are fetched together
 REQUESTS = 16  # at once
-MOST_WHOLE = 2**31  # bytes of a file that is read as a whole: fragments, and what arrays say of themselves
+MOST_WHOLE = 2**29  # bytes of a file that is read as a whole: fragments
 CACHE_GB = "LEVELPROOF_CACHE_GB"
 RETRIES: dict[str, Any] = {
     "max_retries": 8,  # of a request that is throttled, refused, cut off or not answered; with jitter
@@ -150,7 +151,7 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
         return found
     store, key = place(folder / INDEX)
     try:
-        text = ask(folder / INDEX, lambda: bytes(obstore_module().get(store, key).bytes())).decode(errors="replace")
+        text = ask(folder / INDEX, lambda: _body(obstore_module().get(store, key), MOST_INDEX)).decode(errors="replace")
     except FileNotFoundError:
         raise UserError(
             f"There is no split at {as_typed(folder.parent)}, or its server was not told what it has: a split on a web "
@@ -159,15 +160,15 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
     return {folder / name: Stored("", 0) for name in text.split() if "/" not in name}
 
 
-def bytes_of(path: Path) -> bytes:
-    """A whole file.
+def bytes_of(path: Path, most: int = MOST_WHOLE) -> bytes:
+    """A whole file of at most so many bytes.
 
     Raises:
-        OSError: it is not there, or larger than MOST_WHOLE.
+        OSError: it is not there, or larger.
         UserError, Failure: as `stored_in`.
     """
     file = RemoteFile(path)
-    if file.size > MOST_WHOLE:
+    if file.size > most:
         raise OSError(f"{as_typed(path)} is larger than it can be")
     return b"".join(file.read([(0, file.size)]))
 
@@ -225,7 +226,7 @@ class RemoteFile:
 
         def request() -> tuple[Any, bytes]:
             answer = obstore_module().get(store, key, options=options)
-            return answer.meta, bytes(answer.bytes())
+            return answer.meta, _body(answer, last - first)
 
         about, data = ask(self.path, request)
         tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's servers have others
@@ -330,6 +331,16 @@ def _cache() -> PieceCache:
 @lru_cache(maxsize=8)
 def _cache_in(folder: Path, most: int) -> PieceCache:
     return PieceCache(folder, most)
+
+
+def _body(answer: Any, most: int) -> bytes:
+    """The bytes of an answer; of one that is longer than it should be, one more than so many, or a few."""
+    found = bytearray()
+    for part in answer.stream(min_chunk_size=PIECE):
+        found += part
+        if len(found) > most:
+            break
+    return bytes(found)
 
 
 def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:

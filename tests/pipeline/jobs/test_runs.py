@@ -13,13 +13,14 @@ from pipeline.store.events import events_of, runs_in
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard
-from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, run, start, status, title, until
+from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, listening, run, start, status, title, until
 from tests.pipeline.made import lasting
 
 LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
 COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
 ALONE = "workers=1"  # where it does not matter how many: each has to start
 SPLIT = Path("data/5k/s")
+LOOPBACK = ("0100007F:", "00000000000000000000000001000000:", "0000000000000000FFFF00000100007F:")  # as Linux has it
 
 pytestmark = pytest.mark.slow
 
@@ -92,6 +93,9 @@ def test_in_other_units_the_same_comes_out(undisturbed: Path, tmp_path: Path) ->
 def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path) -> None:
     process = start([*COMMAND, ALONE], tmp_path)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    places = listening(descendants(process.pid))
+    assert places
+    assert not {place: who for place, who in places.items() if not place.startswith(LOOPBACK)}
     family = {pid for pid in descendants(process.pid) if "Agent" not in title(pid)}
     process.kill()
     process.communicate()

@@ -1,0 +1,483 @@
+"""Every reader, with good input to change: each target writes one changed input, reads it, and looks at what is read.
+
+What is wrong with an input is told by `Refused`; whatever else is raised is a finding.
+"""
+
+import json
+import os
+import shutil
+import warnings
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from random import Random
+from typing import Any
+from unittest.mock import patch
+
+import google_crc32c
+import jax
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numcodecs import blosc  # pyright: ignore[reportAttributeAccessIssue]
+
+from configs.compose import _parsed, compose_job
+from configs.convert import plain, typed
+from configs.errors import ConfigError
+from configs.numbers import parse_count
+from configs.schema import JobConfig
+from experts.judge import Kept
+from experts.labels import Label
+from experts.slots import begin
+from experts.success import no_success
+from levelgen.files.level_file import (
+    LevelFile,
+    LevelFileError,
+    flaws,
+    read_level_file,
+    to_document,
+    write_level_file,
+)
+from levelgen.identity.keys import MAX_LEVEL_ID
+from levelgen.level import size_of
+from levelgen.sampling.sampler import sample_levels
+from levelgen.task.rules import TaskParams
+from pipeline.errors import LevelproofError
+from pipeline.read.kinetix.folder import open_folder, read_trajectories
+from pipeline.read.kinetix.zarr2 import BLOSC, FormatError
+from pipeline.store import bounds, hub, remote
+from pipeline.store.checkpoints import load_experts, save_experts
+from pipeline.store.contents import check_numbers, table_for
+from pipeline.store.fields import arrays_of
+from pipeline.store.job_note import NoteError, note_job, read_note
+from pipeline.store.layout import BEGUN, DATA, FRAGMENT, JOB, MANIFEST, entries
+from pipeline.store.manifest import differences, fragment_paths, read_fragment, read_manifest, told
+from pipeline.store.origins import place_of
+from pipeline.store.pieces import PieceCache
+from pipeline.store.schema import CONFIG_KEY, HASH_KEY, Encoding
+from pipeline.store.shard import Shard, write_shard
+from tests.pipeline.hostile.mutations import (
+    changed_bytes,
+    changed_document,
+    changed_json,
+    changed_word,
+    odd_value,
+    put,
+    remove,
+)
+from tests.pipeline.made import made_job, made_split, played_split
+from tests.pipeline.read.kinetix.folder import GOLDEN
+
+Target = Callable[[Random], None]
+Refused = (LevelproofError, LevelFileError, ConfigError, FormatError, NoteError)
+ENDS = (FormatError, NoteError)  # the ends of sentences
+
+
+def require_possible(arrays: dict[str, np.ndarray], size: Any) -> None:
+    """What engines and pictures look up is there, and flags are flags."""
+    check_numbers({name: np.moveaxis(x, -1, 0) for name, x in arrays.items()}, size)
+    for name, values in arrays.items():
+        assert values.dtype != bool or not (np.ascontiguousarray(values).view(np.uint8) > 1).any(), name
+
+
+def level_files(folder: Path) -> Target:
+    """And a link or a pipe in their place."""
+    level = jax.tree.map(np.asarray, sample_levels(np.array([3], np.int32), size_of("s")))
+    document, path = to_document(LevelFile(level, TaskParams())), folder / "level.json"
+
+    def target(random: Random) -> None:
+        remove(path)
+        put(path, changed_json(document, random), random)
+        found = read_level_file(path)
+        require_possible(arrays_of(found.level, "level/"), found.level.size)
+        assert all(np.isfinite(x).all() for x in arrays_of(found.level).values())
+        assert not any(np.asarray(bad).any() for bad, _, _ in flaws(found.level))
+        if random.random() < 0.02:
+            write_level_file(found, folder / "again.json")
+
+    return target
+
+
+def kinetix_folders(folder: Path) -> Target:
+    """Trajectories of the reference: descriptions, chunks, and what is in these."""
+    source = GOLDEN / "s"
+    chunks = {file.relative_to(source): file.read_bytes() for file in source.rglob("*") if file.is_file()}
+    raw = {name: BLOSC.decode(data) for name, data in chunks.items() if not name.name.startswith(".")}
+
+    def target(random: Random) -> None:
+        shutil.rmtree(folder / "theirs", ignore_errors=True)
+        for name, data in chunks.items():
+            (folder / "theirs" / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / "theirs" / name).write_bytes(data)
+        for name in random.sample(sorted(chunks), random.choice((1, 1, 2))):
+            path, data = folder / "theirs" / name, chunks[name]
+            path.unlink()
+            if name.name.startswith("."):
+                put(path, changed_json(json.loads(data), random), random)
+            elif random.random() < 0.5:
+                put(path, changed_bytes(data, random), random)
+            else:
+                inside = bytearray(raw[name])
+                for _ in range(random.choice((1, 3, 50))):
+                    inside[random.randrange(min(len(inside), 3000))] = random.randrange(256)
+                put(path, blosc.compress(bytes(inside), b"zstd", 1, 0), random)
+        opened = open_folder(folder / "theirs")
+        for array in opened.arrays:
+            found = read_trajectories(array, opened.size, 0, min(array.rows, 3))
+            good = [i for i, what in enumerate(found.wrong) if not what]
+            level = jax.tree.map(lambda x: x[..., good], found.level)  # noqa: B023
+            require_possible(arrays_of(level, "level/"), opened.size)
+            assert all(np.isfinite(x).all() for x in arrays_of(level).values())
+
+    return target
+
+
+SHARD = "shards/000000000000-000000000001-0123abcd.zarr"
+
+
+def shards(folder: Path, density: str) -> Target:
+    """Descriptions, files of chunks, and chunks whose checksums are right."""
+    source = played_split(folder / "played")
+    (name,) = (path.name for path in (source / "shards").iterdir())
+    rows = Shard(source / "shards" / name).read([0, 1])
+    encoding, good, path = Encoding(density), folder / "good" / SHARD, folder / "read" / SHARD  # type: ignore[arg-type]
+    write_shard(good, [0, 1], rows, encoding)
+    shutil.copytree(good, path)
+    files = {file.relative_to(good): file.read_bytes() for file in good.rglob("*") if file.is_file()}
+    fields = [field.name for field in table_for(size_of("s"))]
+    stored = [field.name for field in table_for(size_of("s"), encoding) if field.name in fields]
+
+    def target(random: Random) -> None:
+        name = random.choice(sorted(files))
+        try:
+            remove(path / name)
+            changed = changed_file(name.name, files[name], random)
+            put(path / name, changed, random)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that the engine differs
+                shard = Shard(path)
+                wanted = stored if random.random() < 0.9 else fields
+                found = shard.read(range(min(2, len(shard.level_ids))), wanted)
+            require_possible(found, shard.size)
+            assert 0 <= shard.level_ids[0] <= shard.level_ids[-1] <= MAX_LEVEL_ID
+        finally:
+            remove(path / name)
+            (path / name).write_bytes(files[name])
+
+    return target
+
+
+def changed_file(name: str, data: bytes, random: Random) -> bytes:
+    """Of a shard."""
+    if name == "zarr.json":
+        return changed_json(json.loads(data), random)
+    if random.random() < 0.3:
+        return changed_bytes(data, random)
+    index = np.frombuffer(data[-36:-4], "<u8").reshape(2, 2).copy()
+    chunks = [data[first : first + length] for first, length in index.tolist()]
+    if random.random() < 0.4:  # the index lies
+        index.reshape(-1)[random.randrange(4)] = random.choice(
+            (0, 1, len(data), 2**32, 2**63, 2**64 - 1, len(chunks[0]))
+        )
+        body = data[:-36]
+    else:
+        i = random.randrange(2)
+        chunk = chunks[i][:-4]
+        if random.random() < 0.3:
+            chunk = changed_bytes(chunk, random)
+        else:
+            inside = bytearray(blosc.decompress(chunk))
+            for _ in range(random.choice((1, 3, 100))):
+                inside[random.randrange(len(inside))] = random.choice((0, 1, 2, 7, 127, 255))
+            chunk = blosc.compress(bytes(inside), b"zstd", 1, random.choice((0, 1)), typesize=random.choice((1, 4)))
+        chunks[i] = chunk + google_crc32c.value(chunk).to_bytes(4, "little")
+        index[:, 1] = [len(of) for of in chunks]
+        index[:, 0] = [0, len(chunks[0])]
+        body = b"".join(chunks)
+    told = index.tobytes()
+    return body + told + google_crc32c.value(told).to_bytes(4, "little")
+
+
+def fragments(folder: Path) -> Target:
+    """Footers, pages, metadata and rows of the manifest; checksums of pages are right, or not looked at."""
+    split = made_split(folder, [[Label.SOLVED, Label.UNSOLVED, Label.SOLVED]])
+    (path,) = fragment_paths(split)
+    data, table = path.read_bytes(), pq.read_table(path)
+    metadata = table.schema.metadata
+    long = pa.concat_tables([table] * 20)
+    in_groups = BytesIO()
+    pq.write_table(long, in_groups, row_group_size=7, write_page_checksum=True)
+    bodies = [data, in_groups.getvalue()]
+
+    def written(random: Random) -> bytes:
+        match random.randrange(8):
+            case 0 | 1:
+                return changed_bytes(random.choice(bodies), random)
+            case 2 | 3:  # the footer
+                body = random.choice(bodies)
+                start = len(body) - 8 - int.from_bytes(body[-8:-4], "little")
+                footer = changed_bytes(body[start:-8], random)
+                return body[:start] + footer + len(footer).to_bytes(4, "little") + b"PAR1"
+            case 4:  # pages
+                body = bytearray(random.choice(bodies))
+                for _ in range(random.choice((1, 2, 10))):
+                    body[random.randrange(4, len(body) - 8)] = random.choice(
+                        (0, 1, 127, 128, 255, random.randrange(256))
+                    )
+                return bytes(body)
+            case 5 | 6:  # metadata
+                about = dict(metadata)
+                key = random.choice([key for key in about if not key.startswith(b"ARROW")])
+                try:
+                    about[key] = changed_json(json.loads(about[key]), random)[:2_000_000]
+                except ValueError:
+                    about[key] = changed_bytes(about[key], random)
+                if key == CONFIG_KEY and random.random() < 0.5:
+                    about[HASH_KEY] = _hash_like(about[CONFIG_KEY])
+                changed = table.replace_schema_metadata(about)
+            case _:  # rows
+                i = random.randrange(table.num_columns)
+                field = table.schema.field(i)
+                values = table.column(i).to_pylist()
+                values[random.randrange(3)] = odd_value(random)
+                try:
+                    column = pa.array(values, field.type)
+                except Exception:
+                    column = pa.array(values[:0] + [None] * 3, field.type)
+                changed = table.set_column(i, field.with_nullable(field.nullable or column.null_count > 0), column)
+        sink = BytesIO()
+        try:
+            pq.write_table(changed, sink, write_page_checksum=random.random() < 0.5)
+        except pa.ArrowException:  # what Arrow does not write
+            return changed_bytes(data, random)
+        return sink.getvalue()
+
+    def target(random: Random) -> None:
+        remove(path)
+        put(path, written(random), random)
+        checked = {**bounds.CAREFULLY, "page_checksum_verification": random.random() < 0.3}
+        with patch.object(bounds, "CAREFULLY", checked):
+            if path.is_symlink() or not path.is_file():
+                assert not fragment_paths(split)
+                return
+            fragment, rows = read_fragment(path, None, np.array([1]) if random.random() < 0.3 else None)
+            rows.to_pylist()
+            told(differences(fragment.config, {}))
+            found = read_manifest(split, ["label", "shard", "experts"], compact=random.random() < 0.5)
+            found.counts(np.ones(len(found.level_ids), bool))
+            assert set(found.labels) <= {*Label}
+
+    return target
+
+
+def _hash_like(config: bytes) -> bytes:
+    from configs.schema import hash_of
+
+    try:
+        return hash_of(json.loads(config)).encode()
+    except (ValueError, RecursionError):
+        return b"?"
+
+
+def notes(folder: Path) -> Target:
+    """`job.json`, and names in the folders of a split."""
+    note_job(folder, made_job(), ["levelproof", "generate"], [(0, 7), (9, 9)])
+    document, path = json.loads((folder / JOB).read_text()), folder / JOB
+    names = [".000000000000-000000000001-0123abcd.begun", "000000000000-000000000001.parquet"]
+    (folder / MANIFEST).mkdir()
+
+    def target(random: Random) -> None:
+        marked = folder / MANIFEST / "mark"
+        with suppress(OSError, ValueError):
+            marked = folder / MANIFEST / changed_word(random.choice(names), random).replace("/", "_")
+            put(marked, b"", random)
+        try:
+            for of in (FRAGMENT, BEGUN, DATA):
+                for entry in entries(folder, MANIFEST, of, os.DirEntry.is_file):
+                    assert not entry.is_symlink()
+                    assert entry.is_file()
+        finally:
+            with suppress(OSError, ValueError):
+                remove(marked)
+        remove(path)
+        put(path, changed_json(document, random), random)
+        if not path.exists():
+            return
+        note = read_note(folder)
+        assert note.command.isprintable() or not note.command
+        assert (note.level_ids[:, 0] <= note.level_ids[:, 1]).all()
+
+    return target
+
+
+def origins(folder: Path) -> Target:
+    """The `file` of a row."""
+    shutil.copytree(GOLDEN / "s", folder / "theirs")
+
+    def target(random: Random) -> None:
+        file = changed_word(f"{folder}/theirs/{random.choice(('first', 'second'))}#1", random)
+        if random.random() < 0.5:
+            file = changed_word(file, random)
+        found = place_of(file)
+        if found is not None:
+            assert str(found) == file
+            opened = open_folder(found.folder)
+            read_trajectories(opened.named(found.array), opened.size, 0, 1)
+
+    return target
+
+
+def checkpoints(folder: Path) -> Target:
+    """Experts: archives, the arrays in them, and their headers."""
+    job = made_job("data", "expert.width=8", "expert.environments=24", "expert.attempts=8")
+    ids, path, good = np.arange(2, dtype=np.int32), folder / "experts.npz", folder / "good.npz"
+    levels = sample_levels(ids, size_of("s"), job.distribution)
+    shapes = jax.eval_shape(lambda: begin(levels, ids, no_success(len(ids)), job.expert))
+    begun = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+    save_experts(good, {i: Kept(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(2)})
+    data = good.read_bytes()
+    with np.load(good) as file:
+        arrays = {name: file[name] for name in file.files}
+
+    def written(random: Random) -> bytes:
+        if random.random() < 0.4:
+            return changed_bytes(data, random)
+        name, sink = random.choice([*arrays, "level_id", "curve"]), BytesIO()
+        if random.random() < 0.5:
+            with zipfile.ZipFile(sink, "w", random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+                for of, values in arrays.items():
+                    part = BytesIO()
+                    np.save(part, values)
+                    raw = part.getvalue()
+                    archive.writestr(f"{of}.npy", changed_bytes(raw[:300], random) + raw[300:] if of == name else raw)
+            return sink.getvalue()
+        changed = {
+            0: lambda x: x.astype(np.float64),
+            1: lambda x: x.reshape(-1),
+            2: lambda x: x[:1],
+            3: lambda x: np.array(odd_value(random), dtype=object),
+            4: lambda x: np.full(x.shape, random.choice((-1, 2**31 - 1, 127))).astype(x.dtype),
+            5: lambda x: np.array(7),
+        }[random.randrange(6)]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            np.savez(sink, **{**arrays, name: changed(arrays[name])})
+        return sink.getvalue()
+
+    def target(random: Random) -> None:
+        remove(path)
+        put(path, written(random), random)
+        for level_id, kept in load_experts(path, job).items():
+            assert type(level_id) is int
+            assert 0 <= level_id <= MAX_LEVEL_ID
+            assert isinstance(kept.curve, list)
+
+    return target
+
+
+def listings(folder: Path) -> Target:
+    """What a web server and the hub say there is."""
+    hub_files = [
+        {"type": "file", "oid": "0123", "size": 77, "path": "1M/s/manifest/000000000000-000000000001.parquet"},
+        {"type": "directory", "oid": "0124", "size": 0, "path": "1M/s/manifest"},
+    ]
+    index = b"000000000000-000000000001.parquet\n000000000002-000000000003.parquet\nindex.txt\n"
+
+    class Given:
+        def __init__(self, data: bytes) -> None:
+            self._data = data
+            self.headers: dict[str, str] = {}
+
+        def __enter__(self) -> "Given":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            """Nothing is open."""
+
+        def read(self, most: int = -1) -> bytes:
+            return self._data if most < 0 else self._data[:most]
+
+        def stream(self, **_: object) -> list[bytes]:
+            return [self._data]
+
+        def bytes(self) -> bytes:
+            return self._data
+
+    def target(random: Random) -> None:
+        if random.random() < 0.5:
+            data = changed_json(hub_files, random)
+            with patch.object(hub, "urlopen", lambda *_, **__: Given(data)), patch.object(hub, "PAUSE", 0.0):
+                for path, about in remote.stored_in(Path("hf://datasets/me/levels/1M/s/manifest")).items():
+                    assert ".." not in path.parts
+                    assert type(about.size) is int
+            return
+        data = changed_bytes(index, random)
+        with patch.object(remote, "_ask", lambda *_: data):
+            there = Path("https://host/1M/s")
+            for path in entries(there, MANIFEST, FRAGMENT, os.DirEntry.is_file):
+                assert path.parent == there / MANIFEST
+
+    return target
+
+
+def pieces(folder: Path) -> Target:
+    """What lies in the cache."""
+    cache, piece = PieceCache(folder / "pieces", 10**9), bytes(range(256)) * 4
+    cache.put("name-0", piece)
+    path = folder / "pieces/name-0"
+    data = path.read_bytes()
+
+    def target(random: Random) -> None:
+        remove(path)
+        put(path, changed_bytes(data, random), random)
+        cache._checked.clear()
+        found = cache.read("name-0", 3, 700)
+        assert found is None or found == piece[3:700]
+
+    return target
+
+
+def overrides(folder: Path) -> Target:
+    """Settings as they are typed, and as a split records them."""
+    document = plain(made_job())
+    words = ["levels=64", "budget=11.5M", "expert.width=128", "distribution.joints=0.5", "out=my data", "size=3-1-0-7"]
+
+    def target(random: Random) -> None:
+        word = random.choice(words)
+        match random.randrange(20):
+            case 0:
+                job = compose_job([changed_word(word, random)])
+                assert typed(JobConfig, plain(job)) == job
+            case 1 | 2 | 3 | 4:
+                _parsed(changed_word(word, random)).value()
+            case 5 | 6 | 7:
+                assert parse_count(changed_word("11.5M", random), "levels") > 0
+            case 8 | 9:
+                try:
+                    size_of(changed_word("8-8-8-4", random))
+                except ValueError as error:
+                    raise ConfigError(f"{error}.") from None
+            case _:
+                job = typed(JobConfig, changed_document(document, random))
+                assert len(job.hash) > 7
+
+    return target
+
+
+TARGETS: dict[str, Callable[[Path], Target]] = {
+    "level files": level_files,
+    "folders of the reference": kinetix_folders,
+    "shards, full": partial(shards, density="full"),
+    "shards, resume": partial(shards, density="resume"),
+    "shards, witness": partial(shards, density="witness"),
+    "fragments": fragments,
+    "notes and marks": notes,
+    "origins": origins,
+    "checkpoints": checkpoints,
+    "listings": listings,
+    "pieces": pieces,
+    "settings": overrides,
+}

@@ -1,0 +1,173 @@
+"""Fragments whose footers and pages lie: one sentence each, in little memory, and the process goes on."""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from experts.labels import Label
+from pipeline.errors import Failure
+from pipeline.store.manifest import fragment_paths, read_fragment, read_manifest
+from pipeline.store.schema import COLUMNS
+from pipeline.store.thrift import footer_in, pages_in
+from tests.pipeline.command import ROOT
+from tests.pipeline.made import made_split
+
+MOST = 100 * 2**20  # bytes that reading all of them may take besides those of reading a good one
+PEAK = """
+import json, resource, sys
+from pathlib import Path
+from pipeline.errors import Failure
+from pipeline.store.manifest import read_fragment
+peak = lambda: 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+good, *others = map(Path, sys.argv[1:])
+read_fragment(good)
+before, said = peak(), []
+for path in others:
+    try:
+        read_fragment(path)
+        said.append("")
+    except Failure as failure:
+        said.append(str(failure.__cause__))
+print(json.dumps([peak() - before, said]))
+"""
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    (path,) = fragment_paths(made_split(tmp_path_factory.mktemp("good"), [[Label.SOLVED, Label.UNSOLVED]]))
+    return path
+
+
+def with_column(good: Path, name: str, values: pa.Array, **how: object) -> bytes:
+    """The fragment with as many rows as there are values in one of its columns."""
+    table = pq.read_table(good)
+    rows = table.take(np.zeros(len(values), int))
+    at = COLUMNS.names.index(name)
+    sink = BytesIO()
+    rows = rows.set_column(at, COLUMNS.field(at), values)
+    pq.write_table(rows, sink, compression="zstd", write_page_checksum=True, **how)
+    return sink.getvalue()
+
+
+def footer_of(data: bytes) -> slice:
+    return slice(len(data) - 8 - int.from_bytes(data[-8:-4], "little"), len(data) - 8)
+
+
+def varint(number: int, length: int = 0) -> bytes:
+    """A number in zigzag, in at least so many bytes."""
+    number, found = number << 1, b""
+    while number > 127 or len(found) < length - 1:
+        found += bytes([number & 127 | 128])
+        number >>= 7
+    return found + bytes([number])
+
+
+def with_other_numbers(data: bytes, change: Callable[[int], int], where: slice, numbers: set[int]) -> bytes:
+    """Numbers of at least three bytes changed wherever they stand, in as many bytes as they have."""
+    part = data[where]
+    for number in numbers:
+        if len(told := varint(number)) > 2:
+            part = part.replace(told, varint(change(number), len(told)))
+    assert part != data[where]
+    return data[: where.start] + part + data[where.stop :]
+
+
+def long_texts(good: Path) -> bytes:
+    """A dictionary of one text of 200 kB, which each of 2,000 rows names."""
+    text = pa.chunked_array([pa.array(["x" * 200_000]).take(np.zeros(40, int))] * 50)
+    return with_column(good, "label_reason", text)
+
+
+def long_pages(good: Path) -> bytes:
+    """Hundreds of megabytes of the same byte, and a footer that says nothing of them."""
+    text = pa.array([f"{i:03d}" + "x" * 400_000 for i in range(10)] * 50)
+    data = with_column(good, "label_reason", text, use_dictionary=False)
+    about = pq.read_metadata(BytesIO(data)).row_group(0)
+    sizes = {about.total_byte_size, about.column(COLUMNS.names.index("label_reason")).total_uncompressed_size}
+    return with_other_numbers(data, lambda _: 7, footer_of(data), {size for size in sizes if size > 10**6})
+
+
+def long_lists(good: Path) -> bytes:
+    """A learning curve of millions of zeros, of which a page takes a few bytes."""
+    curve = pa.ListArray.from_arrays([0, 10_000_000], pa.array(np.zeros(10_000_000, np.float32)))
+    return with_column(good, "learning_curve", curve)
+
+
+def many_rows(good: Path) -> bytes:
+    """Millions of the same row."""
+    return with_column(good, "label", pa.array(["solved"]).take(np.zeros(500_000, int)))
+
+
+def other_values(good: Path) -> bytes:
+    """A footer with fewer values than there are."""
+    hashes = [f"{number:064x}" for number in np.random.default_rng(0).integers(0, 2**62, 20_000)]
+    data = with_column(good, "content_hash", pa.array(hashes))
+    return with_other_numbers(data, lambda n: n - 1, footer_of(data), {20_000})
+
+
+HOSTILE = {
+    long_texts: "its rows would take more memory than those of any fragment",
+    long_pages: "its rows would take more memory than those of any fragment",
+    long_lists: "its rows would take more memory than those of any fragment",
+    many_rows: "it has more rows than any fragment of its size",
+    other_values: "it has other numbers of values than its rows",
+}
+
+
+def test_what_becomes_large_is_refused_before_it_does(good: Path, tmp_path: Path) -> None:
+    paths = []
+    for number, make in enumerate(HOSTILE):
+        paths.append(tmp_path / str(number) / good.name)
+        paths[-1].parent.mkdir()
+        paths[-1].write_bytes(make(good))
+        assert paths[-1].stat().st_size < 5_000_000
+    done = subprocess.run(
+        [sys.executable, "-c", PEAK, str(good), *map(str, paths)],
+        env={"PYTHONPATH": str(ROOT), "PATH": ""},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    grown, said = json.loads(done.stdout)
+    assert said == [*HOSTILE.values()]
+    assert grown < MOST
+
+
+def test_answers_that_would_end_the_process_are_not_asked_for(good: Path) -> None:
+    """Of size statistics with too many numbers in them, pyarrow's `column` is an exception that nobody catches."""
+    data = good.read_bytes()
+    start, end = footer_of(data).start, footer_of(data).stop
+    lists = [found.end() for found in re.finditer(rb"[\x19\x29\x39]\x26", data[start:end])]  # of two numbers
+    assert len(lists) > 3
+    for at in lists:
+        footer = data[start : start + at - 1] + b"\x36\x02" + data[start + at : end]
+        good.write_bytes(data[:start] + footer + len(footer).to_bytes(4, "little") + b"PAR1")
+        with suppress(Failure):
+            read_fragment(good)
+            read_manifest(good.parents[1], ["label"], [1])
+    good.write_bytes(data)
+
+
+def test_a_footer_and_its_pages_are_read_as_arrow_reads_them(good: Path) -> None:
+    data = good.read_bytes()
+    footer, about = footer_in(data[footer_of(data)]), pq.read_metadata(good)
+    assert (footer.rows, footer.made_by) == (about.num_rows, about.created_by)
+    for group, columns in enumerate(footer.groups):
+        for i, column in enumerate(columns.columns):
+            of = about.row_group(group).column(i)
+            assert column.values == of.num_values
+            assert column.length == of.total_compressed_size
+            assert column.first == min(filter(None, (of.data_page_offset, of.dictionary_page_offset)))
+            pages = list(pages_in(data[column.first : column.first + column.length]))
+            assert sum(page.values for page in pages if not page.is_dictionary) == of.num_values
+            assert sum(page.bytes for page in pages) <= of.total_uncompressed_size

@@ -1,0 +1,73 @@
+"""What others can write to is refused in one sentence: compiled programs are executed, experts go on."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from experts.labels import Label
+from pipeline import runtime
+from pipeline.errors import UserError
+from pipeline.owned import own_folder, require_own
+from pipeline.runtime import CACHE_VARIABLE, cache_folder, prepare_jax
+from pipeline.store.checkpoints import load_experts, require_same_experts
+from tests.pipeline.command import assert_refused, here
+from tests.pipeline.made import made_job, made_split
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="the system has no such users")
+
+
+def test_a_folder_is_made_for_its_user_alone(tmp_path: Path) -> None:
+    before = os.umask(0o002)  # as many systems have it
+    try:
+        made = own_folder(tmp_path / "deeper/cache", "delete it")
+    finally:
+        os.umask(before)
+    assert made.stat().st_mode & 0o777 == 0o700
+    assert own_folder(made, "delete it") == made
+
+
+@pytest.mark.parametrize("mode", [0o720, 0o702, 0o777])
+def test_a_cache_that_others_write_to_is_not_used(tmp_path: Path, mode: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    cache.chmod(mode)
+    monkeypatch.setenv(CACHE_VARIABLE, str(cache))
+    done = here(["generate", "levels=1", "budget=5k", "out=data"], tmp_path)
+    assert_refused(done, 2, f"Other users can write to {cache}", f"{CACHE_VARIABLE} name a folder of your own")
+    assert not (tmp_path / "data").exists()
+
+
+def test_nor_are_programs_that_others_could_have_put_into_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    (tmp_path / "jax").mkdir()
+    (tmp_path / "jax").chmod(0o777)
+    monkeypatch.setattr(runtime, "remove_damaged", lambda _: pytest.fail("it is looked into"))
+    with pytest.raises(UserError, match=r"Other users can write to .*/jax"):
+        prepare_jax()
+
+
+def test_another_user_s_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    cache_folder()
+    about = tmp_path.stat().st_uid
+    monkeypatch.setattr(os, "getuid", lambda: about + 1)
+    if about:
+        with pytest.raises(UserError, match="belongs to another user"):
+            cache_folder()
+    else:
+        cache_folder()  # an administrator's: who is one may write anywhere
+
+
+def test_experts_that_others_write_to_do_not_go_on(tmp_path: Path) -> None:
+    split = made_split(tmp_path, [[Label.SOLVED]])
+    (split / "experts").mkdir(exist_ok=True)
+    (split / "experts").chmod(0o777)
+    with pytest.raises(UserError, match=r"Other users can write to .*/experts.* leave continue_from out"):
+        require_same_experts(made_job("data", f"continue_from={split}", "budget=1M"))
+    file = tmp_path / "experts.npz"
+    file.touch()
+    file.chmod(0o666)
+    with pytest.raises(UserError, match="Other users can write to"):
+        load_experts(file, made_job())
+    require_own(tmp_path / "nothing", "make it")
