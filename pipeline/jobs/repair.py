@@ -13,7 +13,7 @@ from rich.console import Console
 from configs.compose import compose_job, words_for
 from configs.errors import ConfigError
 from configs.numbers import parse_count
-from configs.schema import JobConfig, from_files, hash_of
+from configs.schema import FROM_RECORDS, JobConfig, from_files, hash_of
 from pipeline.errors import Exit, Failure, UserError
 from pipeline.jobs.generate import generate
 from pipeline.jobs.progress import say
@@ -38,7 +38,7 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
     Returns FAILED where some are left, else what came of making the others.
 
     Raises:
-        UserError: no split, a setting that is none of these, or somebody is writing to it.
+        UserError: no split, a setting that is none of these, it was imported, or somebody is writing to it.
         Failure: it was made with other settings than this program knows, or the disk refuses.
     """
     if wrong := [word for word in settings if word.partition("=")[0] not in SETTINGS]:
@@ -47,6 +47,7 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
     print(findings.report(split))
     if not findings.wrong:
         return Exit.DONE
+    _require_made(split, findings)
     job = _job(split, findings, settings)
     left = _left(findings)
     lost = findings.lost - findings.beyond.keys()
@@ -82,6 +83,15 @@ def _examine(split: Path) -> Findings:
     from pipeline.read.verify import examine  # starts JAX
 
     return examine(split, Console(stderr=True))
+
+
+def _require_made(split: Path, findings: Findings) -> None:
+    """Refuse a split of which this program has made nothing: whose actions are lost, nobody here can make again."""
+    if (findings.config or {}).get("distribution") == FROM_RECORDS:
+        raise UserError(
+            f"The split {split} was imported, so nothing here makes its levels again: delete it, and import the folder "
+            f"that they come from with `levelproof import FOLDER -o {split}`."
+        )
 
 
 def _job(split: Path, findings: Findings, settings: Sequence[str]) -> JobConfig:

@@ -19,8 +19,8 @@ from pipeline.runtime import prepare_jax
 from pipeline.store import seal as store
 from pipeline.store.disk import REFUSALS
 from pipeline.store.layout import fragment_path, unit_name
-from pipeline.store.manifest import Fragment, require_manifest
-from pipeline.store.remote import as_typed
+from pipeline.store.manifest import Fragment, require_manifest, write_index
+from pipeline.store.remote import as_typed, is_remote
 from pipeline.store.seal import Piece, seal
 from pipeline.store.split import taken
 
@@ -30,7 +30,7 @@ def seal_split(
 ) -> None:
     """Seal all of a split that is not, in fragments of about so many rows (default: `store.seal.ROWS`).
 
-    With a `density`, what is stored otherwise is converted, sealed or not.
+    With a `density`, what is stored otherwise is converted, sealed or not. At the end the manifest has its index.
 
     Raises:
         UserError: there is no split, it cannot be written, or somebody writes to it.
@@ -59,6 +59,8 @@ def seal_split(
                     done += sum(piece.rows for piece in group)
                     seal(split, group, density=wanted, converted=partial(bar.advance, task))
                     bar.update(task, completed=done)
+                if not is_remote(split):  # what stores list needs none
+                    write_index(split)
             except OSError as error:
                 raise _refused(split, error) from error
     merged = sum(map(len, groups))

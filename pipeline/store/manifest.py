@@ -22,6 +22,7 @@ from pipeline.store.checksums import digests_below, with_own
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.fragment import FULL, Fragment, read_fragment
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
+from pipeline.store.remote import INDEX
 from pipeline.store.runs import ascending
 from pipeline.store.schema import (
     COLUMNS,
@@ -96,6 +97,18 @@ def fragment_paths(split: Path) -> list[Path]:
     Whatever else is in the folder (copies, links, what file systems and editors leave) is none.
     """
     return sorted(entries(split, MANIFEST, FRAGMENT, DirEntry.is_file))
+
+
+def write_index(split: Path) -> None:
+    """Write down which fragments there are, for readers of a web server that does not list them.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    path = split / MANIFEST / INDEX
+    unfinished = path.with_name(f".{INDEX}")
+    unfinished.write_text("".join(f"{fragment.name}\n" for fragment in fragment_paths(split)))
+    unfinished.replace(path)
 
 
 def _any_within(ordered: np.ndarray, first: int, last: int) -> bool:

@@ -155,7 +155,7 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
     except FileNotFoundError:
         raise UserError(
             f"There is no split at {as_typed(folder.parent)}, or its server was not told what it has: a split on a web "
-            f"server needs {folder.name}/{INDEX}, which `ls manifest > manifest/{INDEX}` makes in its folder."
+            f"server needs {folder.name}/{INDEX}, which `levelproof seal` writes."
         ) from None
     return {folder / name: Stored("", 0) for name in text.split() if "/" not in name}
 

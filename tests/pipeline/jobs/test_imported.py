@@ -117,6 +117,16 @@ def test_no_other_job_writes_into_it(folder: Path) -> None:
 
 
 @pytest.mark.campaign
+def test_it_is_not_repaired(folder: Path) -> None:
+    split = folder / "data/1M/s"
+    shutil.rmtree(next((split / "shards").iterdir()))
+    before = sorted(path for path in split.rglob("*"))
+    done = here(["verify", str(split), "--repair", "executor=inline"], folder)
+    assert_refused(done, 2, "was imported", f"levelproof import FOLDER -o {split}")
+    assert "it hits levels" in done.stdout
+    assert sorted(path for path in split.rglob("*")) == before
+
+
 def test_its_levels_are_labelled_at_another_budget(once: Path, tmp_path: Path) -> None:
     words = [f"manifest={once / 'data/1M/s'}", "budget=5k", "procedure=label", "executor=inline"]
     done = here(["regenerate", *words, "where=label != 'solved'"], tmp_path)

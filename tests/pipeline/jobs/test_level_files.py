@@ -24,7 +24,7 @@ from pipeline.look.rows import Asked
 from pipeline.look.status import look
 from pipeline.read.level_files import LevelUnseen, level_at, levels_below
 from pipeline.read.verify import examine
-from pipeline.store.manifest import read_manifest
+from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.origins import Origin
 from tests.experts.search.worlds import switchback
 from tests.pipeline.command import assert_refused, here, run
@@ -126,6 +126,21 @@ def test_every_level_is_made_again_and_looked_at(once: Path, folder: Path) -> No
     raw[len(raw) // 2] ^= 1
     chunk.write_bytes(raw)
     assert any("is missing or damaged" in sentence for sentence in examine(split).wrong)
+
+
+def test_it_is_repaired_from_the_files(folder: Path) -> None:
+    """A shard that is gone, and then the fragment, whose rows alone know where the files are."""
+    split = folder / "data/5k/s"
+    before, (shard,) = lasting(split), (split / "shards").iterdir()
+    shutil.rmtree(shard)
+    done = here(["verify", str(split), "--repair", "executor=inline"], folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert not examine(split).wrong
+    assert lasting(split) == before
+    fragment_paths(split)[0].write_bytes(b"PAR1")
+    done = here(["verify", str(split), "--repair", "executor=inline"], folder)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "whose level files no row names" in done.stdout
 
 
 def test_without_shard_and_file_a_level_is_gone(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from pipeline.store.fields import same_bits
 from pipeline.store.layout import JOB, new_attempt
 from pipeline.store.manifest import begin_fragment, fragment_paths, read_fragment, read_manifest, write_fragment
 from pipeline.store.shard import Shard
-from tests.pipeline.command import assert_refused, here
+from tests.pipeline.command import assert_refused, here, run
 from tests.pipeline.made import lasting
 from tests.pipeline.read.test_damage import files_of, flip
 
@@ -46,6 +46,15 @@ def sealed(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     away = last.rename(split.parent / last.name)
     seal_split(split, None, Console(quiet=True))
     away.rename(last)
+    return split
+
+
+@pytest.fixture(scope="module")
+def witness(sealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same in actions and key frames."""
+    split = tmp_path_factory.mktemp("witness") / "s"
+    shutil.copytree(sealed, split)
+    seal_split(split, 2, Console(quiet=True), "witness")
     return split
 
 
@@ -106,7 +115,19 @@ def test_several_damages_are_repaired_together(whole: Path, copied: Callable[[Pa
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("kind", ["whole", "sealed"])
+def test_workers_repair(whole: Path, copied: Callable[[Path], Path]) -> None:
+    """Two on Ray, in processes that have not started JAX when they are forked."""
+    split = copied(whole)
+    for path in fragment_paths(split)[:2]:
+        path.write_bytes(b"PAR1")
+    done = run(["verify", str(split), "--repair", "workers=2", "unit=1"], split.parent)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    assert_as_before(split, whole)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["whole", "sealed", "witness"])
 def test_each_kind_of_file_is_repaired(
     kind: str, whole: Path, copied: Callable[[Path], Path], request: pytest.FixtureRequest
 ) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from configs.schema import Density
 from pipeline.jobs.seal import seal_split
 from pipeline.read.findings import Findings
 from pipeline.read.verify import examine
@@ -17,6 +18,7 @@ from tests.pipeline.made import honest_split
 
 pytestmark = pytest.mark.slow
 FLIPS = 1000
+LESS = ("resume", "witness")
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +39,23 @@ def mixed(unsealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (later / path.name).rename(path)
     assert len(fragment_paths(split)) == 4
     return split
+
+
+def converted(split: Path, folder: Path, density: Density) -> Path:
+    """Three sealed fragments, whose shards store less."""
+    shutil.copytree(split, folder / "s")
+    seal_split(folder / "s", 8, Console(quiet=True), density, 16)
+    return folder / "s"
+
+
+@pytest.fixture(scope="module")
+def resume(unsealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return converted(unsealed, tmp_path_factory.mktemp("resume"), "resume")
+
+
+@pytest.fixture(scope="module")
+def witness(unsealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return converted(unsealed, tmp_path_factory.mktemp("witness"), "witness")
 
 
 def files_of(split: Path) -> dict[Path, set[int]]:
@@ -81,22 +100,62 @@ def copied(tmp_path: Path) -> Callable[[Path], Path]:
     return lambda split: Path(shutil.copytree(split, tmp_path / "s"))
 
 
-@pytest.mark.parametrize("kind", ["unsealed", "mixed"])
+def assert_all_named(
+    split: Path, files: dict[Path, set[int]], change: Callable[[Path], None], some: list[Path]
+) -> None:
+    """A change of some files is seen in each of them, and what is hit is what they hold; they are put back."""
+    before = {file: file.read_bytes() for file in some}
+    for file in some:
+        change(file)
+    found = examine(split)
+    for file, data in before.items():
+        file.write_bytes(data)
+    assert (split / JOB not in some) or any(f"{split / JOB}" in sentence for sentence in found.sentences)
+    named = hit(found)
+    assert named <= set[int]().union(*(files[file] for file in some))
+    for file in set(some) - {split / JOB}:
+        assert named & files[file], file
+        assert "c" in file.relative_to(split).parts or files[file] <= named, file
+
+
+@pytest.mark.parametrize("kind", ["unsealed", "mixed", *LESS])
 def test_flips_in_many_files_at_once(kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest) -> None:
     """One in each of ten; what is hit is what they hold, and what they do not is looked at nevertheless."""
     split, chance = copied(request.getfixturevalue(kind)), random.Random(0)
     assert not examine(split).wrong
     files = files_of(split)
-    chosen = chance.sample(sorted(files.keys() - {split / JOB}), 9)
-    for file in [*chosen, split / JOB]:
-        flip(file, chance)
-    found = examine(split)
-    assert any(f"{split / JOB}" in sentence for sentence in found.sentences)
-    named, all_of_them = hit(found), set[int]().union(*(files[file] for file in chosen))
-    assert named <= all_of_them
-    for file in chosen:
-        assert named & files[file], file
-        assert "c" in file.relative_to(split).parts or files[file] <= named, file
+    chosen = [*chance.sample(sorted(files.keys() - {split / JOB}), 9), split / JOB]
+    assert_all_named(split, files, lambda file: flip(file, chance), chosen)
+
+
+def spoil(file: Path, chance: random.Random) -> None:
+    """A byte is another one, or the file is shorter, longer, empty, or all zeros."""
+    data = file.read_bytes()
+    match chance.randrange(8):
+        case 0:
+            file.write_bytes(data[: chance.randrange(len(data))])
+        case 1:
+            file.write_bytes(data + bytes([chance.randrange(256)]))
+        case 2:
+            file.write_bytes(b"")
+        case 3:
+            file.write_bytes(bytes(len(data)))
+        case _:
+            flip(file, chance)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", LESS)
+def test_a_thousand_damages_of_splits_that_store_less(
+    kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest
+) -> None:
+    """Five files at a time."""
+    split, chance = copied(request.getfixturevalue(kind)), random.Random(5)
+    files = files_of(split)
+    for _ in range(FLIPS // 2 // 5):
+        chosen = chance.sample(sorted(files), 5)
+        assert_all_named(split, files, lambda file: spoil(file, chance), chosen)
+    assert not examine(split).wrong
 
 
 @pytest.mark.campaign
@@ -142,13 +201,13 @@ def exchange(a: Path, b: Path) -> None:
     other.rename(b)
 
 
-@pytest.mark.parametrize("kind", ["unsealed", "mixed"])
+@pytest.mark.parametrize("kind", ["unsealed", "mixed", *(pytest.param(x, marks=pytest.mark.campaign) for x in LESS)])
 def test_what_is_exchanged(kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest) -> None:
     """Two shards, two fragments, two files of chunks; and a file that was not there."""
     split = copied(request.getfixturevalue(kind))
     fragments, shards = fragment_paths(split), sorted((split / "shards").iterdir())
     files = files_of(split)
-    chunks = [shards[1] / "dyn32/c/0/0/0", shards[2] / "dyn32/c/0/0/0"]
+    chunks = [min(file for file in shard.glob("*/c/**/*") if file.is_file()) for shard in shards[1:3]]
     for a, b in (shards[:2], fragments[:2], chunks):
         exchange(a, b)
         found = examine(split)

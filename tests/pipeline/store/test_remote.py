@@ -27,7 +27,7 @@ from pipeline.errors import Failure, LevelproofError, UserError
 from pipeline.read.rows import read_rows
 from pipeline.store import hub, remote
 from pipeline.store.fields import same_bits
-from pipeline.store.manifest import read_manifest, require_manifest
+from pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
 from tests.pipeline.command import ROOT, assert_refused
 from tests.pipeline.command import here as command
 from tests.pipeline.made import made_split, played_split
@@ -336,9 +336,13 @@ def test_a_split_on_a_web_server(split: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(split, tmp_path / "www" / "s"))
     with serving(files_of(tmp_path / "www")) as server:
         there = Path(f"{server.url}/s")
-        with pytest.raises(UserError, match=r"needs manifest/index\.txt, which `ls manifest > manifest/index\.txt`"):
+        with pytest.raises(UserError, match=r"needs manifest/index\.txt, which `levelproof seal`"):
             read_manifest(there)
-        subprocess.run("ls manifest > manifest/index.txt", shell=True, check=True, cwd=folder)
+        assert command(["seal", str(folder)], tmp_path).returncode == 0
+        assert command(["seal", str(folder)], tmp_path).returncode == 0
+        names = (folder / "manifest/index.txt").read_text().splitlines()
+        assert names == [path.name for path in fragment_paths(folder)]
+        assert sorted(entry.name for entry in (folder / "manifest").iterdir()) == [*names, "index.txt"]
         require_same(there, split)
         server.log.clear()
         forget()
