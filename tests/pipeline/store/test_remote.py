@@ -343,15 +343,15 @@ def test_a_split_on_a_web_server(split: Path, tmp_path: Path) -> None:
         names = (folder / "manifest/index.txt").read_text().splitlines()
         assert names == [path.name for path in fragment_paths(folder)]
         assert sorted(entry.name for entry in (folder / "manifest").iterdir()) == [*names, "index.txt"]
-        require_same(there, split)
+        require_same(there, folder)
         server.log.clear()
         forget()
-        require_same(there, split)
+        require_same(there, folder)
         assert [line for line in server.log if line.startswith("GET") and "index.txt" not in line] == []
         server.spoil(3, "cut")
         forget()
         shutil.rmtree(os.environ["LEVELPROOF_CACHE_DIR"])
-        require_same(there, split)
+        require_same(there, folder)
 
 
 def test_a_split_on_the_hub(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
