@@ -20,7 +20,7 @@ from pipeline.store import seal as store
 from pipeline.store.disk import REFUSALS
 from pipeline.store.layout import fragment_path, unit_name
 from pipeline.store.manifest import Fragment, require_manifest, write_index
-from pipeline.store.remote import as_typed, is_remote
+from pipeline.store.remote import as_typed
 from pipeline.store.seal import Piece, seal
 from pipeline.store.split import taken
 
@@ -59,8 +59,7 @@ def seal_split(
                     done += sum(piece.rows for piece in group)
                     seal(split, group, density=wanted, converted=partial(bar.advance, task))
                     bar.update(task, completed=done)
-                if not is_remote(split):  # what stores list needs none
-                    write_index(split)
+                write_index(split)
             except OSError as error:
                 raise _refused(split, error) from error
     merged = sum(map(len, groups))

@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from configs.convert import flat
 from pipeline.errors import Failure, UserError
+from pipeline.store import files
 from pipeline.store.checksums import digests_below, with_own
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.fragment import FULL, Fragment, read_fragment
@@ -102,13 +103,9 @@ def fragment_paths(split: Path) -> list[Path]:
 def write_index(split: Path) -> None:
     """Write down which fragments there are, for readers of a web server that does not list them.
 
-    Raises:
-        OSError: the disk refuses.
+    Raises: as `files.write`.
     """
-    path = split / MANIFEST / INDEX
-    unfinished = path.with_name(f".{INDEX}")
-    unfinished.write_text("".join(f"{fragment.name}\n" for fragment in fragment_paths(split)))
-    unfinished.replace(path)
+    files.write(split / MANIFEST / INDEX, "".join(f"{path.name}\n" for path in fragment_paths(split)).encode())
 
 
 def _any_within(ordered: np.ndarray, first: int, last: int) -> bool:

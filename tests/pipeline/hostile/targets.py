@@ -415,7 +415,7 @@ def listings(folder: Path) -> Target:
                     assert type(about.size) is int
             return
         data = changed_bytes(index, random)
-        with patch.object(remote, "_ask", lambda *_: data):
+        with patch.object(remote, "ask", lambda *_: data):
             there = Path("https://host/1M/s")
             for path in entries(there, MANIFEST, FRAGMENT, os.DirEntry.is_file):
                 assert path.parent == there / MANIFEST
