@@ -171,3 +171,9 @@ def test_a_footer_and_its_pages_are_read_as_arrow_reads_them(good: Path) -> None
             pages = list(pages_in(data[column.first : column.first + column.length]))
             assert sum(page.values for page in pages if not page.is_dictionary) == of.num_values
             assert sum(page.bytes for page in pages) <= of.total_uncompressed_size
+
+
+def test_a_fragment_without_rows_is_read(good: Path, tmp_path: Path) -> None:
+    empty = pq.read_table(good).slice(0, 0)
+    pq.write_table(empty, tmp_path / good.name, compression="zstd", write_page_checksum=True)
+    assert read_fragment(tmp_path / good.name)[1].num_rows == 0
