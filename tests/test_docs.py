@@ -1,6 +1,7 @@
 """Every Python block of the README and the docs runs as it stands, and imports of ours the one door."""
 
 import ast
+import json
 import os
 import re
 import subprocess
@@ -24,6 +25,8 @@ def blocks(page: Path) -> list[str]:
 
 
 PAGES = [page for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))] if blocks(page)]
+
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +56,15 @@ def test_a_page_imports_of_ours_the_door_alone(page: Path) -> None:
     modules = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
     modules += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
     assert not {module.partition(".")[0] for module in modules} & INSIDE
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("page", NOTEBOOKS, ids=lambda page: page.stem)
+def test_a_notebook_runs_from_top_to_bottom(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    cells = json.loads(page.read_text())["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    exec(compile("\n\n".join(code), str(page), "exec"), {"__name__": "__main__"})
 
 
 def test_the_docs_are_a_site_without_a_broken_link(tmp_path: Path) -> None:

@@ -158,7 +158,7 @@ class Manifest:
 
 
 def read_manifest(
-    split: Path,
+    split: Path | str,
     columns: Sequence[str] | None = None,
     level_ids: Sequence[int] | np.ndarray | None = None,
     *,
@@ -177,6 +177,7 @@ def read_manifest(
     Raises:
         Failure: a fragment is damaged, or fragments of several configurations lie side by side.
     """
+    split = Path(split)
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
     asked = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))
     read = partial(_part, names=names, level_ids=asked, compact=compact, each=each)
