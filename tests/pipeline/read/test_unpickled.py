@@ -1,0 +1,50 @@
+"""Nothing of a split is unpickled, whatever reads it."""
+
+import _pickle
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import levelproof
+from pipeline.errors import Failure
+from pipeline.jobs.seal import seal_split
+from pipeline.read.kinetix.folder import open_folder, read_trajectories
+from pipeline.read.verify import examine
+from pipeline.store.checkpoints import load_experts
+from pipeline.store.job_note import read_note
+from tests.pipeline.made import made_job, played_split
+from tests.pipeline.read.kinetix.folder import GOLDEN
+
+
+def reached(*_: object, **__: object) -> None:
+    pytest.fail("something is unpickled")
+
+
+class Unpickler:
+    """In place of pickle's own."""
+
+    __init__ = reached
+
+
+def test_pickle_is_not_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    split = played_split(tmp_path)
+    theirs = tmp_path / "experts.npz"
+    np.savez(theirs, level_id=np.array([{}], object), curve=np.zeros((1, 1)))
+    for module in (pickle, _pickle):
+        monkeypatch.setattr(module, "load", reached)
+        monkeypatch.setattr(module, "loads", reached)
+        monkeypatch.setattr(module, "Unpickler", Unpickler)
+    for density in (None, "resume", "witness"):
+        if density:
+            seal_split(split, None, Console(quiet=True), density)
+        data = levelproof.open(str(split))
+        assert next(data.batches(2, seed=0)).observation is not None
+        assert examine(split).levels == 64
+    assert read_note(split).intact
+    with pytest.raises(Failure, match="cannot be read"):
+        load_experts(theirs, made_job())
+    folder = open_folder(GOLDEN / "s")
+    assert read_trajectories(folder.arrays[0], folder.size, 0, 1).wrong == [""]
