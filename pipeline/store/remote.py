@@ -125,7 +125,11 @@ def stored_in(folder: Path) -> dict[Path, Stored]:
     else:
         listed = ask(folder, lambda: obstore_module().list(store, prefix=key).collect())
         found = {entry["path"]: Stored(_tag(entry), entry["size"]) for entry in listed}
-    return {folder / name[len(key) + 1 :]: about for name, about in found.items() if name.startswith(f"{key}/")}
+    return {
+        folder / name[len(key) + 1 :]: about
+        for name, about in found.items()
+        if name.startswith(f"{key}/") and ".." not in name.split("/")
+    }
 
 
 def names_in(folder: Path) -> list[Path]:

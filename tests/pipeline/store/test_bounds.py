@@ -83,14 +83,14 @@ def with_other_numbers(data: bytes, change: Callable[[int], int], where: slice, 
 
 
 def long_texts(good: Path) -> bytes:
-    """A dictionary of one text of 200 kB, which each of 2,000 rows names."""
-    text = pa.chunked_array([pa.array(["x" * 200_000]).take(np.zeros(40, int))] * 50)
+    """A dictionary of one text of 200 kB, which each of 500 rows names."""
+    text = pa.chunked_array([pa.array(["x" * 200_000]).take(np.zeros(50, int))] * 10)
     return with_column(good, "label_reason", text)
 
 
 def long_pages(good: Path) -> bytes:
-    """Hundreds of megabytes of the same byte, and a footer that says nothing of them."""
-    text = pa.array([f"{i:03d}" + "x" * 400_000 for i in range(10)] * 50)
+    """100 MB of the same byte, and a footer that says nothing of them."""
+    text = pa.array([f"{i:03d}" + "x" * 400_000 for i in range(10)] * 25)
     data = with_column(good, "label_reason", text, use_dictionary=False)
     about = pq.read_metadata(BytesIO(data)).row_group(0)
     sizes = {about.total_byte_size, about.column(COLUMNS.names.index("label_reason")).total_uncompressed_size}
@@ -99,13 +99,13 @@ def long_pages(good: Path) -> bytes:
 
 def long_lists(good: Path) -> bytes:
     """A learning curve of millions of zeros, of which a page takes a few bytes."""
-    curve = pa.ListArray.from_arrays([0, 10_000_000], pa.array(np.zeros(10_000_000, np.float32)))
+    curve = pa.ListArray.from_arrays([0, 6_000_000], pa.array(np.zeros(6_000_000, np.float32)))
     return with_column(good, "learning_curve", curve)
 
 
 def many_rows(good: Path) -> bytes:
-    """Millions of the same row."""
-    return with_column(good, "label", pa.array(["solved"]).take(np.zeros(500_000, int)))
+    """Many times the same row."""
+    return with_column(good, "label", pa.array(["solved"]).take(np.zeros(100_000, int)))
 
 
 def other_values(good: Path) -> bytes:
