@@ -69,7 +69,7 @@ def polished() -> Shortened:
 def test_the_shortest_way_is_found() -> None:
     success, length = polished().success
     np.testing.assert_array_equal(length, shortest()[1])
-    record = replay(levels(), np.moveaxis(success, 0, -1))
+    record = replay(levels(), np.moveaxis(np.asarray(success), 0, -1))
     np.testing.assert_array_equal(steps_to_goal(record.done), length)
     assert record.goal[length[0] - 1].all()
     assert not success[:, length[0] :].any()
@@ -111,4 +111,4 @@ def test_a_witness_is_polished() -> None:
 def test_settings_that_cannot_be() -> None:
     for wrong in ({"polish": -1}, {"polish": 2**31}, {"steady": -1}):
         with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
-            SearchConfig(**wrong)
+            SearchConfig(**wrong)  # pyright: ignore[reportArgumentType]
