@@ -183,6 +183,12 @@ def test_a_phone_by_day_and_by_night(chromium: Any, address: str, split: Path, s
         page.goto(address + at)
         page.wait_for_timeout(400)
         assert page.evaluate("document.scrollingElement.scrollWidth") <= PHONE["width"]
+    page.goto(address)
+    drawn(page)
+    page.get_by_text("Filters", exact=True).click()
+    assert page.get_by_role("button", name=re.compile("^solved")).is_visible()
+    page.get_by_text("Filters", exact=True).click()
+    page.wait_for_function("document.querySelectorAll('.cell:not([hidden])').length > 3")
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(19, 21, 25)"
     assert dark == (scheme == "dark")
     context.close()

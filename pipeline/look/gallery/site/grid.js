@@ -23,7 +23,9 @@
       this.asked = false;
       const later = () => this.later();
       addEventListener("scroll", later, { passive: true });
-      new ResizeObserver(later).observe(element);
+      const resized = new ResizeObserver(later);
+      resized.observe(element);
+      resized.observe(document.body); // what is above may fold away
       element.addEventListener("keydown", (event) => this.key(event));
       element.addEventListener("focusin", (event) => {
         const cell = event.target.closest(".cell");

@@ -74,10 +74,10 @@
     // Success rate of training per update; where no episode ended there is none.
     learning(rates) {
       const known = rates.map((rate, update) => [update, rate]).filter(([, rate]) => rate !== null);
-      at("learning").hidden = !known.length;
-      if (!known.length) return;
+      at("learning").hidden = !known.length || rates.length < 2;
+      if (at("learning").hidden) return;
       const [left, right, top, bottom] = [30, 314, 8, 102];
-      const x = (update) => left + ((right - left) * update) / Math.max(1, rates.length - 1);
+      const x = (update) => left + ((right - left) * update) / (rates.length - 1);
       const y = (rate) => bottom - (bottom - top) * rate;
       const text = (words, place, anchor) => made("text", { svg: true, ...place, "text-anchor": anchor }, words);
       const grid = [0, 0.5, 1].flatMap((rate) => [
