@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from rich.console import Console
-from rich.progress import track
 
 from experts.config import RECORD_STEPS
 from levelgen.level import size_of
@@ -22,6 +20,7 @@ from pipeline.read.rows import read_rows
 from pipeline.store.contents import table_for
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.schema import COLUMNS
+from pipeline.store.shown import shown
 
 PICTURES = ("start", "goal")  # the initial world; the moment that the witness reaches the goal, where there is one
 SHOWN = (  # columns beside them
@@ -48,10 +47,9 @@ def preview(manifest: Manifest, count: int) -> pa.Table:
     """
     ids = manifest.level_ids
     chosen = ids[np.unique(np.linspace(0, len(ids) - 1, count).round().astype(int))]
-    full, console = require_manifest(manifest.split, level_ids=chosen.tolist()), Console(stderr=True)
-    blocks, words = range(0, full.table.num_rows, BLOCK), f"pictures of {manifest.split}"
-    shown = track(blocks, words, console=console, transient=True, disable=not console.is_terminal)
-    rows = [row for first in shown for row in _pictured(full, full.table.slice(first, BLOCK))]
+    full = require_manifest(manifest.split, level_ids=chosen.tolist())
+    blocks = shown(range(0, full.table.num_rows, BLOCK), f"pictures of {manifest.split}")
+    rows = [row for first in blocks for row in _pictured(full, full.table.slice(first, BLOCK))]
     return pa.Table.from_pylist(rows, SCHEMA)
 
 

@@ -36,9 +36,11 @@ from pipeline.store.schema import (
     VERSION_KEY,
     schema_of,
 )
+from pipeline.store.shown import shown
 
 SHOWN = 6  # differing settings that an error lists
 THREADS = 8  # fragments read at once: a shared folder takes its time for each
+MANY = 2000  # fragments: to read so many takes seconds
 ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
 ROUNDS = 20  # looks at a split that is sealed meanwhile; each takes a moment, and sealing a fragment takes seconds
 Each = Callable[[pa.Table], pa.Table]
@@ -216,7 +218,7 @@ def _parts(
         for look in range(ROUNDS):
             listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
             new = [one for one in listed if one not in found and _wanted(one[0], level_ids)]
-            parts = list(threads.map(read, (path for path, _ in new)))
+            parts = list(shown(threads.map(read, (path for path, _ in new)), "fragments", len(new), MANY))
             found |= {one: part for one, part in zip(new, parts, strict=True) if part}
             if look and all(part and not part[0].sealed for part in parts):
                 latest = {path: part for (path, _), part in found.items()}  # of those that had one name in turn

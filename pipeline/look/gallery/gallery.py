@@ -15,8 +15,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from experts.witness import steps_to_goal, succeeds
 from levelgen.level import Level
@@ -32,6 +30,7 @@ from pipeline.read.rows import read_rows
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.remote import as_typed
+from pipeline.store.shown import shown
 
 SITE = Path(__file__).parent / "site"
 ABOUT = Path("data") / "about.js"  # what makes a folder a gallery
@@ -51,14 +50,11 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
         Failure: the split is damaged.
     """
     manifest, found = _chosen(split, where, most)
-    count, console = manifest.table.num_rows, Console(stderr=True)
+    count = manifest.table.num_rows
     with new_folder(out, replaces=lambda folder: (folder / ABOUT).is_file()) as folder:
         shutil.copytree(SITE, folder, dirs_exist_ok=True)
         (folder / "palette.css").write_text(palette_css(), encoding="utf-8")
-        blocks = track(
-            range(0, count, BLOCK), "levels", console=console, transient=True, disable=not console.is_terminal
-        )
-        counted = [_write_block(folder, manifest, first) for first in blocks]
+        counted = [_write_block(folder, manifest, first) for first in shown(range(0, count, BLOCK), "levels")]
         things = {name: np.concatenate([of[name] for of in counted]) for name in THINGS}
         about, values = columns_of(manifest.table, things | {"seconds": cost.seconds_of(manifest.table)})
         for page in range(math.ceil(count / PAGE)):

@@ -27,7 +27,7 @@ from pipeline.errors import Failure, UserError
 from pipeline.read.dataset.batch import Batch, named
 from pipeline.read.dataset.batches import Batches
 from pipeline.read.dataset.observations import kind_of, observed
-from pipeline.read.dataset.order import Order
+from pipeline.read.dataset.order import EpochOrder
 from pipeline.read.dataset.parts import check_share, in_part
 from pipeline.read.dataset.sources import TrajectorySource
 from pipeline.read.dataset.windows import Windows
@@ -185,7 +185,7 @@ class Dataset:
         """
         windows, numbers, fields = Windows.of(length), self._part(part), tuple(named(fields, self.size))
         kind_of(observation)
-        order = Order(len(numbers) * windows.each, batch, seed, process_index, process_count)
+        order = EpochOrder(len(numbers) * windows.each, batch, seed, process_index, process_count)
 
         def load(position: int) -> Batch:
             items, new = order.items(position)

@@ -16,7 +16,7 @@ ROUNDS = 6
 
 
 @dataclass(frozen=True)
-class Order:
+class EpochOrder:
     """The batches of all epochs, as one host has them."""
 
     count: int  # items

@@ -2,9 +2,6 @@
 
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import track
-
 from experts.config import RECORD_STEPS
 from experts.witness import Record
 from levelgen.level import Level, size_of
@@ -16,6 +13,7 @@ from pipeline.read.select import SOLVED, witnessed
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.remote import as_typed
+from pipeline.store.shown import shown
 
 BLOCK = 4 * ROWS  # trajectories in memory at a time
 ARRAY = 64 * ROWS  # trajectories of an array: the reference shuffles arrays, and what they have
@@ -30,10 +28,9 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
     """
     rows = witnessed(split, where or SOLVED)
     prepare_jax()
-    console, count = Console(stderr=True), rows.num_rows
+    count = rows.num_rows
     with new_folder(out) as folder:
-        blocks = range(0, count, BLOCK)
-        for first in track(blocks, "trajectories", console=console, transient=True, disable=not console.is_terminal):
+        for first in shown(range(0, count, BLOCK), "trajectories"):
             fields = read_rows(split, rows.slice(first, BLOCK))
             made = trajectories_of(tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/"))
             array, at = divmod(first, ARRAY)

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-from rich.console import Console
-from rich.progress import track
 
 from experts.witness import Record
 from levelgen.level import MOTOR_BINDINGS, Level, size_of
@@ -27,6 +25,7 @@ from pipeline.read.select import SOLVED, witnessed
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import require_manifest
+from pipeline.store.shown import shown
 from pipeline.version import __version__
 
 if TYPE_CHECKING:
@@ -79,8 +78,7 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
 
 
 def _episodes(split: Path, rows: pa.Table, rules: TaskParams, kind: ActionKind) -> Iterator[Episode]:
-    console, firsts = Console(stderr=True), range(0, rows.num_rows, BLOCKS)
-    for first in track(firsts, "records", console=console, transient=True, disable=not console.is_terminal):
+    for first in shown(range(0, rows.num_rows, BLOCKS), "records"):
         some = rows.slice(first, BLOCKS)
         fields = read_rows(split, some)
         level, record = tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/")

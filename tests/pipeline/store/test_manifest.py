@@ -1,5 +1,6 @@
 """Fragments: committed at once or not at all, damage is seen, each level counts once."""
 
+import io
 import itertools
 from pathlib import Path
 from typing import Any
@@ -7,12 +8,14 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from rich.console import Console
 
 from configs.schema import JobConfig
 from experts.labels import Label
 from pipeline.errors import Failure, UserError
 from pipeline.jobs.unit import manifest_row
 from pipeline.store import manifest as manifest_file
+from pipeline.store import shown
 from pipeline.store.layout import new_attempt, unit_name
 from pipeline.store.manifest import (
     begin_fragment,
@@ -60,6 +63,21 @@ def test_rows_come_back_sorted_with_every_column(tmp_path: Path, job: JobConfig)
     assert {
         nothing[name] for name in (*rates, "best_return", "steps_to_goal", "portability", "steps_to_first_success")
     } == {None}
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_of_many_fragments_people_see_how_many_are_read(
+    tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
+    seen = io.StringIO()
+    monkeypatch.setattr(manifest_file, "MANY", 2)
+    monkeypatch.setattr(shown, "Console", lambda stderr: Console(file=seen, force_terminal=terminal))
+    commit(tmp_path, job, [0])
+    assert read_manifest(tmp_path).level_ids.tolist() == [0]
+    assert not seen.getvalue()
+    commit(tmp_path, job, [1])
+    assert read_manifest(tmp_path).level_ids.tolist() == [0, 1]
+    assert ("fragments" in seen.getvalue()) == terminal
 
 
 def test_the_issue_s_columns_are_there() -> None:

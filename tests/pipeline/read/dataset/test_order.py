@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 
 from pipeline.errors import UserError
-from pipeline.read.dataset.order import Order, permuted
+from pipeline.read.dataset.order import EpochOrder, permuted
 
 
 @settings(max_examples=50, deadline=None)
@@ -45,7 +45,7 @@ def test_seeds_and_epochs_have_orders_of_their_own() -> None:
 @pytest.mark.parametrize("seed", [None, 5])
 @pytest.mark.parametrize(("count", "batch", "hosts"), [(103, 8, 3), (5, 8, 2), (48, 8, 3), (1, 1, 1)])
 def test_hosts_share_an_epoch(count: int, batch: int, hosts: int, seed: int | None) -> None:
-    orders = [Order(count, batch, seed, host, hosts) for host in range(hosts)]
+    orders = [EpochOrder(count, batch, seed, host, hosts) for host in range(hosts)]
     assert len({order.batches for order in orders}) == 1
     for epoch in range(2):
         seen = []
@@ -58,7 +58,7 @@ def test_hosts_share_an_epoch(count: int, batch: int, hosts: int, seed: int | No
 
 
 def test_without_a_seed_items_come_in_their_order() -> None:
-    assert Order(10, 4, None).items(1)[0].tolist() == [4, 5, 6, 7]
+    assert EpochOrder(10, 4, None).items(1)[0].tolist() == [4, 5, 6, 7]
 
 
 @pytest.mark.parametrize(
@@ -72,4 +72,4 @@ def test_without_a_seed_items_come_in_their_order() -> None:
 )
 def test_what_makes_no_order_is_refused(words: dict, sentence: str) -> None:
     with pytest.raises(UserError, match=sentence):
-        Order(**({"count": 10, "batch": 2, "seed": 0} | words))
+        EpochOrder(**({"count": 10, "batch": 2, "seed": 0} | words))
