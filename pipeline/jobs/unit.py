@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Collection
 from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ from pipeline.store.manifest import begin_fragment, write_fragment
 from pipeline.store.origins import RECORD, Origin
 from pipeline.store.provenance import device, versions
 from pipeline.store.publish import committed_levels
-from pipeline.store.remote import StoreFailure
+from pipeline.store.remote import StoreFailure, is_remote
 from pipeline.store.schema import Encoding
 from pipeline.store.shard import write_shard
 
@@ -83,7 +84,8 @@ def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     if isinstance(error, (LockRefused, SourceUnseen, LevelUnseen, LeaseLost, StoreFailure)):
         fatal = str(error)
     elif isinstance(error, OSError) and (what := REFUSALS.get(error.errno or 0)):
-        fatal = f"Cannot write to {split}, {what}, then run the same command again."
+        where = gettempdir() if is_remote(split) else split
+        fatal = f"Cannot write to {where}, {what}, then run the same command again."
     return UnitOutcome(unit, reason=reason, fatal=fatal)
 
 

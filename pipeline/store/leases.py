@@ -56,10 +56,10 @@ class Lease:
         self._thread.start()
 
     def release(self) -> None:
-        """Let the next one have it at once."""
+        """Let the next one have it at once; of a store that does not answer now, it is left to run out."""
         self._over.set()
-        self._thread.join()
-        if not self.lost:
+        self._thread.join(RENEWAL)
+        if not (self.lost or self._thread.is_alive()):
             with suppress(LevelproofError):
                 put_if(self._path, b"{}", self._version)
 

@@ -45,7 +45,12 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / SPLIT
 
 
-@pytest.fixture(params=["little", pytest.param("moto", marks=pytest.mark.campaign)])
+ALSO_MOTO = pytest.mark.parametrize(
+    "server", ["little", pytest.param("moto", marks=pytest.mark.campaign)], indirect=True
+)  # with S3's conditions as others know them
+
+
+@pytest.fixture
 def server(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moto: Any
 ) -> Iterator[Server]:
@@ -55,7 +60,7 @@ def server(
     monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
     monkeypatch.setattr(leases, "POLL", 0.02)
     (tmp_path / "s3/bucket").mkdir(parents=True)
-    answers = bucket_of(tmp_path / "s3") if request.param == "little" else before_it(*moto())
+    answers = bucket_of(tmp_path / "s3") if getattr(request, "param", "") != "moto" else before_it(*moto())
     with serving(answers) as server:
         for name in [name for name in os.environ if name.startswith("AWS_")]:
             monkeypatch.delenv(name)
@@ -136,7 +141,7 @@ def requests_of_a_run(server: Server) -> int:
     return count
 
 
-@pytest.mark.parametrize("some", [3, pytest.param(25, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("some", [2, pytest.param(12, marks=pytest.mark.campaign)])
 def test_a_store_that_is_gone_is_one_sentence_and_the_same_command_goes_on(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, some: int
 ) -> None:
@@ -158,7 +163,7 @@ def test_a_store_that_is_gone_is_one_sentence_and_the_same_command_goes_on(
 @pytest.mark.campaign
 def test_a_driver_killed_at_any_request(server: Server, here: Path) -> None:
     requests = requests_of_a_run(server)
-    for request in sorted(random.Random(0).sample(range(1, requests), 12)):
+    for request in sorted(random.Random(0).sample(range(1, requests), 5)):
         begun = server.count
         words = [sys.executable, "-m", "tests.pipeline.driver", OUT]
         with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
@@ -188,6 +193,7 @@ STEPS = {  # requests of an attempt
 }
 
 
+@ALSO_MOTO
 @pytest.mark.parametrize(
     "step",
     ["look", "fragment", *(pytest.param(x, marks=pytest.mark.campaign) for x in ("mark", "lease", "data", "end"))],
@@ -223,6 +229,7 @@ def test_a_worker_whose_writer_is_replaced_meanwhile_commits_before_or_never(
     require_whole(here)
 
 
+@ALSO_MOTO
 def test_a_sealed_split_is_as_before(server: Server, here: Path, tmp_path: Path) -> None:
     drive(OUT)
     done = command(["seal", str(THERE)], tmp_path)
@@ -240,7 +247,7 @@ def test_a_store_that_is_gone_while_a_split_is_sealed(
     drive(OUT)
     count = server.count
     assert command(["seal", str(THERE)], tmp_path).returncode == 0
-    for request in sorted(random.Random(0).sample(range(1, server.count - count), 12)):
+    for request in sorted(random.Random(0).sample(range(1, server.count - count), 8)):
         server.meanwhile = lambda _: None
         server.spoil(0)
         empty()
@@ -262,6 +269,7 @@ def assert_sealed(here: Path) -> None:
     assert not [path for path in remote.stored_in(THERE) if path.suffix == ".begun"]
 
 
+@ALSO_MOTO
 def test_of_two_attempts_at_a_unit_one_is_committed(server: Server) -> None:
     with ThreadPoolExecutor() as threads:
         for ended in [threads.submit(commit_made, THERE, WorkUnit((0, 1))) for _ in range(3)]:
@@ -347,6 +355,7 @@ def test_a_store_that_heeds_no_conditions_is_refused(server: Server, tmp_path: P
             drive(OUT)
 
 
+@ALSO_MOTO
 def test_a_fence_is_nothing_to_readers_and_the_next_unit_takes_its_place(server: Server, here: Path) -> None:
     mark = new_attempt(THERE, unit_name(0, 1)).begun
     put(mark, b"")
@@ -361,11 +370,11 @@ def test_a_fence_is_nothing_to_readers_and_the_next_unit_takes_its_place(server:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("words", [["executor=inline"], ["workers=1"]], ids=["inline", "Ray"])
-def test_generate_into_a_store_is_generate_into_a_folder(server: Server, tmp_path: Path, words: list[str]) -> None:
+@pytest.mark.parametrize("server", ["moto"], indirect=True)
+def test_generate_into_a_store_is_generate_into_a_folder(server: Server, tmp_path: Path) -> None:
     generate = ["generate", *TINY, "keep_experts=true"]
     assert command([*generate, "executor=inline"], tmp_path).returncode == 0
-    done = run([*generate, f"out={OUT}", *words], tmp_path)
+    done = run([*generate, f"out={OUT}", "workers=1"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert f"levelproof inspect {OUT}/5k/s" in done.stdout
