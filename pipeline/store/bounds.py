@@ -25,8 +25,9 @@ from pipeline.store.thrift import Column, footer_in, pages_in
 MOST_FOOTER = 2**24  # bytes; most of them are digests
 MOST_ROWS, MOST_GROUPS = 2**20, 2**9  # of a fragment; a sealed one has 100,000 rows, in groups of 16,384
 FEWEST_BYTES = 8  # of a file for each row: content hashes alone take more, however they are packed
-# Bytes in memory: of what is read at once, for each of its rows, and for a learning curve
-MOST_FIXED, MOST_A_ROW, MOST_A_CURVE = 2**26, 2**12, 2**15
+# Bytes in memory: of what is read at once, for each of its rows, and for a learning curve, of as many updates as the
+# largest budgets have
+MOST_FIXED, MOST_A_ROW, MOST_A_CURVE = 2**26, 2**12, 2**17
 A_VALUE = 16  # bytes that a value takes besides those of its page
 CURVE = "learning_curve"
 UNSEEN = "content_hash"  # is compared and never shown

@@ -29,6 +29,7 @@ class Unpickler:
     __init__ = reached
 
 
+@pytest.mark.campaign
 def test_pickle_is_not_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     split = played_split(tmp_path)
     theirs = tmp_path / "experts.npz"
