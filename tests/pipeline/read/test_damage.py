@@ -149,11 +149,11 @@ def spoil(file: Path, chance: random.Random) -> None:
 def test_a_thousand_damages_of_splits_that_store_less(
     kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest
 ) -> None:
-    """Five files at a time."""
+    """In ten files at a time."""
     split, chance = copied(request.getfixturevalue(kind)), random.Random(5)
     files = files_of(split)
-    for _ in range(FLIPS // 2 // 5):
-        chosen = chance.sample(sorted(files), 5)
+    for _ in range(FLIPS // 2 // 10):
+        chosen = chance.sample(sorted(files), 10)
         assert_all_named(split, files, lambda file: spoil(file, chance), chosen)
     assert not examine(split).wrong
 
