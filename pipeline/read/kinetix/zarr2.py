@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numcodecs.blosc import Blosc
 
+from configs.errors import readable
 from experts.config import RECORD_STEPS
 
 ARRAY, GROUP = ".zarray", ".zgroup"
@@ -58,6 +59,9 @@ def write_array(path: Path, rows: int, dtype: np.dtype) -> None:
 
 class FormatError(ValueError):
     """A folder has no trajectories that can be read; the message is the end of a sentence."""
+
+    def __str__(self) -> str:
+        return readable(super().__str__())
 
 
 @dataclass(frozen=True)
