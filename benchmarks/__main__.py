@@ -32,6 +32,8 @@ BENCHMARKS = {  # name: (module, what it measures)
     "handmade": ("benchmarks.handmade", "what it takes to label the reference's 74 handmade levels, one by one"),
     "storage": ("benchmarks.storage", "bytes per transition of each density, and trajectories/s written and read"),
     "plan": ("benchmarks.plan", "what `levelproof plan` says of a job, against the job itself"),
+    "rehearsal": ("benchmarks.rehearsal", "millions of levels on thousands of workers, under a simulated clock"),
+    "night": ("benchmarks.night", "a long run for real: seconds, bytes, files, and memory over time"),
     "manifest": ("benchmarks.manifest", "how long commands take to start on a split of millions of levels"),
     "gallery": ("benchmarks.gallery", "how soon a gallery of many levels shows, and how smoothly it scrolls"),
     "reader": ("benchmarks.reader", "trajectories/s of both readers on the same trajectories"),

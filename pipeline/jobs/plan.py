@@ -33,7 +33,7 @@ from pipeline.words import duration
 
 SECONDS = 60.0  # of making levels, about
 MOST = 4096  # levels
-STORED = 64  # witnesses that are written in every density
+STORED = 256  # witnesses that are written in every density
 UNITS = (3600.0, "hours"), (60.0, "minutes"), (1.0, "seconds")  # s, the first that is short enough
 NEITHER = ("idle", "compiling")  # of `Seconds`: not a level's, however many there are
 
@@ -87,12 +87,12 @@ def measured(job: JobConfig, console: Console, seconds: float = SECONDS) -> Samp
         split, begun = split_path(folder, job.budget, job.size), time.monotonic()
         some = min(levels, here * unit)
         first = _made(job, Path(folder), some, here)
-        _, busy, _ = _costs(split)
+        _, busy, _ = costs_of(split)
         more = int(seconds * here / max(busy.mean(), 1e-6)) // unit * unit
         count, wall = min(levels, MOST, max(some, more)), first
         if count > some:
             wall = _made(job, Path(folder), count, here)
-        table, busy, compiling = _costs(split)
+        table, busy, compiling = costs_of(split)
         new = busy[some:] if count > some else busy
         labels = np.array(table.column("label").to_pylist())
         prepare_jax()
@@ -119,7 +119,7 @@ def _made(job: JobConfig, folder: Path, count: int, workers: int) -> float:
     return time.monotonic() - begun
 
 
-def _costs(split: Path) -> tuple[pa.Table, np.ndarray, np.ndarray]:
+def costs_of(split: Path) -> tuple[pa.Table, np.ndarray, np.ndarray]:
     """The sample's rows, what each level took of a worker, and what was compiled meanwhile."""
     table = read_manifest(split).table
     if not table.num_rows:

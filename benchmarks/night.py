@@ -1,0 +1,176 @@
+"""A long run for real: made, sealed and verified, with the memory of its processes and its files over time."""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from benchmarks import oracle
+from benchmarks.plan import measured
+from benchmarks.report import Report, Table
+from pipeline.errors import Failure
+from pipeline.store.layout import split_path
+
+PLOT = "night.svg"
+COLOURS = {"driver": "#0072b2", "workers": "#d55e00", "ray": "#777777"}  # Okabe and Ito
+EVERY = 10.0  # s between samples
+MOST = 2000  # samples; of more, every other one is kept
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("settings", nargs="*", help="more settings of generate")
+    parser.add_argument("--levels", default="100k", help="how many (default: 100k)")
+    parser.add_argument("--size", default="s")
+    parser.add_argument("--budget", default="64k")
+    parser.add_argument("--out", type=Path, help="where the split stays (default: it does not)")
+    parser.add_argument("--every", type=float, default=EVERY, metavar="SECONDS", help="between samples of memory")
+
+
+def run(given: argparse.Namespace) -> Report:
+    with tempfile.TemporaryDirectory() as folder:
+        out = str(given.out or folder)
+        split = split_path(out, given.budget, given.size)
+        words = [f"size={given.size}", f"levels={given.levels}", f"budget={given.budget}", f"out={out}"]
+        samples: list[dict[str, Any]] = []
+        steps = {
+            "generate": _timed(["generate", *words, *given.settings], samples, given.every, split),
+            "seal": _timed(["seal", str(split)], samples, given.every, split),
+            "verify": _timed(["verify", str(split)], samples, given.every, split),
+        }
+        workers = max(sample["worker_count"] for sample in samples)
+        found = measured(split, max(workers, 1), steps["generate"])
+        status = json.loads(_levelproof("status", str(split), "--json"))
+    while len(samples) > MOST:
+        samples = samples[::2]
+    memory = {of: max(sample[of] for sample in samples) for of in COLOURS}
+    late = [sample for sample in samples if sample["step"] == "generate"]
+    half = late[len(late) // 2 :]
+    table = {
+        "levels": f"{status['done']:,}",
+        "workers": str(workers),
+        **{f"{step}, s": f"{seconds:,.0f}" for step, seconds in steps.items()},
+        "solved": f"{found['solved']:,}",
+        "core-seconds a solved level": f"{found['seconds_per_solved']:.3g}" if found["solved"] else "-",
+        "bytes, sealed": f"{found['bytes']:,}",
+        "files, sealed": f"{found['files']:,}",
+        "most fragments meanwhile": f"{max(sample['fragments'] for sample in samples):,}",
+        **{f"most memory of {of}, MB": f"{value / 2**20:,.0f}" for of, value in memory.items()},
+        "driver's memory, second half of generate, MB": " to ".join(
+            f"{value / 2**20:,.0f}" for value in (half[0]["driver"], half[-1]["driver"])
+        ),
+    }
+    return Report(
+        title=f"{given.levels} levels of size {given.size} at {given.budget}",
+        results=[{**steps, **found, "memory": memory, "samples": samples}],
+        tables=[Table(("", ""), list(table.items()))],
+        notes=[
+            "`levelproof generate`, `seal` and `verify`, one after another. Memory is what processes have in RAM, each "
+            "page shared by several counted once: of the command itself, of its workers, and of Ray's own processes.",
+            f"![Memory, files and levels over time]({PLOT})",
+        ],
+        plots={PLOT: lambda path: draw(samples, path)},
+    )
+
+
+def _timed(words: Sequence[str], samples: list[dict[str, Any]], every: float, split: Path) -> float:
+    """Seconds that a command takes; meanwhile its processes are looked at again and again."""
+    oracle.tell(f"levelproof {' '.join(words)}")
+    begun = time.time()
+    command = [sys.executable, "-m", "levelproof", *words]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=dict(oracle.our_environment()))
+    over = threading.Event()
+
+    def look() -> None:
+        while not over.is_set():
+            samples.append({"time": time.time(), "step": words[0], **memory_of(process.pid), **parts_of(split)})
+            over.wait(every)
+
+    looking = threading.Thread(target=look)
+    looking.start()
+    try:
+        code = process.wait()
+    finally:
+        process.terminate()
+        over.set()
+        looking.join()
+    if code:
+        raise Failure(f"`levelproof {' '.join(words)}` ended with exit code {code}: it has said why above.")
+    return time.time() - begun
+
+
+def memory_of(driver: int) -> dict[str, int]:
+    """Bytes in RAM of a command, of its workers and of all else below it; pages that are shared in parts."""
+    found = {"driver": _memory(driver), "workers": 0, "ray": 0, "worker_count": 0}
+    for pid in _below(driver):
+        title = _read(pid, "cmdline").replace("\0", " ")
+        is_worker = title.startswith("ray::WorkerActor")
+        found["workers" if is_worker else "ray"] += _memory(pid)
+        found["worker_count"] += is_worker
+    return found
+
+
+def _below(pid: int) -> list[int]:
+    """All processes that a process has started, and those that these have."""
+    tasks = Path(f"/proc/{pid}/task").glob("*")
+    children = [int(child) for task in tasks for child in _read_path(task / "children").split()]
+    return [below for child in children for below in (child, *_below(child))]
+
+
+def _memory(pid: int) -> int:
+    for line in _read(pid, "smaps_rollup").splitlines():
+        if line.startswith("Pss:"):
+            return int(line.split()[1]) * 1024
+    return 0
+
+
+def _read(pid: int, name: str) -> str:
+    return _read_path(Path(f"/proc/{pid}/{name}"))
+
+
+def _read_path(path: Path) -> str:
+    with suppress(OSError):  # it has ended
+        return path.read_text(errors="replace")
+    return ""
+
+
+def parts_of(split: Path) -> dict[str, int]:
+    """How many fragments and shards a split has."""
+    return {"fragments": len([*split.glob("manifest/[!.]*")]), "shards": len([*split.glob("shards/*")])}
+
+
+def _levelproof(*words: str) -> str:
+    command = [sys.executable, "-m", "levelproof", *words]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=dict(oracle.our_environment()))
+    return done.stdout
+
+
+def draw(samples: Sequence[Mapping[str, Any]], file: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("svg")
+    matplotlib.rcParams.update({"svg.hashsalt": "levelproof", "font.size": 9})
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout="constrained")
+    minutes = [(sample["time"] - samples[0]["time"]) / 60 for sample in samples]
+    for of, colour in COLOURS.items():
+        left.plot(minutes, [sample[of] / 2**30 for sample in samples], color=colour, label=of)
+    left.set(xlabel="minutes", ylabel="memory, GB", ylim=0)
+    right.plot(minutes, [sample["fragments"] for sample in samples], color="#009e73", label="fragments")
+    right.plot(minutes, [sample["shards"] for sample in samples], color="#777777", label="shards")
+    right.set(xlabel="minutes", ylabel="in the split", ylim=0)
+    steps = [i for i in range(1, len(samples)) if samples[i]["step"] != samples[i - 1]["step"]]
+    for axes in (left, right):
+        for i in steps:
+            axes.axvline(minutes[i], color="#cccccc", linewidth=0.8)
+        axes.legend(frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.25, linewidth=0.5)
+    figure.savefig(file, metadata={"Date": None})

@@ -1,0 +1,398 @@
+"""A job of millions of levels on thousands of workers, rehearsed: the scheduler is the real one, the clock is not.
+
+Levels take as long as levels of a real run did. Machines die without a word or are taken away with notice, and come
+back; workers crash; some are slow. The driver hears one report at a time, and a worker waits until it is heard. What is
+counted: levels, work that was lost, reports, requests to the store, what the driver computes and keeps in memory.
+"""
+
+import argparse
+import time
+import tracemalloc
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+
+from benchmarks.report import Report, Table
+from configs.compose import compose_job
+from configs.numbers import parse_count
+from experts.steps import EnvSteps
+from pipeline.errors import UserError
+from pipeline.jobs.cluster import REPORTS
+from pipeline.jobs.plan import costs_of, measured
+from pipeline.jobs.schedule import ROUND, Cut, Order, Round, Scheduler, Summary, UnitOutcome, WorkUnit, plan_units
+
+UNIT, SLOTS = 32, 4  # levels of a unit, experts side by side: of size s on a core
+HEARING = 1e-3  # s of the driver for a report beside the scheduler's: Ray's call and its answer; assumed
+PUTS = 3500  # a second to one prefix of S3, as its documentation says
+REQUESTS = 13  # to write for a unit of density full: a shard of 11 files, its mark, its fragment
+LOOK = 1.0  # s between two looks at workers that have nothing
+AWAY = 300.0  # s after which another machine takes the place of one that is gone
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is rehearsed."""
+
+    name: str
+    levels: int
+    workers: int
+    a_machine: int  # workers
+    speed: float = 1.0  # of a worker, against the core of the sample
+    stretch: float = 1.0  # of what a level takes
+    lifetime: float = 24 * 3600.0  # s of a machine on average, until it is taken away with notice
+    failures: float = 30 * 24 * 3600.0  # s of a machine on average, until it dies without
+    crashes: float = 7 * 24 * 3600.0  # s of a worker on average, until its process dies
+    slow: float = 0.01  # share of workers
+    slower: float = 5.0  # times
+
+
+@dataclass
+class Counts:
+    """What came of it."""
+
+    seconds: float = 0.0  # by the simulated clock
+    levels: int = 0
+    useful: float = 0.0  # s of workers, on what was committed
+    lost: float = 0.0  # s of workers, on what was not
+    reports: int = 0
+    commits: int = 0
+    scheduling: float = 0.0  # s of this process, in the scheduler
+    hearing: float = 0.0  # s of the simulated driver
+    quarantined: int = 0
+    gone: int = 0  # machines
+
+
+class Work:
+    """What levels take: always the same for a level, whoever makes it."""
+
+    def __init__(self, seconds: Float[np.ndarray, " level"]) -> None:
+        drawn = np.random.default_rng(0).choice(seconds, 2**20)
+        self._sums = np.concatenate([[0.0], np.cumsum(drawn)])
+
+    def of(self, unit: WorkUnit) -> float:
+        ids, period = unit.level_ids, len(self._sums) - 1
+        if isinstance(ids, range):
+            first, end = ids[0] % period, ids[-1] % period + 1
+            return float(self._sums[end] - self._sums[first] + (self._sums[-1] if end <= first else 0.0))
+        at = np.array(ids) % period
+        return float((self._sums[at + 1] - self._sums[at]).sum())
+
+
+@dataclass(eq=False)
+class SimulatedWorker:
+    """Does its units one after another; as the real one, it reports when one ends, or when it is time."""
+
+    machine: int
+    speed: float
+    slots: int
+    units: deque[tuple[WorkUnit, float]] = field(default_factory=deque)
+    into: float = 0.0  # s of work on the first of them
+    since: float = 0.0  # when it began with what it does
+    until: float = 0.0  # when it reports
+    cuts: list[Cut] = field(default_factory=list)
+    alive: bool = True
+
+    def begin(self, order: Order, now: float, seconds: float, work: Work) -> float:
+        """Take what is ordered; when it will report."""
+        self.into = self.into if self.units else 0.0
+        self._give(order.give, work)
+        self.units.extend((unit, work.of(unit)) for unit in order.units)
+        first = (self.units[0][1] - self.into) / self.speed if self.units else seconds
+        self.since, self.until = now, now + min(seconds, max(first, 0.0))
+        return self.until
+
+    @property
+    def decided(self) -> int:
+        """Levels of its first unit."""
+        unit, seconds = self.units[0] if self.units else (None, 0.0)
+        return min(int(self.into / seconds * len(unit.level_ids)), len(unit.level_ids)) if unit and seconds else 0
+
+    def report(self, now: float) -> tuple[Round, float]:
+        """What it has done by now, and how much work it was."""
+        self.into += (now - self.since) * self.speed if self.units else 0.0
+        self.since = now
+        outcomes, useful = [], 0.0
+        while self.units and self.into >= self.units[0][1] - 1e-9:
+            unit, seconds = self.units.popleft()
+            self.into -= seconds
+            useful += seconds
+            outcomes.append(committed(unit))
+        waiting = max(0, sum(len(unit.level_ids) for unit, _ in self.units) - self.decided - self.slots)
+        cuts, self.cuts = self.cuts, []
+        return Round(outcomes, {}, max(0, self.slots - waiting), waiting, cuts), useful
+
+    def leave(self, now: float) -> tuple[Round, float]:
+        """As far as it has come: levels that are decided are committed, the others given back."""
+        round, useful = self.report(now)
+        done = self.decided
+        for unit, seconds in self.units:
+            kept, back = (unit.only(part) for part in (unit.level_ids[:done], unit.level_ids[done:]))
+            round.cuts.append(Cut(unit, kept, back))
+            round.outcomes.extend([committed(kept)] if kept else [])
+            useful += seconds * done / len(unit.level_ids)
+            self.into -= seconds * done / len(unit.level_ids)
+            done = 0
+        return Round(round.outcomes, {}, 0, cuts=round.cuts, leaves=True), useful
+
+    def _give(self, levels: int, work: Work) -> None:
+        """Levels that have not begun, of the latest units first."""
+        left = levels
+        for i in range(len(self.units) - 1, -1, -1):
+            unit = self.units[i][0]
+            some = min(left, len(unit.level_ids) - (0 if i else self.decided + self.slots))
+            if some <= 0:
+                return
+            kept, back = (unit.only(part) for part in (unit.level_ids[:-some], unit.level_ids[-some:]))
+            self.cuts.append(Cut(unit, kept, back))
+            left -= some
+            if kept:
+                self.units[i] = kept, work.of(kept)
+            else:
+                del self.units[i]
+
+
+def committed(unit: WorkUnit) -> UnitOutcome:
+    return UnitOutcome(unit, Summary(len(unit.level_ids), 0, EnvSteps()))
+
+
+class Rehearsal:
+    """One scene, event after event."""
+
+    def __init__(self, scene: Scene, seconds: Float[np.ndarray, " level"], seed: int = 0) -> None:
+        self.scene, self.counts = scene, Counts()
+        self._work, self._rng = Work(seconds * scene.stretch), np.random.default_rng(seed)
+        units = plan_units(range(scene.levels), (), UNIT)
+        self._scheduler = Scheduler(units, scene.levels, UNIT)
+        self._events: list[tuple[float, int, str, Any]] = []
+        self._number, self._driver_free, self._idle = count(), 0.0, set[SimulatedWorker]()
+        self._machines: dict[int, list[SimulatedWorker]] = {}
+        for machine in range(-(-scene.workers // scene.a_machine)):
+            self._at(self._rng.uniform(0, 60), "join", machine)
+        self._at(LOOK, "look", None)
+
+    def run(self) -> Counts:
+        handle = {"join": self._join, "report": self._report, "look": self._look, "crash": self._crash}
+        while not (self._machines and self._scheduler.over):
+            self.counts.seconds, _, kind, what = heappop(self._events)
+            if kind in ("preempted", "dies"):
+                self._goes(*what, notice=kind == "preempted")
+            else:
+                handle[kind](what)
+        self.counts.quarantined = len(self._scheduler.quarantined)
+        return self.counts
+
+    def _at(self, when: float, kind: str, what: Any) -> None:
+        heappush(self._events, (when, next(self._number), kind, what))
+
+    def _scheduled(self, work: Any, *words: Any) -> Any:
+        """A call of the scheduler, by this machine's clock."""
+        begun = time.perf_counter()
+        answer = work(*words)
+        self.counts.scheduling += time.perf_counter() - begun
+        return answer
+
+    def _join(self, machine: int) -> None:
+        scene, now = self.scene, self.counts.seconds
+        count = min(scene.a_machine, scene.workers - machine * scene.a_machine)
+        speeds = scene.speed / np.where(self._rng.random(count) < scene.slow, scene.slower, 1.0)
+        slots = max(SLOTS, round(SLOTS * scene.speed))
+        self._machines[machine] = [SimulatedWorker(machine, float(speed), slots) for speed in speeds]
+        for worker in self._machines[machine]:
+            self._scheduled(self._scheduler.join, worker, now)
+            self._at(now + self._rng.exponential(scene.crashes), "crash", worker)
+            self._order(worker)
+        workers = self._machines[machine]
+        self._at(now + self._rng.exponential(scene.lifetime), "preempted", (machine, workers))
+        self._at(now + self._rng.exponential(scene.failures), "dies", (machine, workers))
+
+    def _order(self, worker: SimulatedWorker) -> None:
+        """The driver tells a worker what to do, when it comes to it."""
+        now = max(self._driver_free, self.counts.seconds) + HEARING
+        order = self._scheduled(self._scheduler.order, worker, now)
+        if not self._scheduler.workers[worker].units:
+            self._idle.add(worker)
+            return
+        self._driver_free = now
+        self.counts.hearing += HEARING
+        self._idle.discard(worker)
+        seconds = max(ROUND, len(self._scheduler.workers) / REPORTS)
+        self._at(worker.begin(order, now, seconds, self._work), "report", (worker, worker.until))
+
+    def _report(self, what: tuple[SimulatedWorker, float]) -> None:
+        worker, until = what
+        if worker.alive and worker.until == until:
+            self._heard(worker, *worker.report(self.counts.seconds))
+            self._order(worker)
+
+    def _heard(self, worker: SimulatedWorker, round: Round, useful: float) -> None:
+        self.counts.reports += 1
+        self.counts.useful += useful
+        self.counts.commits += len(round.outcomes)
+        self.counts.levels += sum(len(of.unit.level_ids) for of in round.outcomes)
+        self._scheduled(self._scheduler.report, worker, round, self.counts.seconds)
+
+    def _look(self, _: None) -> None:
+        """Workers that have nothing are offered what there is by now."""
+        if self._idle:
+            self._scheduled(self._scheduler.share)
+            for worker in [*self._idle]:
+                if not self._scheduler.waiting:
+                    break
+                self._order(worker)
+        self._at(self.counts.seconds + LOOK, "look", None)
+
+    def _crash(self, worker: SimulatedWorker) -> None:
+        """The process dies; another takes its place, and its units count as failed."""
+        if not worker.alive:
+            return
+        self._remove(worker)
+        for outcome in self._scheduled(self._scheduler.lost, worker, "crashed"):
+            self._scheduled(self._scheduler.failed, outcome.unit)
+        other = SimulatedWorker(worker.machine, worker.speed, worker.slots)
+        self._machines[worker.machine].append(other)
+        self._scheduled(self._scheduler.join, other, self.counts.seconds)
+        self._at(self.counts.seconds + self._rng.exponential(self.scene.crashes), "crash", other)
+        self._order(other)
+
+    def _goes(self, machine: int, workers: list[SimulatedWorker], notice: bool) -> None:
+        """A machine is taken away, or dies; another comes."""
+        if self._machines.get(machine) is not workers:
+            return
+        self.counts.gone += 1
+        for worker in [*workers]:
+            if notice:
+                self._heard(worker, *worker.leave(self.counts.seconds))
+                worker.units.clear()
+            self._remove(worker)
+            self._scheduled(self._scheduler.leave, worker)
+        del self._machines[machine]
+        self._at(self.counts.seconds + AWAY, "join", machine)
+
+    def _remove(self, worker: SimulatedWorker) -> None:
+        worker.alive = False
+        self._idle.discard(worker)
+        self._machines[worker.machine].remove(worker)
+        done = (self.counts.seconds - worker.since) * worker.speed if worker.units else 0.0
+        self.counts.lost += max(worker.into + done, 0.0)
+
+
+def state_bytes(scene: Scene) -> tuple[int, int]:
+    """Memory of the driver's plan and scheduler with every worker busy: at most, and then."""
+    tracemalloc.start()
+    scheduler = Scheduler(plan_units(range(scene.levels), (), UNIT), scene.levels, UNIT)
+    for worker in range(scene.workers):
+        scheduler.join(worker, 0.0)
+        scheduler.order(worker, 0.0)
+    now, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return most, now
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("settings", nargs="*", default=["size=s", "budget=64k"], help="of the levels that are measured")
+    parser.add_argument("--split", type=Path, help="a split whose rows tell seconds (default: some levels are made)")
+    parser.add_argument("--levels", default="11.5M", help="of the rehearsed job (default: 11.5M)")
+    parser.add_argument("--workers", type=int, default=10_000, metavar="N", help="cores; GPUs are a tenth of them")
+
+
+def run(given: argparse.Namespace) -> Report:
+    seconds, levels = _measured(given), parse_count(given.levels, "levels")
+    gpus = max(1, given.workers // 10)
+    scenes = [
+        Scene(f"{given.workers:,} cores", levels, given.workers, 64),
+        Scene(f"{given.workers:,} cores, levels 16 times as long", levels, given.workers, 64, stretch=16.0),
+        Scene("the same, machines that live an hour", levels, given.workers, 64, stretch=16.0, lifetime=3600.0),
+        Scene(f"{gpus:,} GPUs of 20 cores each", levels, gpus, 8, speed=20.0, stretch=16.0),
+    ]
+    results = [rehearsed(scene, seconds) for scene in scenes]
+    most, now = state_bytes(scenes[0])
+    head = (
+        "",
+        "hours",
+        "levels/s",
+        "busy",
+        "lost",
+        "machines gone",
+        "reports/s",
+        "scheduler",
+        "driver",
+        "writes/s",
+        "first",
+    )
+    return Report(
+        title="A rehearsal at scale",
+        results=[*results, {"state_bytes": now, "state_bytes_at_most": most}],
+        tables=[Table(head, [row(of) for of in results])],
+        notes=[
+            f"{levels:,} levels in units of {UNIT}, by the scheduler of `generate` under a simulated clock; a level "
+            f"takes what one of {len(seconds):,} measured ones did, {seconds.mean():.3g} core-seconds on average. "
+            f"Machines of 64 cores or 8 GPUs are taken away with notice after a day, or as said, and die without after "
+            f"30 days, on average, and another comes {AWAY / 60:.0f} minutes later; processes crash once a week; 1% of "
+            "workers are five times slower. That a GPU is worth 20 cores is assumed, not measured.",
+            "*busy*: share of the workers' time that went into what was committed; *lost*: into what was not. "
+            "*scheduler*: microseconds of this machine for each report; *driver*: share of its time, with "
+            f"{HEARING * 1e3:.0f} ms for Ray's part of a report, which is assumed. *writes/s*: requests to an object "
+            f"store, {REQUESTS} a unit; S3 promises {PUTS:,} a second to a prefix. *first*: what would give out first.",
+            f"The plan and the scheduler take {now / 2**20:.0f} MB of the driver's memory with all workers busy, and "
+            f"{most / 2**20:.0f} MB at most, while levels are counted.",
+        ],
+    )
+
+
+def _measured(given: argparse.Namespace) -> Float[np.ndarray, " level"]:
+    if not given.split:
+        return measured(compose_job([*given.settings, "levels=4k"]), Console(stderr=True)).busy
+    _, busy, _ = costs_of(given.split)
+    if not np.isfinite(busy).all():
+        raise UserError(f"Rows of {given.split} do not tell seconds: give a split that this version made.")
+    return busy
+
+
+def rehearsed(scene: Scene, seconds: Float[np.ndarray, " level"]) -> dict[str, Any]:
+    """A scene in numbers."""
+    of = Rehearsal(scene, seconds).run()
+    writes = of.commits * REQUESTS / of.seconds
+    loads = {
+        "driver": (of.hearing + of.scheduling) / of.seconds,
+        "store": writes / PUTS,
+        "workers": of.useful / (of.seconds * scene.workers * scene.speed),
+    }
+    return {
+        "scene": scene.name,
+        "hours": of.seconds / 3600,
+        "levels": of.levels,
+        "levels_per_second": of.levels / of.seconds,
+        "busy": loads["workers"],
+        "lost": of.lost / (of.useful + of.lost),
+        "machines_gone": of.gone,
+        "quarantined": of.quarantined,
+        "reports_per_second": of.reports / of.seconds,
+        "scheduler_us": of.scheduling / max(of.reports, 1) * 1e6,
+        "driver": loads["driver"],
+        "writes_per_second": writes,
+        "first": max(loads, key=lambda name: loads[name]),
+    }
+
+
+def row(of: Mapping[str, Any]) -> Sequence[str]:
+    return [
+        of["scene"],
+        f"{of['hours']:.2f}",
+        f"{of['levels_per_second']:,.0f}",
+        f"{of['busy']:.0%}",
+        f"{of['lost']:.2%}",
+        f"{of['machines_gone']:,}",
+        f"{of['reports_per_second']:,.0f}",
+        f"{of['scheduler_us']:.0f} µs",
+        f"{of['driver']:.0%}",
+        f"{of['writes_per_second']:,.0f}",
+        of["first"],
+    ]

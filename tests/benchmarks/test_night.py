@@ -1,0 +1,45 @@
+"""A long run, on a small scale."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from benchmarks.__main__ import parser
+from benchmarks.night import memory_of, run
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_memory_of_a_process_and_those_below_it() -> None:
+    child = "x = bytes([1]) * 50_000_000; input()"
+    script = f"import subprocess, sys; subprocess.run([sys.executable, '-c', '{child}'])"
+    process = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE)
+    try:
+        for _ in range(100):
+            found = memory_of(process.pid)
+            if found["ray"] > 40_000_000:
+                break
+            time.sleep(0.1)
+        assert 1_000_000 < found["driver"] < 40_000_000 < found["ray"]
+        assert (found["workers"], found["worker_count"]) == (0, 0)
+    finally:
+        process.communicate(b"\n")
+    assert memory_of(process.pid)["driver"] == 0
+    assert memory_of(os.getpid())["driver"] > 0
+
+
+@pytest.mark.campaign
+@pytest.mark.slow
+def test_it_is_made_sealed_and_verified(tmp_path: Path) -> None:
+    words = ["night", "--levels", "256", "--budget", "4k", "--every", "0.5", "--out", str(tmp_path / "data")]
+    report = run(parser("night").parse_args(words))
+    (found,) = report.results
+    assert found["files"] == sum(path.is_file() for path in (tmp_path / "data").rglob("[!.]*")) - 1  # without events
+    assert {sample["step"] for sample in found["samples"]} == {"generate", "seal", "verify"}
+    assert min(found["memory"].values()) > 0
+    for name, draw in report.plots.items():
+        draw(tmp_path / name)
+        assert (tmp_path / name).stat().st_size > 1000

@@ -1,0 +1,55 @@
+"""Under the simulated clock every level is made once, whatever happens, and time adds up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.rehearsal import Rehearsal, Scene, Work, rehearsed, state_bytes
+from pipeline.jobs.schedule import WorkUnit
+
+NEVER = 1e12
+SECONDS = np.random.default_rng(0).gamma(0.4, 2.0, 300)
+CALM = Scene("calm", 5_000, 48, 8, lifetime=NEVER, failures=NEVER, crashes=NEVER, slow=0.0)
+
+
+def test_an_undisturbed_job_takes_what_its_levels_take() -> None:
+    counts = Rehearsal(CALM, SECONDS).run()
+    work = Work(SECONDS).of(WorkUnit(range(5_000)))
+    assert counts.levels == 5_000
+    assert counts.useful == pytest.approx(work, rel=1e-6)
+    assert (counts.lost, counts.gone, counts.quarantined) == (0.0, 0, 0)
+    assert work / 48 < counts.seconds < work / 48 + 90  # machines come within a minute
+
+
+@pytest.mark.parametrize("scene", [
+    replace(CALM, lifetime=60.0), replace(CALM, failures=60.0), replace(CALM, crashes=600.0),
+    replace(CALM, slow=0.2), replace(CALM, speed=8.0, workers=6, a_machine=2),
+], ids=["taken away", "die", "crash", "slow", "fast"])  # fmt: skip
+def test_every_level_is_made_whatever_happens(scene: Scene) -> None:
+    counts = Rehearsal(scene, SECONDS).run()
+    assert counts.levels == 5_000
+    assert counts.quarantined == 0
+    assert (counts.gone > 0) == (scene.lifetime < NEVER or scene.failures < NEVER)
+    assert (counts.lost > 0) == (counts.gone > 0 or scene.crashes < NEVER)
+
+
+def test_a_machine_that_says_so_before_it_goes_loses_less() -> None:
+    told, silent = (Rehearsal(scene, SECONDS).run() for scene in (
+        replace(CALM, lifetime=120.0), replace(CALM, failures=120.0)))  # fmt: skip
+    assert told.lost / told.gone < silent.lost / silent.gone / 2
+
+
+def test_a_unit_takes_what_its_levels_take_wherever_they_are() -> None:
+    work, far = Work(SECONDS), 2**20 - 3
+    for first in (0, far):
+        unit = WorkUnit(range(first, first + 8))
+        parts = [WorkUnit((i,)) for i in unit.level_ids]
+        assert work.of(unit) == pytest.approx(sum(map(work.of, parts)))
+        assert work.of(unit) == pytest.approx(work.of(WorkUnit(tuple(unit.level_ids))))
+
+
+def test_the_scheduler_s_memory_does_not_grow_with_levels() -> None:
+    small, large = state_bytes(replace(CALM, levels=20_000)), state_bytes(replace(CALM, levels=2_000_000))
+    assert large[1] - small[1] < 40 * 1_980_000  # an array of ids and what it was made from
+    assert rehearsed(CALM, SECONDS)["first"] == "workers"
