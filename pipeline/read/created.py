@@ -22,14 +22,14 @@ def new_folder(out: Path, replaces: Callable[[Path], bool] = lambda _: False) ->
     there = out.is_symlink() or out.exists()
     if there and (out.is_symlink() or not out.is_dir() or not replaces(out)):
         raise UserError(f"There is something at {out} already: name a new folder with -o, or remove that one.")
-    out = out.absolute()  # `gallery/` and `.` have names
-    unfinished, replaced = (out.with_name(f".{out.name}.{os.getpid()}{end}") for end in ("", ".old"))
+    whole = out.absolute()  # `gallery/` and `.` have names
+    unfinished, replaced = (whole.with_name(f".{whole.name}.{os.getpid()}{end}") for end in ("", ".old"))
     try:
         unfinished.mkdir(parents=True)
         yield unfinished
         if there:
-            out.rename(replaced)
-        unfinished.rename(out)
+            whole.rename(replaced)
+        unfinished.rename(whole)
         shutil.rmtree(replaced, ignore_errors=True)
     except OSError as error:
         raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another folder with -o.") from None
