@@ -330,9 +330,10 @@ def connected() -> Iterator[threading.Event]:
     Raises:
         UserError: there is none at RAY_ADDRESS.
     """
-    ray._private.ray_constants.ENABLE_RAY_CLUSTER = _existing()  # otherwise Ray listens on loopback
-    if _existing():
-        _require_reachable(os.environ["RAY_ADDRESS"])
+    existing = os.environ.get("RAY_ADDRESS", "")
+    ray._private.ray_constants.ENABLE_RAY_CLUSTER = bool(existing)  # otherwise Ray listens on loopback
+    if existing:
+        _require_reachable(existing)
         settings: dict[str, Any] = {}
     else:
         settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE, "num_cpus": len(own_cores())}
@@ -363,15 +364,10 @@ def _require_reachable(address: str) -> None:
 
 
 def _no_cluster(reason: str) -> UserError:
-    address = os.environ.get("RAY_ADDRESS", "")
     return UserError(
-        f"There is no Ray cluster at RAY_ADDRESS={address} ({reason.rstrip('.')}): "
+        f"There is no Ray cluster at RAY_ADDRESS={os.environ.get('RAY_ADDRESS', '')} ({reason.rstrip('.')}): "
         "start one with `ray start --head`, correct the address, or unset it to use this machine."
     )
-
-
-def _existing() -> bool:
-    return bool(os.environ.get("RAY_ADDRESS"))
 
 
 def _on_gpus() -> bool:
