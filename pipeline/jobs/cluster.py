@@ -6,9 +6,7 @@ Workers write their shards and fragments themselves; only summaries travel. Know
 import io
 import logging
 import os
-import re
 import signal
-import socket
 import threading
 import time
 from collections import Counter
@@ -30,7 +28,8 @@ from ray.util.metrics import Gauge
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from configs.schema import JobConfig
-from pipeline.errors import Failure, UserError
+from pipeline.errors import Failure
+from pipeline.jobs.address import existing, no_cluster, require_reachable
 from pipeline.jobs.likeness import Program, program_of, unlike
 from pipeline.jobs.progress import STOPPING, Board, Tally
 from pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, Settle, UnitOutcome, levels_text
@@ -40,7 +39,6 @@ from pipeline.words import duration
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s after which people see progress, whether a worker has reported or not
-REACH = 5.0  # s in which a cluster has to answer
 RESCAN = 5.0  # s between looks at which machines a cluster has
 PATIENCE = 60.0  # s without any worker after which people are told why
 STARTS = 3  # times in a row that a worker does not start, after which its place is given up
@@ -162,7 +160,7 @@ class Crew:
         self._refused: set[str] = set()  # machines
         self._given_up: Counter[str] = Counter()  # workers that cannot start, by machine
         self._started = 0
-        self._meters = Meters(split) if _existing() else None
+        self._meters = Meters(split) if existing() else None
         self._rescan_at = 0.0
         self._notice_at = time.monotonic() + PATIENCE
 
@@ -170,7 +168,7 @@ class Crew:
         """As many workers as the machines have room for now; one on this machine alone has always the same."""
         if time.monotonic() < self._rescan_at:
             return
-        self._rescan_at = time.monotonic() + RESCAN if _existing() else float("inf")
+        self._rescan_at = time.monotonic() + RESCAN if existing() else float("inf")
         if self._meters:
             self._meters.show(self._board.tally)
         room = _room(self._gpus, self._most, self._refused)
@@ -330,10 +328,9 @@ def connected() -> Iterator[threading.Event]:
     Raises:
         UserError: there is none at RAY_ADDRESS.
     """
-    existing = os.environ.get("RAY_ADDRESS", "")
-    ray._private.ray_constants.ENABLE_RAY_CLUSTER = bool(existing)  # otherwise Ray listens on loopback
-    if existing:
-        _require_reachable(existing)
+    ray._private.ray_constants.ENABLE_RAY_CLUSTER = bool(existing())  # otherwise Ray listens on loopback
+    if existing():
+        require_reachable(existing())
         settings: dict[str, Any] = {}
     else:
         settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE, "num_cpus": len(own_cores())}
@@ -342,32 +339,12 @@ def connected() -> Iterator[threading.Event]:
         try:
             ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
         except ConnectionError as error:
-            raise _no_cluster(str(error).strip().splitlines()[0]) from error
+            raise no_cluster(str(error).strip().splitlines()[0]) from error
         with stoppable() as stop:  # only now: Ray sets a handler of its own when it starts
             try:
                 yield stop
             finally:
                 ray.shutdown()
-
-
-def _require_reachable(address: str) -> None:
-    """Ray itself tries for minutes.
-
-    Raises:
-        UserError: nobody listens there.
-    """
-    if found := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
-        try:
-            socket.create_connection((found[1].strip("[]"), int(found[2])), REACH).close()
-        except (OSError, OverflowError) as error:
-            raise _no_cluster(getattr(error, "strerror", None) or str(error)) from error
-
-
-def _no_cluster(reason: str) -> UserError:
-    return UserError(
-        f"There is no Ray cluster at RAY_ADDRESS={os.environ.get('RAY_ADDRESS', '')} ({reason.rstrip('.')}): "
-        "start one with `ray start --head`, correct the address, or unset it to use this machine."
-    )
 
 
 def _on_gpus() -> bool:
