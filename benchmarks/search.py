@@ -86,7 +86,7 @@ def searched(size: str, first: int, count: int, env_steps: int) -> Int[np.ndarra
     log = cache_folder() / f"search-{size}-{first}-{env_steps}.jsonl"
     known = read(log)
     open_levels = left[steps < 0]
-    config = SearchConfig(env_steps=env_steps, trials=1)  # how short a success is does not matter here
+    config = SearchConfig(env_steps=env_steps, bodies=0, per_cell=0, trials=1)  # how short a success is does not matter here
     for start in range(0, len(open_levels), TOGETHER):
         if wanted := [i for i in open_levels[start : start + TOGETHER] if int(ids[i]) not in known]:
             come = search(take(levels, np.array(wanted)), ids[wanted], config)

@@ -113,7 +113,7 @@ class ExpertConfig:
 class ScoutConfig:
     """How long a level is scouted before its expert trains (hashable: pass as a static argument)."""
 
-    rounds: int = 4  # of 16,384 env steps of persistent random play, until one has a success; 0: none
+    rounds: int = 0  # of 16,384 env steps of persistent random play, until one has a success; 0: none
 
     def __post_init__(self) -> None:
         require(self, ("rounds",), 0)
@@ -128,7 +128,7 @@ class StopConfig:
     share: float = 0.25  # of an update's finished episodes that must reach the goal before an evaluation is worth it
     wait: int = 2048  # env steps of training between an evaluation that failed and the next; doubles each time
     polish: int = 0  # env steps of training after a level is solved, for a shorter way to the goal
-    first_rung: int = 8192  # env steps of training at the first rung; each is twice the one before
+    first_rung: int = 2048  # env steps of training at the first rung; each is twice the one before
     gain: float = 0.05  # by which the best return must have grown since the rung before
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ from experts.search.config import SearchConfig
 class Procedure:
     """Who looks, who trains and when that ends (hashable)."""
 
-    scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first
+    scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first, if anybody
     search: SearchConfig = field(default_factory=SearchConfig)  # who looks where scouts find nothing
     expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
     stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot

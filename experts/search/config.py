@@ -1,6 +1,7 @@
 """How a level is searched."""
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 
 from experts.config import MOST_COUNTED
 from levelgen.bounds import require
@@ -12,7 +13,10 @@ MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are co
 class SearchConfig:
     """Settings of a search (hashable: pass as a static argument)."""
 
-    env_steps: int = 262_144  # of one level, all lanes together; rounded up to whole rounds; 0: none
+    env_steps: int = 524_288  # of one level, all lanes together; rounded up to whole rounds; 0: none
+    bodies: int = 8  # of a world that is searched so long; of more, fewer env steps, as the square of their number
+    first_rung: int = 16_384  # env steps at the first rung; each is four times the one before
+    per_cell: int = 256  # env steps for each cell reached, above which a level leaves at a rung; 0: none leaves
     # play
     lanes: int = 64  # of one level
     redrawn: tuple[float, ...] = (0.02, 0.05, 0.1, 0.3)  # chance of drawing an entry of the action anew, per env step
@@ -34,13 +38,13 @@ class SearchConfig:
     polish: int = 0  # env steps of search around it for a shorter one, rounded up to whole rounds; 0: none
     steady: int = 16  # rounds of search around one that few replays survive, for one that more do; 0: none
     # machine
-    rounds: int = 8  # between looks of the host
+    rounds: int = 2  # between looks of the host
 
     def __post_init__(self) -> None:
-        require(self, ("env_steps",), 0, MOST_COUNTED)
+        require(self, ("env_steps", "bodies", "per_cell"), 0, MOST_COUNTED)
         require(self, ("polish",), 0, MOST_COUNTED // 2)
         require(self, ("steady",), 0)
-        require(self, ("lanes", "segment", "stretch", "trials", "rounds"), 1)
+        require(self, ("lanes", "segment", "stretch", "trials", "rounds", "first_rung"), 1)
         require(self, ("entries",), 1, MOST_ENTRIES)
         require(self, ("nearer", "anew"), 0, 1)
         require(self, ("width",), 0, above=True)
@@ -50,3 +54,19 @@ class SearchConfig:
             raise ValueError(f"redrawn is {self.redrawn}: give chances above 0 and at most 1")
         if self.lanes % len(self.redrawn):
             raise ValueError(f"lanes is {self.lanes}: give a multiple of {len(self.redrawn)}, the chances in redrawn")
+
+    def scaled(self, bodies: int) -> "SearchConfig":
+        """For worlds of so many bodies: about the time that a small world takes, an env step's being as their square."""
+        most = int(self.env_steps * min(1.0, (self.bodies / bodies) ** 2)) if self.bodies else self.env_steps
+        return replace(self, env_steps=most)
+
+    @property
+    def steps_per_round(self) -> int:
+        """Env steps of one level between two choices of where to go on."""
+        return self.lanes * self.stretch * self.segment
+
+    @property
+    def rungs(self) -> tuple[int, ...]:
+        """Rounds after which a level that has reached few cells leaves."""
+        first, rounds = -(-self.first_rung // self.steps_per_round), -(-self.env_steps // self.steps_per_round)
+        return tuple(itertools.takewhile(lambda rung: rung < rounds, (first * 4**i for i in itertools.count())))

@@ -14,12 +14,13 @@ from experts.config import RECORD_STEPS
 from experts.search.archive import Archive, Reached, choose, insert, new_archive, visit
 from experts.search.cells import features
 from experts.search.config import SearchConfig
+from experts.search.near import gap, goals_of
 from experts.search.play import CODES, Arena, Walk, arena, decode, most_steps, play
 from experts.search.rows import from_rows, to_rows
 from experts.success import Success
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import ACTIONS, Level
-from levelgen.task.rules import TaskParams, goal_distance
+from levelgen.task.rules import TaskParams
 
 
 @jax.tree_util.register_dataclass
@@ -63,7 +64,7 @@ def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, 
         one(to_rows(levels.state)),
         jnp.zeros((count, 1, room), jnp.uint16),
         jnp.zeros((count, 1), jnp.int32),
-        one(goal_distance(levels, levels.state)),
+        one(gap(goals_of(levels), levels.state)),
     )
     key = jax.vmap(lambda level_id: key_for(level_id, Stream.SEARCH))(level_ids)
     none, code = jnp.zeros(count, jnp.int32), jnp.zeros((count, room), jnp.uint16)
@@ -100,7 +101,7 @@ def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: Task
     carry = visit(search.archive, chosen, active), walk, code, search.full
     archive, walk, code, full = jax.lax.scan(one, carry, bits)[0]
 
-    env_steps = search.env_steps + jnp.where(active, config.lanes * config.stretch * config.segment, 0)
+    env_steps = search.env_steps + jnp.where(active, config.steps_per_round, 0)
     level, length = jnp.arange(len(active)), length_of(walk, rules).reshape(len(active), -1)
     lane = jnp.argmin(length, axis=-1)
     won = active & (length[level, lane] <= RECORD_STEPS)
@@ -117,8 +118,13 @@ def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: Task
 
 
 def under_way(search: Search, config: SearchConfig) -> Bool[Array, " level"]:
-    """Levels without a success that have env steps left."""
-    return (search.length == 0) & (search.env_steps < config.env_steps)
+    """Levels without a success that have env steps left, and are not at a rung with too few cells.
+
+    Where next to nothing is reached, nothing will be: the world ends at once, or what acts moves little in it.
+    """
+    going = (search.length == 0) & (search.env_steps < config.env_steps)
+    at_rung = jnp.isin(search.env_steps // config.steps_per_round, jnp.array(config.rungs, jnp.int32))
+    return going & ~(at_rung & (search.archive.cells * config.per_cell < search.env_steps) & (config.per_cell > 0))
 
 
 def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> Chance:
@@ -160,7 +166,7 @@ def reached_by(
         state=to_rows(walk.state),
         code=code,
         steps=walk.timestep,
-        distance=goal_distance(ring.lanes, walk.state),
+        distance=gap(ring.goals, walk.state),
     )
     return jax.tree.map(by_level, come), by_level(~walk.ended)
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
 from experts.config import RECORD_STEPS
+from experts.search.near import Goals, goals_of
 from levelgen.level import ACTIONS, Level, Role
 from levelgen.task.actions import CHOICES, action_mask, controls
 from levelgen.task.rules import TaskParams, has_nan, has_roles
@@ -28,6 +29,7 @@ class Arena(NamedTuple):
     live: Bool[Array, "6 lane"]  # entries of an action that can have an effect
     blue: Bool[Array, "contact lane"]  # contacts that reach the goal
     red: Bool[Array, "contact lane"]  # contacts that end the episode without
+    goals: Goals
     redrawn: Float[Array, " lane"]  # chance that an entry of the action is drawn anew, per env step
 
 
@@ -51,7 +53,7 @@ def arena(levels: Level, lanes: int, redrawn: tuple[float, ...]) -> Arena:
     count = levels.role.shape[-1]
     spread = jax.tree.map(lambda x: jnp.repeat(x, lanes, axis=-1), levels)
     chance = jnp.tile(jnp.repeat(jnp.array(redrawn, jnp.float32), lanes // len(redrawn)), count)
-    return Arena(spread, action_mask(spread), contacts(spread, Role.BLUE), contacts(spread, Role.RED), chance)
+    return Arena(spread, action_mask(spread), contacts(spread, Role.BLUE), contacts(spread, Role.RED), goals_of(spread), chance)
 
 
 def contacts(level: Level, second: Role) -> Bool[Array, "contact lane"]:

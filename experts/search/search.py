@@ -49,6 +49,7 @@ class Searching:
             rules: of the task.
         """
         count = len(level_ids)
+        config = config.scaled(levels.model.size.bodies)
         self.levels, self.level_ids, self.config, self.rules = levels, np.asarray(level_ids, np.int32), config, rules
         self._waiting = deque(range(count))
         self._index = np.full(side_by_side(config), -1)  # of the level under search; -1: none

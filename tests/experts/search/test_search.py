@@ -131,8 +131,27 @@ def test_env_steps_add_up() -> None:
         assert (steps % ROUND == 0).all()
         going = np.asarray(now.length) == 0
         np.testing.assert_array_equal(steps[going], calls * CONFIG.rounds * ROUND)
-    assert found().env_steps[KINDS == BROKEN] == CONFIG.env_steps
+    assert found().env_steps[KINDS == BROKEN] == CONFIG.first_rung
     assert (found().grew <= found().env_steps).all()
+
+
+def test_a_level_with_few_cells_leaves_at_a_rung() -> None:
+    """One cell, and it is over at the first rung; as many as a rung asks for, and it goes on to the next."""
+    broken = take(levels(), np.flatnonzero(KINDS == BROKEN)[:1])
+    steps = lambda **changed: search(broken, IDS[:1], replace(CONFIG, env_steps=40_960, **changed), DEFAULT_RULES)
+    assert steps().env_steps == CONFIG.first_rung
+    assert steps(first_rung=4096).env_steps == 4096
+    assert steps(first_rung=4096, per_cell=4096).env_steps == 16_384
+    assert steps(per_cell=0).env_steps == 40_960
+
+
+def test_larger_worlds_are_searched_for_fewer_env_steps() -> None:
+    given = SearchConfig(env_steps=100_000, bodies=8)
+    assert [given.scaled(bodies).env_steps for bodies in (7, 8, 16)] == [100_000, 100_000, 25_000]
+    assert replace(given, bodies=0).scaled(16).env_steps == 100_000
+    four = replace(CONFIG, bodies=4, env_steps=16_384)
+    at = np.flatnonzero(KINDS == BROKEN)[:1]
+    assert search(take(levels(), at), IDS[:1], four, DEFAULT_RULES).env_steps == 4096  # of 8 bodies
 
 
 def test_a_level_that_has_a_success_stays_as_it_is() -> None:
@@ -205,7 +224,8 @@ def test_shortening() -> None:
 @pytest.mark.parametrize(
     "wrong",
     [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"anew": -0.5},
-     {"redrawn": (0.5, 2.0)}, {"redrawn": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"velocity_seconds": -1.0}],
+     {"redrawn": (0.5, 2.0)}, {"redrawn": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"velocity_seconds": -1.0},
+     {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}],
 )  # fmt: skip
 def test_settings_that_cannot_be(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):

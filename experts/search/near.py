@@ -1,0 +1,90 @@
+"""How near the goal is: the gap between green and blue, which closes where they touch.
+
+The task's own distance is one of centres. It says little of a long floor, and sums up where there are several goals.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from levelgen.level import Level, Role
+from physics.manifold import faces
+from physics.types import MAX_VERTICES, Model, State
+from physics.vector import Vec, nonzero, select, vec
+
+MOST_PAIRS = 2  # of a green and a blue body that are measured; sampled levels have one
+FAR = 1e6  # m; where there is none
+
+
+class Shape(NamedTuple):
+    """One body of each pair. A circle is four corners in its centre, with a radius."""
+
+    body: Int[Array, "pair lane"]
+    corner: Vec  # in its own frame, components [vertex, pair, lane]
+    radius: Float[Array, "pair lane"]
+
+
+class Goals(NamedTuple):
+    """Pairs of a green and a blue body."""
+
+    green: Shape
+    blue: Shape
+    there: Bool[Array, "pair lane"]
+
+
+def goals_of(level: Level) -> Goals:
+    """The first pairs of each lane."""
+    role = jnp.where(level.model.active, level.role, Role.PLAIN)
+    bodies = len(role)
+    both = ((role[:, None] == Role.GREEN) & (role[None] == Role.BLUE)).reshape(bodies * bodies, -1)
+    turn = jnp.where(both, jnp.cumsum(both, axis=0), 0)
+    number = jnp.arange(bodies * bodies)[:, None]
+    pair = jnp.stack([jnp.where(turn == 1 + k, number, 0).sum(0) for k in range(MOST_PAIRS)])
+    there = jnp.arange(MOST_PAIRS)[:, None] < both.sum(0)
+    green, blue = jnp.divmod(pair, bodies)
+    return Goals(_shape(level.model, green), _shape(level.model, blue), there)
+
+
+def gap(goals: Goals, state: State) -> Float[Array, " lane"]:
+    """The least gap between the bodies of a pair, m: along the normals of their faces or the line of their centres.
+
+    Exact between circles and opposite a face, else no more than it is; 0 where they overlap.
+    """
+    (centre_a, corner_a), (centre_b, corner_b) = _in_world(goals.green, state), _in_world(goals.blue, state)
+    between = centre_b - centre_a
+    towards = between.scale(1 / nonzero(between.norm()))
+    beyond = [
+        _beyond(corner_a, corner_b),
+        _beyond(corner_b, corner_a),
+        towards.dot(corner_b).min(0) - towards.dot(corner_a).max(0),
+    ]
+    apart = jnp.stack(beyond).max(0) - goals.green.radius - goals.blue.radius
+    return jnp.where(goals.there, jnp.maximum(apart, 0.0), FAR).min(0)
+
+
+def _shape(model: Model, body: Int[Array, "pair lane"]) -> Shape:
+    polygons = model.size.polygons
+    is_round, polygon = body >= polygons, jnp.minimum(body, polygons - 1)
+    triangle = _pick(model.n_vertices, polygon) == MAX_VERTICES - 1
+    local = jnp.where(is_round[:, None, None], 0.0, _pick(model.vertices, polygon))
+    local = local.at[:, -1].set(jnp.where(triangle[:, None], local[:, 0], local[:, -1]))
+    radius = jnp.where(is_round, _pick(model.radius, jnp.maximum(body - polygons, 0)), 0.0)
+    return Shape(body, vec(jnp.swapaxes(local, 0, 1)), radius)
+
+
+def _pick(x: Float[Array, "thing *row lane"], number: Int[Array, "pair lane"]) -> Float[Array, "pair *row lane"]:
+    return jnp.stack([select(x, of_lane) for of_lane in number])
+
+
+def _in_world(shape: Shape, state: State) -> tuple[Vec, Vec]:
+    """Centres and corners."""
+    centre, rotation = vec(_pick(state.position, shape.body)), _pick(state.rotation, shape.body)
+    return centre, shape.corner.rotate(jnp.cos(rotation), jnp.sin(rotation)) + centre
+
+
+def _beyond(corner: Vec, other: Vec) -> Float[Array, "pair lane"]:
+    """How far the other's corners are beyond the face that separates most."""
+    outward = faces(corner).outward
+    reach = [outward.dot(other.map(lambda x, k=k: x[k]) - corner) for k in range(MAX_VERTICES)]
+    return jnp.stack(reach).min(0).max(0)

@@ -1,0 +1,69 @@
+"""The gap between green and blue: what geometry says it is, and nothing where they touch."""
+
+import jax
+import numpy as np
+import pytest
+
+from experts.search.near import FAR, gap, goals_of
+from levelgen.level import Level, Role
+from tests.experts.search.worlds import BALL, BARS, GOAL, side_by_side, switchback
+
+BAR = BARS.start
+GAP = jax.jit(lambda levels: gap(goals_of(levels), levels.state))
+
+
+def measured(*levels: Level) -> np.ndarray:
+    """By one program: the levels that are too few are the last again."""
+    many = side_by_side(*levels, *[levels[-1]] * (2 - len(levels)))
+    return np.asarray(GAP(many))[: len(levels)]
+
+
+def goal_at(body: int, *, role: Role = Role.BLUE) -> Level:
+    """The switchback, whose goal is another body."""
+    level = switchback()
+    level.role[[BAR, BAR + 1, GOAL]], level.role[body] = Role.PLAIN, role
+    return level
+
+
+def test_circles() -> None:
+    assert measured(switchback()) == pytest.approx(np.hypot(4.5 - 0.6, 4.2 - 0.6) - 0.4)
+
+
+def test_above_the_end_of_a_long_bar_it_is_the_height() -> None:
+    """The bar reaches from 0 to 3.6 m; its centre is farther from its end than the ball is."""
+    over = goal_at(BAR)
+    over.state.position[BALL, :, 0] = 0.3, 2.5
+    turned = goal_at(BAR)
+    turned.state.rotation[BAR], turned.state.position[BALL, :, 0] = np.pi / 2, (1.0, 2.9)
+    np.testing.assert_allclose(measured(over, turned), [2.5 - 1.6 - 0.2, 1.8 - 1.0 - 0.1 - 0.2], rtol=1e-5)
+
+
+def test_bodies_that_touch_have_no_gap() -> None:
+    level = goal_at(BAR)
+    level.state.position[BALL, :, 0] = 1.8, 1.7
+    assert measured(level) == 0
+
+
+def test_polygons_and_triangles() -> None:
+    """Bars one above the other; the fourth corner of a triangle, which means nothing, is far away."""
+    bars = goal_at(BAR)
+    bars.role[BALL], bars.role[BAR + 1] = Role.PLAIN, Role.GREEN
+    triangle = goal_at(BAR)
+    triangle.role[BALL], triangle.role[BAR + 1] = Role.PLAIN, Role.GREEN
+    triangle.model.n_vertices[BAR] = 3
+    triangle.model.vertices[BAR, :, :, 0] = [(0, 0.5), (0.5, -0.5), (-0.5, -0.5), (50.0, 50.0)]
+    np.testing.assert_allclose(measured(bars, triangle), [3.2 - 1.5 - 0.2, 3.2 - 1.5 - 0.6], rtol=1e-5)
+
+
+def test_the_nearest_of_several_pairs_counts() -> None:
+    level = goal_at(BAR)
+    level.role[GOAL] = Role.BLUE
+    assert measured(level) == pytest.approx(1.5 - 0.1 - 0.6 - 0.2)
+
+
+def test_without_a_pair_nothing_is_near() -> None:
+    level = goal_at(BAR, role=Role.RED)
+    assert measured(level) == pytest.approx(FAR)
+    gone = goal_at(BAR)
+    gone.model.active[BAR] = False
+    assert measured(gone) == pytest.approx(FAR)
