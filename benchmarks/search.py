@@ -1,11 +1,12 @@
 """How much a longer search would find: the unsolved share against the env steps that a level is searched.
 
-Every level that needs an expert is scouted and then searched, until it has a success or its steps are used up. Levels
+Every level that needs an expert is searched, until it has a success or its steps are used up. Levels
 are searched one after another, so a run that is stopped goes on where it was: what is known of a level waits in the
 cache folder.
 """
 
 import argparse
+import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,8 +22,6 @@ from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
 from configs.numbers import parse_count
 from experts.before import decide
-from experts.config import ScoutConfig
-from experts.scout import STEPS_PER_ROUND, scout
 from experts.search.config import SearchConfig
 from experts.search.search import Searched, Searching
 from experts.witness import take
@@ -66,7 +65,7 @@ def run(given: argparse.Namespace) -> Report:
             ),
         ],
         notes=[
-            f"Levels from id {given.first:,} on that are neither trivial nor proved unsolvable; scouts and the "
+            f"Levels from id {given.first:,} on that are neither trivial nor proved unsolvable; the "
             "default search, no experts. *In the next, at most*: the 95% upper bound of what another doubling of the "
             "steps would find, taking that it finds no more than the last one did (each doubling has found less than "
             "the one before) and that finds are rare and independent (Poisson).",
@@ -81,14 +80,13 @@ def searched(size: str, first: int, count: int, env_steps: int) -> Int[np.ndarra
     ids = np.arange(first, first + count, dtype=np.int32)
     levels = jax.tree.map(np.asarray, sample_levels(ids, SIZES[size]))
     left = np.array([i for i, verdict in enumerate(decide(levels, DEFAULT_RULES).verdicts) if verdict is None])
-    scouted = scout(take(levels, left), ids[left], ScoutConfig(), DEFAULT_RULES)
-    steps = np.where(scouted.success.length > 0, scouted.env_steps, -1)
-    log = cache_folder() / f"search-{size}-{first}-{env_steps}.jsonl"
+    # the whole of it for every level; how short a success is does not matter here
+    config = SearchConfig(env_steps=env_steps, bodies=0, per_cell=0, trials=1)
+    settings = hashlib.sha256(repr(config).encode()).hexdigest()[:12]
+    log = cache_folder() / f"search-{size}-{first}-{settings}.jsonl"
     known = read(log)
-    open_levels = left[steps < 0]
-    config = SearchConfig(env_steps=env_steps, bodies=0, per_cell=0, trials=1)  # how short a success is does not matter here
-    for start in range(0, len(open_levels), TOGETHER):
-        if wanted := [i for i in open_levels[start : start + TOGETHER] if int(ids[i]) not in known]:
+    for start in range(0, len(left), TOGETHER):
+        if wanted := [i for i in left[start : start + TOGETHER] if int(ids[i]) not in known]:
             come = search(take(levels, np.array(wanted)), ids[wanted], config)
             new = {
                 int(ids[i]): int(n) if length else -1
@@ -97,12 +95,8 @@ def searched(size: str, first: int, count: int, env_steps: int) -> Int[np.ndarra
             known |= new
             with log.open("a") as file:
                 file.writelines(f"{json.dumps(pair)}\n" for pair in new.items())
-        tell(f"{size}: {min(start + TOGETHER, len(open_levels))} of {len(open_levels)} levels are searched.")
-    scouts = ScoutConfig().rounds * STEPS_PER_ROUND
-    for at, i in enumerate(left):
-        if steps[at] < 0 and (n := known[int(ids[i])]) >= 0:
-            steps[at] = scouts + n
-    return steps
+        tell(f"{size}: {min(start + TOGETHER, len(left))} of {len(left)} levels are searched.")
+    return np.array([known[int(ids[i])] for i in left])
 
 
 def search(levels: Level, level_ids: Int[np.ndarray, " level"], config: SearchConfig) -> Searched:
@@ -170,7 +164,7 @@ def draw(path: Path, found: dict[str, Int[np.ndarray, " level"]], budgets: list[
     for size, steps in found.items():
         share = [100 * unsolved(steps, n).mean() for n in budgets]
         axes.plot(budgets, share, "o-", color=COLOURS[size], label=size, markersize=3)
-    axes.set(xscale="log", ylim=(0, None), xlabel="env steps of scouts and search, a level", ylabel="unsolved, %")
+    axes.set(xscale="log", ylim=(0, None), xlabel="env steps of search, a level", ylabel="unsolved, %")
     axes.legend(title="size", frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path)

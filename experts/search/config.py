@@ -56,7 +56,7 @@ class SearchConfig:
             raise ValueError(f"lanes is {self.lanes}: give a multiple of {len(self.redrawn)}, the chances in redrawn")
 
     def scaled(self, bodies: int) -> "SearchConfig":
-        """For worlds of so many bodies: about the time that a small world takes, an env step's being as their square."""
+        """For worlds of so many bodies: about the time that a small one takes, where env steps cost as their square."""
         most = int(self.env_steps * min(1.0, (self.bodies / bodies) ** 2)) if self.bodies else self.env_steps
         return replace(self, env_steps=most)
 

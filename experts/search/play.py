@@ -29,7 +29,7 @@ class Arena(NamedTuple):
     live: Bool[Array, "6 lane"]  # entries of an action that can have an effect
     blue: Bool[Array, "contact lane"]  # contacts that reach the goal
     red: Bool[Array, "contact lane"]  # contacts that end the episode without
-    goals: Goals
+    goals: Goals  # of which the gap says how near the goal is
     redrawn: Float[Array, " lane"]  # chance that an entry of the action is drawn anew, per env step
 
 
@@ -53,7 +53,8 @@ def arena(levels: Level, lanes: int, redrawn: tuple[float, ...]) -> Arena:
     count = levels.role.shape[-1]
     spread = jax.tree.map(lambda x: jnp.repeat(x, lanes, axis=-1), levels)
     chance = jnp.tile(jnp.repeat(jnp.array(redrawn, jnp.float32), lanes // len(redrawn)), count)
-    return Arena(spread, action_mask(spread), contacts(spread, Role.BLUE), contacts(spread, Role.RED), goals_of(spread), chance)
+    touching = contacts(spread, Role.BLUE), contacts(spread, Role.RED)
+    return Arena(spread, action_mask(spread), *touching, goals_of(spread), chance)
 
 
 def contacts(level: Level, second: Role) -> Bool[Array, "contact lane"]:
