@@ -24,7 +24,7 @@ from pipeline.jobs.schedule import Summary, WorkUnit, plan_units
 from pipeline.runtime import cache_folder, interruptible, own_cores, prepare_jax
 from pipeline.store.provenance import device, versions
 
-UNIT = 128  # levels that a process trains at a time: slots are rarely empty, as in a job
+UNIT = 64  # levels that a process trains at a time: slots are rarely empty, as in a job
 POLL = 0.5  # s between looks at the processes
 DIGITS = 4  # of a share or of seconds in a file
 
