@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def job() -> JobConfig:
-    return made_job("data", "budget=5k")
+    return made_job("data", "budget=5k", "scout.rounds=1")
 
 
 def outcomes(worker: Worker, units: list[WorkUnit]) -> dict[WorkUnit, UnitOutcome]:

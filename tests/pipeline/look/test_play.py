@@ -26,7 +26,7 @@ from tests.experts.small import untouched
 from tests.pipeline.command import assert_refused, here
 
 PATIENCE = 120  # s
-QUICK = replace(untouched(StopConfig()), scout=ScoutConfig())
+QUICK = replace(untouched(StopConfig()), scout=ScoutConfig(rounds=4))
 
 
 @pytest.fixture(scope="module")
