@@ -23,6 +23,7 @@ os.environ |= {
 }
 
 import ray
+from ray._private import ray_constants
 from ray.exceptions import ActorDiedError, RayError
 from ray.util.metrics import Gauge
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -328,7 +329,7 @@ def connected() -> Iterator[threading.Event]:
     Raises:
         UserError: there is none at RAY_ADDRESS.
     """
-    ray._private.ray_constants.ENABLE_RAY_CLUSTER = bool(existing())  # otherwise Ray listens on loopback
+    ray_constants.ENABLE_RAY_CLUSTER = bool(existing())  # otherwise Ray listens on loopback
     if existing():
         require_reachable(existing())
         settings: dict[str, Any] = {}
