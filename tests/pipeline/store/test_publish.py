@@ -141,7 +141,7 @@ def requests_of_a_run(server: Server) -> int:
     return count
 
 
-@pytest.mark.parametrize("some", [2, pytest.param(12, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("some", [2, pytest.param(8, marks=pytest.mark.campaign)])
 def test_a_store_that_is_gone_is_one_sentence_and_the_same_command_goes_on(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, some: int
 ) -> None:
@@ -183,13 +183,13 @@ def taken_over(split: Path) -> Lease:
     return lease
 
 
-STEPS = {  # requests of an attempt
-    "mark": "begun",
-    "look": ".parquet",
-    "lease": ".writer.lock",
-    "data": "/shards/",
-    "fragment": "PUT /bucket/data/128k/s/manifest/0",
-    "end": "POST",
+STEPS = {  # requests of an attempt, by what they have in them, and which of those it is
+    "mark": ("begun", 1),
+    "look": (".parquet", 2),  # the first asks what an attempt of which nobody has heard has committed
+    "lease": (".writer.lock", 1),
+    "data": ("/shards/", 1),
+    "fragment": ("PUT /bucket/data/128k/s/manifest/0", 1),
+    "end": ("POST", 1),
 }
 
 
@@ -205,10 +205,11 @@ def test_a_worker_whose_writer_is_replaced_meanwhile_commits_before_or_never(
     monkeypatch.setattr(leases, "RENEWAL", 1000.0)
     monkeypatch.setattr(leases, "SILENCE", -1.0)
     with leases.leased(THERE, print):
-        mine, theirs = leases._served[THERE], list[Lease]()
+        mine, theirs, begun = leases._served[THERE], list[Lease](), server.count
 
         def meanwhile(count: int) -> None:
-            if STEPS[step] in server.log[count - 1]:
+            text, number = STEPS[step]
+            if sum(text in line for line in server.log[begun:count]) == number:
                 server.meanwhile = lambda _: None
                 theirs.append(taken_over(THERE))
 
@@ -247,7 +248,7 @@ def test_a_store_that_is_gone_while_a_split_is_sealed(
     drive(OUT)
     count = server.count
     assert command(["seal", str(THERE)], tmp_path).returncode == 0
-    for request in sorted(random.Random(0).sample(range(1, server.count - count), 8)):
+    for request in sorted(random.Random(0).sample(range(1, server.count - count), 5)):
         server.meanwhile = lambda _: None
         server.spoil(0)
         empty()
