@@ -37,6 +37,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "manifest": ("benchmarks.manifest", "how long commands take to start on a split of millions of levels"),
     "gallery": ("benchmarks.gallery", "how soon a gallery of many levels shows, and how smoothly it scrolls"),
     "reader": ("benchmarks.reader", "trajectories/s of both readers on the same trajectories"),
+    "workers": ("benchmarks.workers", "how much faster two workers are than one, and what a thousand cost the driver"),
     "readme": ("benchmarks.readme", "the README's commands in a fresh clone and environment"),
 }
 

@@ -17,10 +17,10 @@ UPDATES = 10**6  # more than a benchmark waits for
 
 def endless_queue(levels: Level, config: ExpertConfig) -> LevelQueue:
     """All of these levels, with as many places."""
-    queue = empty_queue(levels, levels.role.shape[-1], UPDATES, config)
+    queue = empty_queue(levels, levels.role.shape[-1], config)
     for first in range(0, queue.capacity, GROUP):
         some = np.arange(first, min(first + GROUP, queue.capacity))
-        queue = enter(queue, take(levels, some), some, no_success(len(some)), config, {})
+        queue = enter(queue, take(levels, some), some, no_success(len(some)), config, UPDATES)
     return queue
 
 

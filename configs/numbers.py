@@ -1,4 +1,4 @@
-"""Numbers as people type them: 64k, 1M, 11.5M."""
+"""Numbers as people type them: 64k, 1M, 11.5M, 10min."""
 
 import re
 from decimal import Decimal
@@ -7,7 +7,21 @@ from configs.errors import ConfigError
 
 SCALES = {"": 1, "k": 1_000, "M": 1_000_000, "B": 1_000_000_000}
 PATTERN = re.compile(r"([0-9]+(?:\.[0-9]+)?)([kMB]?)")
+SECONDS = {"s": 1, "min": 60, "h": 3600}
+DURATION = re.compile(r"([0-9]{1,6}(?:\.[0-9]+)?)(s|min|h)")
 LARGEST = 10**15  # beyond any budget or level count that could finish; stops typing errors
+
+
+def parse_duration(text: str, what: str) -> float:
+    """The seconds that `text` means: `parse_duration("10min", "checkpoint") == 600`.
+
+    Raises:
+        ConfigError: `text` is no positive number with a unit; `what` names the setting.
+    """
+    match = DURATION.fullmatch(text)
+    if not match or not float(match[1]):
+        raise ConfigError(f"{what} is {text!r}: write a number and its unit, such as 30s, 10min or 2h.")
+    return float(match[1]) * SECONDS[match[2]]
 
 
 def parse_count(text: str | int, what: str) -> int:

@@ -2,13 +2,14 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from configs.convert import plain
 from configs.errors import ConfigError
-from configs.numbers import parse_count
+from configs.numbers import parse_count, parse_duration
 from experts.config import ExpertConfig, ScoutConfig, StopConfig, check_budget
 from experts.procedure import Procedure
 from experts.search.config import SearchConfig
@@ -37,6 +38,7 @@ WITHOUT_EFFECT = frozenset(
         "unit",
         "executor",
         "workers",
+        "checkpoint",
         "keep_experts",
         "continue_from",
         "density",
@@ -61,6 +63,7 @@ class JobConfig:
     unit: int | None = None  # levels per work unit, lost when its worker dies; null: 32 to 4, the larger the fewer
     executor: Literal["ray", "inline"] = "ray"  # ray: a worker per core or GPU; inline: this process, for debugging
     workers: int = 0  # at most so many; 0: one per core, or one per GPU where JAX can use them
+    checkpoint: str = ""  # how often experts under way are kept, as in 10min, to go on with; empty: never
     keep_experts: bool = False  # keep experts, too, so that a larger budget can go on with them
     density: Density = "full"  # what is stored of a record: full (all), resume (states), witness (actions, key frames)
     key_every: int = KEY_EVERY  # env steps of an episode between key frames of density=witness: a power of 2 up to 256
@@ -82,6 +85,7 @@ class JobConfig:
             raise ConfigError(f"unit is {self.unit}: a work unit needs at least 1 level.")
         if self.workers < 0:
             raise ConfigError(f"workers is {self.workers}: use 0 for one per core or GPU, or a number from 1.")
+        _ = self.checkpoint_seconds
         if self.key_every not in KEYS_EVERY:
             raise ConfigError(f"key_every is {self.key_every}: choose one of {', '.join(map(str, KEYS_EVERY))}.")
         if self.density != "full" and self.task.frame_skip > MOST_FRAME_SKIP:
@@ -106,6 +110,11 @@ class JobConfig:
             return self.unit
         bodies = size_of(self.size).bodies
         return next(levels for most, levels in UNITS if bodies <= most)
+
+    @property
+    def checkpoint_seconds(self) -> float:
+        """Infinite: experts under way are not kept."""
+        return parse_duration(self.checkpoint, "checkpoint") if self.checkpoint else math.inf
 
     @property
     def level_ids(self) -> range:

@@ -79,7 +79,8 @@ def advance(
 
 
 def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
-    """Slots that are empty take the next levels of the queue. One that is over is only evaluated again."""
+    """Slots that are empty take the next levels of the queue. An expert that is over is only evaluated again, and so is
+    one whose evaluation was under way when it was kept."""
     free = slots.slot.mode == Mode.EMPTY
     number = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
     takes, index = free & (number < queue.come), number % queue.capacity
@@ -88,14 +89,15 @@ def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
         begun = jax.tree.map(lambda x: x[index], queue.begun)
         choose = lambda new, old: jnp.where(takes.reshape(-1, *[1] * (old.ndim - 1)), new, old)
         put = lambda new, old: jax.tree.map(choose, new, old)
-        over, trial = begun.training.course.over, slots.slot.trial
+        due, final, deadline = jax.tree.map(lambda x: x[index], queue.pending)
+        final, trial = final | begun.training.course.over, slots.slot.trial
         slot = slots.slot._replace(
-            mode=put(jnp.where(over, Mode.EVALUATE, Mode.TRAIN), slots.slot.mode),
+            mode=put(jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), slots.slot.mode),
             queue_index=put(index, slots.slot.queue_index),
-            deadline=put(jnp.full_like(index, queue.updates), slots.slot.deadline),
+            deadline=put(deadline, slots.slot.deadline),
             training=put(begun.training, slots.slot.training),
             trial=trial._replace(
-                part=put(jnp.zeros_like(index), trial.part), due=trial.due & ~takes, final=put(over, trial.final)
+                part=put(jnp.zeros_like(index), trial.part), due=put(due, trial.due), final=put(final, trial.final)
             ),
         )
         return slot, _where(repeat(takes, config.environments), lanes_of(begun.acting), slots.acting)

@@ -1,5 +1,6 @@
 """What is known of levels before their experts train: successes, and what it took to look for them."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -33,6 +34,19 @@ def nothing_found(count: int) -> Found:
     """Of levels in which nobody has looked."""
     zeros = np.zeros(count, np.int64)
     return Found(no_success(count), [Source.EXPLORATION] * count, zeros, zeros.copy(), zeros.copy(), zeros.astype(bool))
+
+
+def row_of(found: Found, index: int) -> Found:
+    """Of one of its levels."""
+    arrays = jax.tree.map(lambda x: x[index : index + 1], found._replace(source=()))
+    return arrays._replace(source=[found.source[index]])
+
+
+def joined(parts: Sequence[Found], order: Int[np.ndarray, " level"]) -> Found:
+    """Of the levels of all parts one after another, in another order."""
+    arrays = jax.tree.map(lambda *xs: np.concatenate(xs)[order], *(part._replace(source=()) for part in parts))
+    source = [source for part in parts for source in part.source]
+    return arrays._replace(source=[source[i] for i in order])
 
 
 class Looking:

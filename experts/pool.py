@@ -5,7 +5,7 @@ leave empty. A result depends on nothing but its level, so sharing changes none.
 """
 
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from types import MappingProxyType
@@ -17,12 +17,13 @@ from jaxtyping import Int
 
 from experts.advance import advance
 from experts.config import RECORD_STEPS, ExpertConfig, check_budget
-from experts.found import Found, nothing_found
+from experts.found import Found, nothing_found, row_of
 from experts.judge import Evaluation, Kept, Trained, Witness, candidates_of
 from experts.ledger import Lap, Ledger, Steps, lap
+from experts.paused import Paused
 from experts.procedure import Procedure
 from experts.queue import GROUP, empty_queue, enter, next_indices
-from experts.slots import Begun, LevelQueue, Mode, Report, Slots, empty_slots
+from experts.slots import Begun, LevelQueue, Mode, Pending, Report, Slots, empty_slots
 from experts.stop import rules_of
 from experts.witness import at_once, take
 from levelgen.level import Level
@@ -32,6 +33,7 @@ IN_CACHE = 128  # lanes: their physics and one minibatch fit the cache of a core
 QUEUED_PER_SLOT = 4  # levels: one that stays long keeps none from coming that could have a slot
 T = TypeVar("T")
 NOTHING_BEGUN: Mapping[int, Kept] = MappingProxyType({})
+NONE_PAUSED: Mapping[int, Paused] = MappingProxyType({})
 
 
 class Totals(NamedTuple):
@@ -52,18 +54,22 @@ class Submission:
         found: Found,
         begun: Mapping[int, Kept],
         keep: bool,
+        paused: Mapping[int, Paused],
     ) -> None:
         count = len(level_ids)
-        self.levels, self.level_ids, self.found, self.begun, self.keep = levels, level_ids, found, begun, keep
-        self.curves = [list(begun[i].curve) if i in begun else [] for i in range(count)]
-        self.evaluations: list[list[Evaluation]] = [[] for _ in range(count)]
+        self.levels, self.level_ids, self.found, self.keep, self.paused = levels, level_ids, found, keep, paused
+        self.begun = {**begun, **{i: of.expert for i, of in paused.items()}}
+        self.curves = [list(self.begun[i].curve) if i in self.begun else [] for i in range(count)]
+        self.evaluations = [list(paused[i].evaluations) if i in paused else [] for i in range(count)]
         self.experts: list[Kept | None] = [None] * count
         self.candidates: list[list[Witness]] = [[] for _ in range(count)]
         self.under_way = set(range(count))
         self.solved = 0
         self.trained_rollouts = self.idle_rollouts = 0
-        self.evaluated_rollouts = np.zeros(count, int)
         self.ledger = Ledger(count)
+        self.evaluated_rollouts = np.array(
+            [paused[i].evaluated_rollouts if i in paused else 0 for i in range(count)], int
+        )
 
     def trained(self, config: ExpertConfig) -> list[Trained]:
         evaluated = (self.evaluated_rollouts * config.steps_per_update).tolist()
@@ -97,6 +103,7 @@ class Pool:
         found: Found | None = None,
         begun: Mapping[int, Kept] = NOTHING_BEGUN,
         keep: bool = False,
+        paused: Mapping[int, Paused] = NONE_PAUSED,
     ) -> Submission:
         """Let levels wait for slots: each stays in one until it is decided or has had its budget.
 
@@ -106,9 +113,10 @@ class Pool:
             found: what their experts rehearse from the start; None: nothing.
             begun: by index among them, experts that go on.
             keep: whether the result has the experts.
+            paused: by index among them, experts that were under way before.
         """
         count = len(level_ids)
-        submission = Submission(levels, level_ids, found or nothing_found(count), begun, keep)
+        submission = Submission(levels, level_ids, found or nothing_found(count), begun, keep, paused)
         self._submissions.append(submission)
         self._coming.extend((submission, range(i, min(i + GROUP, count))) for i in range(0, count, GROUP))
         return submission
@@ -158,6 +166,31 @@ class Pool:
         decided = len(submission.curves) - len(submission.under_way)
         return Totals(steps, decided + parts, submission.solved)
 
+    def paused(self) -> Iterator[tuple[Submission, int, Paused]]:
+        """Every expert that has a slot, as it would go on from here, with its index in its submission."""
+        if self._slots is None:
+            return
+        slot = self._slots.slot
+        now = jax.device_get(
+            (slot.mode, slot.queue_index, slot.trial.part, slot.deadline, slot.trial.due, slot.trial.final)
+        )
+        for number, (mode, index, part, deadline, due, final) in enumerate(zip(*now, strict=True)):
+            if mode == Mode.EMPTY:
+                continue
+            of, i = self._at[int(index)]
+            evaluating = mode == Mode.EVALUATE
+            yield (
+                of,
+                i,
+                Paused(
+                    Kept(expert_of(self._slots, number, self.config), list(of.curves[i])),
+                    Pending(evaluating & due, evaluating & final, deadline),
+                    int(of.evaluated_rollouts[i]) - (int(part) if evaluating else 0),
+                    list(of.evaluations[i]),
+                    row_of(of.found, i),
+                ),
+            )
+
     def _queued(self) -> list[tuple[int, tuple[Submission, int]]]:
         """Levels in the queue that have had no slot, in order, with their indices there."""
         count = int(self._queue.come) - self._taken if self._queue else 0
@@ -199,18 +232,24 @@ class Pool:
         while self._coming:
             submission, some = self._coming[0]
             if self._queue is None:
-                self._queue = empty_queue(submission.levels, capacity_of(self.config), self.updates, self.config)
+                self._queue = empty_queue(submission.levels, capacity_of(self.config), self.config)
                 self._slots = empty_slots(slot_count(self.config), self._queue, self.config)
             indices = next_indices(self._queue, len(some))
             if not self._at.keys().isdisjoint(indices):
                 return
-            begun = {row: submission.begun[i].begun for row, i in enumerate(some) if i in submission.begun}
+            begun = {row: self._goes_on(submission, i) for row, i in enumerate(some) if i in submission.begun}
             at = np.array(some)
             success = jax.tree.map(lambda x, at=at: x[at], submission.found.success)
             levels, level_ids = take(submission.levels, at), submission.level_ids[at]
-            self._queue = enter(self._queue, levels, level_ids, success, self.config, begun)
+            self._queue = enter(self._queue, levels, level_ids, success, self.config, self.updates, begun)
             self._at.update({index: (submission, i) for index, i in zip(indices, some, strict=True)})
             self._coming.popleft()
+
+    def _goes_on(self, submission: Submission, i: int) -> tuple[Begun, Pending]:
+        """An expert that has begun, and what comes next for it."""
+        no = np.bool_(False)
+        fresh = Pending(no, no, np.int32(self.updates))
+        return submission.begun[i].begun, submission.paused[i].pending if i in submission.paused else fresh
 
     def _note(self, slot: int, seen: Report, submission: Submission, i: int) -> None:
         """What became of a submission's level in its slot."""

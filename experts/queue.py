@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from functools import partial
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from experts.config import ExpertConfig
-from experts.slots import Begun, LevelQueue, begin
+from experts.slots import Begun, LevelQueue, Pending, begin
 from experts.success import Success, no_success
 from experts.witness import take
 from levelgen.level import Level
@@ -17,7 +18,7 @@ from levelgen.level import Level
 GROUP = 16  # levels that enter at once
 
 
-def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig) -> LevelQueue:
+def empty_queue(levels: Level, capacity: int, config: ExpertConfig) -> LevelQueue:
     """A queue for levels of the size of these, without any: on the host, where zeros take no program each."""
     one = take(levels, np.zeros(1, int))
     begun = jax.eval_shape(partial(begin, config=config), one, jnp.zeros(1, jnp.int32), no_success(1))
@@ -25,8 +26,8 @@ def empty_queue(levels: Level, capacity: int, updates: int, config: ExpertConfig
         jax.tree.map(lambda x: np.zeros((*x.shape[:-1], capacity), x.dtype), one),
         np.zeros(capacity, np.int32),
         np.int32(0),
-        np.int32(updates),
         jax.tree.map(lambda x: np.zeros((capacity, *x.shape[1:]), x.dtype), begun),
+        Pending(np.zeros(capacity, bool), np.zeros(capacity, bool), np.zeros(capacity, np.int32)),
     )
 
 
@@ -42,7 +43,8 @@ def enter(
     level_ids: Int[np.ndarray, " level"],
     success: Success,
     config: ExpertConfig,
-    begun: Mapping[int, Begun],
+    updates: int,
+    begun: Mapping[int, tuple[Begun, Pending]] = MappingProxyType({}),
 ) -> LevelQueue:
     """The queue (used up) with more levels: some, at most GROUP.
 
@@ -52,29 +54,38 @@ def enter(
         level_ids: their ids.
         success: what their experts rehearse from the start, level first.
         config: what an expert is.
+        updates: that an expert may use.
         begun: experts that go on, by index among these levels; they have their own success.
     """
     count = len(level_ids)
     fill = np.minimum(np.arange(GROUP), count - 1)  # a group that is not full has its last level several times
     group, ids = take(levels, fill), level_ids[fill]
-    experts = begin(group, ids, jax.tree.map(lambda x: x[fill], success), config)
+    no = np.zeros(GROUP, bool)
+    fresh = begin(group, ids, jax.tree.map(lambda x: x[fill], success), config)
+    experts = fresh, Pending(no, no, np.full(GROUP, updates, np.int32))
     if begun:
         experts = jax.tree.map(np.array, experts)
         for i, expert in begun.items():
             for rows, row in zip(jax.tree.leaves(experts), jax.tree.leaves(expert), strict=True):
                 rows[i] = row
     nowhere = [queue.capacity] * (GROUP - count)
-    queue = _put(queue, group, ids, experts, np.array(next_indices(queue, count) + nowhere))
+    queue = _put(queue, group, ids, *experts, np.array(next_indices(queue, count) + nowhere))
     return queue._replace(come=np.int32(int(queue.come) + count))
 
 
 @partial(jax.jit, donate_argnames="queue")
 def _put(
-    queue: LevelQueue, levels: Level, level_ids: Int[Array, "16"], experts: Begun, indices: Int[Array, "16"]
+    queue: LevelQueue,
+    levels: Level,
+    level_ids: Int[Array, "16"],
+    experts: Begun,
+    pending: Pending,
+    indices: Int[Array, "16"],
 ) -> LevelQueue:
     put = lambda old, new: old.at[indices].set(new, mode="drop")
     return queue._replace(
         levels=jax.tree.map(lambda old, new: old.at[..., indices].set(new, mode="drop"), queue.levels, levels),
         level_ids=put(queue.level_ids, level_ids),
         begun=jax.tree.map(put, queue.begun, experts),
+        pending=jax.tree.map(put, queue.pending, pending),
     )

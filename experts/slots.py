@@ -48,6 +48,14 @@ class Begun(NamedTuple):
     acting: Acting  # [..., environment]
 
 
+class Pending(NamedTuple):
+    """What comes next for an expert, beside what its course says."""
+
+    due: Bool[Array, ""] | np.bool_  # an evaluation, by what training showed
+    final: Bool[Array, ""] | np.bool_  # one after which the level leaves
+    deadline: Int[Array, ""] | np.int32  # updates after which the last evaluation comes
+
+
 class Trial(NamedTuple):
     """An evaluation: every environment rolls out a record."""
 
@@ -88,8 +96,8 @@ class LevelQueue(NamedTuple):
     levels: Level  # [..., index]
     level_ids: Int[Array, " index"] | Int[np.ndarray, " index"]
     come: Int[Array, ""] | np.int32  # levels that have come, ever
-    updates: Int[Array, ""] | np.int32  # that an expert may use
     begun: Begun  # where their experts go on, index first
+    pending: Pending  # index first
 
     @property
     def capacity(self) -> int:

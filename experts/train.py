@@ -1,6 +1,6 @@
 """From levels to verdicts: they are decided without an expert, or scouted, trained and judged."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -9,11 +9,12 @@ from jaxtyping import Int
 
 from experts.before import decide
 from experts.config import RECORD_STEPS, ExpertConfig, Rule
-from experts.found import Found, Looking
+from experts.found import Found, Looking, joined
 from experts.judge import Kept, Trained, Witness, judge, repeating
 from experts.labels import WITNESSED, Source, Verdict
 from experts.ledger import Ledger, lap
-from experts.pool import NOTHING_BEGUN, Pool, Submission, Totals
+from experts.paused import Paused
+from experts.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Submission, Totals
 from experts.portability import choose
 from experts.rework import rework
 from experts.steps import EnvSteps
@@ -47,6 +48,7 @@ class TrainingRun:
         begun: Mapping[int, Kept] = NOTHING_BEGUN,
         keep: bool = False,
         ledger: Ledger | None = None,
+        paused: Mapping[int, Paused] = NONE_PAUSED,
     ) -> None:
         """
         Args:
@@ -56,6 +58,7 @@ class TrainingRun:
             begun: by level id, experts that go on with what they have left of the budget; the others begin.
             keep: whether the result has the experts.
             ledger: what the levels have cost before.
+            paused: by level id, experts that were under way before with this budget; nobody looks into their levels.
         """
         self.ledger = ledger or Ledger(len(level_ids))
         self.pool, self.level_ids, self._begun, self._keep = pool, level_id_array(level_ids), begun, keep
@@ -63,8 +66,11 @@ class TrainingRun:
             self.levels: Level = jax.tree.map(np.asarray, levels)
             self.before = decide(self.levels, pool.rules)
         self.left = np.array([i for i, verdict in enumerate(self.before.verdicts) if verdict is None], int)
+        self._paused = {i: paused[i] for i in self.level_ids[self.left].tolist() if i in paused}
+        new = ~np.isin(self.level_ids[self.left], list(self._paused))
+        self._order = np.argsort(np.r_[np.flatnonzero(new), np.flatnonzero(~new)])  # of new ones and others, as left
         with self.ledger.timing("search"):
-            self.looking = Looking(*self._some(self.left), pool.procedure, pool.rules)
+            self.looking = Looking(*self._some(self.left[new]), pool.procedure, pool.rules)
         self.submission: Submission | None = None  # of those that an expert is asked for
         self._gone: set[int] = set()  # ids of levels that others label
         self.look()
@@ -80,8 +86,9 @@ class TrainingRun:
     def _submit(self) -> None:
         some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
         levels, level_ids = self._some(some)
-        mine = {i: self._begun[level_id] for i, level_id in enumerate(level_ids.tolist()) if level_id in self._begun}
-        self.submission = self.pool.submit(levels, level_ids, self.looking.found, mine, self._keep)
+        of = lambda known: {i: known[one] for i, one in enumerate(level_ids.tolist()) if one in known}
+        found = joined([self.looking.found, *(one.found for one in self._paused.values())], self._order)
+        self.submission = self.pool.submit(levels, level_ids, found, of(self._begun), self._keep, of(self._paused))
 
     @property
     def searching(self) -> int:
@@ -90,8 +97,19 @@ class TrainingRun:
 
     @property
     def unbegun(self) -> list[int]:
-        """Ids of levels that wait for an expert."""
-        return self.submission.level_ids[self.pool.waiting(self.submission)].tolist() if self.submission else []
+        """Ids of levels that wait for an expert to begin."""
+        waiting = (
+            self.submission.level_ids[self.pool.waiting(self.submission)] if self.submission else self.level_ids[:0]
+        )
+        return [level_id for level_id in waiting.tolist() if level_id not in self._paused]
+
+    def paused(self, in_slots: Iterable[tuple[Submission, int, Paused]]) -> dict[int, Paused]:
+        """Its experts under way, by level id: those among these, which have a slot, and those that wait for one."""
+        undecided = set(self.undecided)
+        waiting = {level_id: of for level_id, of in self._paused.items() if level_id in undecided}
+        return waiting | {
+            int(self.level_ids[self.left[i]]): of for submission, i, of in in_slots if submission is self.submission
+        }
 
     @property
     def undecided(self) -> list[int]:
@@ -117,12 +135,12 @@ class TrainingRun:
 
     def finish(self) -> UnitResult:
         """Choose witnesses and give verdicts, once the submission has finished; of all levels that are not left out."""
-        found, submission = self.looking.found, self.submission
+        submission = self.submission
         assert submission is not None
         with lap() as took:
-            result = self._judged(found, submission)
+            result = self._judged(submission)
         looks = np.zeros(len(self.level_ids), np.int64)
-        looks[self.left] = found.scout_steps + found.search_steps
+        looks[self.left] = submission.found.scout_steps + submission.found.search_steps
         self.ledger.share("search", looks)
         if len(submission.level_ids):
             self.ledger.take(submission.ledger, self.left)
@@ -130,11 +148,12 @@ class TrainingRun:
         ledger.add("replay", took)
         return replace(result, ledger=ledger)
 
-    def _judged(self, found: Found, submission: Submission) -> UnitResult:
+    def _judged(self, submission: Submission) -> UnitResult:
         config, rules = self.pool.config, self.pool.rules
         kept = np.flatnonzero(~np.isin(self.level_ids, list(self._gone)))
         levels, level_ids = self._some(kept)
         before, failed = [self.before.verdicts[i] for i in kept], self.before.failed_by_noop[kept]
+        found = submission.found
         asked = np.flatnonzero(np.isin(self.left, kept))  # of those that came to the submission
         left = np.searchsorted(kept, self.left[asked])
         trained = submission.trained(config) if len(submission.level_ids) else as_found(found)

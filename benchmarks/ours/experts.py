@@ -45,10 +45,9 @@ def main() -> None:
         return [train_batch(of_batch(everyone, batch), updates) for batch in batches]
 
     def of_batch(queue: LevelQueue, batch: np.ndarray) -> LevelQueue:
-        begun, count = jax.tree.map(lambda x: x[batch], queue.begun), np.int32(len(batch))
-        return jax.device_put(
-            LevelQueue(take(queue.levels, batch), queue.level_ids[batch], count, queue.updates, begun)
-        )
+        begun, pending = jax.tree.map(lambda x: x[batch], (queue.begun, queue.pending))
+        some = take(queue.levels, batch), queue.level_ids[batch], np.int32(len(batch))
+        return jax.device_put(LevelQueue(*some, begun, pending))
 
     def train_batch(queue: LevelQueue, updates: int) -> tuple[Training, float]:
         now, goals, ended = empty_slots(slots, queue, config), 0.0, np.zeros(slots)

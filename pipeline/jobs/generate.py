@@ -25,6 +25,7 @@ from pipeline.store.job_note import note_job
 from pipeline.store.layout import quarantine_path
 from pipeline.store.manifest import Manifest, read_manifest
 from pipeline.store.origins import Origin, require_same_levels
+from pipeline.store.paused import prune_paused
 from pipeline.store.remote import as_typed
 from pipeline.store.runs import ascending, runs
 from pipeline.store.split import writing
@@ -58,6 +59,7 @@ def generate(
         require_same_levels(split, origins or {}, done)
         units = plan_units(wanted, done, job.levels_per_unit, origins)
         scheduler = Scheduler(units, len(wanted) - len(done), job.levels_per_unit)
+        prune_paused(split, manifest.level_ids)
         if not repaired:
             note_job(split, job, command, runs(wanted))
         if scheduler.waiting:
@@ -79,6 +81,7 @@ def generate(
                 )
                 raise
             manifest = read_manifest(split, ["label", "env_steps"], compact=True)
+            prune_paused(split, manifest.level_ids)
             spent = _spent(manifest, np.setdiff1d(wanted, done), board.tally.spent) if board.tally.spent.shown else ""
         else:
             print(f"Nothing to do: all {len(wanted)} levels are there.")

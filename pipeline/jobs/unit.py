@@ -38,6 +38,7 @@ from pipeline.store.leases import LeaseLost
 from pipeline.store.locks import LockRefused, committing
 from pipeline.store.manifest import begin_fragment, write_fragment
 from pipeline.store.origins import RECORD, Origin
+from pipeline.store.paused import drop_paused, load_paused
 from pipeline.store.provenance import device, versions
 from pipeline.store.publish import committed_levels
 from pipeline.store.remote import StoreFailure, is_remote
@@ -50,7 +51,7 @@ def pool_for(job: JobConfig) -> Pool:
     return Pool(job.env_steps, job.procedure, job.task)
 
 
-def begin_unit(job: JobConfig, unit: WorkUnit, pool: Pool) -> TrainingRun:
+def begin_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool) -> TrainingRun:
     """Sample or read a unit's levels and submit to the pool those that need an expert.
 
     Raises:
@@ -59,7 +60,8 @@ def begin_unit(job: JobConfig, unit: WorkUnit, pool: Pool) -> TrainingRun:
     ids, ledger = level_id_array(unit.level_ids), Ledger(len(unit.level_ids))
     with ledger.timing("sampling"):
         levels = levels_at(unit.origins) if unit.origins else sample_levels(ids, size_of(job.size), job.distribution)
-    return TrainingRun(pool, levels, ids, experts_for(job, unit.level_ids), job.keep_experts, ledger)
+    experts, paused = experts_for(job, unit.level_ids), load_paused(split, unit.level_ids, job)
+    return TrainingRun(pool, levels, ids, experts, job.keep_experts, ledger, paused)
 
 
 def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -> Summary:
@@ -74,6 +76,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
     with result.ledger.timing("replay"):
         check_witnesses(result, job.task)
     commit(job, split, unit, result)
+    drop_paused(split, unit.name)
     labels = [verdict.label for verdict in result.verdicts]
     return Summary(len(labels), labels.count(Label.SOLVED), result.spent, result.ledger.total())
 

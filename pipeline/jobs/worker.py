@@ -3,6 +3,7 @@
 The same in this process and in a Ray worker. Knows nothing of either.
 """
 
+import contextlib
 import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from experts.train import TrainingRun
 from pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
 from pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
 from pipeline.store.leases import serve
+from pipeline.store.paused import save_paused
 
 
 class Worker:
@@ -22,6 +24,7 @@ class Worker:
         self._job, self._split = job, split
         self._pool = pool_for(job)
         self._runs: dict[WorkUnit, TrainingRun] = {}
+        self._keep_at = time.monotonic() + job.checkpoint_seconds
         self.stopping = False  # set by whoever wants it to leave soon
 
     def work(self, order: Order, seconds: float) -> Round:
@@ -34,6 +37,8 @@ class Worker:
         outcomes = [outcome for unit in order.units if (outcome := self._begin(unit))]
         while self._runs and not outcomes and not self.stopping and time.monotonic() < until:
             outcomes = self._step()
+        if self._job.checkpoint and time.monotonic() >= self._keep_at:
+            self._keep()
         if self.stopping:
             return self.leave(outcomes, cuts)
         now = {unit: run.totals() for unit, run in self._runs.items()}
@@ -43,9 +48,21 @@ class Worker:
 
     def leave(self, outcomes: Sequence[UnitOutcome] = (), cuts: Sequence[Cut] = ()) -> Round:
         """Commit what is decided of the units under way; they are cut for it."""
+        if self._job.checkpoint:
+            self._keep()
         last = [self._cut(unit, run.undecided) for unit, run in list(self._runs.items())]
         ended = [self._finish(unit) for unit in list(self._runs)]
         return Round([*outcomes, *ended], {}, 0, cuts=[*cuts, *last], leaves=True)
+
+    def _keep(self) -> None:
+        """Experts under way, on the disk: who takes up their levels later goes on with them. Tried again, where the
+        disk refuses."""
+        self._keep_at = time.monotonic() + self._job.checkpoint_seconds
+        in_slots = list(self._pool.paused())
+        for unit, run in self._runs.items():
+            if paused := run.paused(in_slots):
+                with contextlib.suppress(OSError):
+                    save_paused(self._split, unit.name, paused, self._job)
 
     def _give(self, levels: int) -> list[Cut]:
         """Give back so many levels that have not begun, if there are, of the latest units first."""
@@ -67,7 +84,7 @@ class Worker:
 
     def _begin(self, unit: WorkUnit) -> UnitOutcome | None:
         try:
-            self._runs[unit] = begin_unit(self._job, unit, self._pool)
+            self._runs[unit] = begin_unit(self._job, self._split, unit, self._pool)
         except Exception as error:
             return failure(self._split, unit, error)
         return None

@@ -14,7 +14,7 @@ from configs.schema import JobConfig
 from experts.config import Rule
 from experts.judge import Kept
 from experts.labels import BY_EXPERT
-from experts.slots import begin
+from experts.slots import Begun, begin
 from experts.success import no_success
 from levelgen.level import size_of
 from levelgen.sampling.scenery import empty_level
@@ -58,16 +58,16 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
         Failure: it is damaged or gone, or of another version of this program.
     """
     require_own(path, COPY)
-    like = _like(job)
+    like = begun_like(job)
     try:
-        _require_plain(path)
+        require_plain(path)
         with np.load(path, allow_pickle=False) as file:  # whole files only: each array has a checksum
             arrays = {name: file[name] for name in file.files}
         level_ids, curves = arrays.pop("level_id"), arrays.pop("curve")
         if (level_ids.dtype, level_ids.ndim, curves.ndim, len(curves)) != (np.int64, 1, 2, len(level_ids)):
             raise ValueError("its level ids or curves are none")
         for name, one in arrays_of(like, "begun/").items():
-            if (arrays[name].shape, arrays[name].dtype) != ((len(level_ids), *one.shape[1:]), one.dtype):
+            if (arrays[name].shape, arrays[name].dtype) != ((len(level_ids), *one.shape), one.dtype):
                 raise ValueError(f"{name} has another shape or type")
     except Exception as error:  # numpy and zipfile raise many kinds
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -83,14 +83,14 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
 
 
 @lru_cache(maxsize=8)
-def _like(job: JobConfig) -> Any:
-    """What is kept of one expert, with zeros in it and a level axis of length 1."""
+def begun_like(job: JobConfig) -> Begun:
+    """An expert of this job, in shapes and types."""
     level = empty_level(size_of(job.size), 1)
     like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), no_success(1), job.expert), level)
-    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
+    return jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), like)
 
 
-def _require_plain(path: Path) -> None:
+def require_plain(path: Path) -> None:
     """Raises ValueError where a file is no archive as `save_experts` writes it: not packed, no larger than it is."""
     if not path.is_file():
         raise ValueError("it is no file" if path.exists() else "it is not there")

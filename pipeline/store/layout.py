@@ -11,7 +11,8 @@ from typing import NamedTuple
 from pipeline.errors import Failure
 from pipeline.store.remote import BUCKETS, fragments_in, is_remote, names_in
 
-FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE = "manifest", "shards", "experts", "quarantine"
+MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS = "manifest", "shards", "experts", "quarantine", "checkpoints"
+FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS
 WRITER_LOCK, COMMIT_LOCK, JOB = ".writer.lock", ".commit.lock", "job.json"
 EVENTS = "events"  # of runs; nothing else reads them
 DIGITS = 12  # of a level id in file names, so that names sort as ids do
@@ -21,6 +22,7 @@ ATTEMPT = rf"{UNIT}-[0-9a-f]{{8}}"
 FRAGMENT = re.compile(rf"{MANIFEST}/{UNIT}\.parquet")
 BEGUN = re.compile(rf"{MANIFEST}/\.{ATTEMPT}\.begun")
 DATA = re.compile(rf"{SHARDS}/{ATTEMPT}\.zarr|{EXPERTS}/{ATTEMPT}\.npz")
+CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.npz")  # of experts under way
 JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # by the process of this number
 
 
@@ -96,9 +98,13 @@ def begun_path(data: Path) -> Path:
     return data.parent.parent / MANIFEST / f".{attempt_of(data)}.begun"
 
 
-def ids_of(fragment: Path) -> tuple[int, int]:
-    """The lowest and the highest level id in a fragment, by its name."""
-    first, last = fragment.stem.split("-")
+def checkpoint_path(split: Path, unit: str) -> Path:
+    return split / CHECKPOINTS / f"{unit}.npz"
+
+
+def ids_of(path: Path) -> tuple[int, int]:
+    """The lowest and the highest level id in a fragment, or in a checkpoint of experts under way, by its name."""
+    first, last = path.stem.split("-")
     return int(first), int(last)
 
 

@@ -92,6 +92,28 @@ def test_levels_that_wait_are_taken_out_and_change_no_other(levels: Level, alone
     same([trained[i] for i in range(36)], alone)
 
 
+def test_an_expert_that_is_paused_at_any_moment_goes_on_to_the_same(levels: Level, alone: list[Trained]) -> None:
+    """In a slot of another pool, from a training step or an evaluation, and from the middle of one."""
+    pool, evaluated = new_pool(), 0
+    submission = pool.submit(*part(levels, range(4)))
+    while True:
+        now = {i: of for _, i, of in pool.paused()}
+        evaluated += sum(bool(of.pending.due or of.pending.final) for of in now.values())
+        if evaluated > 1:
+            break
+        pool.step()
+    steps = sum(len(of.expert.curve) for of in now.values())
+    assert steps, "one has begun"
+    other, at = new_pool(), np.array(sorted(now))
+    paused = {row: now[i] for row, i in enumerate(at)}
+    later = other.submit(take(levels, at), IDS[at], paused=paused)
+    finished(other, later)
+    same(later.trained(CONFIG), [alone[i] for i in at])
+    assert later.trained_rollouts == sum(len(alone[i].curve) for i in at) - steps
+    finished(pool, submission)
+    same(submission.trained(CONFIG), alone[:4])
+
+
 def test_totals_grow_to_the_whole(levels: Level) -> None:
     pool = new_pool()
     submission, seen = pool.submit(*part(levels, range(5))), []

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from configs.schema import JobConfig
@@ -17,6 +18,7 @@ from pipeline.jobs.schedule import Order, Round, UnitOutcome, WorkUnit
 from pipeline.jobs.worker import Worker
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import read_manifest
+from pipeline.store.paused import load_paused, prune_paused
 from pipeline.store.shard import Shard
 from tests.pipeline.made import lasting, made_job
 
@@ -133,6 +135,36 @@ def test_levels_given_back_and_levels_left_undecided_are_made_by_another_to_the_
     assert read_manifest(tmp_path / "cut").level_ids.tolist() == list(done.level_ids if done else ())
     outcomes(other, [part for part in (back, rest) if part])
     assert repr(lasting(tmp_path / "alone")) == repr(lasting(tmp_path / "cut"))
+
+
+def test_experts_that_are_kept_go_on_where_they_were(tmp_path: Path, job: JobConfig) -> None:
+    job = replace(job, scout=ScoutConfig(0), search=SearchConfig(env_steps=0), checkpoint="1h")
+    unit = WorkUnit(range(8))
+    for name in ("alone", "kept"):
+        (tmp_path / name).mkdir()
+    (alone,) = outcomes(Worker(job, tmp_path / "alone"), [unit]).values()
+    worker = Worker(job, tmp_path / "kept")
+    round = worker.work(Order([unit]), 0.0)
+    while not round.totals[unit][0]:
+        round = worker.work(Order([]), 0.0)
+    worker.stopping = True
+    round = worker.work(Order([]), 60.0)
+    (path,) = (tmp_path / "kept/checkpoints").iterdir()
+    kept = load_paused(tmp_path / "kept", unit.level_ids, job)
+    steps = sum(int(of.expert.begun.training.progress.env_steps) for of in kept.values())
+    assert steps
+    assert load_paused(tmp_path / "kept", unit.level_ids, replace(job, budget="8k")) == {}
+    rest = round.cuts[-1].back
+    assert rest
+    (later,) = outcomes(Worker(job, tmp_path / "kept"), [rest]).values()
+    one, two = ([row | {"row": 0} for row in lasting(tmp_path / name)] for name in ("alone", "kept"))
+    assert repr(one) == repr(two)
+    assert alone.summary
+    assert later.summary
+    decided = sum(row["env_steps"] for row in two if row["level_id"] not in rest.level_ids)
+    assert later.summary.spent.trained == alone.summary.spent.trained - decided - steps
+    prune_paused(tmp_path / "kept", np.arange(8))
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("phase", ["begin_unit", "finish_unit"])

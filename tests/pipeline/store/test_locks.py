@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from pipeline.errors import Exit, UserError
-from pipeline.jobs.schedule import UnitOutcome, WorkUnit
+from pipeline.jobs.schedule import Order, UnitOutcome, WorkUnit
 from pipeline.jobs.worker import Worker
 from pipeline.store import locks
 from pipeline.store.layout import COMMIT_LOCK
@@ -101,7 +101,7 @@ def test_a_worker_whose_file_system_has_no_locks_stops_the_run(tmp_path: Path, m
 
     monkeypatch.setattr("pipeline.jobs.worker.begin_unit", refuse)
     unit = WorkUnit((0,))
-    (ended,) = Worker(made_job(), tmp_path).work([unit], 1.0).outcomes
+    (ended,) = Worker(made_job(), tmp_path).work(Order([unit]), 1.0).outcomes
     assert ended == UnitOutcome(unit, reason=ended.reason, fatal="no locks here")
 
 

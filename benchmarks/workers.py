@@ -1,0 +1,163 @@
+"""How much faster two workers are than one, on two cores; and what the driver needs for a thousand of them.
+
+The first is the same job with `workers=1` and `workers=2`, in turns, from when its first worker has begun until
+everything is committed: the start of Ray and of Python is not in it, loading compiled programs and the end, when one
+worker has nothing left, are. The second is the scheduler alone, with workers that are simulated: as many seconds of
+its own, and bytes, as it takes to hand out all units and hear all reports.
+"""
+
+import argparse
+import heapq
+import multiprocessing
+import tempfile
+import time
+import tracemalloc
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from benchmarks.report import Report, Table
+from configs.compose import compose_job
+from pipeline.errors import Failure
+from pipeline.jobs.progress import Board, Tally
+from pipeline.jobs.schedule import ROUND, Round, Scheduler, UnitOutcome, plan_units
+from pipeline.store.split import writing
+
+UNIT = 32  # levels
+WORKERS, UNITS = 1_000, (2_000, 20_000, 200_000)  # simulated
+SECONDS = 6.0  # that a simulated unit takes, on average; of each worker a rate of its own, so that some are slow
+POLL = 0.25  # s
+SPREAD = 0.5  # of the logarithm of those rates
+
+
+class Timed(Scheduler):
+    """Knows when the first worker began."""
+
+    began = 0.0
+
+    def join(self, worker: Any, now: float) -> None:
+        self.began = self.began or time.monotonic()
+        super().join(worker, now)
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", default="s", help="default: s")
+    parser.add_argument("--budget", default="64k", help="default: 64k")
+    parser.add_argument("--levels", type=int, default=1024, help="of the job; default: 1024")
+    parser.add_argument("--repeats", type=int, default=2, help="pairs of runs; default: 2, 0: the scheduler alone")
+
+
+def run(given: argparse.Namespace) -> Report:
+    simulated = [simulate(units) for units in UNITS]
+    words = [f"size={given.size}", f"budget={given.budget}", f"levels={given.levels}", "first_level=1000000"]
+    pairs = [tuple(given.levels / seconds_of(words, workers) for workers in (1, 2)) for _ in range(given.repeats)]
+    ratios = [two / one for one, two in pairs]
+    results = [{"workers": WORKERS, **of} for of in simulated]
+    results += [{"size": given.size, "budget": given.budget, "one": one, "two": two} for one, two in pairs]
+    rows = [[f"{one:.2f}", f"{two:.2f}", f"{two / one:.2f}"] for one, two in pairs]
+    of_driver = [
+        [
+            f"{of['units']:,}",
+            f"{1e6 * of['seconds'] / of['units']:.0f}",
+            f"{of['share']:.1%}",
+            f"{of['bytes'] / 1e6:.1f}",
+        ]
+        for of in simulated
+    ]
+    return Report(
+        title="One worker, two workers, a thousand",
+        results=results,
+        tables=[
+            Table(("levels/s, one worker", "two workers", "ratio"), rows, f"A job of {given.levels} levels of size "
+                  f"{given.size}, {given.budget} env steps each, on two cores"),
+            Table(
+                ("units", "µs of the driver a unit", "of one core, while they work", "most MB"),
+                of_driver,
+                f"The scheduler with {WORKERS:,} simulated workers, units of {UNIT} levels and {SECONDS:.0f} s",
+            ),
+        ],
+        notes=[f"Two workers are {np.median(ratios):.2f} times as fast as one (the median)."] if ratios else [],
+    )  # fmt: skip
+
+
+def seconds_of(words: Sequence[str], workers: int) -> float:
+    """Of a job with so many workers, in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    told = context.SimpleQueue()
+    with tempfile.TemporaryDirectory() as out:
+        process = context.Process(target=work, args=([*words, f"workers={workers}", f"out={out}"], told))
+        process.start()
+        process.join()
+        if process.exitcode:
+            raise Failure(f"A job with workers={workers} failed: see above.")
+    return told.get()
+
+
+def work(words: Sequence[str], told: Any) -> None:
+    """The job, as `levelproof generate` does it."""
+    from pipeline.jobs import cluster
+
+    job = compose_job(words)
+    count = len(job.level_ids)
+    with writing(job, print) as (split, _), Path("/dev/null").open("w") as nowhere:
+        scheduler = Timed(plan_units(job.level_ids, [], job.levels_per_unit), count, job.levels_per_unit)
+        board = Board(Tally(count, 0, 0), Console(file=nowhere))
+
+        def settle(outcomes: Sequence[UnitOutcome]) -> None:
+            for outcome in outcomes:
+                board.ended(outcome.unit, outcome.summary)
+                if not outcome.summary:
+                    raise Failure(outcome.reason)
+
+        cluster.run(job, split, scheduler, settle, board)
+        told.put(time.monotonic() - scheduler.began)
+
+
+def simulate(units: int) -> dict[str, float]:
+    """What the scheduler takes for so many units of WORKERS workers, one of which dies for every thousand units."""
+    seconds, simulated = schedule(units)
+    tracemalloc.start()  # by itself: it slows everything down
+    schedule(units)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return {"units": units, "seconds": seconds, "bytes": most, "share": seconds / simulated}
+
+
+def schedule(units: int) -> tuple[float, float]:
+    """Seconds of the scheduler, and seconds that pass for the workers."""
+    rng, levels = np.random.default_rng(0), units * UNIT
+    rates = np.exp(rng.normal(0, SPREAD, WORKERS)) * UNIT / SECONDS  # levels/s
+    scheduler = Scheduler(plan_units(range(levels), [], UNIT), levels, UNIT)
+    done, worked, now, share_at = np.zeros(WORKERS), 0.0, 0.0, 0.0  # levels since its last unit ended
+    events = [(float(of), worker) for worker, of in enumerate(rng.random(WORKERS))]
+    heapq.heapify(events)
+    for _, worker in events:
+        scheduler.join(worker, 0.0)
+    while not scheduler.over:
+        now, worker = heapq.heappop(events)
+        done[worker] += rates[worker] * ROUND
+        start = time.process_time()
+        ended, running = [], dict(scheduler.workers[worker].units)
+        for unit in running:
+            if len(unit.level_ids) > done[worker]:
+                break
+            done[worker] -= len(unit.level_ids)
+            ended.append(UnitOutcome(unit))
+        if rng.random() < ROUND / SECONDS / 1000:
+            for outcome in scheduler.lost(worker, "died"):
+                scheduler.failed(outcome.unit)
+            scheduler.join(worker, now)
+        else:
+            scheduler.report(worker, Round(ended, {}, wants=UNIT // 4 if len(running) - len(ended) < 2 else 0), now)
+        if now >= share_at:  # as the driver, which looks several times a second
+            share_at = now + POLL
+            scheduler.share()
+        scheduler.order(worker, now)
+        worked += time.process_time() - start
+        if not scheduler.workers[worker].units:
+            done[worker] = 0.0
+        heapq.heappush(events, (now + ROUND, worker))
+    return worked, now

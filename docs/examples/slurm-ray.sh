@@ -1,0 +1,26 @@
+#!/bin/bash
+# Ray in one allocation of several machines, and one job on all of them: sbatch docs/examples/slurm-ray.sh
+#SBATCH --job-name=levelproof
+#SBATCH --nodes=4
+#SBATCH --ntasks-per-node=1
+#SBATCH --cpus-per-task=32
+#SBATCH --mem-per-cpu=2G
+#SBATCH --time=04:00:00
+#SBATCH --signal=B:TERM@60
+#SBATCH --requeue
+#SBATCH --open-mode=append
+set -u
+mapfile -t hosts < <(scontrol show hostnames "$SLURM_JOB_NODELIST")
+head=${hosts[0]}
+export RAY_ADDRESS=$head:6379 OMP_NUM_THREADS=1
+
+start() { srun --nodes=1 --ntasks=1 --overlap --nodelist="$1" ray start --block --num-cpus="$SLURM_CPUS_PER_TASK" "${@:2}" & }
+start "$head" --head --port=6379
+until ray status > /dev/null 2>&1; do sleep 1; done
+for host in "${hosts[@]:1}"; do start "$host" --address="$RAY_ADDRESS"; done
+
+# Only the command hears of the end (B: above), while its workers still live to commit what is decided
+levelproof generate size=s levels=6M budget=256k checkpoint=10min out=data &
+job=$!
+trap 'kill -TERM "$job"; wait "$job"; scontrol requeue "$SLURM_JOB_ID"; exit 0' TERM
+wait "$job"

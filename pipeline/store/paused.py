@@ -1,0 +1,145 @@
+"""Experts under way on the disk, so that who takes up their levels goes on where they were: an archive a unit.
+
+Whatever is wrong with one costs its experts' training, and nothing else.
+"""
+
+import json
+import os
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from configs.schema import JobConfig
+from experts.config import RECORD_STEPS
+from experts.found import nothing_found
+from experts.judge import Evaluation, Kept
+from experts.labels import Source
+from experts.paused import Paused
+from experts.slots import Pending
+from pipeline.store.checkpoints import begun_like, require_plain
+from pipeline.store.disk import flush, flush_entry
+from pipeline.store.fields import arrays_of
+from pipeline.store.layout import CHECKPOINT, CHECKPOINTS, checkpoint_path, entries, ids_of
+from pipeline.store.provenance import versions
+
+STAMP = "stamp"  # its array: configuration and versions, under which alone the bits are the same
+
+
+def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobConfig) -> None:
+    """Keep these experts of a unit, by level id, in place of those kept before; durably and in one step.
+
+    Raises:
+        OSError: the disk refuses; those kept before stay.
+    """
+    rows = [paused[level_id] for level_id in sorted(paused)]
+    stacked = jax.tree.map(lambda *xs: np.stack(xs), *map(_arrays, rows))
+    curves = np.full((len(rows), max(len(row.expert.curve) for row in rows)), np.nan, np.float32)
+    for i, row in enumerate(rows):
+        curves[i, : len(row.expert.curve)] = row.expert.curve
+    arrays = arrays_of(stacked, "paused/") | {STAMP: _stamp(job), "level_id": np.array(sorted(paused)), "curve": curves}
+    arrays["source"] = np.array([row.found.source[0] for row in rows])
+    if evaluations := [(i, of) for i, row in enumerate(rows) for of in row.evaluations]:
+        arrays["evaluated"] = np.array([i for i, _ in evaluations])
+        arrays |= arrays_of(jax.tree.map(lambda *xs: np.stack(xs), *(of for _, of in evaluations)), "evaluation/")
+    path = checkpoint_path(split, unit)
+    begun = path.with_name(f".{path.name}.{os.getpid()}.npz")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(begun, allow_pickle=False, **arrays)
+    flush(begun)
+    begun.replace(path)
+    flush_entry(path.parent)
+
+
+def load_paused(split: Path, level_ids: Collection[int], job: JobConfig) -> dict[int, Paused]:
+    """Experts that are kept of these levels, each as far as it came."""
+    wanted, found = set(level_ids), dict[int, Paused]()
+    for path in _paths(split):
+        first, last = ids_of(path)
+        if not any(first <= level_id <= last for level_id in wanted):
+            continue
+        for level_id, of in _load(path, job).items():
+            if level_id in wanted and (level_id not in found or _updates(of) > _updates(found[level_id])):
+                found[level_id] = of
+    return found
+
+
+def drop_paused(split: Path, unit: str) -> None:
+    """The unit is committed, and its experts are no longer under way."""
+    checkpoint_path(split, unit).unlink(missing_ok=True)
+
+
+def prune_paused(split: Path, done: np.ndarray) -> None:
+    """Remove what no level needs any more: all of its levels are done, or nobody can read which they are. While nobody
+    works."""
+    for path in (split / CHECKPOINTS).glob(".*.npz"):
+        path.unlink()
+    for path in _paths(split):
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                needed = not np.isin(file["level_id"], done).all()
+        except Exception:  # numpy and zipfile raise many kinds
+            needed = False
+        if not needed:
+            path.unlink(missing_ok=True)
+
+
+def _paths(split: Path) -> Iterable[Path]:
+    return sorted(entries(split, CHECKPOINTS, CHECKPOINT, os.DirEntry.is_file))
+
+
+def _updates(paused: Paused) -> int:
+    return int(paused.expert.begun.training.course.updates)
+
+
+def _arrays(paused: Paused) -> Any:
+    """What of it has the same shape for every expert."""
+    expert, pending, rollouts, _, found = paused
+    return expert.begun, pending, np.int64(rollouts), found._replace(source=())
+
+
+def _stamp(job: JobConfig) -> np.ndarray:
+    return np.array(json.dumps([job.hash, versions()], sort_keys=True))
+
+
+def _load(path: Path, job: JobConfig) -> dict[int, Paused]:
+    """All experts of an archive that is of this job and this program; of any other one, none."""
+    try:
+        require_plain(path)
+        with np.load(path, allow_pickle=False) as file:
+            if str(file[STAMP]) != str(_stamp(job)):
+                return {}
+            return dict(_experts({name: file[name] for name in file.files}, job))
+    except Exception:  # numpy and zipfile raise many kinds
+        return {}
+
+
+def _experts(arrays: dict[str, np.ndarray], job: JobConfig) -> Iterator[tuple[int, Paused]]:
+    """Raises ValueError or KeyError where arrays are none of such experts."""
+    level_ids, of = arrays["level_id"], arrays.get("evaluated", np.zeros(0, int))
+    begun = begun_like(job)
+    like = begun, Pending(np.bool_(0), np.bool_(0), np.int32(0)), np.int64(0), nothing_found(1)._replace(source=())
+    environments, attempts = job.expert.environments, job.expert.attempts
+    flags = np.zeros((RECORD_STEPS, environments), bool)
+    action = np.zeros((RECORD_STEPS, begun.training.recent.shape[1], attempts), np.int32)
+    shown = Evaluation(action, flags, flags, begun.training.progress, begun.training.success)
+    rows = _unstacked(arrays, "paused/", like, len(level_ids))
+    evaluations = _unstacked(arrays, "evaluation/", shown, len(of)) if len(of) else []
+    for i, (level_id, row) in enumerate(zip(level_ids.tolist(), rows, strict=True)):
+        begun, pending, rollouts, found = row
+        curve = arrays["curve"][i, : int(begun.training.course.updates)].tolist()
+        mine = [evaluations[j] for j in np.flatnonzero(of == i)]
+        source = [Source(str(arrays["source"][i]))]
+        yield level_id, Paused(Kept(begun, curve), pending, int(rollouts), mine, found._replace(source=source))
+
+
+def _unstacked(arrays: Mapping[str, np.ndarray], path: str, like: Any, count: int) -> list[Any]:
+    """So many trees such as `like`, out of their stacked arrays."""
+    leaves = []
+    for name, one in arrays_of(like, path).items():
+        if (arrays[name].shape, arrays[name].dtype) != ((count, *one.shape), one.dtype):
+            raise ValueError(f"{name} has another shape or type")
+        leaves.append(arrays[name])
+    return [jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves]) for i in range(count)]

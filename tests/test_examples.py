@@ -1,0 +1,106 @@
+"""The scripts of docs/examples: their commands are accepted, and they do what they are for, with stand-ins for what
+only a cluster has."""
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from configs.compose import compose_job
+
+FOLDER = Path(__file__).parent.parent / "docs" / "examples"
+SCRIPTS = sorted(FOLDER.glob("*.sh"))
+VALUES = {"$size": "s"}
+
+
+def commands(path: Path) -> list[list[str]]:
+    """The words of every command `levelproof generate`."""
+    lines = re.findall(r"levelproof generate (.*?)(?: &)?$", path.read_text(), re.MULTILINE)
+    return [[re.sub(r"\$\w+", lambda name: VALUES[name[0]], word) for word in shlex.split(line)] for line in lines]
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.iterdir()), ids=lambda path: path.name)
+def test_a_job_s_settings_are_settings(path: Path) -> None:
+    assert commands(path)
+    for words in commands(path):
+        assert compose_job(words).checkpoint_seconds == 600
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
+def test_a_script_is_one(path: Path) -> None:
+    subprocess.run(["bash", "-n", str(path)], check=True)
+
+
+def test_kubernetes_gets_a_job_of_ray() -> None:
+    job = yaml.safe_load((FOLDER / "kubernetes.yaml").read_text())
+    assert (job["apiVersion"], job["kind"]) == ("ray.io/v1", "RayJob")
+    cluster = job["spec"]["rayClusterSpec"]
+    pods = [cluster["headGroupSpec"], *cluster["workerGroupSpecs"]]
+    for pod in (group["template"]["spec"] for group in pods):
+        (container,) = pod["containers"]
+        names = {volume["name"] for volume in pod["volumes"]}
+        assert {mount["name"] for mount in container["volumeMounts"]} == names
+        assert [mount["mountPath"] for mount in container["volumeMounts"]] == ["/data"]
+    assert "out=/data" in job["spec"]["entrypoint"]
+
+
+@pytest.fixture
+def stand_ins(tmp_path: Path) -> dict[str, str]:
+    """An environment where every program that runs says so, and `levelproof` ends as `codes` tells, or on SIGTERM."""
+    program = '#!/bin/bash\necho "${0##*/} $*" >> log\n'
+    ends = (
+        "trap 'echo stopped >> log; exit 130' TERM\n"
+        "read -r code < codes; sed -i 1d codes\n"
+        '[ "$code" = wait ] && { touch waits; while :; do sleep 0.1; done; }\nexit "$code"\n'
+    )
+    for name, does in {
+        "levelproof": ends,
+        "srun": "",
+        "ray": "",
+        "scontrol": '[ "$1" = show ] && echo a b | xargs -n1',
+    }.items():
+        (tmp_path / name).write_text(program + does)
+        (tmp_path / name).chmod(0o755)
+    slurm = {"SLURM_JOB_NODELIST": "a,b", "SLURM_CPUS_PER_TASK": "2", "SLURM_JOB_ID": "7"}
+    array = {"SLURM_ARRAY_TASK_ID": "1", "SLURM_ARRAY_JOB_ID": "7"}
+    return os.environ | slurm | array | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PAUSE": "0"}
+
+
+def log(folder: Path) -> list[str]:
+    return (folder / "log").read_text().splitlines()
+
+
+def test_a_spot_machine_runs_the_same_command_until_it_is_done(tmp_path: Path, stand_ins: dict[str, str]) -> None:
+    (tmp_path / "codes").write_text("137\n130\n0\n")
+    done = subprocess.run(["bash", str(FOLDER / "spot.sh")], cwd=tmp_path, env=stand_ins, timeout=60)
+    assert done.returncode == 0
+    first, second, third = log(tmp_path)
+    assert first == second == third
+    (tmp_path / "codes").write_text("2\n")
+    assert subprocess.run(["bash", str(FOLDER / "spot.sh")], cwd=tmp_path, env=stand_ins, timeout=60).returncode == 2
+
+
+@pytest.mark.parametrize(("name", "again"), [("slurm-array", "requeue 7_1"), ("slurm-ray", "requeue 7"), ("spot", "")])
+def test_the_end_of_an_allocation_stops_the_command_and_queues_it_again(
+    tmp_path: Path, stand_ins: dict[str, str], name: str, again: str
+) -> None:
+    (tmp_path / "codes").write_text("wait\n")
+    process = subprocess.Popen(["bash", str(FOLDER / f"{name}.sh")], cwd=tmp_path, env=stand_ins)
+    end = time.monotonic() + 60
+    while not (tmp_path / "waits").exists():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=60) == (0 if again else 130)
+    assert "stopped" in log(tmp_path)
+    assert not again or log(tmp_path)[-1] == f"scontrol {again}"
+    if name == "slurm-ray":
+        started = [line for line in log(tmp_path) if "ray start" in line]
+        assert any("--nodelist=a" in line and "--head --port=6379" in line for line in started)
+        assert any("--nodelist=b" in line and "--address=a:6379" in line for line in started)
