@@ -60,8 +60,8 @@ def begin_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool) -> Train
     ids, ledger = level_id_array(unit.level_ids), Ledger(len(unit.level_ids))
     with ledger.timing("sampling"):
         levels = levels_at(unit.origins) if unit.origins else sample_levels(ids, size_of(job.size), job.distribution)
-    experts, paused = experts_for(job, unit.level_ids), load_paused(split, unit.level_ids, job)
-    return TrainingRun(pool, levels, ids, experts, job.keep_experts, ledger, paused)
+    paused = load_paused(split, unit.level_ids, job) if job.checkpoint else {}
+    return TrainingRun(pool, levels, ids, experts_for(job, unit.level_ids), job.keep_experts, ledger, paused)
 
 
 def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -> Summary:
@@ -76,7 +76,8 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
     with result.ledger.timing("replay"):
         check_witnesses(result, job.task)
     commit(job, split, unit, result)
-    drop_paused(split, unit.name)
+    if job.checkpoint:
+        drop_paused(split, unit.name)
     labels = [verdict.label for verdict in result.verdicts]
     return Summary(len(labels), labels.count(Label.SOLVED), result.spent, result.ledger.total())
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from configs.schema import JobConfig
 from experts.train import TrainingRun
+from pipeline.errors import LevelproofError
 from pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
 from pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
 from pipeline.store.leases import serve
@@ -55,13 +56,13 @@ class Worker:
         return Round([*outcomes, *ended], {}, 0, cuts=[*cuts, *last], leaves=True)
 
     def _keep(self) -> None:
-        """Experts under way, on the disk: who takes up their levels later goes on with them. Tried again, where the
-        disk refuses."""
+        """Experts under way, beside the split: who takes up their levels later goes on with them. What refuses is tried
+        again later."""
         self._keep_at = time.monotonic() + self._job.checkpoint_seconds
         in_slots = list(self._pool.paused())
         for unit, run in self._runs.items():
             if paused := run.paused(in_slots):
-                with contextlib.suppress(OSError):
+                with contextlib.suppress(OSError, LevelproofError):
                     save_paused(self._split, unit.name, paused, self._job)
 
     def _give(self, levels: int) -> list[Cut]:

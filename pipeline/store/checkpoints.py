@@ -4,7 +4,7 @@ import socket
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import IO
 from zipfile import ZIP_STORED, ZipFile
 
 import jax
@@ -60,7 +60,9 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
     require_own(path, COPY)
     like = begun_like(job)
     try:
-        require_plain(path)
+        if not path.is_file():
+            raise ValueError("it is no file" if path.exists() else "it is not there")
+        require_plain(path, path.stat().st_size)
         with np.load(path, allow_pickle=False) as file:  # whole files only: each array has a checksum
             arrays = {name: file[name] for name in file.files}
         level_ids, curves = arrays.pop("level_id"), arrays.pop("curve")
@@ -90,13 +92,11 @@ def begun_like(job: JobConfig) -> Begun:
     return jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), like)
 
 
-def require_plain(path: Path) -> None:
-    """Raises ValueError where a file is no archive as `save_experts` writes it: not packed, no larger than it is."""
-    if not path.is_file():
-        raise ValueError("it is no file" if path.exists() else "it is not there")
-    with ZipFile(path) as archive:
+def require_plain(file: Path | IO[bytes], size: int) -> None:
+    """Raises ValueError where an archive of so many bytes is none of ours: they are not packed, no larger than that."""
+    with ZipFile(file) as archive:
         parts = archive.infolist()
-    if any(part.compress_type != ZIP_STORED for part in parts) or sum(p.file_size for p in parts) > path.stat().st_size:
+    if any(part.compress_type != ZIP_STORED for part in parts) or sum(part.file_size for part in parts) > size:
         raise ValueError("it is packed, and experts are not")
 
 

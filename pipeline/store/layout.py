@@ -23,6 +23,7 @@ FRAGMENT = re.compile(rf"{MANIFEST}/{UNIT}\.parquet")
 BEGUN = re.compile(rf"{MANIFEST}/\.{ATTEMPT}\.begun")
 DATA = re.compile(rf"{SHARDS}/{ATTEMPT}\.zarr|{EXPERTS}/{ATTEMPT}\.npz")
 CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.npz")  # of experts under way
+CHECKPOINT_BEGUN = re.compile(rf"{CHECKPOINTS}/\.{UNIT}\.npz\.[0-9]+")
 JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # by the process of this number
 
 

@@ -3,6 +3,7 @@
 Whatever is wrong with one costs its experts' training, and nothing else.
 """
 
+import io
 import json
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -19,20 +20,22 @@ from experts.judge import Evaluation, Kept
 from experts.labels import Source
 from experts.paused import Paused
 from experts.slots import Pending
+from pipeline.store import objects
 from pipeline.store.checkpoints import begun_like, require_plain
-from pipeline.store.disk import flush, flush_entry
 from pipeline.store.fields import arrays_of
-from pipeline.store.layout import CHECKPOINT, CHECKPOINTS, checkpoint_path, entries, ids_of
+from pipeline.store.files import remove, write
+from pipeline.store.layout import CHECKPOINT, CHECKPOINT_BEGUN, CHECKPOINTS, checkpoint_path, entries, ids_of
 from pipeline.store.provenance import versions
+from pipeline.store.remote import is_remote
 
 STAMP = "stamp"  # its array: configuration and versions, under which alone the bits are the same
 
 
 def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobConfig) -> None:
-    """Keep these experts of a unit, by level id, in place of those kept before; durably and in one step.
+    """Keep these experts of a unit, by level id, in place of those kept before; in one step.
 
     Raises:
-        OSError: the disk refuses; those kept before stay.
+        OSError, UserError, StoreFailure: the disk or the store refuses; those kept before stay.
     """
     rows = [paused[level_id] for level_id in sorted(paused)]
     stacked = jax.tree.map(lambda *xs: np.stack(xs), *map(_arrays, rows))
@@ -44,13 +47,11 @@ def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobCo
     if evaluations := [(i, of) for i, row in enumerate(rows) for of in row.evaluations]:
         arrays["evaluated"] = np.array([i for i, _ in evaluations])
         arrays |= arrays_of(jax.tree.map(lambda *xs: np.stack(xs), *(of for _, of in evaluations)), "evaluation/")
-    path = checkpoint_path(split, unit)
-    begun = path.with_name(f".{path.name}.{os.getpid()}.npz")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(begun, allow_pickle=False, **arrays)
-    flush(begun)
-    begun.replace(path)
-    flush_entry(path.parent)
+    file, path = io.BytesIO(), checkpoint_path(split, unit)
+    np.savez(file, allow_pickle=False, **arrays)
+    if not is_remote(split):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write(path, file.getvalue())
 
 
 def load_paused(split: Path, level_ids: Collection[int], job: JobConfig) -> dict[int, Paused]:
@@ -68,22 +69,21 @@ def load_paused(split: Path, level_ids: Collection[int], job: JobConfig) -> dict
 
 def drop_paused(split: Path, unit: str) -> None:
     """The unit is committed, and its experts are no longer under way."""
-    checkpoint_path(split, unit).unlink(missing_ok=True)
+    remove(checkpoint_path(split, unit))
 
 
 def prune_paused(split: Path, done: np.ndarray) -> None:
     """Remove what no level needs any more: all of its levels are done, or nobody can read which they are. While nobody
     works."""
-    for path in (split / CHECKPOINTS).glob(".*.npz"):
-        path.unlink()
+    for path in entries(split, CHECKPOINTS, CHECKPOINT_BEGUN, os.DirEntry.is_file):
+        remove(path)
     for path in _paths(split):
         try:
-            with np.load(path, allow_pickle=False) as file:
-                needed = not np.isin(file["level_id"], done).all()
+            needed = not np.isin(_read(path)["level_id"], done).all()
         except Exception:  # numpy and zipfile raise many kinds
             needed = False
         if not needed:
-            path.unlink(missing_ok=True)
+            remove(path)
 
 
 def _paths(split: Path) -> Iterable[Path]:
@@ -107,13 +107,20 @@ def _stamp(job: JobConfig) -> np.ndarray:
 def _load(path: Path, job: JobConfig) -> dict[int, Paused]:
     """All experts of an archive that is of this job and this program; of any other one, none."""
     try:
-        require_plain(path)
-        with np.load(path, allow_pickle=False) as file:
-            if str(file[STAMP]) != str(_stamp(job)):
-                return {}
-            return dict(_experts({name: file[name] for name in file.files}, job))
+        arrays = _read(path)
+        return dict(_experts(arrays, job)) if str(arrays[STAMP]) == str(_stamp(job)) else {}
     except Exception:  # numpy and zipfile raise many kinds
         return {}
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """Raises ValueError and others where it is no archive as `save_paused` writes it."""
+    if not is_remote(path):
+        require_own(path, COPY)
+    file = io.BytesIO(objects.get(path).data if is_remote(path) else path.read_bytes())
+    require_plain(file, len(file.getvalue()))
+    with np.load(file, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
 
 
 def _experts(arrays: dict[str, np.ndarray], job: JobConfig) -> Iterator[tuple[int, Paused]]:

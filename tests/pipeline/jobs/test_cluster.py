@@ -1,5 +1,7 @@
 """Workers that die and clusters that shrink, on real Ray: everything that can be done is done."""
 
+import os
+import signal
 import socket
 import subprocess
 from pathlib import Path
@@ -15,7 +17,7 @@ from pipeline.jobs.schedule import COMPANY, Scheduler
 from pipeline.store.layout import JOB
 from pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import PATIENCE, assert_refused, descendants, run, start, title, until
-from tests.pipeline.made import made_job
+from tests.pipeline.made import lasting, made_job
 
 LEVELS, DEADLY = 8, 2
 SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k")
@@ -153,6 +155,46 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
         assert own.returncode == 0, own.stderr  # a cluster that RAY_ADDRESS does not name is let be
     finally:
         machines.shutdown()
+
+
+@pytest.mark.campaign
+@pytest.mark.slow
+def test_a_worker_that_stalls_is_given_up_and_another_does_its_levels(tmp_path: Path) -> None:
+    nobody = LEVELS
+    process = start([str(nobody), *SETTINGS, "workers=1"], tmp_path, module="tests.pipeline.fragile")
+    until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    (worker,) = (pid for pid in descendants(process.pid) if title(pid).startswith("ray::WorkerActor.work"))
+    os.kill(worker, signal.SIGSTOP)
+    _, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, err
+    assert "was silent for" in err
+    assert read_manifest(tmp_path / SPLIT).level_ids.tolist() == list(range(LEVELS))
+
+
+@pytest.mark.campaign
+@pytest.mark.slow
+def test_machines_that_die_and_join_and_a_driver_that_comes_back_change_no_bit(tmp_path: Path) -> None:
+    from ray.cluster_utils import Cluster
+
+    memory: dict[str, Any] = {"object_store_memory": 80 * 2**20}
+    command = ["generate", "levels=24", "unit=2", "budget=5k"]
+    machines = Cluster(initialize_head=True, head_node_args=memory | {"num_cpus": 0, "include_dashboard": False})
+    try:
+        first = machines.add_node(num_cpus=1, **memory)
+        process = start(command, tmp_path, address=str(machines.address))
+        until(lambda: fragment_paths(tmp_path / SPLIT), process)
+        machines.remove_node(first, allow_graceful=False)
+        machines.add_node(num_cpus=1, **memory)
+        before = len(fragment_paths(tmp_path / SPLIT))
+        until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before, process)
+        process.kill()
+        process.communicate()
+        again = run(command, tmp_path, address=str(machines.address))
+        assert again.returncode == 0, again.stderr
+    finally:
+        machines.shutdown()
+    assert run([*command, "out=whole", "executor=inline"], tmp_path).returncode == 0
+    assert repr(lasting(tmp_path / SPLIT)) == repr(lasting(tmp_path / "whole/5k/s"))
 
 
 def works_on(machine: Any) -> bool:

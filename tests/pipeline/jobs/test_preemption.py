@@ -1,0 +1,61 @@
+"""Jobs that are stopped or killed while experts train: the same command ends with the same bits, and trains only what
+was not kept."""
+
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from configs.compose import compose_job
+from pipeline.store.paused import load_paused
+from tests.pipeline.command import heed_ctrl_c, here, run, start, until
+from tests.pipeline.made import lasting
+
+LEVELS = 4
+ALONE = ("scout.rounds=0", "search.env_steps=0", "stop.rule=budget", "expert.replays=0")  # so that experts train long
+SETTINGS = [f"levels={LEVELS}", f"unit={LEVELS}", "budget=256k", *ALONE]
+COMMAND = ["generate", *SETTINGS, "workers=1", "checkpoint=1s"]
+SPLIT = Path("data/256k/s")
+
+pytestmark = [pytest.mark.campaign, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """And its env steps."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    done = here(["generate", *SETTINGS, "executor=inline"], folder)
+    assert done.returncode == 0, done.stderr
+    return folder / SPLIT, env_steps(done.stdout)
+
+
+def env_steps(out: str) -> int:
+    found = re.search(r"^([0-9,]+) env steps: ", out, re.MULTILINE)
+    assert found, out
+    return int(found[1].replace(",", ""))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("executor", ["inline", "ray"])
+def test_the_same_command_goes_on_where_experts_were(
+    undisturbed: tuple[Path, int], tmp_path: Path, number: signal.Signals, executor: str
+) -> None:
+    split, command = tmp_path / SPLIT, [*COMMAND, f"executor={executor}"]
+    process = start(command, tmp_path, preexec_fn=heed_ctrl_c)
+    until(lambda: list(split.glob("checkpoints/[0-9]*.npz")), process)
+    begin = time.monotonic()
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert time.monotonic() - begin < 30
+    assert process.returncode == (-9 if number == signal.SIGKILL else 130), err
+    kept = load_paused(split, range(LEVELS), compose_job(SETTINGS))
+    steps = sum(int(of.expert.begun.training.progress.env_steps) for of in kept.values())
+    assert steps
+    again = run(command, tmp_path)
+    assert again.returncode == 0, again.stderr
+    whole, total = undisturbed
+    assert repr(lasting(split)) == repr(lasting(whole))
+    assert env_steps(again.stdout) <= total - steps
+    assert not list((split / "checkpoints").iterdir())
