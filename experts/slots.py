@@ -51,9 +51,9 @@ class Begun(NamedTuple):
 class Pending(NamedTuple):
     """What comes next for an expert, beside what its course says."""
 
-    due: Bool[Array, ""] | np.bool_  # an evaluation, by what training showed
-    final: Bool[Array, ""] | np.bool_  # one after which the level leaves
-    deadline: Int[Array, ""] | np.int32  # updates after which the last evaluation comes
+    due: Bool[Array, ""] | Bool[np.ndarray, " index"] | np.bool_  # an evaluation, by what training showed
+    final: Bool[Array, ""] | Bool[np.ndarray, " index"] | np.bool_  # one after which the level leaves
+    deadline: Int[Array, ""] | Int[np.ndarray, " index"] | np.int32  # updates after which the last evaluation comes
 
 
 class Trial(NamedTuple):

@@ -118,7 +118,7 @@ def test_levels_given_back_and_levels_left_undecided_are_made_by_another_to_the_
     worker, other = Worker(job, tmp_path / "cut"), Worker(job, tmp_path / "cut")
     round = worker.work(Order([unit]), 0.0)
     while not round.spare:
-        round = worker.work(Order([]), 0.0)
+        round = worker.work(Order([]), 0.01)
     round = worker.work(Order([], give=round.spare - 1), 0.0)
     ((before, kept, back),) = round.cuts
     assert (before, round.spare) == (unit, 1)
@@ -126,7 +126,7 @@ def test_levels_given_back_and_levels_left_undecided_are_made_by_another_to_the_
     assert back
     assert sorted([*kept.level_ids, *back.level_ids]) == list(unit.level_ids)
     while sum(of[1] for of in round.totals.values()) < len(kept.level_ids) - 1:
-        round = worker.work(Order([]), 0.0)
+        round = worker.work(Order([]), 0.01)
     worker.stopping = True
     round = worker.work(Order([]), 60.0)
     assert round.leaves
@@ -146,7 +146,7 @@ def test_experts_that_are_kept_go_on_where_they_were(tmp_path: Path, job: JobCon
     worker = Worker(job, tmp_path / "kept")
     round = worker.work(Order([unit]), 0.0)
     while not round.totals[unit][0]:
-        round = worker.work(Order([]), 0.0)
+        round = worker.work(Order([]), 0.01)
     worker.stopping = True
     round = worker.work(Order([]), 60.0)
     (path,) = (tmp_path / "kept/checkpoints").iterdir()
