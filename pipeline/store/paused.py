@@ -20,6 +20,7 @@ from experts.judge import Evaluation, Kept
 from experts.labels import Source
 from experts.paused import Paused
 from experts.slots import Pending
+from pipeline.owned import require_own
 from pipeline.store import objects
 from pipeline.store.checkpoints import begun_like, require_plain
 from pipeline.store.fields import arrays_of
@@ -116,7 +117,7 @@ def _load(path: Path, job: JobConfig) -> dict[int, Paused]:
 def _read(path: Path) -> dict[str, np.ndarray]:
     """Raises ValueError and others where it is no archive as `save_paused` writes it."""
     if not is_remote(path):
-        require_own(path, COPY)
+        require_own(path, "remove it")
     file = io.BytesIO(objects.get(path).data if is_remote(path) else path.read_bytes())
     require_plain(file, len(file.getvalue()))
     with np.load(file, allow_pickle=False) as arrays:
