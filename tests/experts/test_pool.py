@@ -140,11 +140,11 @@ def test_a_pool_wants_levels_while_fewer_wait_than_there_are_slots(levels: Level
 
 def test_entries_of_a_queue_go_round(levels: Level) -> None:
     capacity = capacity_of(CONFIG)
-    queue = empty_queue(levels, capacity, 1, CONFIG)
+    queue = empty_queue(levels, capacity, CONFIG)
     for at in (range(12), range(12, 24), range(24, 36)):
         some, ids = part(levels, at)
         assert next_indices(queue, len(ids)) == [i % capacity for i in at]
-        queue = enter(queue, some, ids, no_success(len(ids)), CONFIG, {})
+        queue = enter(queue, some, ids, no_success(len(ids)), CONFIG, UPDATES)
     assert int(queue.come) == 36 > capacity
     expected = [*IDS[capacity:], *IDS[36 - capacity : capacity]]
     np.testing.assert_array_equal(queue.level_ids, expected)
