@@ -18,6 +18,7 @@ def cost_of(rows: pa.Table) -> dict[str, Any] | None:
 
     What a solved level cost is everything, the levels that were not solved included, divided by those that were.
     """
+    rows = rows.select(READ)
     rows = rows.filter(pc.is_valid(rows.column("seconds")))  # pyright: ignore[reportAttributeAccessIssue]
     if not rows.num_rows:
         return None

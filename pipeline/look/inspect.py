@@ -6,7 +6,6 @@ Reads no shard's data.
 import json
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -68,21 +67,21 @@ def survey(
     asked = asked._replace(limit=LIMIT if asked.limit is None else max(asked.limit, 0))
     chosen, shown = select(manifest.table, asked.where), asked.limit or 0
     ids, labels = chosen["level_id"].to_numpy(), _counts(chosen, "label")
-    with ThreadPoolExecutor(1) as beside:  # what takes seconds of millions of levels leaves a core to others
-        made_of = beside.submit(solved_by_things, manifest, ids) if things else None
-        facts = _told(split, manifest, chosen, labels)
-        others = {str(other): duplicates.compared_in(other) for other in against}
-        levels = duplicates.compared_of(split, ids) if others else None
-        facts["duplicates"] = duplicates.within(duplicates.perhaps_alike(split, ids), shown)
-        facts["against"] = {name: duplicates.between(levels, other, shown) for name, other in others.items()}
+    facts = _told(split, manifest, chosen, labels)
+    facts["solved_by"] = solved_by_things(manifest, ids) if things else None
+    others = {str(other): duplicates.compared_in(other) for other in against}
+    levels = duplicates.compared_of(split, ids) if others else None
+    facts["duplicates"] = duplicates.within(duplicates.perhaps_alike(split, ids), shown)
+    facts["against"] = {name: duplicates.between(levels, other, shown) for name, other in others.items()}
     rows = [row for block in rows_of(split, ids_of(chosen, asked), asked.columns) for row in block.to_pylist()]
-    return facts | {"solved_by": made_of.result() if made_of else None, "rows": rows}
+    return facts | {"rows": rows}
 
 
 def _told(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str, int]) -> dict[str, Any]:
     """What the rows that are chosen say."""
-    of_label = {label: chosen.filter(pc.equal(chosen["label"], label)) for label in labels}  # pyright: ignore[reportAttributeAccessIssue]
-    none = chosen.slice(0, 0)
+    told = chosen.select(["label_reason", "steps_to_goal", "steps_to_first_success", "env_steps"])
+    of_label = {label: told.filter(pc.equal(chosen["label"], label)) for label in labels}  # pyright: ignore[reportAttributeAccessIssue]
+    none = told.slice(0, 0)
     solved, unsolved = (of_label.get(label, none) for label in (Label.SOLVED, Label.UNSOLVED))
     tried = solved.num_rows + unsolved.num_rows
     stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards) if is_listed(split) else None
@@ -101,7 +100,7 @@ def _told(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str, i
         "failed_by_noop": _total(chosen["failed_by_noop"].to_numpy()),
         "solve_rate": solved.num_rows / tried if tried else None,  # of the levels with an expert
         "solve_interval": Share(solved.num_rows, tried).rounded if tried else None,  # of 95%
-        "witness": _counts(chosen.filter(pc.is_valid(chosen["witness"])), "witness"),  # pyright: ignore[reportAttributeAccessIssue]
+        "witness": _counts(chosen.select(["witness"]).filter(pc.is_valid(chosen["witness"])), "witness"),  # pyright: ignore[reportAttributeAccessIssue]
         "steps_to_goal": _quantiles(solved, "steps_to_goal"),
         "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
         **{name: _total(chosen[name].to_numpy()) for name in SPENT},

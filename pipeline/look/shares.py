@@ -18,17 +18,21 @@ from pipeline.read.levels import COLUMNS, levels_of
 from pipeline.store.manifest import Manifest, require_manifest
 
 SAMPLED, READ = 4096, 256  # levels that are looked at: made again from their ids, or read
+MANY = 1_000_000
 
 
 def solved_by_things(manifest: Manifest, ids: np.ndarray) -> dict[str, Any]:
     """For each kind of thing and each count of it: how many levels that could use an expert have it, and are solved.
 
-    `ids` are ascending; of many, SAMPLED are looked at, spread evenly. Levels that cannot be read are a `problem`.
+    `ids` are ascending; of many, the first SAMPLED are looked at: levels of low ids are like all others. Levels that
+    cannot be read are a `problem`, and so are more than MANY, of which other answers take long enough.
     """
+    if len(ids) > MANY:
+        problem = f"nobody looks into more than {MANY:,} levels: choose some with --where"
+        return {"levels": 0, "looked_at": 0, "of": len(ids), "problem": problem}
     read = from_files(manifest.config or {})
     most = min(READ if read else SAMPLED, len(ids))
-    chosen = ids[np.unique(np.linspace(0, len(ids) - 1, most).round().astype(int))] if most else ids
-    rows = require_manifest(manifest.split, COLUMNS, chosen).table
+    rows = require_manifest(manifest.split, COLUMNS, ids[:most]).table
     tried = np.isin(rows["label"].to_pylist(), [label.value for label in TRAINED])
     rows = rows.filter(pa.array(tried))
     found: dict[str, Any] = {"levels": rows.num_rows, "looked_at": most, "of": len(ids), "problem": None}
