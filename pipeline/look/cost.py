@@ -19,7 +19,8 @@ def cost_of(rows: pa.Table) -> dict[str, Any] | None:
     What a solved level cost is everything, the levels that were not solved included, divided by those that were.
     """
     rows = rows.select(READ)
-    rows = rows.filter(pc.is_valid(rows.column("seconds")))  # pyright: ignore[reportAttributeAccessIssue]
+    if rows.column("seconds").null_count:  # nearly never, and copies of millions of rows take memory
+        rows = rows.filter(pc.is_valid(rows.column("seconds")))  # pyright: ignore[reportAttributeAccessIssue]
     if not rows.num_rows:
         return None
     seconds = {stage: pc.sum(pc.struct_field(rows.column("seconds"), stage)).as_py() for stage in Seconds._fields}  # pyright: ignore[reportAttributeAccessIssue]

@@ -104,7 +104,9 @@ class Bounded:
         ]
         self._require_room(sum(max(0, column.length) for column, _, _ in columns), names)
         self._require_room(sum(self._room(*each) for each in columns), names)
-        table = self._file.read_row_groups(groups, list(names), use_threads=False)
+        # One by one: of several, Arrow now and then cannot read lists of texts as dictionaries
+        parts = [self._file.read_row_groups([group], list(names), use_threads=False) for group in groups]
+        table = pa.concat_tables(parts or [self._file.read_row_groups([], list(names))])
         table.validate(full=True)  # indices into dictionaries, offsets and UTF-8, which others then rely on
         return table
 
