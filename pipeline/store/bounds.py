@@ -141,7 +141,8 @@ def bounded(path: Path) -> Iterator[Bounded]:
 def _obeyed(column: pa.Array) -> bool:
     """Whether a text of an array has characters that control terminals."""
     if pa.types.is_dictionary(column.type):
-        return bool(pc.any(pc.match_substring_regex(column.dictionary, r"\p{Cc}")).as_py())
+        found = pc.call_function("match_substring_regex", [column.dictionary], pc.MatchSubstringOptions(r"\p{Cc}"))
+        return found.true_count > 0
     nested = pa.types.is_list(column.type) or pa.types.is_struct(column.type)
     return nested and any(map(_obeyed, _inside(column)))
 
@@ -149,7 +150,8 @@ def _obeyed(column: pa.Array) -> bool:
 def _expanded(column: pa.Array) -> int:
     """Bytes of all texts in an array, each as often as it is named."""
     if pa.types.is_dictionary(column.type):
-        return pc.sum(pc.binary_length(column.dictionary).take(column.indices)).as_py() or 0
+        lengths = pc.call_function("binary_length", [column.dictionary]).take(column.indices)
+        return pc.call_function("sum", [lengths]).as_py() or 0
     nested = pa.types.is_list(column.type) or pa.types.is_struct(column.type)
     return sum(map(_expanded, _inside(column))) if nested else 0
 

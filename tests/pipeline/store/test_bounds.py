@@ -48,14 +48,14 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def with_column(good: Path, name: str, values: pa.Array, **how: object) -> bytes:
+def with_column(good: Path, name: str, values: pa.Array, use_dictionary: bool = True) -> bytes:
     """The fragment with as many rows as there are values in one of its columns."""
     table = pq.read_table(good)
     rows = table.take(np.zeros(len(values), int))
     at = COLUMNS.names.index(name)
     sink = BytesIO()
     rows = rows.set_column(at, COLUMNS.field(at), values)
-    pq.write_table(rows, sink, compression="zstd", write_page_checksum=True, **how)
+    pq.write_table(rows, sink, compression="zstd", write_page_checksum=True, use_dictionary=use_dictionary)
     return sink.getvalue()
 
 
@@ -83,14 +83,14 @@ def with_other_numbers(data: bytes, change: Callable[[int], int], where: slice, 
 
 
 def long_texts(good: Path) -> bytes:
-    """A dictionary of one text of 200 kB, which each of 500 rows names."""
-    text = pa.chunked_array([pa.array(["x" * 200_000]).take(np.zeros(50, int))] * 10)
+    """A dictionary of one text of 1.2 MB, which each of 100 rows names."""
+    text = pa.chunked_array([pa.array(["x" * 1_200_000]).take(np.zeros(10, int))] * 10)
     return with_column(good, "label_reason", text)
 
 
 def long_pages(good: Path) -> bytes:
-    """100 MB of the same byte, and a footer that says nothing of them."""
-    text = pa.array([f"{i:03d}" + "x" * 400_000 for i in range(10)] * 25)
+    """120 MB of the same byte, and a footer that says nothing of them."""
+    text = pa.array([f"{i:03d}" + "x" * 1_200_000 for i in range(10)] * 10)
     data = with_column(good, "label_reason", text, use_dictionary=False)
     about = pq.read_metadata(BytesIO(data)).row_group(0)
     sizes = {about.total_byte_size, about.column(COLUMNS.names.index("label_reason")).total_uncompressed_size}
