@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
 
 from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role, name_of
 from levelgen.sampling.scenery import NORMAL
@@ -220,18 +219,18 @@ def _edited(level: Level, change: Callable[[Level], None]) -> Level:
     return replace(after, model=replace(after.model, collides=np.asarray(separate(after.model))))
 
 
-def _moving(one: Level) -> Float[np.ndarray, "body 2"]:
+def _moving(one: Level) -> Any:
     return one.state.position[FIXED_POLYGONS:][one.model.active[FIXED_POLYGONS:]]
 
 
-def _free(active: Bool[np.ndarray, " row"], kind: str, level: Level) -> int:
+def _free(active: Any, kind: str, level: Level) -> int:
     """The first row that is not in use."""
     if active.all():
         raise EditError(f"Size {name_of(level.size)} has no room for more {kind}: delete one, or take a larger size.")
     return int(active.argmin())
 
 
-def _there(active: Bool[np.ndarray, " row"], index: int, kind: str) -> int:
+def _there(active: Any, index: int, kind: str) -> int:
     if not 0 <= index < len(active) or not active[index]:
         raise EditError(f"There is no {kind} {index}.")
     return index
@@ -295,12 +294,12 @@ def _anchors(one: Level) -> Iterator[tuple[Any, Any]]:
     yield model.thruster_position, model.thruster_body
 
 
-def _turned(points: Any, angle: float) -> np.ndarray:
+def _turned(points: Any, angle: Any) -> np.ndarray:
     cos, sin = math.cos(angle), math.sin(angle)
     return (np.asarray(points) @ np.array(((cos, sin), (-sin, cos)))).astype(np.float32)
 
 
-def _in_world(one: Level, body: int, anchor: Any) -> np.ndarray:
+def _in_world(one: Level, body: int, anchor: Any) -> Any:
     return one.state.position[body] + _turned(anchor, one.state.rotation[body])
 
 
