@@ -16,7 +16,7 @@ from pipeline.store.seal import ROWS
 
 DRAWS = 2000
 LIKELY = 0.9  # of an interval
-SHARDS_OWN, OTHERS = 1, 1  # zarr.json of a shard; job.json of a split
+SHARDS_OWN, OTHERS = 1, 2  # zarr.json of a shard; job.json and manifest/index.txt of a split
 
 
 class PerWitness(NamedTuple):

@@ -25,7 +25,7 @@ from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, IDS, SHAPED, WHOLE, untouched
 
-SOLVED = StopConfig(successes=2, share=0.6, wait=2048)
+SOLVED = StopConfig(rule=Rule.SOLVED, successes=2, share=0.6, wait=2048)
 HALVED = StopConfig(rule=Rule.HALVING, successes=4, first_rung=4 * 512, gain=10.0)
 UPDATES = 24  # 12,288 env steps
 

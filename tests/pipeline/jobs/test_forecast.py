@@ -41,7 +41,7 @@ def test_numbers_follow_levels_and_workers() -> None:
     assert of.seconds_per_solved.expected == pytest.approx(2.0, rel=1e-3)
     assert of.bytes["full"].expected == 3_000_000 * 10_000 + 6_000_000 * 200
     rows = ROWS // 2
-    assert of.files["full"] == 60 * (1 + 1 + 5 * (1 + -(-rows // 8192))) + 1
+    assert of.files["full"] == 60 * (1 + 1 + 5 * (1 + -(-rows // 8192))) + 2
     assert FILE_BYTES / 10_000 <= 8192
     assert forecast(sample(seconds, np.zeros(200, bool)), 100, 2).seconds_per_solved is None
 

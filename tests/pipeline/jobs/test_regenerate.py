@@ -17,7 +17,7 @@ from pipeline.store.manifest import begin_fragment, read_manifest
 from tests.pipeline.command import here, run
 from tests.pipeline.made import lasting, made_job
 
-SETTINGS = ["levels=12", "executor=inline"]
+SETTINGS = ["levels=12", "stop.rule=solved", "executor=inline"]  # so that some use their whole budget
 
 
 @pytest.fixture(scope="module")

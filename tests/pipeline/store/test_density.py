@@ -38,7 +38,7 @@ from pipeline.store.contents import blank_row, table_for
 from pipeline.store.density import CHECKSUM, key_rows, task_states
 from pipeline.store.fields import arrays_of, same_bits, tree_of
 from pipeline.store.layout import split_path
-from pipeline.store.manifest import read_manifest
+from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.merge import Place
 from pipeline.store.packing import pack, unpack
 from pipeline.store.schema import Encoding, field_table
@@ -428,7 +428,7 @@ def assert_whole(split: Path, density: str) -> None:
     assert {Shard(split / name).encoding.density for name in rows["shard"].to_pylist()} == {density}
     shards = {f"shards/{path.name}" for path in (split / "shards").iterdir()}
     assert shards == set(rows["shard"].to_pylist())  # and nothing else is there
-    assert len(list((split / "manifest").iterdir())) == len(read_manifest(split).fragments)
+    assert len(fragment_paths(split)) == len(read_manifest(split).fragments)
 
 
 def test_a_split_becomes_another_density_and_the_same_again(split: Path, capsys: pytest.CaptureFixture[str]) -> None:

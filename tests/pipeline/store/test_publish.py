@@ -313,6 +313,15 @@ def test_a_second_writer_is_refused_while_the_first_renews_its_lease(
     )
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Also where the tests are a job in the background, which ignores Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_a_writer_that_is_silent_is_waited_for_and_replaced_and_notices(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
