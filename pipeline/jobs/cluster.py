@@ -24,7 +24,7 @@ os.environ |= {
 
 import ray
 from ray._private import ray_constants
-from ray.exceptions import ActorDiedError, RayError
+from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 from ray.util.metrics import Gauge
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -87,6 +87,7 @@ class WorkerHandle:
     actor: Any = None
     answer: Any = None  # reference to what it will answer: to `begin`, then to `work`
     up: bool = False  # it has begun
+    out_of_reach: bool = False  # it is asked whether it is there
     failed_starts: int = 0  # in a row
     why: str = ""  # of the last of them
 
@@ -110,7 +111,7 @@ class WorkerHandle:
         """It dies, if it is not dead; its place is free for another."""
         if self.actor is not None:
             ray.kill(self.actor)
-        self.actor, self.answer, self.up = None, None, False
+        self.actor, self.answer, self.up, self.out_of_reach = None, None, False, False
 
 
 def _told(error: RayError) -> str:
@@ -237,8 +238,13 @@ class Crew:
         over, handle.answer = handle.answer, None
         try:
             answer: Any = ray.get(over)
+        except ActorUnavailableError:  # Ray knows soon whether it died, and whether its machine did
+            handle.answer, handle.out_of_reach = handle.actor.__ray_ready__.remote(), True
+            return []
         except RayError as error:
             return self._lose(handle, f"{error}\n\n{_told(error)}", _told(error))
+        if handle.out_of_reach:
+            return self._lose(handle, "The worker was out of reach", "The worker was out of reach")
         if not handle.up:
             if answer:
                 self._refuse(handle, answer)

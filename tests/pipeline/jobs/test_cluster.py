@@ -160,15 +160,17 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
 @pytest.mark.campaign
 @pytest.mark.slow
 def test_a_worker_that_stalls_is_given_up_and_another_does_its_levels(tmp_path: Path) -> None:
-    nobody = LEVELS
-    process = start([str(nobody), *SETTINGS, "workers=1"], tmp_path, module="tests.pipeline.fragile")
-    until(lambda: fragment_paths(tmp_path / SPLIT), process)
-    (worker,) = (pid for pid in descendants(process.pid) if title(pid).startswith("ray::WorkerActor.work"))
-    os.kill(worker, signal.SIGSTOP)
+    alone = ("scout.rounds=0", "search.env_steps=0", "stop.rule=budget")  # so that experts train long
+    command = ["generate", f"levels={LEVELS}", "unit=1", "budget=1M", "workers=1", *alone]
+    process = start([str(LEVELS), *command], tmp_path, module="tests.pipeline.fragile")
+    split, at_work = tmp_path / "data/1M/s", "ray::Fragile.work"
+    working = lambda: [pid for pid in descendants(process.pid) if title(pid).startswith(at_work)]
+    until(lambda: fragment_paths(split) and working(), process)
+    os.kill(working()[0], signal.SIGSTOP)
     _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, err
     assert "was silent for" in err
-    assert read_manifest(tmp_path / SPLIT).level_ids.tolist() == list(range(LEVELS))
+    assert read_manifest(split).level_ids.tolist() == list(range(LEVELS))
 
 
 @pytest.mark.campaign
