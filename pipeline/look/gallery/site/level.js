@@ -17,7 +17,8 @@
       at("step-on").addEventListener("click", () => this.seek(Math.floor(this.time) + 1));
       at("scrub").addEventListener("input", () => this.seek(Number(at("scrub").value)));
       at("trails").addEventListener("change", () => this.draw());
-      at("copy").addEventListener("click", () => this.copy());
+      at("copy").addEventListener("click", () => this.copy("command", "copy"));
+      at("copy-hands").addEventListener("click", () => this.copy("hands", "copy-hands"));
       addEventListener("keydown", (event) => this.key(event));
       new ResizeObserver(() => this.fit()).observe(at("stage"));
     }
@@ -51,6 +52,7 @@
       const reason = row.label_reason;
       at("reason").textContent = `${reason[0].toUpperCase()}${reason.slice(1)}.`;
       at("command").textContent = row.command;
+      at("hands").textContent = `levelproof play ${this.columns.about.split} ${row.level_id}`;
       at("controls").hidden = !this.film;
       at("scrub").max = this.film ? this.film.steps : 0;
       this.keys = liveEntries(this.world).map((entry) => {
@@ -158,16 +160,16 @@
       }
     }
 
-    async copy() {
-      const words = at("command").textContent;
+    async copy(from, button) {
+      const words = at(from).textContent;
       try {
         await navigator.clipboard.writeText(words);
       } catch {
-        getSelection().selectAllChildren(at("command")); // a page from the disk may not be let
+        getSelection().selectAllChildren(at(from)); // a page from the disk may not be let
         document.execCommand("copy");
       }
-      at("copy").textContent = "Copied";
-      setTimeout(() => { at("copy").textContent = "Copy"; }, 1500);
+      at(button).textContent = "Copied";
+      setTimeout(() => { at(button).textContent = "Copy"; }, 1500);
     }
 
     key(event) {
