@@ -16,6 +16,7 @@ from experts.judge import Kept
 from experts.labels import BY_EXPERT
 from experts.slots import Begun, begin
 from experts.success import no_success
+from levelgen.identity.keys import level_id_array
 from levelgen.level import size_of
 from levelgen.sampling.scenery import empty_level
 from pipeline.errors import Failure, UserError
@@ -68,6 +69,7 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
         level_ids, curves = arrays.pop("level_id"), arrays.pop("curve")
         if (level_ids.dtype, level_ids.ndim, curves.ndim, len(curves)) != (np.int64, 1, 2, len(level_ids)):
             raise ValueError("its level ids or curves are none")
+        level_id_array(level_ids)  # within their bounds
         for name, one in arrays_of(like, "begun/").items():
             if (arrays[name].shape, arrays[name].dtype) != ((len(level_ids), *one.shape), one.dtype):
                 raise ValueError(f"{name} has another shape or type")
