@@ -25,6 +25,7 @@ def smaller(line: str) -> list[str]:
     for said, small in BUDGETS.items():
         line = re.sub(rf"\b{said}\b", small, line)
     words = [re.sub(r"^levels=.*", f"levels={LEVELS}", word) for word in shlex.split(line, comments=True)[1:]]
+    words = words[: words.index(">")] if ">" in words else words  # of a shell
     asks = words[0] == "generate" and not any(word.startswith(("levels=", "level_files=", "-")) for word in words)
     return words + asks * [f"levels={LEVELS}"]
 
