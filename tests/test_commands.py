@@ -17,7 +17,7 @@ LEVELS = 8  # in place of as many as a page says
 BUDGETS = {"64k": "2k", "128k": "3k", "256k": "4k", "1M": "5k"}  # what a page says, and what runs, folders as well
 JOBS = ("generate", "regenerate", "plan")
 ELSEWHERE = ("levelproof play", "://", "HEAD:", "me/levels")  # servers, and other hosts: tests/pipeline has their tests
-NOBODY = "No level", "no trajectories"  # of so few fits a condition
+NOBODY = "No level", "no trajectories", "holds for none"  # of so few fits a condition
 
 
 def smaller(line: str) -> list[str]:
