@@ -141,7 +141,7 @@ def test_a_level_plays_what_its_record_has(page: Any, address: str, split: Path)
     assert page.locator("#stage").evaluate("(canvas) => canvas.toDataURL()") != start
     page.keyboard.press("ArrowLeft")
     assert page.locator("#clock").inner_text().startswith(f"step {steps - 1} of {steps} · ")
-    page.get_by_role("button", name="Play").click()
+    page.get_by_role("button", name="Play", exact=True).click()
     page.wait_for_timeout(200)
     assert page.locator("#play").inner_text() == "Pause"
     assert page.locator("#command").inner_text().startswith("levelproof generate")
