@@ -1,14 +1,15 @@
 """How much a longer search would find: the unsolved share against the env steps that a level is searched.
 
-Every level that needs an expert is searched, until it has a success or its steps are used up. Levels
-are searched one after another, so a run that is stopped goes on where it was: what is known of a level waits in the
-cache folder.
+Every level that needs an expert is searched, until it has a success or its env steps are used up: first all of them a
+little, then those without a success twice as long, and so on. What is known of a level waits in the cache folder, so a
+run that is stopped goes on where it was; and a curve can be drawn as far as all levels of a size have come.
 """
 
 import argparse
 import hashlib
-import json
-from collections.abc import Sequence
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,11 @@ from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
 from configs.numbers import parse_count
 from experts.before import decide
+from experts.config import MOST_COUNTED
 from experts.search.config import SearchConfig
-from experts.search.search import Searched, Searching
-from experts.witness import take
+from experts.search.explore import Search, begin, explore, successes
+from experts.search.search import side_by_side
+from experts.witness import blocks, replay, take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
@@ -32,8 +35,8 @@ from pipeline.runtime import cache_folder, own_cores, prepare_jax
 
 FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
 LEVELS = {"s": 256, "m": 128, "l": 64}
-TOGETHER = 4  # levels that one program searches
 LEAST = 16_384  # env steps at which the curve begins
+CONFIG = SearchConfig(env_steps=MOST_COUNTED, bodies=0, per_cell=0, rounds=64)  # the default one, without an end
 COLOURS = {"s": "#0072b2", "m": "#d55e00", "l": "#009e73"}  # Okabe and Ito
 PLOT = "search.svg"
 
@@ -42,74 +45,115 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
     parser.add_argument("--levels", type=int, help="ids of each size (default: 256 of s, 128 of m, 64 of l)")
     parser.add_argument("--first", type=int, default=FIRST, help=f"level id (default: {FIRST:,})")
-    parser.add_argument("--env-steps", default="100M", help="of a search (default: 100M)")
+    parser.add_argument("--env-steps", nargs="+", default=["100M"], help="of a search, of each size (default: 100M)")
 
 
 def run(given: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
-    env_steps = parse_count(given.env_steps, "--env-steps")
-    found = {size: searched(size, given.first, given.levels or LEVELS[size], env_steps) for size in given.size}
-    budgets = doublings(env_steps)
+    wanted = np.broadcast_to([parse_count(x, "--env-steps") for x in given.env_steps], len(given.size)).tolist()
+    most = dict(zip(given.size, wanted, strict=True))
+    kept = cache_folder() / "search"
+    found = {size: searched(size, given.first, given.levels or LEVELS[size], n, kept) for size, n in most.items()}
     return Report(
         title="How much a longer search would find",
-        results=[result(size, of, env_steps) for size, of in found.items()],
-        tables=[
-            Table(
-                ("env steps a level", *(f"{size}, {len(of)} levels: unsolved" for size, of in found.items())),
-                [[f"{n:,}", *(f"{unsolved(of, n).mean():.1%}" for of in found.values())] for n in budgets[::2]],
-            ),
-            Table(
-                ("size", "unsolved at the end (95% interval)", "found in the last doubling", "in the next, at most"),
-                [row(size, of, env_steps) for size, of in found.items()],
-                "What more would find",
-            ),
-        ],
+        results=[result(size, of, most[size]) for size, of in found.items()],
+        tables=[curve(found, most), more(found, most)],
         notes=[
-            f"Levels from id {given.first:,} on that are neither trivial nor proved unsolvable; the "
-            "default search, no experts. *In the next, at most*: the 95% upper bound of what another doubling of the "
-            "steps would find, taking that it finds no more than the last one did (each doubling has found less than "
-            "the one before) and that finds are rare and independent (Poisson).",
-            f"![Unsolved share against env steps of search]({PLOT})",
+            f"Levels from id {given.first:,} on that are neither trivial nor proved unsolvable; the default search "
+            "without an early end, no experts; every success is replayed. *In the next, at most*: the 95% upper bound "
+            "of what another doubling of the steps would find, if finds are rare and independent (Poisson) and it "
+            "finds no more than the last one did.",
+            f"![Unsolved share against env steps of search, with its 95% interval]({PLOT})",
         ],
-        plots={PLOT: lambda path: draw(path, found, budgets)},
+        plots={PLOT: lambda path: draw(path, found, most)},
     )
 
 
-def searched(size: str, first: int, count: int, env_steps: int) -> Int[np.ndarray, " level"]:
-    """Env steps to the success of each level that needs an expert; -1: none within `env_steps` of search."""
+def searched(size: str, first: int, count: int, env_steps: int, kept: Path) -> Int[np.ndarray, " level"]:
+    """Env steps to the success of each level that needs an expert; -1: none within `env_steps` of search.
+
+    Args:
+        size: by its name.
+        first: level id.
+        count: how many ids.
+        env_steps: of each level.
+        kept: folder for what is known of levels.
+    """
     ids = np.arange(first, first + count, dtype=np.int32)
     levels = jax.tree.map(np.asarray, sample_levels(ids, SIZES[size]))
     left = np.array([i for i, verdict in enumerate(decide(levels, DEFAULT_RULES).verdicts) if verdict is None])
-    # the whole of it for every level; how short a success is does not matter here
-    config = SearchConfig(env_steps=env_steps, bodies=0, per_cell=0, trials=1)
-    settings = hashlib.sha256(repr(config).encode()).hexdigest()[:12]
-    log = cache_folder() / f"search-{size}-{first}-{settings}.jsonl"
-    known = read(log)
-    for start in range(0, len(left), TOGETHER):
-        if wanted := [i for i in left[start : start + TOGETHER] if int(ids[i]) not in known]:
-            come = search(take(levels, np.array(wanted)), ids[wanted], config)
-            new = {
-                int(ids[i]): int(n) if length else -1
-                for i, n, length in zip(wanted, come.env_steps, come.success.length, strict=True)
-            }
-            known |= new
-            with log.open("a") as file:
-                file.writelines(f"{json.dumps(pair)}\n" for pair in new.items())
-        tell(f"{size}: {min(start + TOGETHER, len(left))} of {len(left)} levels are searched.")
-    return np.array([known[int(ids[i])] for i in left])
+    levels, ids = take(levels, left), ids[left]
+    settings = hashlib.sha256(repr(CONFIG).encode()).hexdigest()[:12]
+    folder = kept / f"{size}-{settings}"
+    rows = [read(folder, level_id) for level_id in ids]
+    for most in doublings(env_steps):
+        going = np.array([i for i, row in enumerate(rows) if row is None or under_way(row, most)], int)
+        for block in blocks(len(going), side_by_side(CONFIG)):
+            at = going[block]
+            for i, row in zip(at, advanced(take(levels, at), ids[at], [rows[i] for i in at], most), strict=True):
+                rows[i] = row
+                write(folder, ids[i], row)
+        tell(f"{size}: {sum(int(row.length[0]) == 0 for row in rows if row)} levels unsolved within {most:,}.")
+    return steps_to_success(levels, [row for row in rows if row], env_steps)
 
 
-def search(levels: Level, level_ids: Int[np.ndarray, " level"], config: SearchConfig) -> Searched:
-    """Search every level until it has a success or has had its env steps."""
-    searching = Searching(levels, level_ids, config, DEFAULT_RULES)
-    while searching.step():
-        pass
-    return searching.result()
+def under_way(row: Search, env_steps: int) -> bool:
+    """Whether a level has no success yet, and has been searched for less."""
+    return int(row.length[0]) == 0 and int(row.env_steps[0]) < env_steps
 
 
-def read(log: Path) -> dict[int, int]:
-    """What an earlier run found, by level id."""
-    return dict(map(json.loads, log.read_text().splitlines())) if log.exists() else {}
+def advanced(
+    levels: Level, level_ids: Int[np.ndarray, " level"], rows: Sequence[Search | None], env_steps: int
+) -> list[Search]:
+    """Levels searched on side by side, until each has a success or so many env steps; a row each, as before.
+
+    Args:
+        levels: as many as go side by side.
+        level_ids: their ids.
+        rows: what is known of each; None: nothing yet.
+        env_steps: of each level, from its beginning.
+    """
+    start = begin(levels, level_ids, CONFIG, DEFAULT_RULES)
+    known = joined([row or fresh for row, fresh in zip(rows, split(start), strict=True)])
+    search = replace(known, levels=start.levels, key=start.key)
+    while np.asarray((search.length == 0) & (search.env_steps < env_steps)).any():
+        search = explore(search, CONFIG, DEFAULT_RULES)
+    return split(search)
+
+
+def split(search: Search) -> list[Search]:
+    """A row for each level, on the host: what evolves, and of a level with a success no archive."""
+    kept = jax.device_get(replace(search, levels=None, key=None))
+    rows = [jax.tree.map(lambda x, i=i: x[i : i + 1], kept) for i in range(len(kept.length))]
+    return [replace(row, archive=None) if row.length[0] else row for row in rows]
+
+
+def joined(rows: Sequence[Search]) -> Search:
+    """The levels of all rows."""
+    return jax.tree.map(lambda *x: np.concatenate(x), *rows)
+
+
+def steps_to_success(levels: Level, rows: Sequence[Search], env_steps: int) -> Int[np.ndarray, " level"]:
+    """Env steps of search to a success that replays; -1: none within so many."""
+    found = successes(joined([replace(row, archive=None) for row in rows]))
+    length, steps = np.asarray(found.length), np.array([int(row.env_steps[0]) for row in rows])
+    goal = replay(levels, np.moveaxis(np.asarray(found.action), 0, -1)).goal
+    reached = goal[length - 1, np.arange(len(length))] & (length > 0)
+    return np.where(reached & (steps <= env_steps), steps, -1)
+
+
+def read(folder: Path, level_id: int) -> Search | None:
+    """What an earlier run knew of a level."""
+    path = folder / f"{level_id}.pickle"
+    return pickle.loads(path.read_bytes()) if path.exists() else None
+
+
+def write(folder: Path, level_id: int, row: Search) -> None:
+    """Keep it for the next run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    unfinished = folder / f"{level_id}.unfinished"
+    unfinished.write_bytes(pickle.dumps(row))
+    unfinished.replace(folder / f"{level_id}.pickle")
 
 
 def doublings(env_steps: int) -> list[int]:
@@ -145,25 +189,43 @@ def upper(count: int) -> float:
     return float(chi2.ppf(0.95, 2 * (count + 1)) / 2)
 
 
+def curve(found: Mapping[str, Int[np.ndarray, " level"]], most: Mapping[str, int]) -> Table:
+    """The unsolved share of each size after each doubling, as far as it was searched."""
+    head = "env steps a level", *(f"{size}, {len(steps)} levels: unsolved" for size, steps in found.items())
+    cell = lambda size, n: f"{unsolved(found[size], n).mean():.1%}" if n in doublings(most[size]) else "-"
+    budgets = sorted({n for each in most.values() for n in doublings(each)})
+    return Table(head, [[f"{n:,}", *(cell(size, n) for size in found)] for n in budgets])
+
+
+def more(found: Mapping[str, Int[np.ndarray, " level"]], most: Mapping[str, int]) -> Table:
+    """What is left at the end, and what would come."""
+    head = "size", "env steps", "unsolved then (95% interval)", "found in the last doubling", "in the next, at most"
+    return Table(head, [row(size, of, most[size]) for size, of in found.items()], "What more would find")
+
+
 def row(size: str, steps: Int[np.ndarray, " level"], env_steps: int) -> Sequence[str]:
     of = result(size, steps, env_steps)
     low, high = of["interval"]
     return (
         size,
+        f"{env_steps:,}",
         f"{of['unsolved']:.1%} ({low:.1%} to {high:.1%})",
         f"{of['last_doubling']} of {len(steps)} levels",
         f"{of['next_doubling_at_most']:.1%} of the levels",
     )
 
 
-def draw(path: Path, found: dict[str, Int[np.ndarray, " level"]], budgets: list[int]) -> None:
-    """The curves."""
+def draw(path: Path, found: Mapping[str, Int[np.ndarray, " level"]], most: Mapping[str, int]) -> None:
+    """The curves and their intervals."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
     for size, steps in found.items():
-        share = [100 * unsolved(steps, n).mean() for n in budgets]
-        axes.plot(budgets, share, "o-", color=COLOURS[size], label=size, markersize=3)
+        budgets = doublings(most[size])
+        counts = [int(unsolved(steps, n).sum()) for n in budgets]
+        low, high = 100 * np.array([wilson(count, len(steps)) for count in counts]).T
+        axes.plot(budgets, 100 * np.array(counts) / len(steps), "o-", color=COLOURS[size], label=size, markersize=3)
+        axes.fill_between(budgets, low, high, color=COLOURS[size], alpha=0.15, linewidth=0)
     axes.set(xscale="log", ylim=(0, None), xlabel="env steps of search, a level", ylabel="unsolved, %")
     axes.legend(title="size", frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
