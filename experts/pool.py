@@ -196,16 +196,6 @@ class Pool:
         count = int(self._queue.come) - self._taken if self._queue else 0
         return list(self._at.items())[len(self._at) - count :]
 
-    def expert(self, submission: Submission, i: int) -> Begun | None:
-        """An expert in training as it is now, on the host; None where its level is in no slot."""
-        if self._slots is None:
-            return None
-        of_slot = jax.device_get((self._slots.slot.mode, self._slots.slot.queue_index))
-        for slot, (mode, index) in enumerate(zip(*of_slot, strict=True)):
-            if mode != Mode.EMPTY and self._at.get(int(index)) == (submission, i):
-                return expert_of(self._slots, slot, self.config)
-        return None
-
     def _advance(self) -> None:
         """A rollout in every slot, and the account of it."""
         with lap() as took:

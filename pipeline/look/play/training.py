@@ -47,10 +47,10 @@ def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event, pla
             return
         curve = run.submission.curves[0]
         yield {"stage": "training", "env_steps": run.totals().env_steps, "curve": np.nan_to_num(curve).tolist()}
-        expert = pool.expert(run.submission, 0)
-        if expert is not None and monotonic() - shown > BETWEEN:
+        if monotonic() - shown > BETWEEN:
             shown, key = monotonic(), jax.random.key(len(curve))
-            params = expert.training.train_state.params
+            ((_, _, paused),) = pool.paused()
+            params = paused.expert.begun.training.train_state.params
             seen = attempts(file.level, params, key, procedure.expert, file.rules, ATTEMPTS, SHOWN_STEPS)
             seen = jax.device_get(seen)
             each = [places(seen.position[..., i], seen.rotation[..., i]) for i in range(ATTEMPTS)]
