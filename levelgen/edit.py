@@ -4,7 +4,6 @@ An edit is a pure function of one level, whose arrays have one lane, to another 
 moves or turns a body takes along all that joints hold to it. Masses are those of the sampler's bodies.
 """
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from levelgen.frames import in_world, turned
 from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role, name_of
 from levelgen.sampling.scenery import NORMAL
 from levelgen.sampling.shuffle import separate
@@ -76,7 +76,7 @@ def turn(level: Level, body: int, angle: float) -> Level:
 
     def change(one: Level) -> None:
         centre, together = one.state.position[_movable(one, body)].copy(), _joined(one, body)
-        one.state.position[together] = centre + _turned(one.state.position[together] - centre, angle)
+        one.state.position[together] = centre + turned(one.state.position[together] - centre, angle)
         one.state.rotation[together] += angle
 
     return _edited(level, change)
@@ -282,7 +282,7 @@ def _rejoin(one: Level, body: int) -> None:
     for position, there in enumerate(settled):
         for a, b, anchor_a, anchor_b in _joints(one):
             if b == there and a in settled[:position]:
-                one.state.position[b] = _in_world(one, a, anchor_a) - _turned(anchor_b, one.state.rotation[b])
+                one.state.position[b] = in_world(one.state, a, anchor_a) - turned(anchor_b, one.state.rotation[b])
                 break
 
 
@@ -294,15 +294,6 @@ def _anchors(one: Level) -> Iterator[tuple[Any, Any]]:
     yield model.thruster_position, model.thruster_body
 
 
-def _turned(points: Any, angle: Any) -> np.ndarray:
-    cos, sin = math.cos(angle), math.sin(angle)
-    return (np.asarray(points) @ np.array(((cos, sin), (-sin, cos)))).astype(np.float32)
-
-
-def _in_world(one: Level, body: int, anchor: Any) -> Any:
-    return one.state.position[body] + _turned(anchor, one.state.rotation[body])
-
-
 def _inside(one: Level, body: int, x: float, y: float) -> np.ndarray:
     """A point of the world in the frame of a body."""
-    return _turned(np.array((x, y)) - one.state.position[body], -one.state.rotation[body])
+    return turned(np.array((x, y)) - one.state.position[body], -one.state.rotation[body])

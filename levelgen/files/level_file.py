@@ -16,11 +16,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from levelgen.files import entries as layout
 from levelgen.files.entries import Entry, LevelFileError, entries_of, item, told
 from levelgen.files.kinetix import MANIFOLDS, Fields, level_from_kinetix, state_to_kinetix
+from levelgen.frames import in_world
 from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
 from levelgen.sampling.scenery import empty_level
 from levelgen.sampling.shuffle import separate
@@ -213,16 +215,8 @@ def _nested(values: Any) -> Any:
 
 def _with_points(level: Level) -> Fields:
     """The reference's arrays, with the positions of joints and thrusters that its first picture shows."""
-    model = level.model
+    model, state = jax.tree.map(lambda x: np.asarray(x)[..., 0], (level.model, level.state))
     return state_to_kinetix(level, level.state, np.zeros(1), np.full(1, NO_DISTANCE)) | {
-        "joint/global_position": _in_world(level, model.joint_a, model.joint_anchor_a),
-        "thruster/global_position": _in_world(level, model.thruster_body, model.thruster_position),
+        "joint/global_position": in_world(state, model.joint_a, model.joint_anchor_a)[None],
+        "thruster/global_position": in_world(state, model.thruster_body, model.thruster_position)[None],
     }
-
-
-def _in_world(level: Level, body: Any, anchor: Any) -> np.ndarray:
-    """Positions, m, (1, thing, 2), of points in the frames of bodies."""
-    body, anchor = np.asarray(body)[:, 0], np.asarray(anchor)
-    position, angle = np.asarray(level.state.position)[body], np.asarray(level.state.rotation)[body]
-    cos, sin, x, y = np.cos(angle), np.sin(angle), anchor[:, 0], anchor[:, 1]
-    return np.moveaxis(position + np.stack([x * cos - y * sin, x * sin + y * cos], 1), -1, 0)

@@ -15,9 +15,10 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
+from levelgen.frames import in_world, turned
 from levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
 from levelgen.pictures import style
-from levelgen.pictures.shapes import Host, Part, Point, Scene, disc, line, polygon, rectangle, turned
+from levelgen.pictures.shapes import Host, Part, Point, Scene, disc, line, polygon, rectangle
 from levelgen.pictures.words import Caption, caption_parts, key_parts, printable
 from physics.types import State
 
@@ -96,11 +97,6 @@ def _body(level: Level, state: State, body: int) -> Part:
     return Part(shapes, _point(state.position[body]), float(state.rotation[body]))
 
 
-def _attachment(state: State, body: int, anchor: Host) -> Point:
-    """A point of a body's frame in the world."""
-    return _point(np.asarray(state.position[body]) + turned(anchor, float(state.rotation[body])))
-
-
 def _motor_turn(level: Level, joint: int, action: np.ndarray | None) -> int:
     """1: the motor turns body b counterclockwise against body a, -1: clockwise, 0: it is off."""
     if action is None or not level.model.motor_on[joint] or level.model.joint_fixed[joint]:
@@ -112,7 +108,7 @@ def _motor_turn(level: Level, joint: int, action: np.ndarray | None) -> int:
 def _joint(level: Level, state: State, joint: int, action: np.ndarray | None) -> list[Part]:
     """The joint, and the arrow of its motor."""
     model = level.model
-    position = _attachment(state, int(model.joint_a[joint]), model.joint_anchor_a[joint])
+    position = _point(in_world(state, int(model.joint_a[joint]), model.joint_anchor_a[joint]))
     if model.joint_fixed[joint]:
         corners = 0.065 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
         cross = line(corners[::2], style.INK, style.EDGE) + line(corners[1::2], style.INK, style.EDGE)
@@ -140,7 +136,7 @@ def _thruster(level: Level, state: State, thruster: int, action: np.ndarray | No
     """The flame and the nozzle, which opens against the force on the body: that is along the thruster's rotation."""
     model, binding = level.model, MOTOR_BINDINGS + int(level.thruster_binding[thruster])
     body = int(model.thruster_body[thruster])
-    position = _attachment(state, body, model.thruster_position[thruster])
+    position = _point(in_world(state, body, model.thruster_position[thruster]))
     angle = float(model.thruster_rotation[thruster] + state.rotation[body])
     flame = _flame() if action is not None and action[binding] else ""
     return [

@@ -92,12 +92,6 @@ def number(value: float) -> str:
     return "0" if words == "-0" else words
 
 
-def turned(points: Sequence[Point] | Host, angle: float) -> np.ndarray:
-    """Points (..., 2) turned about the origin by an angle in radians."""
-    points, cos, sin = np.asarray(points), np.cos(angle), np.sin(angle)
-    return np.stack([points[..., 0] * cos - points[..., 1] * sin, points[..., 0] * sin + points[..., 1] * cos], -1)
-
-
 @cache
 def font() -> ImageFont.FreeTypeFont:
     """The letters of all pictures: Pillow's own."""
