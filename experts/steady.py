@@ -60,7 +60,7 @@ def steady(
         best, goes = now.success, ~now.steady
         bits = jax.vmap(lambda key: jax.random.bits(jax.random.fold_in(key, now.number), (10, LANES)))(keys)
         action = jax.vmap(varied)(best.action, best.length, bits, live).at[:, 0].set(best.action)
-        length = replayed(ring, action, jnp.where(goes, best.length, 0), rules)
+        length, _ = replayed(ring, action, jnp.where(goes, best.length, 0), rules)
         kept = jnp.argsort(jnp.where(lane, length * LANES + lane, 0), axis=-1)[:, :KEPT]
         action, length = action[level[:, None], kept], length[level[:, None], kept]
         reached = length <= RECORD_STEPS

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from experts.config import RECORD_STEPS
-from experts.search.play import CODES, Arena, act, arena, decode, fresh_walk
-from experts.search.shorten import Shortened, drawn, edited
+from experts.search.play import CODES, Arena, Walk, arena, decode
+from experts.search.shorten import Shortened, drawn, edited, replayed
 from experts.success import Success
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import ACTIONS, Level
@@ -58,7 +58,7 @@ def polish(
         best, goes = now.success, active(now)
         bits = jax.vmap(lambda key: jax.random.bits(jax.random.fold_in(key, now.number), (10, LANES)))(keys)
         action = jax.vmap(varied)(best.action, best.length, bits, live)
-        length, near = replayed(ring, action, jnp.where(goes, best.length, 0), rules)
+        length, near = neared(ring, action, jnp.where(goes, best.length, 0), rules)
         least = length == length.min(-1, keepdims=True)
         lane = jnp.argmin(jnp.where(least, near, jnp.inf), axis=-1)
         length, near = length[level, lane], near[level, lane]
@@ -102,24 +102,14 @@ def varied(
     return jnp.where(inside[:, :, None] & which[:, None], fresh[:, None], cut).astype(action.dtype)
 
 
-def replayed(
+def neared(
     ring: Arena, action: Int[Array, "level lane 256 6"], most: Int[Array, " level"], rules: TaskParams
 ) -> tuple[Int[Array, "level lane"], Float[Array, "level lane"]]:
-    """Env steps until the goal, RECORD_STEPS + 1 where it is not reached within `most`.
+    """As `replayed`; and how far green and blue were apart a step before `most`, m, where the goal is reached then."""
+    last = jnp.repeat(most, action.shape[1])
 
-    Also returns how far green and blue were apart a step before `most`, m, where it is reached just then.
-    """
-    count, lanes = action.shape[:2]
-    by_step = jnp.moveaxis(action.reshape(count * lanes, RECORD_STEPS, ACTIONS), 0, -1).astype(jnp.int32)
-    last = jnp.repeat(most, lanes)
+    def look(walk: Walk, near: Float[Array, " lane"]) -> Float[Array, " lane"]:
+        return jnp.where(walk.timestep == last - 1, goal_distance(ring.lanes, walk.state), near)
 
-    def step(carry):
-        walk, near = carry
-        walk = act(ring, walk, by_step[walk.timestep[0]], rules)
-        return walk, jnp.where(walk.timestep == last - 1, goal_distance(ring.lanes, walk.state), near)
-
-    going = lambda carry: (carry[0].timestep[0] < most.max()) & ~carry[0].ended.all()
-    walk, near = jax.lax.while_loop(going, step, (fresh_walk(ring.lanes), jnp.zeros(count * lanes)))
-    reached = walk.reached.reshape(count, lanes)
-    length = jnp.where((reached > 0) & (reached <= most[:, None]), reached, RECORD_STEPS + 1)
-    return length, jnp.where(length == most[:, None], near.reshape(count, lanes), 0.0)
+    length, near = replayed(ring, action, most, rules, look, jnp.zeros(len(last)))
+    return length, jnp.where(length == most[:, None], near.reshape(length.shape), 0.0)

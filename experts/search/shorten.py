@@ -1,7 +1,8 @@
 """A success made shorter: stretches of it are left out or held, and what then reaches the goal sooner is kept."""
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -9,13 +10,14 @@ from jaxtyping import Array, Int, UInt32
 
 from experts.config import RECORD_STEPS
 from experts.search.config import SearchConfig
-from experts.search.play import Arena, act, arena, fresh_walk
+from experts.search.play import Arena, Walk, act, arena, fresh_walk
 from experts.success import Success
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import ACTIONS, Level
 from levelgen.task.rules import TaskParams
 
 MOST_HALVINGS = 6  # stretches are from a whole success to a 64th of it
+T = TypeVar("T")
 
 
 class Shortened(NamedTuple):
@@ -60,7 +62,7 @@ def shorten(
         nothing = (number == 0) & (jnp.arange(config.lanes) == 0)
         edits = jax.tree.map(lambda x: jnp.where(nothing, 0, x), edits)
         action = jax.vmap(edited)(best.action, best.length, edits)
-        length = replayed(ring, action, best.length, rules)
+        length, _ = replayed(ring, action, best.length, rules)
         lane = jnp.argmin(length, axis=-1)
         level = jnp.arange(count)
         shorter = (length[level, lane] < best.length) | (number == 0)
@@ -94,16 +96,25 @@ def edited(action: Int[Array, "256 6"], length: Int[Array, ""], edit: Edit) -> I
 
 
 def replayed(
-    ring: Arena, action: Int[Array, "level lane 256 6"], most: Int[Array, " level"], rules: TaskParams
-) -> Int[Array, "level lane"]:
-    """Env steps until the goal, from the level's start; RECORD_STEPS + 1 where it is not reached within `most`."""
+    ring: Arena,
+    action: Int[Array, "level lane 256 6"],
+    most: Int[Array, " level"],
+    rules: TaskParams,
+    look: Callable[[Walk, T], T] = lambda _, seen: seen,
+    seen: T = None,
+) -> tuple[Int[Array, "level lane"], T]:
+    """Env steps until the goal, from the level's start; RECORD_STEPS + 1 where it is not reached within `most`.
+
+    After each env step, `look` makes of the walk and what was seen before what is returned as well.
+    """
     count, lanes = action.shape[:2]
     by_step = jnp.moveaxis(action.reshape(count * lanes, RECORD_STEPS, ACTIONS), 0, -1).astype(jnp.int32)
 
-    def step(walk):
-        return act(ring, walk, by_step[walk.timestep[0]], rules)
+    def step(now: tuple[Walk, T]) -> tuple[Walk, T]:
+        walk = act(ring, now[0], by_step[now[0].timestep[0]], rules)
+        return walk, look(walk, now[1])
 
-    going = lambda walk: (walk.timestep[0] < most.max()) & ~walk.ended.all()
-    walk = jax.lax.while_loop(going, step, fresh_walk(ring.lanes))
+    going = lambda now: (now[0].timestep[0] < most.max()) & ~now[0].ended.all()
+    walk, seen = jax.lax.while_loop(going, step, (fresh_walk(ring.lanes), seen))
     reached = walk.reached.reshape(count, lanes)
-    return jnp.where((reached > 0) & (reached <= most[:, None]), reached, RECORD_STEPS + 1)
+    return jnp.where((reached > 0) & (reached <= most[:, None]), reached, RECORD_STEPS + 1), seen

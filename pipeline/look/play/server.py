@@ -19,12 +19,10 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
 from experts.procedure import Procedure
-from levelgen.edit import one_of
 from levelgen.files.level_file import LevelFile
 from levelgen.pictures.palette import palette_css
 from pipeline.errors import UserError
 from pipeline.look.gallery.gallery import SITE
-from pipeline.look.gallery.worlds import drawn_bodies
 from pipeline.look.play.session import Session
 from pipeline.look.play.training import Message, trained
 
@@ -104,14 +102,8 @@ class Visit:
         return {}
 
     def _tell(self, file: LevelFile, stop: Event) -> None:
-        order, _ = drawn_bodies(one_of(file.level))
-
-        def places(position: np.ndarray, rotation: np.ndarray) -> list[list[float]]:
-            where = np.concatenate([position, rotation[..., None]], -1)[:, order]
-            return np.nan_to_num(where).reshape(len(where), -1).round(3).tolist()
-
         try:
-            for message in trained(file, self._procedure, self._budget, stop, places):
+            for message in trained(file, self._procedure, self._budget, stop):
                 if (witness := message.pop("witness", None)) is not None and file is self._session.file:
                     self._session.solve(witness)
                     message["film"] = self._session.film(witness)

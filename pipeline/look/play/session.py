@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from experts.config import RECORD_STEPS
 from experts.witness import replay, steps_to_goal, succeeds
@@ -18,7 +19,6 @@ from levelgen.sampling.scenery import empty_level
 from levelgen.task import rules as task
 from levelgen.task.actions import CHOICES
 from levelgen.task.rules import TaskParams, TaskState
-from physics.types import State
 from pipeline.errors import UserError
 from pipeline.look.gallery.worlds import drawn_bodies, world_of
 from pipeline.version import __version__
@@ -143,9 +143,9 @@ class Session:
 
     def film(self, actions: np.ndarray) -> Asked:
         """Where bodies are before each of these actions, and at the end."""
-        record = replay(self._file.level, _padded(actions), self._file.rules)
-        shown = slice(0, min(len(actions) + 1, RECORD_STEPS))
-        return {"places": self._places(record.state, shown), "actions": actions.tolist()}
+        state = replay(self._file.level, _padded(actions), self._file.rules).state
+        position, rotation = (x[: len(actions) + 1, ..., 0] for x in (state.position, state.rotation))
+        return {"places": places_of(self._file.level, position, rotation), "actions": actions.tolist()}
 
     def solve(self, actions: np.ndarray) -> None:
         """Take over a witness that an expert has found."""
@@ -170,14 +170,9 @@ class Session:
         self._actions: list[np.ndarray] = []
 
     def _moment(self) -> Asked:
-        state = jax.tree.map(lambda x: np.asarray(x)[None], self._now.state)
-        return {"places": self._places(state, slice(0, 1))[0], "timestep": len(self._actions)}
-
-    def _places(self, state: State, times: slice) -> list[list[float]]:
-        """x, y and angle of the drawn bodies, one after the other, at each time."""
-        bodies, _ = drawn_bodies(one_of(self._file.level))
-        where = np.concatenate([state.position[times, :, :, 0], state.rotation[times, :, None, 0]], -1)[:, bodies]
-        return np.nan_to_num(where).reshape(len(where), -1).round(4).tolist()
+        position, rotation = (np.asarray(x)[None, ..., 0] for x in (self._now.state.position, self._now.state.rotation))
+        (places,) = places_of(self._file.level, position, rotation)
+        return {"places": places, "timestep": len(self._actions)}
 
 
 ASKS: dict[str, Callable[[Session, Asked], Asked]] = {
@@ -192,6 +187,15 @@ ASKS: dict[str, Callable[[Session, Asked], Asked]] = {
 @partial(jax.jit, static_argnames="rules")
 def _advance(level: Level, now: TaskState, action: Any, rules: TaskParams) -> Any:
     return task.advance(level, now, action, rules)
+
+
+def places_of(
+    level: Level, position: Float[np.ndarray, "time body 2"], rotation: Float[np.ndarray, "time body"]
+) -> list[list[float]]:
+    """x, y and angle of the drawn bodies of a level, one after the other, at each time."""
+    bodies, _ = drawn_bodies(one_of(level))
+    where = np.concatenate([position, rotation[..., None]], -1)[:, bodies]
+    return np.nan_to_num(where).reshape(len(where), -1).round(4).tolist()
 
 
 def witness_in(document: Any, file: LevelFile) -> np.ndarray | None:

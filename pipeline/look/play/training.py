@@ -1,6 +1,6 @@
 """An expert trained for the one level of a page, told about while it trains."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from threading import Event
 from time import monotonic
 from typing import Any
@@ -15,15 +15,15 @@ from experts.procedure import Procedure
 from experts.train import TrainingRun
 from levelgen.files.level_file import LevelFile
 from levelgen.identity.content import content_hashes, level_id_for
+from pipeline.look.play.session import places_of
 
 ATTEMPTS = 12  # that a page shows at once
 SHOWN_STEPS = 128  # env steps of each
 BETWEEN = 0.8  # s between attempts that are shown
 Message = dict[str, Any]
-Places = Callable[[np.ndarray, np.ndarray], list[list[float]]]  # of positions [time, body, 2], rotations [time, body]
 
 
-def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event, places: Places) -> Iterator[Message]:
+def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event) -> Iterator[Message]:
     """Label a level as `generate` labels level files, and tell how far it is; the last message has the verdict.
 
     Args:
@@ -31,7 +31,6 @@ def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event, pla
         procedure: how it is labelled.
         budget: env steps of its expert.
         stop: set: end before the label is known.
-        places: what a page takes for where bodies are.
     """
     yield {"stage": "compiling", "budget": budget}
     pool, shown = Pool(budget, procedure, file.rules), monotonic()
@@ -53,7 +52,7 @@ def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event, pla
             params = paused.expert.begun.training.train_state.params
             seen = attempts(file.level, params, key, procedure.expert, file.rules, ATTEMPTS, SHOWN_STEPS)
             seen = jax.device_get(seen)
-            each = [places(seen.position[..., i], seen.rotation[..., i]) for i in range(ATTEMPTS)]
+            each = [places_of(file.level, seen.position[..., i], seen.rotation[..., i]) for i in range(ATTEMPTS)]
             yield {"attempts": each, "goals": seen.goal.tolist()}
     yield {"stage": "stopped"}
 
