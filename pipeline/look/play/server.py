@@ -28,7 +28,7 @@ from pipeline.look.play.training import Message, trained
 
 HOST = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
-SHARED = ("draw.js", "style.css")  # files of the gallery's pages that this one uses, too
+SHARED = ("draw.js", "curve.js", "style.css")  # files of the gallery's pages that this one uses, too
 PALETTE = "palette.css"
 MOST_BYTES = 8_000_000  # of a question: a level file
 SOCKET = "/socket"

@@ -1,6 +1,7 @@
 """An expert trained for the one level of a page, told about while it trains."""
 
 from collections.abc import Iterator
+from math import isnan
 from threading import Event
 from time import monotonic
 from typing import Any
@@ -45,7 +46,11 @@ def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event) -> 
             yield verdict_of(run)
             return
         curve = run.submission.curves[0]
-        yield {"stage": "training", "env_steps": run.totals().env_steps, "curve": np.nan_to_num(curve).tolist()}
+        yield {
+            "stage": "training",
+            "env_steps": run.totals().env_steps,
+            "curve": [None if isnan(rate) else rate for rate in curve],
+        }
         if monotonic() - shown > BETWEEN:
             shown, key = monotonic(), jax.random.key(len(curve))
             ((_, _, paused),) = pool.paused()

@@ -18,6 +18,7 @@ from experts.config import RECORD_STEPS, ScoutConfig, StopConfig
 from experts.witness import replay, succeeds
 from levelgen.files.level_file import from_document, write_level_file
 from pipeline.errors import UserError
+from pipeline.look.play import training
 from pipeline.look.play.open import level_to_play
 from pipeline.look.play.server import HOST, serving
 from pipeline.look.play.session import empty_file
@@ -101,7 +102,8 @@ def test_edits_are_made_taken_back_and_refused(page: ClientConnection) -> None:
 
 
 @pytest.mark.campaign
-def test_an_expert_is_trained_while_the_page_looks_on(page: ClientConnection) -> None:
+def test_an_expert_is_trained_while_the_page_looks_on(page: ClientConnection, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "BETWEEN", 0.0)
     assert "error" not in ask(page, "train")
     told, end = [], time.monotonic() + PATIENCE
     while not told or told[-1].get("stage") not in ("done", "failed"):
@@ -110,6 +112,11 @@ def test_an_expert_is_trained_while_the_page_looks_on(page: ClientConnection) ->
         told.append(message["training"])
     assert told[-1]["label"] == "solved", told[-1]
     assert any("curve" in message for message in told)
+    seen = [message for message in told if "attempts" in message]
+    assert all(len(of["attempts"]) == len(of["goals"]) == training.ATTEMPTS for of in seen)
+    assert seen
+    start, drawn = ask(page, "restart")["places"], np.array(seen[0]["attempts"])
+    assert drawn.shape == (training.ATTEMPTS, training.SHOWN_STEPS, len(start))
     film = told[-1]["film"]
     assert ask(page, "play")["actions"] == film["actions"]
 
@@ -121,7 +128,7 @@ def test_only_its_own_page_may_ask(address: str) -> None:
         request = urllib.request.Request(address + path, headers={"Host": host} if host else {})
         with pytest.raises(urllib.error.HTTPError):
             urllib.request.urlopen(request)
-    for path in ("/", "/draw.js", "/palette.css", "/main.js"):
+    for path in ("/", "/draw.js", "/curve.js", "/palette.css", "/main.js"):
         assert urllib.request.urlopen(address + path).read()
 
 

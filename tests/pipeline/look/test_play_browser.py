@@ -97,3 +97,12 @@ def test_an_expert_trains_in_sight(page: Any, tmp_path: Path) -> None:
     button(page, "Train an expert for this level")
     done = "/^(solved|unsolved|trivial|unsolvable):/.test(document.querySelector('#stage-of-training').textContent)"
     page.wait_for_function(done, timeout=240_000)
+    assert page.locator("#learning").is_hidden() == (page.locator("#curve path").count() == 0)
+
+
+def test_a_learning_curve_is_seen(page: Any) -> None:
+    rates = "levelproof.drawCurve(document.querySelector('#curve'), [null, 0.25, null, 0.5])"
+    assert page.locator("#curve").is_hidden()
+    page.evaluate(rates)
+    assert page.locator("#curve").is_visible()
+    assert "from 25% to 50%" in (page.locator("#curve").get_attribute("aria-label") or "")

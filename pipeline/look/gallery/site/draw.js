@@ -12,6 +12,7 @@ window.levelproof = window.levelproof || {};
   const SIDE = 5; // m, of the world
   const BORDER = 0.08; // m, of the walls that show
   const VIEW = SIDE + 2 * BORDER; // m, of a picture: it is square
+  const PIXELS = 1200; // most, of a canvas
   const EDGE = 0.022; // m, width of the line around a shape
   const LENGTH = 1 / 2000; // m, what lengths are counted in
   const ANGLE = 1 / 10000; // rad
@@ -298,5 +299,21 @@ window.levelproof = window.levelproof || {};
     for (const joint of world.joints) drawJoint(context, joint, places, now.action, colours);
   }
 
-  Object.assign(window.levelproof, { bytesOf, worldOf, statesOf, between, liveEntries, entryName, coloursOf, drawWorld });
+  // Gives a canvas as many pixels as it takes on the screen; whether it is there at all.
+  function fit(canvas) {
+    const pixels = Math.min(PIXELS, Math.round(canvas.clientWidth * devicePixelRatio));
+    if (pixels && canvas.width !== pixels) canvas.width = canvas.height = pixels;
+    return pixels > 0;
+  }
+
+  // A pointer's position in the world that a canvas shows, m.
+  function metresOf(canvas, event) {
+    const box = canvas.getBoundingClientRect();
+    const scale = VIEW / box.width;
+    return [(event.clientX - box.left) * scale - BORDER, SIDE + BORDER - (event.clientY - box.top) * scale];
+  }
+
+  Object.assign(window.levelproof, {
+    bytesOf, worldOf, statesOf, between, liveEntries, entryName, coloursOf, attached, drawWorld, fit, metresOf,
+  });
 })();

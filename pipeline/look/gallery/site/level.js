@@ -5,7 +5,6 @@
   const { load, made, spoken, shown, statesOf, between, bytesOf, liveEntries, entryName, drawWorld } = window.levelproof;
   const ENTRIES = 6; // of an action
   const REST = 0.8; // s that the last picture stays before the witness begins again
-  const PIXELS = 1200; // most, of the canvas
   const at = (id) => document.getElementById(id);
 
   class LevelPage {
@@ -60,7 +59,7 @@
         return { entry, element, motor: entry < 4 };
       });
       at("keys").replaceChildren(...this.keys.map((key) => key.element));
-      this.learning(row.learning_curve);
+      levelproof.drawCurve(at("curve"), row.learning_curve);
       const value = (of) => {
         if (of === null) return "–";
         if (typeof of === "number") return shown(of);
@@ -73,40 +72,13 @@
       at("stage").setAttribute("aria-label", `Level ${row.level_id}, ${row.label}: ${known}. ${described(this.world)}`);
     }
 
-    // Success rate of training per update; where no episode ended there is none.
-    learning(rates) {
-      const known = rates.map((rate, update) => [update, rate]).filter(([, rate]) => rate !== null);
-      at("learning").hidden = !known.length || rates.length < 2;
-      if (at("learning").hidden) return;
-      const [left, right, top, bottom] = [30, 314, 8, 102];
-      const x = (update) => left + ((right - left) * update) / (rates.length - 1);
-      const y = (rate) => bottom - (bottom - top) * rate;
-      const text = (words, place, anchor) => made("text", { svg: true, ...place, "text-anchor": anchor }, words);
-      const grid = [0, 0.5, 1].flatMap((rate) => [
-        made("line", { svg: true, x1: left, x2: right, y1: y(rate), y2: y(rate) }),
-        text(`${100 * rate}%`, { x: left - 5, y: y(rate) + 3 }, "end"),
-      ]);
-      const path = known.map(([update, rate], i) => `${i ? "L" : "M"}${x(update).toFixed(1)} ${y(rate).toFixed(1)}`).join("");
-      const dots = known.length > 60 ? [] : known.map(([update, rate]) => made("circle", { svg: true, cx: x(update), cy: y(rate), r: 2 }));
-      at("curve").replaceChildren(...grid, made("path", { svg: true, d: path }), ...dots,
-        text("update 1", { x: left, y: 115 }, "start"), text(String(rates.length), { x: right, y: 115 }, "end"));
-      const last = known[known.length - 1][1];
-      const words = `Share of training episodes that reached the goal, in each of ${rates.length} updates`;
-      at("curve").setAttribute("aria-label", `${words}: from ${Math.round(100 * known[0][1])}% to ${Math.round(100 * last)}%`);
-      at("learning-caption").textContent = `${words}.`;
-    }
-
     recolour() {
       this.colours = levelproof.coloursOf();
       this.draw();
     }
 
     fit() {
-      const canvas = at("stage");
-      const pixels = Math.min(PIXELS, Math.round(canvas.clientWidth * devicePixelRatio));
-      if (!pixels) return;
-      if (canvas.width !== pixels) canvas.width = canvas.height = pixels;
-      this.draw();
+      if (levelproof.fit(at("stage"))) this.draw();
     }
 
     seek(time) {

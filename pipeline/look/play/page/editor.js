@@ -2,6 +2,7 @@
 "use strict";
 
 (function () {
+  const { metresOf } = window.levelproof;
   const at = (id) => document.getElementById(id);
   const NEAR = 0.14; // m, from a joint or thruster that a click means
   const TURN = Math.PI / 12; // rad, of a click
@@ -69,7 +70,7 @@
     }
 
     async down(event) {
-      const [x, y] = this.stage.metres(event);
+      const [x, y] = metresOf(this.stage.canvas, event);
       this.stage.canvas.setPointerCapture(event.pointerId);
       this.stage.show(this.stage.world.start, null); // edits are of the start
       if (this.tool === "thruster") this.drag = { from: [x, y] };
@@ -101,7 +102,7 @@
 
     moved(event) {
       if (!this.drag || this.drag.index === undefined) return;
-      const [x, y] = this.stage.metres(event);
+      const [x, y] = metresOf(this.stage.canvas, event);
       const places = Array.from(this.stage.world.start);
       places[3 * this.drag.index] = this.drag.start[0] + x - this.drag.from[0];
       places[3 * this.drag.index + 1] = this.drag.start[1] + y - this.drag.from[1];
@@ -112,7 +113,7 @@
       const drag = this.drag;
       this.drag = null;
       if (!drag) return;
-      const [x, y] = this.stage.metres(event);
+      const [x, y] = metresOf(this.stage.canvas, event);
       const [dx, dy] = [x - drag.from[0], y - drag.from[1]];
       const far = Math.hypot(dx, dy) > 0.02;
       if (this.tool === "thruster") await this.edit("add_thruster", ...drag.from, far ? Math.atan2(dy, dx) : Math.PI / 2);

@@ -2,7 +2,7 @@
 "use strict";
 
 (function () {
-  const { drawWorld } = window.levelproof;
+  const { drawCurve, drawWorld } = window.levelproof;
   const at = (id) => document.getElementById(id);
   const STAGES = {
     compiling: "Loading the programs of this size; the first time takes a minute.",
@@ -35,7 +35,7 @@
     run(running) {
       this.running = running;
       at("train").textContent = running ? "Stop" : "Train an expert for this level";
-      if (running) at("curve").hidden = at("attempts").hidden = true;
+      if (running) at("learning").hidden = at("attempts").hidden = true;
     }
 
     // What the server tells of the training.
@@ -45,25 +45,13 @@
       const steps = message.env_steps === undefined ? "" : `: ${message.env_steps.toLocaleString("en")} env steps`;
       if (message.budget) this.budget = message.budget;
       at("stage-of-training").textContent = stage === "training" ? `${STAGES[stage]}${steps}.` : stage === "searching" ? `${STAGES[stage]}${steps}.` : STAGES[stage] || "";
-      if (message.curve) this.curve(message.curve);
+      if (message.curve) drawCurve(at("curve"), message.curve);
       if (stage === "done") {
         at("stage-of-training").textContent = `${message.label}: ${message.reason} (${message.env_steps.toLocaleString("en")} env steps).`;
         if (message.film && this.world === this.stage.world) this.solved(message.film);
       }
       if (stage === "failed") at("stage-of-training").textContent = message.reason;
       if (["done", "stopped", "failed"].includes(stage)) this.run(false);
-    }
-
-    // Success rate of training by update.
-    curve(rates) {
-      const [left, right, top, bottom] = [30, 314, 8, 102];
-      const x = (update) => left + ((right - left) * update) / Math.max(1, rates.length - 1);
-      const y = (rate) => bottom - (bottom - top) * rate;
-      const grid = [0, 0.5, 1].map((rate) => `<line x1="${left}" x2="${right}" y1="${y(rate)}" y2="${y(rate)}"/><text x="${left - 5}" y="${y(rate) + 3}" text-anchor="end">${100 * rate}%</text>`);
-      const path = rates.map((rate, update) => `${update ? "L" : "M"}${x(update).toFixed(1)} ${y(rate).toFixed(1)}`).join("");
-      at("curve").hidden = false;
-      at("curve").innerHTML = `${grid.join("")}<path d="${path}"/><text x="${right}" y="115" text-anchor="end">update ${rates.length}</text>`;
-      at("curve").setAttribute("aria-label", `Share of episodes that reach the goal in ${rates.length} updates, ${Math.round(100 * rates.at(-1))}% in the last`);
     }
 
     attempts({ attempts, goals }) {

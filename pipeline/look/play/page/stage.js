@@ -1,11 +1,8 @@
-// The canvas: the world as it is now, the pointer in metres, and what is selected.
+// The canvas: the world as it is now, and what is selected.
 "use strict";
 
 (function () {
-  const { drawWorld, coloursOf, worldOf } = window.levelproof;
-  const SIDE = 5; // m, of the world
-  const BORDER = 0.08; // m, of the walls that show: as draw.js has them
-  const PIXELS = 1200; // most, of the canvas
+  const { attached, drawWorld, coloursOf, fit, worldOf } = window.levelproof;
 
   class Stage {
     constructor(canvas) {
@@ -36,10 +33,7 @@
     }
 
     fit() {
-      const pixels = Math.min(PIXELS, Math.round(this.canvas.clientWidth * devicePixelRatio));
-      if (!pixels) return;
-      if (this.canvas.width !== pixels) this.canvas.width = this.canvas.height = pixels;
-      this.draw();
+      if (fit(this.canvas)) this.draw();
     }
 
     draw() {
@@ -62,17 +56,7 @@
       const places = this.places || this.world.start;
       if (kind === "body") return index < this.world.bodies.length ? [places[3 * index], places[3 * index + 1]] : null;
       const thing = (kind === "joint" ? this.world.joints : this.world.thrusters)[index];
-      if (!thing) return null;
-      const [x, y] = thing.anchor || thing.position;
-      const [cos, sin] = [Math.cos(places[3 * thing.body + 2]), Math.sin(places[3 * thing.body + 2])];
-      return [places[3 * thing.body] + x * cos - y * sin, places[3 * thing.body + 1] + x * sin + y * cos];
-    }
-
-    // A pointer's position in the world, m.
-    metres(event) {
-      const box = this.canvas.getBoundingClientRect();
-      const scale = (SIDE + 2 * BORDER) / box.width;
-      return [(event.clientX - box.left) * scale - BORDER, SIDE + BORDER - (event.clientY - box.top) * scale];
+      return thing ? attached(places, thing.body, thing.anchor || thing.position) : null;
     }
   }
 
