@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.handmade import KINDS, PIXELS, labelled, totals, write_sheet
+from benchmarks import handmade
+from benchmarks.handmade import KINDS, PIXELS, PPO_TOLD, labelled, ppo, totals, write_sheet
 from configs.compose import compose_job
 from levelgen.files.level_file import LevelFile, write_level_file
 from levelgen.level import SIZES
@@ -19,16 +20,22 @@ TRIVIAL, UNSOLVABLE = 1, 16
 
 
 @pytest.mark.campaign
-def test_each_level_has_its_row_and_each_size_its_sum(tmp_path: Path) -> None:
+def test_each_level_has_its_row_and_each_size_its_sum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, level_id in {"falls": TRIVIAL, "hopeless": UNSOLVABLE}.items():
         level = jax.tree.map(np.asarray, sample_levels([level_id], SIZES["s"]))
         write_level_file(LevelFile(level, TaskParams()), tmp_path / f"{name}.json")
     job = compose_job([f"level_files={tmp_path}", "procedure=label", "budget=5k"])
-    results, pictures = labelled(job, levels_below(tmp_path, job).levels["s"])
+    origins = levels_below(tmp_path, job).levels["s"]
+    results, pictures = labelled(job, origins)
     write_sheet(pictures, tmp_path / "sheet.png")
     with Image.open(tmp_path / "sheet.png") as sheet:
         assert sheet.width == PIXELS, "of the one that has a witness"
     assert {of["level"]: of["label"] for of in results} == {"falls": "trivial", "hopeless": "unsolvable"}
     assert all(of[kind] == 0 for of in results for kind in KINDS)
-    ((size, levels, with_witness, _, *sums),) = totals(results)
-    assert (size, levels, with_witness, sums) == ("s", "2", "1", ["0"] * len(KINDS))
+    by_ppo = ppo(origins, tmp_path / "kept")
+    monkeypatch.setattr(handmade, "label", None)
+    assert ppo(origins, tmp_path / "kept") == by_ppo, "what is known is not trained again"
+    assert [[of[name] is not None for name in PPO_TOLD] for of in by_ppo] == [[False, True], [False, False]]
+    results = [of | of_ppo for of, of_ppo in zip(results, by_ppo, strict=True)]
+    ((size, levels, with_witness, by_ppo, _, *sums),) = totals(results)
+    assert (size, levels, with_witness, by_ppo, sums) == ("s", "2", "1", "1", ["0"] * len(KINDS))
