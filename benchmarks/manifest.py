@@ -27,10 +27,10 @@ from benchmarks.report import Report, Table
 from configs.compose import compose_job
 from configs.numbers import parse_count
 from experts.steps import Seconds
+from pipeline.store.columns import COLUMNS
 from pipeline.store.layout import new_attempt, split_path, unit_name
 from pipeline.store.manifest import begin_fragment, write_fragment
 from pipeline.store.merge import FILE_BYTES
-from pipeline.store.schema import COLUMNS
 from pipeline.store.seal import ROWS
 
 REFERENCE = Path(__file__).parent.parent / "manifests" / "128k-s.parquet"

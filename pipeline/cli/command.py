@@ -1,6 +1,8 @@
 """The words that commands use alike."""
 
 import argparse
+import textwrap
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 EXITS = "exit codes: 0 done, 1 failed, 2 change the command, 3 some units quarantined"
@@ -18,3 +20,15 @@ def add_out(parser: argparse.ArgumentParser, default: str, kinds: str = "") -> N
 
 def add_json(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def listed(entries: Iterable[tuple[str, str]], columns: int, indent: int) -> Iterator[str]:
+    """Names and, from column `indent` on, what each means, in lines that are at most `columns` wide."""
+    for name, meaning in entries:
+        first = f"  {name}  "
+        lines = textwrap.wrap(meaning, max(columns - indent, indent))
+        if len(first) > indent:
+            yield first.rstrip()
+        else:
+            yield f"{first:{indent}}{lines.pop(0)}"
+        yield from (" " * indent + line for line in lines)

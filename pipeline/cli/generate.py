@@ -3,6 +3,7 @@
 import argparse
 import shutil
 
+from pipeline.cli.command import listed
 from pipeline.errors import Exit
 
 DOES = "make levels and their experts"
@@ -48,9 +49,9 @@ def run(arguments: argparse.Namespace) -> Exit:
 def _help(parser: argparse.ArgumentParser) -> str:
     """argparse's help, with the settings that people change before the examples: on one screen."""
     from configs.meanings import every_setting
-    from pipeline.cli.settings import rows
 
     settings = {setting.name: setting for setting in every_setting()}
-    often = "\n".join(rows((settings[name] for name in OFTEN), shutil.get_terminal_size().columns, INDENT))
+    entries = ((settings[name].word, settings[name].text) for name in OFTEN)
+    often = "\n".join(listed(entries, shutil.get_terminal_size().columns, INDENT))
     parser.epilog = f"settings and their defaults (all of them: levelproof settings):\n{often}\n\n{parser.epilog}"
     return argparse.ArgumentParser.format_help(parser)

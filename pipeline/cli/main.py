@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from configs.errors import ConfigError, readable
 from pipeline.cli import (
     card,
+    columns,
     diff,
     export,
     gallery,
@@ -38,6 +39,7 @@ COMMANDS = (
     settings,
     sample,
     inspect,
+    columns,
     plan,
     diff,
     show,

@@ -3,13 +3,12 @@
 import argparse
 import json
 import shutil
-import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from pipeline.cli.command import add_json
+from pipeline.cli.command import add_json, listed
 from pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -52,19 +51,8 @@ def run(arguments: argparse.Namespace) -> None:
 def as_text(settings: Iterable["Setting"], columns: int) -> str:
     """The settings in two columns, group after group."""
     groups = groupby(settings, lambda setting: setting.group)
-    return "\n\n".join("\n".join([group, *rows(members, columns, INDENT)]) for group, members in groups)
-
-
-def rows(settings: Iterable["Setting"], columns: int, indent: int) -> Iterator[str]:
-    """Each setting and, from column `indent` on, what it means, in lines that are at most `columns` wide."""
-    for setting in settings:
-        first = f"  {setting.word}  "
-        lines = textwrap.wrap(setting.text, max(columns - indent, indent))
-        if len(first) > indent:
-            yield first.rstrip()
-        else:
-            yield f"{first:{indent}}{lines.pop(0)}"
-        yield from (" " * indent + line for line in lines)
+    lines = lambda members: listed(((setting.word, setting.text) for setting in members), columns, INDENT)
+    return "\n\n".join("\n".join([group, *lines(members)]) for group, members in groups)
 
 
 def as_markdown(settings: Iterable["Setting"]) -> str:

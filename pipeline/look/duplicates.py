@@ -13,8 +13,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.errors import UserError
+from pipeline.store.columns import COLUMNS
 from pipeline.store.manifest import require_manifest
-from pipeline.store.schema import COLUMNS
 
 COMPARED = ("content_hash", "signature")
 # The few that share a half of a signature; the same content has the same signature. Grouping hashes of 8 bytes takes a

@@ -17,9 +17,9 @@ from levelgen.pictures.words import Caption
 from pipeline.look.show import recorded_film
 from pipeline.read.levels import levels_of, rules_of
 from pipeline.read.rows import read_rows
+from pipeline.store.columns import COLUMNS
 from pipeline.store.contents import table_for
 from pipeline.store.manifest import Manifest, require_manifest
-from pipeline.store.schema import COLUMNS
 from pipeline.store.shown import shown
 
 PICTURES = ("start", "goal")  # the initial world; the moment that the witness reaches the goal, where there is one

@@ -193,7 +193,7 @@ level after every end; how much of it is stored is the split's density, and read
 reward, end and goal whatever that is. One trajectory is one compressed chunk with a checksum.
 - `{PREVIEW}/*.parquet`: a sample of the levels with pictures, which the viewer shows.
 
-Columns and fields: {_link("docs/storage.md", wishes.code, "/blob/main/docs/storage.md")} and \
+Columns and fields: {_link("docs/columns.md", wishes.code, "/blob/main/docs/columns.md")} and \
 {_link("docs/shards.md", wishes.code, "/blob/main/docs/shards.md")}."""
 
 

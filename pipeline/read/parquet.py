@@ -20,8 +20,8 @@ from pipeline.read.created import new_folder
 from pipeline.read.levels import levels_of
 from pipeline.read.pace import Pace
 from pipeline.read.select import columns_in, select
+from pipeline.store.columns import COLUMNS
 from pipeline.store.manifest import Manifest, read_fragment, require_manifest
-from pipeline.store.schema import COLUMNS
 
 GROUP = 16 * CHUNK  # rows: what is in memory at once, and what a query reads or skips
 FILE = 25 * GROUP  # rows of a file, about as many as a sealed manifest's files have

@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import UserError
+from pipeline.store.columns import COLUMNS
 from pipeline.store.manifest import require_manifest
-from pipeline.store.schema import COLUMNS
 
 SOLVED = "label = 'solved'"  # exported where nothing else is asked for
 WITNESSED = ("level_id", "size", "budget", "shard", "row")  # columns that exporters read

@@ -18,8 +18,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pipeline.store.checksums import TAIL
+from pipeline.store.columns import COLUMNS, schema_of
 from pipeline.store.remote import bytes_of, is_remote
-from pipeline.store.schema import COLUMNS, schema_of
 from pipeline.store.thrift import Column, footer_in, pages_in
 
 MOST_FOOTER = 2**24  # bytes; most of them are digests

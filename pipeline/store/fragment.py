@@ -16,20 +16,10 @@ from levelgen.identity.keys import MAX_LEVEL_ID
 from levelgen.level import size_of
 from pipeline.errors import Failure
 from pipeline.store.bounds import DAMAGE, bounded
+from pipeline.store.columns import COLUMNS, MANIFEST_VERSION, VERSIONS, completed
 from pipeline.store.layout import ids_of
 from pipeline.store.remote import mended
-from pipeline.store.schema import (
-    COLUMNS,
-    CONFIG_KEY,
-    DENSITIES_KEY,
-    DIGESTS_KEY,
-    HASH_KEY,
-    MANIFEST_VERSION,
-    SEALED_KEY,
-    VERSION_KEY,
-    VERSIONS,
-    completed,
-)
+from pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 
 FULL = (stored_as("full"),)
 DENSITIES = {stored_as(density, every) for density in get_args(Density) for every in KEYS_EVERY}

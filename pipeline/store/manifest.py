@@ -20,22 +20,13 @@ from configs.convert import flat
 from pipeline.errors import Failure, UserError
 from pipeline.store import files
 from pipeline.store.checksums import digests_below, with_own
+from pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.fragment import FULL, Fragment, read_fragment
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
 from pipeline.store.remote import INDEX
 from pipeline.store.runs import ascending
-from pipeline.store.schema import (
-    COLUMNS,
-    CONFIG_KEY,
-    DENSITIES_KEY,
-    DIGESTS_KEY,
-    HASH_KEY,
-    MANIFEST_VERSION,
-    SEALED_KEY,
-    VERSION_KEY,
-    schema_of,
-)
+from pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from pipeline.store.shown import shown
 
 SHOWN = 6  # differing settings that an error lists

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import pyarrow as pa
 
 from configs.schema import Density, stored_as
+from pipeline.store.columns import COLUMNS
 from pipeline.store.convert import convert
 from pipeline.store.files import remove
 from pipeline.store.layout import (
@@ -41,7 +42,7 @@ from pipeline.store.manifest import (
 from pipeline.store.merge import Place, merge_shards
 from pipeline.store.publish import publishing
 from pipeline.store.remote import is_remote
-from pipeline.store.schema import COLUMNS, Encoding
+from pipeline.store.schema import Encoding
 from pipeline.store.shard import Shard
 
 ROWS = 100_000  # of a sealed fragment, about; more: fewer files, and more to write again when some are added

@@ -27,12 +27,12 @@ from physics.pairs import pairs_of
 from physics.types import MAX_VERTICES, Size
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
+from pipeline.store.columns import OF_THE_RUN
 from pipeline.store.contents import highest
 from pipeline.store.fields import arrays_of, tree_of
 from pipeline.store.job_note import note_job
 from pipeline.store.layout import split_path
 from pipeline.store.manifest import fragment_paths, read_manifest
-from pipeline.store.schema import OF_THE_RUN
 
 T = TypeVar("T")
 PLAYED = 64  # levels of `played_split`

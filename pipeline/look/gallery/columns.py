@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from pipeline.look.gallery.worlds import text_of
 from pipeline.look.reasons import kind_of_reason
-from pipeline.store.schema import COLUMNS
+from pipeline.store.columns import COLUMNS
 
 PAGE = 8192  # rows
 NOTHING = 2**16 - 1  # in place of a word

@@ -35,10 +35,10 @@ from pipeline.read.levels import rules_of
 from pipeline.read.rows import COLUMNS, moved_rows, read_placed, same_places
 from pipeline.read.select import columns_in, select
 from pipeline.runtime import own_cores
+from pipeline.store.columns import COLUMNS as ALL_COLUMNS
+from pipeline.store.columns import schema_of
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import require_manifest
-from pipeline.store.schema import COLUMNS as ALL_COLUMNS
-from pipeline.store.schema import schema_of
 from pipeline.store.shard import open_shard
 
 READ = ("content_hash", "label", "steps_to_goal", *COLUMNS)  # columns of the manifest that are always read

@@ -12,9 +12,9 @@ from pipeline.look.show import show
 from pipeline.look.status import look
 from pipeline.read.export import export
 from pipeline.read.verify import examine
+from pipeline.store.columns import OF_THE_RUN
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import read_manifest
-from pipeline.store.schema import OF_THE_RUN
 from pipeline.store.shard import Shard
 from tests.pipeline.command import assert_refused, run
 

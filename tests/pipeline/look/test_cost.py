@@ -5,7 +5,7 @@ import pytest
 
 from experts.steps import Seconds
 from pipeline.look.cost import cost_of, cost_told
-from pipeline.store.schema import COLUMNS
+from pipeline.store.columns import COLUMNS
 
 
 def table(labels: list[str], seconds: list[Seconds | None], device: str = "cpu: of some kind") -> pa.Table:

@@ -32,9 +32,9 @@ from pipeline.look.things import things_of
 from pipeline.read import levels as levels_module
 from pipeline.read.select import columns_in
 from pipeline.store import manifest
+from pipeline.store.columns import COLUMNS
 from pipeline.store.layout import split_path
 from pipeline.store.manifest import Fragment, read_fragment, read_manifest
-from pipeline.store.schema import COLUMNS
 from tests.pipeline.made import made_job, made_result, made_split, made_verdict
 
 LABELS = [Label.SOLVED, Label.TRIVIAL, Label.UNSOLVED, Label.UNSOLVABLE]

@@ -8,8 +8,8 @@ from levelgen.level import SIZES, Level, size_of
 from levelgen.sampling.scenery import empty_level
 from pipeline.errors import UserError
 from pipeline.read.columns import column_fields, columns_for, levels_from
+from pipeline.store.columns import COLUMNS
 from pipeline.store.fields import arrays_of, same_bits
-from pipeline.store.schema import COLUMNS
 from tests.pipeline.made import made_level
 
 EMPTY = "8-8-0-0"  # no joints, no thrusters

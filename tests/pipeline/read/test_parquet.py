@@ -11,9 +11,10 @@ import pytest
 import levelproof
 from pipeline.cli.main import main
 from pipeline.read import parquet
+from pipeline.store.columns import COLUMNS
 from pipeline.store.layout import MANIFEST
 from pipeline.store.manifest import read_manifest
-from pipeline.store.schema import COLUMNS, CONFIG_KEY
+from pipeline.store.schema import CONFIG_KEY
 from tests.pipeline.made import PLAYED, made_job, played_split
 
 pytestmark = pytest.mark.slow

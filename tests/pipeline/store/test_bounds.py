@@ -16,8 +16,8 @@ import pytest
 
 from experts.labels import Label
 from pipeline.errors import Failure
+from pipeline.store.columns import COLUMNS
 from pipeline.store.manifest import fragment_paths, read_fragment, read_manifest
-from pipeline.store.schema import COLUMNS
 from pipeline.store.thrift import footer_in, pages_in
 from tests.pipeline.command import ROOT
 from tests.pipeline.made import made_split

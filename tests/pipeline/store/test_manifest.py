@@ -16,6 +16,7 @@ from pipeline.errors import Failure, UserError
 from pipeline.jobs.unit import manifest_row
 from pipeline.store import manifest as manifest_file
 from pipeline.store import shown
+from pipeline.store.columns import COLUMNS
 from pipeline.store.layout import new_attempt, unit_name
 from pipeline.store.manifest import (
     begin_fragment,
@@ -27,7 +28,6 @@ from pipeline.store.manifest import (
     told,
     write_fragment,
 )
-from pipeline.store.schema import COLUMNS
 from tests.pipeline.made import made_job, made_verdict
 
 

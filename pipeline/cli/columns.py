@@ -1,0 +1,71 @@
+"""`levelproof columns`: every column of a manifest with its meaning, type and unit."""
+
+import argparse
+import json
+import shutil
+from typing import TYPE_CHECKING
+
+from pipeline.cli.command import add_json, listed
+from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from pipeline.store.columns import ManifestColumn
+
+DOES = "list a manifest's columns with their meanings, types and units"
+EXAMPLE = "levelproof columns steps"
+INDENT = 26  # where meanings start
+INTRODUCTION = """# Columns
+
+Every column of a manifest, version {version}, which has one row for every level that was tried. They are the names \
+for `--where`, `--columns` and `--sort`, for `levelproof.open(where=...)`, and for every program that reads parquet. \
+`levelproof columns WORD` finds them on the command line. A rate or number that does not exist is null, never NaN, so \
+comparisons skip it.
+
+| column | type | unit | meaning | null says |
+|---|---|---|---|---|
+"""
+END = """
+Version {oldest}, which had no {newer}, is read as well: there they are null. `seconds` is a struct, so SQL asks for \
+`seconds.training`, and `versions.jax` likewise.
+
+More on [labels](labels.md) and what they rest on, on [content hashes and signatures](levels.md), on \
+[portability](experts.md), on [seconds, shards and rows](storage.md). This page is written by `levelproof columns \
+--markdown`, from `pipeline/store/columns.py`.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("word", nargs="?", default="", metavar="WORD", help="only columns that have this word")
+    shape = parser.add_mutually_exclusive_group()
+    add_json(shape)
+    shape.add_argument("--markdown", action="store_true", help="print the page docs/columns.md")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from pipeline.store.columns import DESCRIBED
+
+    has_word = lambda of: arguments.word.lower() in f"{of.name} {of.type_name} {of.unit} {of.meaning}".lower()
+    found = [of for of in DESCRIBED if has_word(of)]
+    if not found:
+        raise UserError(f"No column has the word {arguments.word!r}: levelproof columns, without a word, lists all.")
+    if arguments.json:
+        print(json.dumps([of._asdict() | {"type": of.type_name} for of in found], indent=2))
+    elif arguments.markdown:
+        print(as_markdown(), end="")
+    else:
+        print(*listed(map(_entry, found), shutil.get_terminal_size().columns, INDENT), sep="\n")
+
+
+def _entry(of: "ManifestColumn") -> tuple[str, str]:
+    details = [of.type_name, of.unit, of.null and f"null: {of.null}"]
+    return of.name, f"{of.meaning} ({', '.join(filter(None, details))})"
+
+
+def as_markdown() -> str:
+    """The page docs/columns.md."""
+    from pipeline.store.columns import DESCRIBED, MANIFEST_VERSION, OLDEST_VERSION
+
+    newer = " and ".join(f"`{of.name}`" for of in DESCRIBED if of.since > OLDEST_VERSION)
+    rows = [f"| `{of.name}` | {of.type_name} | {of.unit} | {of.meaning} | {of.null} |" for of in DESCRIBED]
+    start, end = INTRODUCTION.format(version=MANIFEST_VERSION), END.format(oldest=OLDEST_VERSION, newer=newer)
+    return start + "\n".join(rows) + "\n" + end
