@@ -25,7 +25,8 @@ def cost_of(rows: pa.Table) -> dict[str, Any] | None:
         return None
     seconds = {stage: pc.sum(pc.struct_field(rows.column("seconds"), stage)).as_py() for stage in Seconds._fields}  # pyright: ignore[reportAttributeAccessIssue]
     devices = {str(device).partition(":")[0] for device in rows.column("device").unique().to_pylist()}
-    total, solved = sum(seconds.values()), (rows.column("label").cast(pa.string()).to_numpy() == Label.SOLVED).sum()
+    total, counts = sum(seconds.values()), rows.column("label").value_counts().to_pylist()
+    solved = sum(entry["counts"] for entry in counts if entry["values"] == Label.SOLVED)
     return {
         "of": "core" if devices == {"cpu"} else "device" if "cpu" in devices else "GPU",
         "levels": rows.num_rows,

@@ -66,21 +66,24 @@ def survey(
     manifest = require_manifest(split, columns, compact=True)
     asked = asked._replace(limit=LIMIT if asked.limit is None else max(asked.limit, 0))
     chosen, shown = select(manifest.table, asked.where), asked.limit or 0
-    ids, labels = chosen["level_id"].to_numpy(), _counts(chosen, "label")
-    facts = _told(split, manifest, chosen, labels)
+    ids, wanted = chosen["level_id"].to_numpy(), ids_of(chosen, asked)
+    facts = _told(split, manifest, chosen, _counts(chosen, "label"))
     facts["solved_by"] = solved_by_things(manifest, ids) if things else None
+    del manifest, chosen  # of millions of rows, duplicates take as much memory
     others = {str(other): duplicates.compared_in(other) for other in against}
     levels = duplicates.compared_of(split, ids) if others else None
     facts["duplicates"] = duplicates.within(duplicates.perhaps_alike(split, ids), shown)
     facts["against"] = {name: duplicates.between(levels, other, shown) for name, other in others.items()}
-    rows = [row for block in rows_of(split, ids_of(chosen, asked), asked.columns) for row in block.to_pylist()]
+    rows = [row for block in rows_of(split, wanted, asked.columns) for row in block.to_pylist()]
     return facts | {"rows": rows}
 
 
 def _told(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str, int]) -> dict[str, Any]:
     """What the rows that are chosen say."""
     told = chosen.select(["label_reason", "steps_to_goal", "steps_to_first_success", "env_steps"])
-    of_label = {label: told.filter(pc.equal(chosen["label"], label)) for label in labels}  # pyright: ignore[reportAttributeAccessIssue]
+    label = chosen["label"].combine_chunks()  # compared by its indices: as texts, millions of rows take seconds
+    numbers, names = label.indices.to_numpy(zero_copy_only=False), label.dictionary.to_pylist()
+    of_label = {name: told.filter(pa.array(numbers == i)) for i, name in enumerate(names) if name in labels}
     none = told.slice(0, 0)
     solved, unsolved = (of_label.get(label, none) for label in (Label.SOLVED, Label.UNSOLVED))
     tried = solved.num_rows + unsolved.num_rows
