@@ -188,8 +188,5 @@ def _in_grammar(value: Any) -> str:
         return f"[{','.join(map(_in_grammar, value))}]"
     if not isinstance(value, str):
         return repr(value)
-    return value if value.isidentifier() and _means_itself(value) else QuotedString(value, Quote.single).with_quotes()
-
-
-def _means_itself(word: str) -> bool:
-    return OverridesParser.create().parse_override(f"name={word}").value() == word
+    alone = value.isidentifier() and OverridesParser.create().parse_override(f"name={value}").value() == value
+    return value if alone else QuotedString(value, Quote.single).with_quotes()

@@ -205,6 +205,7 @@ class Pool:
             self._slots, report = advance(self._slots, self._queue, self.config, self._stopping, self._shaped)
             seen = jax.device_get(report)
             self._taken = int(seen.taken)
+            # Empty slots are the last submission's, so that their cost is counted once, whoever else is here
             self._submissions[-1].idle_rollouts += int((seen.mode == Mode.EMPTY).sum())
             busy = np.flatnonzero(seen.mode != Mode.EMPTY).tolist()
             levels = [self._at[int(seen.queue_index[slot])] for slot in busy]
@@ -272,7 +273,7 @@ def capacity_of(config: ExpertConfig) -> int:
 
 
 def expert_of(slots: Slots, slot: int, config: ExpertConfig) -> Begun:
-    """The expert that has just left a slot, on the host, as it would go on."""
+    """The expert in a slot, or that has just left it, on the host, as it would go on."""
     lanes = np.arange(slot * config.environments, (slot + 1) * config.environments)
     return jax.device_get(Begun(_row(slots.slot.training, slot), take(slots.acting, lanes)))
 

@@ -214,13 +214,10 @@ def _edited(level: Level, change: Callable[[Level], None]) -> Level:
     one = one_of(level)
     change(one)
     after: Level = jax.tree.map(lambda x: np.asarray(x)[..., None], one)
-    if not np.isfinite(after.state.position).all() or np.abs(_moving(one)).max(initial=0) > 2 * WORLD_SIDE:
+    bodies = one.state.position[FIXED_POLYGONS:][one.model.active[FIXED_POLYGONS:]]
+    if not np.isfinite(after.state.position).all() or np.abs(bodies).max(initial=0) > 2 * WORLD_SIDE:
         raise EditError("That is too far outside of the world.")
     return replace(after, model=replace(after.model, collides=np.asarray(separate(after.model))))
-
-
-def _moving(one: Level) -> Any:
-    return one.state.position[FIXED_POLYGONS:][one.model.active[FIXED_POLYGONS:]]
 
 
 def _free(active: Any, kind: str, level: Level) -> int:

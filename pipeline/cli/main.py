@@ -8,50 +8,18 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
 
 from configs.errors import ConfigError, readable
-from pipeline.cli import (
-    card,
-    columns,
-    diff,
-    export,
-    gallery,
-    generate,
-    import_,
-    inspect,
-    plan,
-    play,
-    regenerate,
-    sample,
-    seal,
-    settings,
-    show,
-    status,
-    verify,
-)
 from pipeline.cli.command import EXITS
 from pipeline.errors import Exit, LevelproofError
 from pipeline.version import __version__
 
-COMMANDS = (
-    generate,
-    regenerate,
-    settings,
-    sample,
-    inspect,
-    columns,
-    plan,
-    diff,
-    show,
-    gallery,
-    play,
-    export,
-    import_,
-    card,
-    status,
-    verify,
-    seal,
+NAMES = (
+    "generate regenerate settings sample inspect columns plan diff show gallery play export import_ card status verify "
+    "seal"
 )
+COMMANDS = [import_module(f"pipeline.cli.{name}") for name in NAMES.split()]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -91,6 +91,7 @@ def generate(
 
 
 def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, sealer: Sealer, events: Events) -> None:
+    """Have every unit done or given up, by workers or in this process."""
     notes = set(quarantine.given_up(split))
 
     def settle(outcomes: Sequence[UnitOutcome]) -> None:
@@ -148,8 +149,7 @@ def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, given_up: list
     labels, folder = manifest.counts(np.isin(manifest.level_ids, wanted)), shlex.quote(as_typed(split))
     total = sum(labels.values())
     counts = ", ".join(f"{count} {label}" for label, count in labels.items())
-    where = as_typed(split)
-    print(f"{where}: {total} levels, {counts}." if total else f"{where}: nothing is committed.")
+    print(f"{as_typed(split)}: {f'{total} levels, {counts}' if total else 'nothing is committed'}.")
     if spent:
         print(spent)
     for unit in given_up:

@@ -43,7 +43,7 @@ class Worker:
         if self.stopping:
             return self.leave(outcomes, cuts)
         now = {unit: run.totals() for unit, run in self._runs.items()}
-        plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}  # read without JAX
+        plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}  # for a driver without JAX
         wants = max(0, self._pool.wants - sum(run.searching for run in self._runs.values()))
         return Round(outcomes, plain, wants, sum(len(run.unbegun) for run in self._runs.values()), cuts)
 

@@ -22,7 +22,7 @@ from experts.labels import Label
 from levelgen.pictures.raster import sheet, write_png
 from levelgen.sampling.distribution import Distribution
 from pipeline.errors import UserError
-from pipeline.look.figures import draw_histograms, draw_shares
+from pipeline.look.figures import draw_panels, draw_shares
 from pipeline.look.preview import preview
 from pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, SplitFacts, Wishes, readme
 from pipeline.read.levels import writing_to
@@ -135,6 +135,6 @@ def _draw(folder: Path, facts: Sequence[SplitFacts], tables: Sequence[pa.Table])
         drawn.append(RATES)
     if steps := {of.path: of.steps_to_goal for of in facts if len(of.steps_to_goal)}:
         title = f"Steps to the goal of solved levels (bins of {RECORD_STEPS // BINS})"
-        draw_histograms(steps, RECORD_STEPS, BINS, title, folder / STEPS)
+        draw_panels(steps, {}, BINS, title, folder / STEPS, RECORD_STEPS)
         drawn.append(STEPS)
     return drawn

@@ -20,7 +20,7 @@ from pipeline.errors import UserError
 from pipeline.look import cost
 from pipeline.look.inspect import QUANTILES, SPENT
 from pipeline.read.select import columns_in, select
-from pipeline.store.manifest import Manifest, differences, require_manifest, told
+from pipeline.store.manifest import differences, require_manifest, told
 from pipeline.store.remote import as_typed
 
 READ = (*cost.READ, "content_hash", "signature", "steps_to_goal", *SPENT)
@@ -44,7 +44,8 @@ def diff(one: Path, other: Path, where: str | None, rows: int, as_json: bool) ->
 
 def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) -> dict[str, Any]:
     """The facts that `diff` prints, as JSON's types."""
-    manifests = [require_manifest(one, [*READ, *columns_in(where)], compact=True), _read(other)]
+    asked = (one, columns_in(where)), (other, ())
+    manifests = [require_manifest(split, [*READ, *columns], compact=True) for split, columns in asked]
     chosen = select(manifests[0].table, where)
     left, right = _common(chosen, manifests[1].table, (one, other))
     solved, tried = np.stack([_labelled(of, WITNESSED) for of in (left, right)]), _labelled(left, TRAINED)
@@ -57,7 +58,7 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
     counts = [[int(part.sum()) for part in (of & tried, tried)] for of in solved]
     return {
         "splits": [as_typed(one), as_typed(other)],
-        "settings": _settings(manifests[0], manifests[1]),
+        "settings": differences(*(manifest.config or {} for manifest in manifests)),  # that decide results
         "levels": left.num_rows,
         "alone": [
             chosen.num_rows - left.num_rows,
@@ -84,10 +85,6 @@ def exact_p(fewer: int, more: int) -> float:
     heads = np.arange(1, few + 1)
     chances = np.cumsum(np.log((flips - heads + 1) / heads))  # of 1, 2, ... heads, as logarithms of those of none
     return float(min(1.0, 2 * np.exp(np.concatenate([[0.0], chances]) - flips * np.log(2)).sum()))
-
-
-def _read(split: Path) -> Manifest:
-    return require_manifest(split, READ, compact=True)
 
 
 def _common(one: pa.Table, other: pa.Table, splits: tuple[Path, Path]) -> tuple[pa.Table, pa.Table]:
@@ -119,11 +116,6 @@ def _labelled(rows: pa.Table, labels: frozenset[Label]) -> Bool[np.ndarray, " ro
 
 def _spent(rows: pa.Table) -> dict[str, int]:
     return {name: int(rows[name].to_numpy().sum()) for name in SPENT}
-
-
-def _settings(one: Manifest, other: Manifest) -> dict[str, list[Any]]:
-    """Those that differ and decide results."""
-    return {name: list(values) for name, values in differences(one.config or {}, other.config or {}).items()}
 
 
 def _moves(left: pa.Table, right: pa.Table) -> dict[str, dict[str, int]]:
@@ -185,8 +177,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         f"{count:,} only in {split}" for count, split in zip(facts["alone"], facts["splits"], strict=True) if count
     ]
     say(f"{facts['levels']:,} levels are in both" + (f" ({', '.join(alone)})." if alone else "."))
-    changed = told({name: (a, b) for name, (a, b) in facts["settings"].items()})
-    say(f"Settings that differ: {changed or 'none'}.")
+    say(f"Settings that differ: {told(facts['settings']) or 'none'}.")
     for name, unit in (("env_steps", "env steps"), ("seconds", "seconds")):
         if (more := facts[f"{name}_for_one_more"]) is not None:
             say(f"{more * gained:+,.0f} {unit} for {gained:+,} solved levels: {more:,.3g} for each one more.")

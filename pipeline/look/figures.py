@@ -66,24 +66,18 @@ def draw_shares(shares: Mapping[str, Share], title: str, path: Path) -> None:
     _write(parts, (LABEL + AXIS + VALUE, top + 0.8), path)
 
 
-def draw_histograms(values: Mapping[str, np.ndarray], most: int, bins: int, title: str, path: Path) -> None:
-    """A histogram for each name: whole numbers from 1 to `most`, in so many bins, as shares of all."""
-    lines = -(-len(values) // ACROSS)
-    height = lines * (HIGH + 0.75)
-    parts = [text((0.05, height + 0.25), title, INK, LETTER)]
-    for number, (name, numbers) in enumerate(values.items()):
-        left = 0.15 + (number % ACROSS) * (PANEL + GAP)
-        low = height - (number // ACROSS + 1) * (HIGH + 0.75) + 0.4
-        counts, _ = np.histogram(numbers, bins, (0.5, most + 0.5))
-        parts += _histogram(counts / counts.sum(), (left, low), f"{name}: {len(numbers):,}")
-        parts += _ends((left, low), "1", str(most))
-    _write(parts, (0.3 + min(len(values), ACROSS) * (PANEL + GAP), height + 0.5), path)
-
-
 def draw_panels(
-    values: Mapping[str, np.ndarray], curves: Mapping[str, Sequence[np.ndarray]], bins: int, title: str, path: Path
+    values: Mapping[str, np.ndarray],
+    curves: Mapping[str, Sequence[np.ndarray]],
+    bins: int,
+    title: str,
+    path: Path,
+    most: int | None = None,
 ) -> None:
-    """A histogram for each name, over the range of its numbers; then shares along updates, a line for each level."""
+    """A histogram for each name, then shares along updates, a line for each level.
+
+    Histograms are over the range of their numbers or, where these are whole ones, from 1 to `most`.
+    """
     panels = len(values) + len(curves)
     height = -(-panels // ACROSS) * (HIGH + 0.75)
     parts = [text((0.05, height + 0.25), title, INK, LETTER)]
@@ -92,9 +86,10 @@ def draw_panels(
         for number in range(panels)
     ]
     for (name, numbers), (left, low) in zip(values.items(), corners, strict=False):
-        counts, edges = np.histogram(numbers, bins)
+        counts, edges = np.histogram(numbers, bins, (0.5, most + 0.5) if most else None)
+        ends = (1, most) if most else (edges[0], edges[-1])
         parts += _histogram(counts / counts.sum(), (left, low), f"{name}: {len(numbers):,}")
-        parts += _ends((left, low), *(f"{edge:,.0f}" if edge > 9 else f"{edge:.2g}" for edge in (edges[0], edges[-1])))
+        parts += _ends((left, low), *(f"{end:,.0f}" if end > 9 else f"{end:.2g}" for end in ends))
     for (name, lines), (left, low) in zip(curves.items(), corners[len(values) :], strict=True):
         last = max(2, *map(len, lines))
         parts += [line([(left, low + y), (left + PANEL, low + y)], GRID, 0.012) for y in (0, HIGH / 2, HIGH)]

@@ -4,11 +4,12 @@ import socket
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeVar
 from zipfile import ZIP_STORED, ZipFile
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from configs.schema import JobConfig
 from experts.config import Rule
@@ -28,6 +29,7 @@ from pipeline.store.manifest import differences, read_manifest, require_manifest
 from pipeline.store.remote import require_folder
 
 COPY = "make a copy of your own of the split that continue_from names, or leave continue_from out"
+T = TypeVar("T")
 
 
 class SourceUnseen(Failure):
@@ -41,10 +43,7 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
         OSError: the disk refuses.
     """
     rows = [experts[level_id] for level_id in sorted(experts)]
-    curves = np.full((len(rows), max(len(row.curve) for row in rows)), np.nan, np.float32)
-    for i, row in enumerate(rows):
-        curves[i, : len(row.curve)] = row.curve
-    begun = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows))
+    begun, curves = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows)), stacked_curves(rows)
     path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
     np.savez(path, allow_pickle=False, level_id=np.array(sorted(experts)), curve=curves, **arrays_of(begun, "begun/"))
     path.chmod(path.stat().st_mode & ~OTHERS)
@@ -59,7 +58,6 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
         Failure: it is damaged or gone, or of another version of this program.
     """
     require_own(path, COPY)
-    like = begun_like(job)
     try:
         if not path.is_file():
             raise ValueError("it is no file" if path.exists() else "it is not there")
@@ -70,20 +68,36 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
         if (level_ids.dtype, level_ids.ndim, curves.ndim, len(curves)) != (np.int64, 1, 2, len(level_ids)):
             raise ValueError("its level ids or curves are none")
         level_id_array(level_ids)  # within their bounds
-        for name, one in arrays_of(like, "begun/").items():
-            if (arrays[name].shape, arrays[name].dtype) != ((len(level_ids), *one.shape), one.dtype):
-                raise ValueError(f"{name} has another shape or type")
+        begun = unstacked(arrays, "begun/", begun_like(job), len(level_ids))
     except Exception as error:  # numpy and zipfile raise many kinds
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise Failure(
             f"The experts in {path} cannot be read ({reason}): leave out continue_from to train them from the start."
         ) from error
-    experts = {}
-    leaves = [arrays[name] for name in arrays_of(like, "begun/")]
-    for i, level_id in enumerate(level_ids.tolist()):
-        begun = jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves])
-        experts[level_id] = Kept(begun, curves[i, : int(begun.training.course.updates)].tolist())
-    return experts
+    return {i: kept(of, curve) for i, of, curve in zip(level_ids.tolist(), begun, curves, strict=True)}
+
+
+def stacked_curves(experts: Sequence[Kept]) -> Float[np.ndarray, "expert update"]:
+    """Their learning curves, NaN after each one's end."""
+    curves = np.full((len(experts), max(len(of.curve) for of in experts)), np.nan, np.float32)
+    for row, of in zip(curves, experts, strict=True):
+        row[: len(of.curve)] = of.curve
+    return curves
+
+
+def kept(begun: Begun, curve: Float[np.ndarray, " update"]) -> Kept:
+    """An expert with its own part of a row of `stacked_curves`."""
+    return Kept(begun, curve[: int(begun.training.course.updates)].tolist())
+
+
+def unstacked(arrays: Mapping[str, np.ndarray], path: str, like: T, count: int) -> list[T]:
+    """So many trees such as `like`, out of their stacked arrays. Raises ValueError or KeyError if they are none."""
+    leaves = []
+    for name, one in arrays_of(like, path).items():
+        if (arrays[name].shape, arrays[name].dtype) != ((count, *one.shape), one.dtype):
+            raise ValueError(f"{name} has another shape or type")
+        leaves.append(arrays[name])
+    return [jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves]) for i in range(count)]
 
 
 @lru_cache(maxsize=8)

@@ -88,7 +88,8 @@ def _opened(paths: Iterable[Path]) -> tuple[dict[str, Any], dict[Path, _Source]]
     for path in paths:
         shard, arrays = Shard(path), {}
         try:
-            documents = {name: _document(path, name) for name in ("", *shard.arrays)}
+            files = {"": "zarr.json"} | {name: f"{name}/zarr.json" for name in shard.arrays}
+            documents = {name: json.loads(read_whole(path, file)) for name, file in files.items()}
             for name in shard.arrays:
                 of = documents[name]
                 arrays[name] = Chunks(path, name, tuple(of["shape"]), np.dtype(of["data_type"]))
@@ -102,10 +103,6 @@ def _opened(paths: Iterable[Path]) -> tuple[dict[str, Any], dict[Path, _Source]]
             raise Failure(f"The shards {first} and {path} hold other fields, so they cannot be merged.")
         sources[path] = _Source(shard.level_ids, arrays)
     return shared, sources
-
-
-def _document(shard: Path, name: str) -> dict[str, Any]:
-    return json.loads(read_whole(shard, f"{name}/zarr.json" if name else "zarr.json"))
 
 
 def _rows_a_file(sources: dict[Path, _Source]) -> int:

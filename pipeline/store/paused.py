@@ -16,13 +16,13 @@ import numpy as np
 from configs.schema import JobConfig
 from experts.config import RECORD_STEPS
 from experts.found import nothing_found
-from experts.judge import Evaluation, Kept
+from experts.judge import Evaluation
 from experts.labels import Source
 from experts.paused import Paused
 from experts.slots import Pending
 from pipeline.owned import require_own
 from pipeline.store import objects
-from pipeline.store.checkpoints import begun_like, require_plain
+from pipeline.store.checkpoints import begun_like, kept, require_plain, stacked_curves, unstacked
 from pipeline.store.fields import arrays_of
 from pipeline.store.files import remove, write
 from pipeline.store.layout import CHECKPOINT, CHECKPOINT_BEGUN, CHECKPOINTS, checkpoint_path, entries, ids_of
@@ -40,10 +40,8 @@ def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobCo
     """
     rows = [paused[level_id] for level_id in sorted(paused)]
     stacked = jax.tree.map(lambda *xs: np.stack(xs), *map(_arrays, rows))
-    curves = np.full((len(rows), max(len(row.expert.curve) for row in rows)), np.nan, np.float32)
-    for i, row in enumerate(rows):
-        curves[i, : len(row.expert.curve)] = row.expert.curve
-    arrays = arrays_of(stacked, "paused/") | {STAMP: _stamp(job), "level_id": np.array(sorted(paused)), "curve": curves}
+    arrays = arrays_of(stacked, "paused/") | {STAMP: _stamp(job), "level_id": np.array(sorted(paused))}
+    arrays["curve"] = stacked_curves([row.expert for row in rows])
     arrays["source"] = np.array([row.found.source[0] for row in rows])
     if evaluations := [(i, of) for i, row in enumerate(rows) for of in row.evaluations]:
         arrays["evaluated"] = np.array([i for i, _ in evaluations])
@@ -133,21 +131,10 @@ def _experts(arrays: dict[str, np.ndarray], job: JobConfig) -> Iterator[tuple[in
     flags = np.zeros((RECORD_STEPS, environments), bool)
     action = np.zeros((RECORD_STEPS, begun.training.recent.shape[1], attempts), np.int32)
     shown = Evaluation(action, flags, flags, begun.training.progress, begun.training.success)
-    rows = _unstacked(arrays, "paused/", like, len(level_ids))
-    evaluations = _unstacked(arrays, "evaluation/", shown, len(of)) if len(of) else []
+    rows = unstacked(arrays, "paused/", like, len(level_ids))
+    evaluations = unstacked(arrays, "evaluation/", shown, len(of)) if len(of) else []
     for i, (level_id, row) in enumerate(zip(level_ids.tolist(), rows, strict=True)):
         begun, pending, rollouts, found = row
-        curve = arrays["curve"][i, : int(begun.training.course.updates)].tolist()
         mine = [evaluations[j] for j in np.flatnonzero(of == i)]
-        source = [Source(str(arrays["source"][i]))]
-        yield level_id, Paused(Kept(begun, curve), pending, int(rollouts), mine, found._replace(source=source))
-
-
-def _unstacked(arrays: Mapping[str, np.ndarray], path: str, like: Any, count: int) -> list[Any]:
-    """So many trees such as `like`, out of their stacked arrays."""
-    leaves = []
-    for name, one in arrays_of(like, path).items():
-        if (arrays[name].shape, arrays[name].dtype) != ((count, *one.shape), one.dtype):
-            raise ValueError(f"{name} has another shape or type")
-        leaves.append(arrays[name])
-    return [jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves]) for i in range(count)]
+        found = found._replace(source=[Source(str(arrays["source"][i]))])
+        yield level_id, Paused(kept(begun, arrays["curve"][i]), pending, int(rollouts), mine, found)

@@ -4,9 +4,9 @@ The new data first, then the new fragment, which counts before those that it was
 process that dies in between leaves what `leftovers.clean` removes. Knows nothing of who seals, and when.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -100,8 +100,8 @@ def seal(
     """Merge these fragments, and their shards of each density. Only the writer of a split may.
 
     Kept experts stay where they are. `moved` and `rows_a_file` are those of `merge_shards`; `moved` is called before
-    each fragment is read, too. With a `density` and its `key_every`, all shards get that one;
-    `converted` is called with how many levels have.
+    each fragment is read, too. With a `density` and its `key_every`, all shards get that one; `converted` is called
+    with how many levels have.
 
     Returns:
         The sealed fragment.
@@ -110,7 +110,6 @@ def seal(
         Failure: a fragment or a shard is damaged, or the engine cannot convert it; nothing has changed.
         OSError: the disk refuses; nothing has changed.
     """
-
     paths = {piece.path for piece in pieces}
     if is_remote(split):
         fragment_paths(split)  # what was known of its files is forgotten
@@ -123,7 +122,8 @@ def seal(
     densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(of.densities for of, _ in parts))
     first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
     unit, count = unit_name(first, last), 1 if density else len(places)
-    with _written_to(split, paths) as folder, _attempted(folder, unit, max(count, 1), replaced, between) as attempts:
+    making = publishing(split, paths) if is_remote(split) else nullcontext(split)  # where the new ones are made
+    with making as folder, _attempted(folder, unit, max(count, 1), replaced, between) as attempts:
         if density:
             places = _converted(places, density, lambda: _another(folder, unit, between), converted)
         merged = dict(zip((attempt.shard for attempt in attempts), places.values(), strict=False))
@@ -139,12 +139,9 @@ def seal(
     return Piece(sealed, table.num_rows, True)
 
 
-def _written_to(split: Path, replaced: Collection[Path]) -> AbstractContextManager[Path]:
-    """The folder in which the new fragment and its shards are made."""
-    return publishing(split, replaced) if is_remote(split) else nullcontext(split)
-
-
 def _read(paths: Iterable[Path], moved: Callable[[int], None]) -> list[tuple[Fragment, pa.Table]]:
+    """Fragments with their rows, in the order of level ids."""
+
     def read(path: Path) -> tuple[Fragment, pa.Table]:
         moved(0)
         return read_fragment(path)

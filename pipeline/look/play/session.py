@@ -104,17 +104,11 @@ class Session:
 
     def undo(self, _: Asked) -> Asked:
         """The level before the last edit."""
-        if self._done:
-            self._undone.append(self._file.level)
-            return self._changed(self._done.pop())
-        return self.level({})
+        return self._exchanged(self._done, self._undone)
 
     def redo(self, _: Asked) -> Asked:
         """The level after the edit that was taken back last."""
-        if self._undone:
-            self._done.append(self._file.level)
-            return self._changed(self._undone.pop())
-        return self.level({})
+        return self._exchanged(self._undone, self._done)
 
     def at(self, asked: Asked) -> Asked:
         """Numbers of the bodies at a point, the uppermost first."""
@@ -144,7 +138,7 @@ class Session:
     def film(self, actions: np.ndarray) -> Asked:
         """Where bodies are before each of these actions, and at the end."""
         state = replay(self._file.level, _padded(actions), self._file.rules).state
-        position, rotation = (x[: len(actions) + 1, ..., 0] for x in (state.position, state.rotation))
+        position, rotation = (np.asarray(x)[: len(actions) + 1, ..., 0] for x in (state.position, state.rotation))
         return {"places": places_of(self._file.level, position, rotation), "actions": actions.tolist()}
 
     def solve(self, actions: np.ndarray) -> None:
@@ -158,6 +152,12 @@ class Session:
         self._take(file)
         self._done, self._undone, self._witness = [], [], witness
         return self.level({})
+
+    def _exchanged(self, wanted: list[Level], instead: list[Level]) -> Asked:
+        if not wanted:
+            return self.level({})
+        instead.append(self._file.level)
+        return self._changed(wanted.pop())
 
     def _changed(self, level: Level) -> Asked:
         self._take(replace(self._file, level=level))

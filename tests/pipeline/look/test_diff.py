@@ -51,7 +51,7 @@ def test_who_solved_what(splits: tuple[Path, Path]) -> None:
     assert (facts["only"], facts["only_rows"]) == ([1, 2], [[1], [2, 6]])
     assert (facts["both"], facts["neither"], facts["p"]) == (3, 1, 1.0)  # the trivial one is solved in both
     assert facts["labels"]["unsolved"] == {"solved": 2, "unsolved": 1}
-    assert facts["settings"] == {"budget": [64_000, 256_000]}
+    assert facts["settings"] == {"budget": (64_000, 256_000)}
 
 
 def test_what_the_difference_costs(splits: tuple[Path, Path]) -> None:
