@@ -141,6 +141,9 @@ def bounded(path: Path) -> Iterator[Bounded]:
 def _obeyed(column: pa.Array) -> bool:
     """Whether a text of an array has characters that control terminals."""
     if pa.types.is_dictionary(column.type):
+        data = np.frombuffer(column.dictionary.buffers()[2] or b" ", np.uint8)
+        if data.min(initial=32) >= 32 and data.max(initial=32) < 127:  # nearly always, and soon known
+            return False
         found = pc.call_function("match_substring_regex", [column.dictionary], pc.MatchSubstringOptions(r"\p{Cc}"))
         return found.true_count > 0
     nested = pa.types.is_list(column.type) or pa.types.is_struct(column.type)
