@@ -14,7 +14,7 @@ from pipeline.read.verify import examine
 from pipeline.store.checkpoints import load_experts, require_same_experts
 from pipeline.store.layout import new_attempt
 from pipeline.store.manifest import begin_fragment, read_manifest
-from tests.pipeline.command import here, run
+from tests.pipeline.command import here
 from tests.pipeline.made import lasting, made_job
 
 SETTINGS = ["levels=12", "stop.rule=solved", "executor=inline"]  # so that some use their whole budget
@@ -22,9 +22,9 @@ SETTINGS = ["levels=12", "stop.rule=solved", "executor=inline"]  # so that some 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With data/8k/s, made with `keep_experts=true` by a worker that saves several units at once, and sealed."""
+    """With data/8k/s, made with `keep_experts=true` by a worker that has several units at once, and sealed."""
     folder = tmp_path_factory.mktemp("ladder")
-    done = run(["generate", *SETTINGS, "budget=8k", "keep_experts=true", "executor=ray", "workers=1", "unit=2"], folder)
+    done = here(["generate", *SETTINGS, "budget=8k", "keep_experts=true", "unit=2"], folder)
     assert done.returncode == 0, done.stderr
     done = here(["seal", "data/8k/s", "--rows", "5"], folder)
     assert "6 fragments were merged into 2; it has 12 levels in 2 fragments now" in done.stdout

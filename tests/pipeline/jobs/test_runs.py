@@ -90,12 +90,10 @@ def test_in_other_units_the_same_comes_out(undisturbed: Path, tmp_path: Path) ->
     assert_same_content(tmp_path / SPLIT, undisturbed)
 
 
-def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path) -> None:
-    process = start([*COMMAND, ALONE], tmp_path)
+@pytest.mark.parametrize("executor", ["inline", pytest.param("ray", marks=pytest.mark.campaign)])
+def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path, executor: str) -> None:
+    process = start([*COMMAND, ALONE, f"executor={executor}"], tmp_path)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
-    places = listening(descendants(process.pid))
-    assert places
-    assert not {place: who for place, who in places.items() if not place.startswith(LOOPBACK)}
     family = {pid for pid in descendants(process.pid) if "Agent" not in title(pid)}
     process.kill()
     process.communicate()
@@ -109,9 +107,12 @@ def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.campaign), signal.SIGTERM])
 def test_kill_9_of_a_worker_then_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
-    """Another worker takes what the dead one had, and is at work when the run is stopped."""
+    """Another worker takes what the dead one had, and is at work when the run is stopped. They listen on loopback."""
     process = start([*COMMAND, ALONE], tmp_path, preexec_fn=heed_ctrl_c)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    places = listening(descendants(process.pid))
+    assert places
+    assert not {place: who for place, who in places.items() if not place.startswith(LOOPBACK)}
     (worker,) = workers(process)
     os.kill(worker, signal.SIGKILL)
     before = len(fragment_paths(tmp_path / SPLIT))

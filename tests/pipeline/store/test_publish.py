@@ -119,7 +119,7 @@ def test_a_store_gets_what_a_folder_gets(server: Server, here: Path, every: int,
 def test_a_store_that_is_slow_is_asked_again(server: Server, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(remote.PATIENCE, "timeout", timedelta(seconds=0.5))
     forget()
-    server.spoil(9, "slow")
+    server.spoil(25, "slow")
     drive(OUT)
     server.spoil(0)
     require_whole(here)
@@ -141,7 +141,7 @@ def requests_of_a_run(server: Server) -> int:
     return count
 
 
-@pytest.mark.parametrize("some", [2, pytest.param(8, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("some", [1, pytest.param(8, marks=pytest.mark.campaign)])
 def test_a_store_that_is_gone_is_one_sentence_and_the_same_command_goes_on(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, some: int
 ) -> None:

@@ -213,8 +213,10 @@ def test_a_store_that_throttles_or_cuts_off_gives_the_right_bits(bucket: Bucket,
     require_same(S3, split)
 
 
-def test_a_store_that_dies_is_one_sentence_in_bounded_time(bucket: Bucket) -> None:
+def test_a_store_that_dies_is_one_sentence_in_bounded_time(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = witnessed(S3)
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.5))
+    remote._store.cache_clear()
     bucket.server.spoil(1)
     start = time.monotonic()
     with pytest.raises(Failure, match=r"Cannot read s3://bucket/data/s/.* \(503 Service Unavailable\)"):
