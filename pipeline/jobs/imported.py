@@ -28,7 +28,6 @@ from pipeline.read.kinetix.folder import Folder, open_folder, read_trajectories
 from pipeline.read.kinetix.records import dtype_of
 from pipeline.read.kinetix.zarr2 import FormatError, StoredArray
 from pipeline.runtime import interruptible, prepare_jax
-from pipeline.store.disk import REFUSALS
 from pipeline.store.job_note import note_job
 from pipeline.store.manifest import Manifest, read_manifest
 from pipeline.store.origins import Origin, RecordPlace, can_be_noted
@@ -88,9 +87,6 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
             raise
         except FormatError as error:
             raise Failure(f"Cannot go on with {folder}: {error}; mend it, and the same command goes on.") from None
-        except OSError as error:
-            what = REFUSALS.get(error.errno or 0, error.strerror or type(error).__name__)
-            raise Failure(f"Cannot write to {split}, {what}, then run the same command again.") from None
         manifest = read_manifest(split, ["label", "label_reason"])
         note_job(split, job, command, runs(manifest.level_ids))
         _closing(found, split, manifest)

@@ -18,7 +18,6 @@ from pipeline.errors import Exit, Failure, UserError
 from pipeline.jobs.generate import generate
 from pipeline.jobs.progress import say
 from pipeline.read.findings import Findings
-from pipeline.store.disk import REFUSALS
 from pipeline.store.job_note import note_job, sound_note
 from pipeline.store.layout import EXPERTS, data_paths
 from pipeline.store.locks import nobody_commits
@@ -55,15 +54,11 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
         ids = lost & findings.origins.keys()
     else:
         ids = lost | {i for first, last in findings.missing for i in range(first, last + 1)}
-    try:
-        with locked(split, partial(say, console)), nobody_commits(split, partial(say, console)):
-            _note(split, job, findings)
-            take_out(split, lost, findings.unlike, list(findings.fragments))
-        with taken(split, partial(say, console)):
-            pass  # what nothing names any more goes
-    except OSError as error:
-        reason = REFUSALS.get(error.errno or 0) or error.strerror or type(error).__name__
-        raise Failure(f"Cannot write to {split}, {reason}, then run the same command again.") from error
+    with locked(split, partial(say, console)), nobody_commits(split, partial(say, console)):
+        _note(split, job, findings)
+        take_out(split, lost, findings.unlike, list(findings.fragments))
+    with taken(split, partial(say, console)):
+        pass  # what nothing names any more goes
     origins = {i: findings.origins[i] for i in sorted(ids)} if files else None
     end = generate(job, _command(split), console, sorted(ids), origins, split) if ids else Exit.DONE
     for sentence in left:

@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from configs.schema import KEY_EVERY, KEYS_EVERY, Density, stored_as
-from pipeline.errors import Failure, LevelproofError, UserError
+from pipeline.errors import LevelproofError, UserError
 from pipeline.jobs.progress import say
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.runtime import prepare_jax
 from pipeline.store import seal as store
-from pipeline.store.disk import REFUSALS
+from pipeline.store.disk import told_of
 from pipeline.store.layout import fragment_path, unit_name
 from pipeline.store.manifest import Fragment, require_manifest, write_index
 from pipeline.store.remote import as_typed
@@ -54,25 +54,17 @@ def seal_split(
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
             task = bar.add_task("levels sealed", total=sum(piece.rows for group in groups for piece in group))
             done = 0
-            try:
-                for group in groups:
-                    done += sum(piece.rows for piece in group)
-                    seal(split, group, density=wanted, converted=partial(bar.advance, task))
-                    bar.update(task, completed=done)
-                write_index(split)
-            except OSError as error:
-                raise _refused(split, error) from error
+            for group in groups:
+                done += sum(piece.rows for piece in group)
+                seal(split, group, density=wanted, converted=partial(bar.advance, task))
+                bar.update(task, completed=done)
+            write_index(split)
     merged = sum(map(len, groups))
     levels, fragments = sum(piece.rows for piece in pieces), len(pieces) - merged + len(groups)
     done = f"{merged:,} fragments were merged into {len(groups):,}" if groups else "there was nothing to seal"
     now = f"{fragments:,} fragment{'s' if fragments > 1 else ''}"
     print(f"{as_typed(split)}: {done}; it has {levels:,} levels in {now} now.")
     print(f"Next:  levelproof inspect {shlex.quote(as_typed(split))}")
-
-
-def _refused(split: Path, error: OSError) -> Failure:
-    reason = REFUSALS.get(error.errno or 0) or f"{error.strerror or type(error).__name__}"
-    return Failure(f"Cannot write to {split}, {reason}, then run the same command again; nothing is lost.")
 
 
 class _Stopped(Exception):
@@ -117,7 +109,7 @@ class Sealer:
         end = None if first is None else fragment_path(self._split, unit_name(first, first))
         group = store.due((piece for piece in self._pieces.values() if end is None or piece.path < end), store.ROWS)
         if group and not self._broken:
-            self._at_work = group, self._thread.submit(seal, self._split, group, self._go_on)
+            self._at_work = group, self._thread.submit(self._seal, group)
 
     def finish(self) -> None:
         """Seal all that there is enough of; nothing is to come."""
@@ -130,6 +122,10 @@ class Sealer:
         """End at once; what is half sealed goes."""
         self._stop.set()
         self._thread.shutdown()
+
+    def _seal(self, group: list[Piece]) -> Piece:
+        with told_of(self._split):
+            return seal(self._split, group, self._go_on)
 
     def _go_on(self, _: int) -> None:
         if self._stop.is_set():
@@ -146,7 +142,6 @@ class Sealer:
             self._pieces[future.result().path] = future.result()
             return
         self._broken = True
-        told = _refused(self._split, error) if isinstance(error, OSError) else error
-        reason = str(told) if isinstance(told, LevelproofError) else f"{type(told).__name__}: {told}"
+        reason = str(error) if isinstance(error, LevelproofError) else f"{type(error).__name__}: {error}"
         split = as_typed(self._split)
         self._tell(f"Not sealed ({reason.rstrip('.')}): `levelproof seal {split}` seals it when this has ended.")

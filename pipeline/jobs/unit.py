@@ -120,7 +120,7 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult, comm
     Raises:
         OSError: the disk refuses; nothing is committed.
     """
-    if there := committed_levels(split, unit.name):
+    while there := committed_levels(split, unit.name) & {*unit.level_ids}:
         left, result = unit.only(set(unit.level_ids) - there), _without(result, there)
         if left is None:
             return

@@ -2,7 +2,11 @@
 
 import errno
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from pipeline.errors import Failure
 
 # The disk refuses: whoever tries again works for nothing.
 REFUSALS = {
@@ -13,6 +17,24 @@ REFUSALS = {
     errno.EACCES: "writing is not permitted: check the folder's permissions",
     errno.EPERM: "writing is not permitted: check the folder's permissions",
 }
+FAILS = {errno.EIO: "the disk fails: see `dmesg`"}  # or did once, so a unit is tried again
+
+
+@contextmanager
+def told_of(split: Path) -> Iterator[None]:
+    """For what writes to a split: where the disk refuses, that is said in a sentence.
+
+    Raises:
+        Failure: the disk refuses.
+    """
+    try:
+        yield
+    except OSError as error:
+        if not (reason := (REFUSALS | FAILS).get(error.errno or 0)):
+            raise
+        raise Failure(
+            f"Cannot write to {split}, {reason}, then run the same command again; nothing is lost."
+        ) from error
 
 
 def flush(path: Path) -> None:

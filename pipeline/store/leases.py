@@ -1,4 +1,7 @@
-"""The writer of a split in an object store: it renews a lease, and who finds that silent for long enough takes it.
+"""The writer of a split: its name is in the split's lock file, and who works for another one commits nothing there.
+
+In a folder the system keeps writers apart (`locks`). In an object store a writer renews a lease, and who finds that
+silent for long enough takes it.
 
 No clock is compared with another: whoever waits measures by its own. And no time has to be right for a split to stay
 whole: a writer that was only slow finds its lease taken, and so do its workers, before they commit anything.
@@ -14,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from pipeline.errors import Failure, LevelproofError, UserError
 from pipeline.store.layout import WRITER_LOCK
@@ -33,8 +36,9 @@ class LeaseLost(Failure):
     """Another writer has taken a split over."""
 
     def __init__(self, split: Path) -> None:
+        gone = f"was silent for {SILENCE:.0f} s" if is_remote(split) else "ended, or its folder was removed"
         super().__init__(
-            f"Another command has taken over {as_typed(split)}, because this one was silent for {SILENCE:.0f} s: "
+            f"Another command has taken over {as_typed(split)}, because this one {gone}: "
             "nothing more of this one is committed there."
         )
 
@@ -75,8 +79,7 @@ class Lease:
                 self._version = version
 
     def _text(self) -> bytes:
-        about = {"writer": self.token, "host": _here(), "pid": os.getpid(), "renewals": self._renewals}
-        return json.dumps(about).encode()
+        return _about(self.token, renewals=self._renewals).encode()
 
 
 @contextmanager
@@ -88,28 +91,53 @@ def leased(split: Path, say: Callable[[str], None]) -> Iterator[None]:
         LeaseLost: another one has it now.
     """
     lease = Lease(split, say)
-    _served[split] = lease.token
     try:
-        yield
+        with serving(split, lease.token):
+            yield
     except KeyboardInterrupt:
         if lease.lost:
             raise LeaseLost(split) from None
         raise
     finally:
         lease.release()
+
+
+@contextmanager
+def named(split: Path, lock: IO[str]) -> Iterator[None]:
+    """Write down in the file of a folder's lock, which this process holds, that it is the writer now.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    token = secrets.token_hex(8)
+    lock.truncate(0)
+    lock.write(_about(token))
+    lock.flush()
+    os.fsync(lock.fileno())  # workers on other machines read it
+    with serving(split, token):
+        yield
+
+
+@contextmanager
+def serving(split: Path, writer: str) -> Iterator[None]:
+    """This process, and those that it starts, work for this writer meanwhile."""
+    _served[split] = writer
+    try:
+        yield
+    finally:
         del _served[split]
 
 
 def serve(split: Path) -> None:
-    """Work from now on for whoever writes to a split now, if it is in a store."""
-    if is_remote(split) and split not in _served:
-        _served[split] = _holder(split / WRITER_LOCK).get("writer", "")
+    """Work from now on for whoever writes to a split now."""
+    if split not in _served:
+        _served[split] = _writer(split)
 
 
 def require_served(split: Path) -> None:
     """Raises LeaseLost where the writer for whom this process works is not that of the split any more."""
     served = _served.get(split)
-    if served is not None and _holder(split / WRITER_LOCK).get("writer") != served:
+    if served is not None and _writer(split) != served:
         raise LeaseLost(split)
 
 
@@ -151,11 +179,19 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
         time.sleep(POLL)
 
 
-def _holder(path: Path) -> dict[str, Any]:
+def _writer(split: Path) -> str:
+    """The name of the writer that a split has, or had last; nobody's is empty."""
+    path = split / WRITER_LOCK
     try:
-        return _said(get(path).data)
+        data = get(path).data if is_remote(path) else path.read_bytes()
     except FileNotFoundError:
-        return {}
+        return ""
+    return str(_said(data).get("writer", "")) if data else ""
+
+
+def _about(token: str, **more: int) -> str:
+    """A lock file's text."""
+    return json.dumps({"writer": token, "host": _here(), "pid": os.getpid(), **more})
 
 
 def _said(data: bytes) -> dict[str, Any]:

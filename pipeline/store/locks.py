@@ -15,7 +15,7 @@ from typing import IO
 
 from pipeline.errors import UserError
 from pipeline.store.layout import COMMIT_LOCK, WRITER_LOCK
-from pipeline.store.leases import is_leased, leased
+from pipeline.store.leases import is_leased, leased, named, require_served
 from pipeline.store.publish import publishing
 from pipeline.store.remote import is_remote
 
@@ -43,15 +43,20 @@ def only_writer(split: Path, say: Callable[[str], None]) -> Iterator[None]:
     with (split / WRITER_LOCK).open("a+") as file:
         if not _taken_within(PATIENCE, file):
             raise UserError(f"Another `levelproof generate` is writing to {split}: wait for it, or stop it first.")
-        yield
+        with named(split, file):
+            yield
 
 
 @contextmanager
 def committing(split: Path) -> Iterator[Path]:
     """Held while a unit writes its shard and its fragment, to the folder that it gives; many units may at once.
 
+    A writer names itself before it waits for nobody to commit (`nobody_commits`), so a worker of an earlier one has
+    either committed by then, or finds another name here.
+
     Raises:
-        LeaseLost, UserError, StoreFailure: as `publishing`, where the split is in a store.
+        LeaseLost: the writer for whom this process works is not that of the split any more.
+        UserError, StoreFailure: as `publishing`, where the split is in a store.
     """
     if is_remote(split):
         with publishing(split) as folder:
@@ -59,6 +64,7 @@ def committing(split: Path) -> Iterator[Path]:
         return
     with (split / COMMIT_LOCK).open("a+") as file:
         _take(file, fcntl.LOCK_SH)
+        require_served(split)
         yield split
 
 

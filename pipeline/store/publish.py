@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from configs.schema import hash_of
 from pipeline.errors import Failure
 from pipeline.store.files import remove_data
+from pipeline.store.fragment import read_fragment
 from pipeline.store.layout import MANIFEST, attempt_of, begun_path, data_paths, fragment_path, new_attempt, unit_name
 from pipeline.store.leases import LeaseLost, require_served
 from pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
@@ -72,8 +73,18 @@ def _carry_over(folder: Path, split: Path, replaced: Collection[Path]) -> None:
 
 
 def committed_levels(split: Path, unit: str) -> frozenset[int]:
-    """Levels that the fragment of a unit in a store has by now, of an attempt of which nobody has heard."""
-    return _at(fragment_path(split, unit)).ids if is_remote(split) else frozenset()
+    """Levels that the fragment of a unit has by now, of an attempt of which nobody has heard.
+
+    Raises:
+        Failure: it is damaged.
+    """
+    path = fragment_path(split, unit)
+    if is_remote(split):
+        return _at(path).ids
+    try:
+        return frozenset(read_fragment(path, ["level_id"])[1].column("level_id").to_pylist())
+    except FileNotFoundError:
+        return frozenset()
 
 
 def ended(split: Path, marks: Iterable[Path], committed: Collection[Path]) -> set[Path]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from configs.schema import JobConfig
 from pipeline.errors import UserError
+from pipeline.store.disk import told_of
 from pipeline.store.layout import EVENTS, FOLDERS, JOB, split_path
 from pipeline.store.leftovers import clean
 from pipeline.store.locks import committing, only_writer
@@ -60,6 +61,7 @@ def locked(split: Path, say: Callable[[str], None]) -> Iterator[None]:
 
     Raises:
         UserError: it cannot be written or locked, or is being written.
+        Failure: the disk refuses later.
         StoreFailure, LeaseLost: its store does not answer, or has another writer by now.
     """
     if is_remote(split):
@@ -69,7 +71,7 @@ def locked(split: Path, say: Callable[[str], None]) -> Iterator[None]:
         return
     _make_writable(split)
     _require_own_folders(split)
-    with only_writer(split, say):
+    with told_of(split), only_writer(split, say):
         with committing(split):
             pass  # as workers do: a file system that refuses their lock is named before anything trains
         yield

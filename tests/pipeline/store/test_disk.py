@@ -15,7 +15,9 @@ from experts.slots import begin as begin_experts
 from experts.success import no_success
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
+from pipeline.errors import Failure
 from pipeline.store.checkpoints import save_experts
+from pipeline.store.disk import told_of
 from pipeline.store.fields import arrays_of
 from pipeline.store.layout import new_attempt, unit_name
 from pipeline.store.manifest import begin_fragment, write_fragment
@@ -43,6 +45,14 @@ def kept_experts() -> dict[int, Kept]:
     levels = sample_levels(ids, SIZES["s"], job.distribution)
     begun = jax.eval_shape(lambda: begin_experts(levels, ids, no_success(len(ids)), job.expert))
     return {0: Kept(jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), begun), [0.0])}
+
+
+@pytest.mark.parametrize(("code", "words"), [(errno.ENOSPC, "the disk is full: free"), (errno.EIO, "the disk fails")])
+def test_what_the_disk_refuses_is_said_in_a_sentence(tmp_path: Path, code: int, words: str) -> None:
+    with pytest.raises(Failure, match=f"^Cannot write to {tmp_path}, {words}.* same command again"), told_of(tmp_path):
+        raise OSError(code, "refused")
+    with pytest.raises(FileNotFoundError), told_of(tmp_path):
+        (tmp_path / "gone").read_bytes()
 
 
 @pytest.mark.slow

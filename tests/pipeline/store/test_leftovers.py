@@ -11,7 +11,7 @@ from pipeline.errors import Failure
 from pipeline.jobs import unit
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.jobs.unit import commit
-from pipeline.store.layout import attempt_of
+from pipeline.store.layout import attempt_of, unit_name
 from pipeline.store.leftovers import clean
 from pipeline.store.locks import committing
 from pipeline.store.manifest import fragment_paths
@@ -47,6 +47,16 @@ def dead(split: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     (split / "experts").mkdir()
     (split / f"experts/{attempt}.npz").touch()
     return attempt
+
+
+def test_levels_that_an_attempt_of_which_nobody_has_heard_has_committed_are_left_out(tmp_path: Path) -> None:
+    """It gave some of its levels back, and its word of that was lost: the unit was handed out again as it had been."""
+    said: list[str] = []
+    for ids in [[0, 3], [0, 1, 2, 3], [0, 1, 2, 3]]:
+        commit(made_job(), tmp_path, WorkUnit(tuple(ids)), made_result(ids, [Label.SOLVED] * len(ids)))
+    assert clean(tmp_path, said.append).level_ids.tolist() == [0, 1, 2, 3]
+    assert [path.stem for path in fragment_paths(tmp_path)] == [unit_name(0, 3), unit_name(1, 2)]
+    assert not said, "a shard that nobody names"
 
 
 def everything(split: Path) -> set[Path]:

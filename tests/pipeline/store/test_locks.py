@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,8 +17,9 @@ import pytest
 from pipeline.errors import Exit, UserError
 from pipeline.jobs.schedule import Order, UnitOutcome, WorkUnit
 from pipeline.jobs.worker import Worker
-from pipeline.store import locks
+from pipeline.store import leases, locks
 from pipeline.store.layout import COMMIT_LOCK
+from pipeline.store.leases import LeaseLost
 from pipeline.store.locks import LockRefused, committing, is_written, nobody_commits, only_writer
 from pipeline.store.split import writing
 from tests.pipeline.command import ROOT, heed_ctrl_c, start
@@ -29,6 +31,26 @@ def test_commits_do_not_wait_for_each_other(tmp_path: Path) -> None:
         pass
     with nobody_commits(tmp_path, print):
         pass
+
+
+def test_a_worker_of_an_earlier_command_commits_nothing_beside_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not even into a folder that was made anew."""
+    monkeypatch.setattr(leases, "_served", {})
+    worker = Path(os.path.relpath(tmp_path))  # as another process has it
+    with only_writer(tmp_path, print):
+        leases.serve(worker)
+    with committing(worker):
+        pass
+    for _ in range(2):
+        with only_writer(tmp_path, print):
+            with pytest.raises(LeaseLost, match="Another command has taken over"), committing(worker):
+                pytest.fail("it would commit")
+            with committing(tmp_path):
+                pass
+        shutil.rmtree(tmp_path)
+        tmp_path.mkdir()
 
 
 # NFS makes locks of byte ranges out of `flock`: so does this process, which holds one until its input ends.
