@@ -52,7 +52,11 @@ class Server:
                 server.meanwhile(server.count)
                 spoiled = server.spoiled if server.every and server.count % server.every == 0 else ""
                 headers = {name.lower(): x for name, x in self.headers.items()}
-                body = self.rfile.read(int(headers.get("content-length", 0)))
+                length = int(headers.get("content-length", 0))
+                body = self.rfile.read(length)
+                if len(body) < length:  # who asked died in the middle of it
+                    self.close_connection = True
+                    return
                 if spoiled == "busy":
                     self.give(Answer(503, {}, b"<Error><Code>SlowDown</Code></Error>"))
                     return

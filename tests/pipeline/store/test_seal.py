@@ -1,7 +1,6 @@
 """Sealing: the same rows and bits in fewer files, whoever reads, commits or dies meanwhile."""
 
 import errno
-import itertools
 import json
 import os
 import shutil
@@ -162,28 +161,7 @@ def sealed(split: Path, rows: int) -> None:
         seal(split, group, rows_a_file=2)
 
 
-@pytest.mark.filterwarnings("ignore:os.fork")
-@pytest.mark.parametrize("stride", [59, pytest.param(1, marks=pytest.mark.campaign)])
-def test_a_kill_at_any_step_loses_nothing_and_doubles_nothing(made: Path, tmp_path: Path, stride: int) -> None:
-    expected, split, deaths = whole(made), tmp_path / "split", 0
-    for step in itertools.count(0, stride):
-        shutil.copytree(made, split)
-        dead = killed(split, step)
-        assert whole(split) == expected
-        said: list[str] = []
-        clean(split, said.append)
-        assert whole(split) == expected
-        sealed(split, 100)
-        assert whole(split) == expected
-        assert_tidy(split, 1)
-        assert not said
-        shutil.rmtree(split)
-        if not dead:
-            break
-        deaths += 1
-    assert deaths > 150 / stride, "every change of a file is a step"
-
-
+@pytest.mark.campaign
 @pytest.mark.filterwarnings("ignore:os.fork")
 @settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(

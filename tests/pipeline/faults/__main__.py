@@ -1,0 +1,53 @@
+"""`python -m tests.pipeline.faults [FIRST COUNT]`: runs schedules, and prints how many there are of which; with
+`--count`, only that."""
+
+import argparse
+import os
+import resource
+import sys
+import traceback
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from tests.pipeline.faults.schedules import schedule_of, table
+
+
+def run() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.pipeline.faults")
+    parser.add_argument("first", type=int, nargs="?", default=0, help="seed of the first schedule")
+    parser.add_argument("count", type=int, nargs="?", default=520, help="schedules")
+    parser.add_argument("--count", action="store_true", dest="only", help="only count what they are")
+    asked = parser.parse_args()
+    schedules = [schedule_of(seed) for seed in range(asked.first, asked.first + asked.count)]
+    if asked.only:
+        print(table(schedules))
+        return 0
+    from tests.pipeline.faults.campaign import Campaign
+    from tests.pipeline.faults.process import set_up
+    from tests.pipeline.servers import bucket_of, serving
+
+    failed, missed = 0, 0
+    with TemporaryDirectory(prefix="faults-") as name, serving(bucket_of(Path(name) / "s3")) as server:
+        os.environ |= {"AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any", "AWS_REGION": "us-east-1"}
+        os.environ |= {"AWS_ENDPOINT_URL": server.url, "LEVELPROOF_CACHE_DIR": f"{name}/cache"}
+        set_up()
+        campaign = Campaign(Path(name), server)
+        for schedule in schedules:
+            begun = cpu_seconds()
+            try:
+                missed += not campaign.run(schedule)
+            except Exception:
+                failed += 1
+                print(f"FAILED {schedule}\n{traceback.format_exc(limit=-3)}", flush=True)
+            print(f"{schedule} ({cpu_seconds() - begun:.1f} s of a core)", flush=True)
+    print(table(schedules))
+    print(f"{len(schedules)} schedules, {failed} failed; in {missed} the command ended before its fault.")
+    return bool(failed)
+
+
+def cpu_seconds() -> float:
+    return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
+if __name__ == "__main__":
+    sys.exit(run())

@@ -1,0 +1,272 @@
+"""The command `levelproof` in a forked process, with all that it forks, to which something may happen.
+
+Nothing here computes with JAX: a process that has started it cannot fork. So what trains is `crew`, and what the engine
+computes again when a density is changed is looked up in what was stored before.
+"""
+
+import errno
+import mmap
+import os
+import resource
+import select
+import signal
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from datetime import datetime, timedelta
+from functools import cache, partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from configs import compose
+from pipeline.cli.main import main
+from pipeline.jobs import inline, unit
+from pipeline.store import density, events, leases, remote, seal, shard
+from tests.pipeline.faults import crew
+from tests.pipeline.faults.effects import Effects, Tell
+from tests.pipeline.faults.schedules import LEVELS
+
+PATIENCE = 60.0  # s after which a command hangs
+HELD = 0.5  # s that a worker that has outlived its driver waits for the next command, at most
+SLOW, FOR = 0.02, 10  # s of each of so many effects
+DAY = 86_400.0  # s
+BESIDE_ROWS = 4  # of a fragment that is sealed beside a job
+TORN = "a kill within a write"
+LEAST = 4096  # bytes of a file that may be written: those of what the command says
+SPARE, MORTAL = 2, 10  # workers, where one dies, and where all do
+ERRORS = {"no space": errno.ENOSPC, "input/output error": errno.EIO, "read-only": errno.EROFS}
+DRIVER, WORKER, HAPPENED, DRIVER_PID, WORKER_PID = range(5)  # places in what processes share: counts of effects first
+ROLES = {"driver": DRIVER, "worker": WORKER}
+
+
+class Happening(NamedTuple):
+    """What happens to a command, in one of its processes."""
+
+    fault: str = ""
+    whose: str = "driver"
+    at: int = 0  # effect, or bytes of a file
+    when: Callable[[str, str], bool] | None = None  # of an effect's kind and path, instead
+
+
+class Command:
+    """One run of the command, in a session of its own."""
+
+    def __init__(
+        self,
+        words: list[str],
+        below: Path,
+        output: Path,
+        happening: Happening,
+        log: Path | None = None,
+        beside: bool = False,
+    ) -> None:
+        """What it says goes to `output`, and what it does to files `below`, if that is wanted, to a `log`."""
+        self.shared = memoryview(mmap.mmap(-1, 64)).cast("q")
+        self.control, theirs = socket.socketpair()
+        reads, alive = os.pipe()  # closed when the last process that has it ends
+        self._alive: int | None = reads
+        self._output, self._end = output, time.monotonic() + PATIENCE
+        self._code: int | None = None
+        self.pid = os.fork()
+        if self.pid:
+            theirs.close()
+            os.close(alive)
+            return
+        code = 70
+        try:
+            os.setsid()
+            self.shared[DRIVER_PID] = os.getpid()
+            _redirect(output)
+            _prepare(below, happening, log, beside, theirs, self.shared)
+            code = main(words)
+            sys.stdout.flush()
+            sys.stderr.flush()
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+
+    def over(self) -> bool:
+        """Whether the process itself has ended; its worker may go on."""
+        if self._code is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self._code = os.waitstatus_to_exitcode(status) if pid else None
+            if time.monotonic() > self._end:
+                self.kill()
+                raise AssertionError(f"it hangs: {self.said()}")
+        return self._code is not None
+
+    def wait(self) -> int:
+        """Its exit code; negative: of a signal. Raises AssertionError where it hangs."""
+        while not self.over():
+            time.sleep(0.002)
+        assert self._code is not None
+        return self._code
+
+    def asks(self) -> bool:
+        """Whether a process of it has said that it is time."""
+        try:
+            return bool(self.control.recv(1, socket.MSG_DONTWAIT))
+        except OSError:
+            return False
+
+    def ended(self) -> None:
+        """Wait until all that it has forked have ended, too."""
+        while self._alive is not None:
+            if select.select([self._alive], [], [], PATIENCE)[0]:
+                os.close(self._alive)
+                self._alive = None
+                self.control.close()
+            else:
+                self.kill()
+                raise AssertionError(f"a worker hangs: {self.said()}")
+
+    def kill(self) -> None:
+        os.killpg(self.pid, signal.SIGKILL)
+
+    def end(self) -> None:
+        """All that it has forked, if it is not over: what was to be seen was not."""
+        if self._alive is not None:
+            with suppress(ProcessLookupError):
+                self.kill()
+            self.wait()
+            self.ended()
+
+    def said(self) -> str:
+        return self._output.read_text()
+
+
+def _redirect(output: Path) -> None:
+    descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for standard in (1, 2):
+        os.dup2(descriptor, standard)
+    sys.stdout, sys.stderr = (os.fdopen(n, "w", closefd=False) for n in (1, 2))
+    os.environ["COLUMNS"] = "400"
+
+
+def _prepare(
+    below: Path, happening: Happening, log: Path | None, beside: bool, control: socket.socket, shared: memoryview
+) -> None:
+    """Make this process, forked a moment ago, the command's."""
+    if beside:
+        seal.ROWS = BESIDE_ROWS
+    if happening.fault in (TORN, "files that grow too large"):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (max(happening.at, LEAST), resource.RLIM_INFINITY))
+        kills = happening.fault == TORN
+        signal.signal(signal.SIGXFSZ, signal.SIG_DFL if kills else signal.SIG_IGN)
+        shared[HAPPENED] = 1
+    mine = lambda role: _tell(happening, control, shared) if happening.whose == role else None
+    effects = Effects(below, _counted(shared, DRIVER, mine("driver")), log)
+
+    def begin_worker(tell: Tell | None) -> None:
+        shared[WORKER_PID] = os.getpid()
+        effects.count, effects.tell = 0, _counted(shared, WORKER, tell)
+
+    for number in range(MORTAL if happening.fault == TORN else SPARE):
+        crew.fork_worker(partial(begin_worker, None if number else mine("worker")))
+
+
+def _counted(shared: memoryview, role: int, tell: Tell | None) -> Tell:
+    def count(number: int, kind: str, path: str) -> None:
+        shared[role] += 1
+        if tell:
+            tell(number, kind, path)
+
+    return count
+
+
+def _tell(happening: Happening, control: socket.socket, shared: memoryview) -> Tell:
+    """What is to happen at an effect, in the process that is about to have it."""
+    fault, _, at, when = happening
+    code = next((code for name, code in ERRORS.items() if name in fault), 0)
+
+    def tell(number: int, kind: str, path: str) -> None:
+        now = number == at if when is None else when(kind, path)
+        if now:
+            shared[HAPPENED] = 1
+        if now and fault == "a kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        elif now and fault in ("a kill of all", "loss of power"):
+            os.killpg(0, signal.SIGKILL)
+        elif now and fault == "a kill of the driver, the worker goes on":
+            os.kill(shared[DRIVER_PID], signal.SIGKILL)
+            _ask(control, HELD)
+        elif now and fault in ("a second command", "go on"):
+            _ask(control, PATIENCE if fault == "a second command" else 0.0)
+        elif now and fault == "a clock that goes back":
+            _set_clock_back()
+        elif fault == "slow writes" and at <= number < at + FOR:
+            time.sleep(SLOW)
+        elif code and kind != "lock" and (now or ("from then on" in fault and number > at)):
+            raise OSError(code, os.strerror(code), path)
+
+    return tell
+
+
+def _ask(control: socket.socket, seconds: float) -> None:
+    """Say that it is time, and wait for an answer."""
+    control.send(b"!")
+    if seconds:
+        control.settimeout(seconds)
+        with suppress(TimeoutError):
+            control.recv(1)
+
+
+def _set_clock_back() -> None:
+    now = time.time
+
+    class Earlier(datetime):
+        @classmethod
+        def now(cls, tz: Any = None) -> datetime:  # pyright: ignore[reportIncompatibleMethodOverride]
+            return datetime.now(tz) - timedelta(seconds=DAY)
+
+    time.time = lambda: now() - DAY
+    events.datetime = Earlier  # type: ignore[misc]
+
+
+def set_up() -> None:
+    """Make this process one whose forks are the command's: without JAX, and with all that they share already there."""
+    inline.run = crew.run
+    unit.device = lambda: "cpu: none"
+    compose.compose_job = cache_of(compose.compose_job)
+    for name in (
+        "pipeline.jobs.generate",
+        "pipeline.jobs.regenerate",
+        "pipeline.jobs.seal",
+        "pipeline.jobs.level_files",
+    ):
+        import_module(name)
+    import_module("obstore.store")
+    for first in range(0, LEVELS, 2):
+        for experts in (False, True):
+            crew.result_of((first, first + 1), experts)
+    stored = {}
+    for first in range(0, LEVELS, 2):
+        result = crew.result_of((first, first + 1), True)
+        arrays = unit.shard_arrays(result.levels, result.record, [0, 1])
+        stored |= {arrays["record/action"][..., i].tobytes(): (arrays, i) for i in (0, 1)}
+    shard.restored = _looked_up(stored)
+    remote.RETRIES |= {"retry_timeout": timedelta(seconds=0.5), "backoff": {"init_backoff": timedelta(milliseconds=5)}}
+    leases.POLL, leases.RENEWAL, leases.SILENCE = 0.02, 0.2, 3.0
+
+
+def cache_of(function: Callable) -> Callable:
+    """The same of a list of words, each asked once."""
+    known = cache(function)
+    return lambda words: known(tuple(words))
+
+
+def _looked_up(stored: Mapping[bytes, tuple[Mapping[str, np.ndarray], int]]) -> Callable[..., density.Restored]:
+    def restored(arrays: Mapping[str, np.ndarray], wanted: Any, _: Any) -> density.Restored:
+        action = arrays["record/action"]
+        of = [stored[action[..., i].tobytes()] for i in range(action.shape[-1])]
+        found = {field.name: np.stack([all[field.name][..., i] for all, i in of], -1) for field in wanted}
+        return density.Restored(found, np.full(len(of), -1))
+
+    return restored

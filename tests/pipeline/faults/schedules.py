@@ -1,0 +1,114 @@
+"""Schedules: a command, what goes wrong in it, and at which of its effects. A seed makes one."""
+
+import random
+from collections import Counter
+from collections.abc import Iterable
+from typing import NamedTuple
+
+LEVELS = 6
+ALL = f"levels={LEVELS}"
+GENERATE = ("generate", "size=s", ALL, "unit=2", "budget=128k", "executor=inline", "keep_experts=true")
+REGENERATE = ("regenerate", "manifest=OUT/128k/s", "budget=256k", "executor=inline", "unit=2", "out=OUT")
+
+
+class Operation(NamedTuple):
+    """A command, and what is there before it; `OUT` stands for the folder or the store's URL."""
+
+    words: tuple[str, ...]
+    before: tuple[tuple[str, ...], ...] = ()  # commands
+    left: bool = False  # and what dead processes have left
+    beside: bool = False  # it seals while it works
+    works: bool = True  # it has a worker
+
+
+OPERATIONS = {
+    "generate": Operation((*GENERATE, "out=OUT")),
+    "generate, sealing beside": Operation((*GENERATE, "out=OUT"), beside=True),
+    "generate on leftovers": Operation((*GENERATE, "out=OUT"), left=True),
+    "regenerate": Operation(REGENERATE, ((*GENERATE, "out=OUT"),)),
+    "seal": Operation(("seal", "OUT/128k/s"), ((*GENERATE, "out=OUT"),), works=False),
+    "change of density": Operation(
+        ("seal", "OUT/128k/s", "--density", "resume"), ((*GENERATE, "out=OUT"),), works=False
+    ),
+}
+STORED = ("generate", "seal")  # operations that also run in an object store
+
+OF_PROCESSES = {  # what happens at an effect, each of a driver or of a worker
+    "a kill": ("driver", "worker"),
+    "a kill of all": ("driver", "worker"),
+    "loss of power": ("driver", "worker"),
+    "a kill of the driver, the worker goes on": ("worker",),
+    "a kill within a write": ("all",),
+    "a second command": ("driver", "worker"),
+    "no space, once": ("driver", "worker"),
+    "no space from then on": ("driver", "worker"),
+    "an input/output error, once": ("driver", "worker"),
+    "input/output errors from then on": ("driver", "worker"),
+    "read-only from then on": ("driver", "worker"),
+    "files that grow too large": ("all",),
+    "a disk that is really full": ("all",),
+    "slow writes": ("driver", "worker"),
+    "a clock that goes back": ("driver",),
+}
+OF_STORES = {  # at a request
+    "a kill": ("driver", "worker"),
+    "a kill of all": ("all",),
+    "a kill of the driver, the worker goes on": ("worker",),
+    "a store that is gone from then on": ("all",),
+    "lost answers": ("all",),
+    "a busy store": ("all",),
+    "a second command": ("all",),
+}
+OFTEN = {"a kill": 3, "a kill of all": 2, "loss of power": 3, "a kill of the driver, the worker goes on": 2}
+
+
+class Schedule(NamedTuple):
+    """What is done, what goes wrong, in which process, and when."""
+
+    seed: int
+    operation: str
+    place: str  # folder, store
+    fault: str
+    whose: str  # driver, worker, all
+    when: float  # share of the effects of an undisturbed run before it
+    again: float  # the same of the run after it, in which a worker that has outlived its driver goes on
+
+    def __str__(self) -> str:
+        where = "" if self.place == "folder" else " in a store"
+        return f"{self.seed}: {self.operation}{where}, {self.fault} ({self.whose}) after {self.when:.1%}"
+
+
+def _cells() -> list[tuple[str, str, str, str]]:
+    """Everything that there is to choose from, what matters most several times, in an order without meaning."""
+    cells = []
+    for name, operation in OPERATIONS.items():
+        for place, faults in (("folder", OF_PROCESSES), ("store", OF_STORES if name in STORED else {})):
+            for fault, processes in faults.items():
+                of = [who for who in processes if operation.works or who != "worker"]
+                often = OFTEN.get(fault, 1) * (1 if operation.works else 2) if place == "folder" else 1
+                cells += [(name, place, fault, who) for who in of] * often
+    random.Random(0).shuffle(cells)
+    return cells
+
+
+CELLS = _cells()
+
+
+def schedule_of(seed: int) -> Schedule:
+    dice = random.Random(seed)
+    return Schedule(seed, *CELLS[seed % len(CELLS)], dice.random(), dice.random())
+
+
+def table(schedules: Iterable[Schedule]) -> str:
+    """How many there are of each fault, by operation."""
+    schedules = list(schedules)
+    columns = list(dict.fromkeys((name, place) for place in ("folder", "store") for name in OPERATIONS))
+    columns = [of for of in columns if of[1] == "folder" or of[0] in STORED]
+    count = Counter((of.fault, of.operation, of.place) for of in schedules)
+    heads = [name + (" (store)" if place == "store" else "") for name, place in columns]
+    lines = [f"| fault | {' | '.join(heads)} | all |", "|---|" + "---|" * (len(heads) + 1)]
+    for fault in dict.fromkeys([*OF_PROCESSES, *OF_STORES]):
+        row = [count[fault, *of] for of in columns]
+        lines.append(f"| {fault} | {' | '.join(str(n or '') for n in row)} | {sum(row)} |")
+    totals = [sum((of.operation, of.place) == column for of in schedules) for column in columns]
+    return "\n".join([*lines, f"| all | {' | '.join(map(str, totals))} | {len(schedules)} |"])
