@@ -17,6 +17,7 @@ LEVELS = 8  # in place of as many as a page says
 BUDGETS = {"64k": "3k", "128k": "4k", "256k": "5k", "1M": "6k"}  # what a page says, and what runs, folders as well
 JOBS = ("generate", "regenerate", "plan")
 ELSEWHERE = ("levelproof play", "://", "HEAD:", "me/levels")  # servers, and other hosts: tests/pipeline has their tests
+WITH_WORKERS = ("README", "cluster")  # pages of which every job starts Ray; others' are done in this process
 NOBODY = "No level", "no trajectories", "holds for none"  # of so few fits a condition
 
 
@@ -35,9 +36,11 @@ def commands(page: Path) -> list[list[str]]:
     return [smaller(line) for line in lines if not any(word in line for word in ELSEWHERE)]
 
 
-def typed(words: list[str], folder: Path) -> None:
-    """In a process of its own what starts workers, in this one what only reads."""
-    done = (run if words[0] in JOBS or "--repair" in words else here)(words, folder)
+def typed(words: list[str], folder: Path, inline: bool) -> None:
+    """In a process of its own what starts workers, in this one what only reads, and jobs that are to be `inline`."""
+    inline &= words[0] in JOBS
+    starts = words[0] in JOBS or "--repair" in words
+    done = run(words, folder) if starts and not inline else here([*words, *["executor=inline"] * inline], folder)
     nobody = done.returncode == 2 and any(word in done.stderr for word in NOBODY)
     assert done.returncode == 0 or nobody, f"levelproof {shlex.join(words)}: {done.stdout[-500:]}{done.stderr[-1500:]}"
 
@@ -47,13 +50,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What pages take for granted: splits, level files, and a folder of the reference's."""
     folder = tmp_path_factory.mktemp("docs")
     for size, budget in (("s", "4k"), ("s", "5k"), ("s", "6k"), ("m", "5k"), ("m", "6k")):
-        typed(["generate", f"size={size}", f"budget={budget}", f"levels={LEVELS}"], folder)
-    typed(["export", "data/4k/s", "7", "-o", "level.json"], folder)
+        typed(["generate", f"size={size}", f"budget={budget}", f"levels={LEVELS}"], folder, True)
+    typed(["export", "data/4k/s", "7", "-o", "level.json"], folder, True)
     for name in ("mine", "handmade"):
         (folder / name).mkdir()
         shutil.copy(folder / "level.json", folder / name)
     everything = ["--where", "shard IS NOT NULL"]
-    typed(["export", "data/6k/s", "--format", "kinetix", *everything, "-o", "kinetix/6k/s"], folder)
+    typed(["export", "data/6k/s", "--format", "kinetix", *everything, "-o", "kinetix/6k/s"], folder, True)
     return folder
 
 
@@ -66,4 +69,4 @@ def test_a_page_s_commands_run_in_their_order(page: Path, made: Path, tmp_path: 
                 copy = shutil.copytree if (made / name).is_dir() else shutil.copy
                 (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
                 copy(made / name, tmp_path / name)
-        typed(words, tmp_path)
+        typed(words, tmp_path, page.stem not in WITH_WORKERS)

@@ -37,8 +37,10 @@ def env_steps(out: str) -> int:
     return int(found[1].replace(",", ""))
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
-@pytest.mark.parametrize("executor", ["inline", "ray"])
+@pytest.mark.parametrize(
+    ("executor", "number"),
+    [("inline", signal.SIGINT), ("inline", signal.SIGKILL), ("ray", signal.SIGTERM), ("ray", signal.SIGKILL)],
+)
 def test_the_same_command_goes_on_where_experts_were(
     undisturbed: tuple[Path, int], tmp_path: Path, number: signal.Signals, executor: str
 ) -> None:
