@@ -1,19 +1,25 @@
-"""Writes a split's manifest as one file, and its levels' initial worlds, into this folder. See README.md here.
+"""Writes a split's manifest as one file, and its levels' initial worlds, into this folder, and its gallery's data into
+docs/example/, whose pages are links to the program's. See README.md here.
 
 python manifests/make_reference.py data/128k/s
 """
 
+import shutil
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pyarrow.parquet as pq
 
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
+from pipeline.look.gallery.gallery import gallery
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import arrays_of
 from pipeline.store.manifest import read_manifest
+
+EXAMPLE = Path(__file__).parent.parent / "docs" / "example"
 
 
 def main(split: Path) -> None:
@@ -24,6 +30,11 @@ def main(split: Path) -> None:
     pq.write_table(table, here / f"{name}.parquet", compression="zstd")
     levels = arrays_of(sample_levels(table["level_id"].to_numpy(), SIZES[split.name]))
     np.savez_compressed(here / f"{name}-levels.npz", **levels)
+    with TemporaryDirectory() as folder:
+        gallery(split, Path(folder) / "gallery", None, len(table))
+        shutil.rmtree(EXAMPLE / "data", ignore_errors=True)
+        shutil.copytree(Path(folder) / "gallery" / "data", EXAMPLE / "data")
+        shutil.copy(Path(folder) / "gallery" / "palette.css", EXAMPLE)
 
 
 if __name__ == "__main__":

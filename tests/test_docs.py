@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import levelproof
+from pipeline.look.gallery.gallery import SITE
 from pipeline.read.export import export
 from pipeline.read.parquet import export_parquet
 from pipeline.store.manifest import read_manifest
@@ -74,5 +75,6 @@ def test_the_docs_are_a_site_without_a_broken_link(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     page = (tmp_path / "api.html").read_text()
     assert all(f'id="levelproof.{name}"' in page for name in levelproof.__all__ if name != "__version__")
+    assert (tmp_path / "example/main.js").read_text() == (SITE / "main.js").read_text()  # a link, in docs/
     asked = {link for html in tmp_path.rglob("*.html") for link in re.findall(r'src="(https?:[^"]+)', html.read_text())}
     assert not asked, "the site asks other hosts for something"

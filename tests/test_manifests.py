@@ -1,5 +1,6 @@
 """The committed reference manifest can be made again."""
 
+import json
 from pathlib import Path
 
 import jax
@@ -10,10 +11,13 @@ import pytest
 from benchmarks.alone import label
 from configs.compose import compose_job
 from levelgen.level import SIZES
+from levelgen.pictures.palette import palette_css
 from levelgen.sampling.sampler import sample_levels
+from pipeline.look.gallery.gallery import SITE
 from pipeline.store.fields import arrays_of
 
 FOLDER = Path(__file__).parent.parent / "manifests"
+EXAMPLE = FOLDER.parent / "docs" / "example"
 ROWS = pq.read_table(FOLDER / "128k-s.parquet").to_pylist()
 WORLDS = dict(np.load(FOLDER / "128k-s-levels.npz"))
 IDS = np.array([row["level_id"] for row in ROWS])
@@ -34,6 +38,18 @@ def test_it_has_null_where_there_is_no_number() -> None:
 def test_every_level_starts_as_it_did() -> None:
     for name, values in arrays_of(sample_levels(IDS, SIZES["s"])).items():
         np.testing.assert_allclose(values, WORLDS[name], rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def test_the_docs_example_is_its_gallery() -> None:
+    """Its pages are the program's own, its data are of these rows."""
+    links = {path.name: path.resolve() for path in EXAMPLE.iterdir() if path.is_symlink()}
+    assert links == {path.name: path for path in SITE.iterdir()}
+    assert {path.name for path in EXAMPLE.iterdir()} == {*links, "palette.css", "data"}
+    assert (EXAMPLE / "palette.css").read_text() == palette_css()
+    for row in ROWS:
+        text = (EXAMPLE / f"data/levels/0/{row['level_id']}.js").read_text()
+        shown = json.loads(text[text.index("{") : text.rindex("}") + 1])["row"]
+        assert all(shown[name] == row[name] for name in ("content_hash", "label", "steps_to_goal", "config_hash"))
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from pipeline.look.gallery.gallery import gallery
 from pipeline.look.gallery.worlds import ANGLE, LENGTH
 from pipeline.read.rows import read_row
 from pipeline.store.manifest import require_manifest
+from tests.pipeline.command import ROOT
 from tests.pipeline.made import PLAYED
 
 DEMANDED = "LEVELPROOF_TEST_BROWSER"
@@ -192,6 +193,16 @@ def test_a_phone_by_day_and_by_night(chromium: Any, address: str, split: Path, s
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(19, 21, 25)"
     assert dark == (scheme == "dark")
     context.close()
+
+
+def test_the_docs_example_opens_where_it_lies(page: Any) -> None:
+    page.goto((ROOT / "docs/example/index.html").as_uri())
+    drawn(page)
+    assert page.locator("#count").inner_text() == "64 levels"
+    page.goto((ROOT / "docs/example/index.html").as_uri() + "#level=7")
+    page.wait_for_selector("#title:has-text('Level 7')")
+    page.keyboard.press("End")
+    assert page.locator("#clock").inner_text().startswith("step 24 of 24 · ")
 
 
 def test_a_damaged_file_is_told(chromium: Any, tmp_path: Path, split: Path) -> None:
