@@ -76,5 +76,6 @@ def test_the_docs_are_a_site_without_a_broken_link(tmp_path: Path) -> None:
     page = (tmp_path / "api.html").read_text()
     assert all(f'id="levelproof.{name}"' in page for name in levelproof.__all__ if name != "__version__")
     assert (tmp_path / "example/main.js").read_text() == (SITE / "main.js").read_text()  # a link, in docs/
+    assert (tmp_path / "favicon.svg").is_file()
     asked = {link for html in tmp_path.rglob("*.html") for link in re.findall(r'src="(https?:[^"]+)', html.read_text())}
     assert not asked, "the site asks other hosts for something"

@@ -21,8 +21,8 @@ for `--where`, `--columns` and `--sort`, for `levelproof.open(where=...)`, and f
 `levelproof columns WORD` finds them on the command line. A rate or number that does not exist is null, never NaN, so \
 comparisons skip it.
 
-| column | type | unit | meaning | null says |
-|---|---|---|---|---|
+| column | type, unit | meaning |
+|---|---|---|
 """
 END = """
 Version {oldest}, which had no {newer}, is read as well: there they are null. `seconds` is a struct, so SQL asks for \
@@ -57,8 +57,11 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _entry(of: "ManifestColumn") -> tuple[str, str]:
-    details = [of.type_name, of.unit, of.null and f"null: {of.null}"]
-    return of.name, f"{of.meaning} ({', '.join(filter(None, details))})"
+    return of.name, f"{of.text} ({_kind(of)})"
+
+
+def _kind(of: "ManifestColumn") -> str:
+    return ", ".join(filter(None, [of.type_name, of.unit]))
 
 
 def as_markdown() -> str:
@@ -66,6 +69,6 @@ def as_markdown() -> str:
     from pipeline.store.columns import DESCRIBED, MANIFEST_VERSION, OLDEST_VERSION
 
     newer = " and ".join(f"`{of.name}`" for of in DESCRIBED if of.since > OLDEST_VERSION)
-    rows = [f"| `{of.name}` | {of.type_name} | {of.unit} | {of.meaning} | {of.null} |" for of in DESCRIBED]
+    rows = [f"| `{of.name}` | {_kind(of)} | {of.text} |" for of in DESCRIBED]
     start, end = INTRODUCTION.format(version=MANIFEST_VERSION), END.format(oldest=OLDEST_VERSION, newer=newer)
     return start + "\n".join(rows) + "\n" + end

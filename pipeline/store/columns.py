@@ -30,6 +30,11 @@ class ManifestColumn(NamedTuple):
     since: int = OLDEST_VERSION  # the manifest version
 
     @property
+    def text(self) -> str:
+        """Meaning, and what null says."""
+        return f"{self.meaning}; null: {self.null}" if self.null else self.meaning
+
+    @property
     def type_name(self) -> str:
         name = lambda of: {"float": "float32"}.get(str(of), str(of))
         if pa.types.is_list(self.type):

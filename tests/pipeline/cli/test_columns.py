@@ -29,7 +29,7 @@ def test_all_columns_are_listed_on_a_narrow_screen(
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80
     text = " ".join(out.split())
-    assert all(f"{of.name} {of.meaning} ({of.type_name}" in text for of in DESCRIBED)
+    assert all(f"{of.name} {of.text} ({of.type_name}" in text for of in DESCRIBED)
 
 
 def test_a_word_chooses(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,66 @@
+"""Draws docs/concepts-level.svg: a level with a name on each thing that it is made of.
+
+python docs/make_level.py
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from levelgen.edit import add_body, add_joint, add_thruster, bind, fix, resize, set_role
+from levelgen.level import Level, Role
+from levelgen.pictures.scene import scene_of
+from levelgen.pictures.shapes import Part, Point, line, text
+from levelgen.pictures.style import INK
+from levelgen.pictures.svg import svg_of
+from levelgen.pictures.words import Caption
+from pipeline.look.play.session import empty_file
+from pipeline.runtime import prepare_jax
+
+DRAWING = Path(__file__).with_name("concepts-level.svg")
+ACTION = np.array([1, 0, 0, 0, 1, 0])
+LETTERS = 0.15  # m
+BODIES = (  # shape, centre, times as large, role
+    ("rectangle", (1.45, 1.05), 1.7, Role.GREEN),
+    ("circle", (1.2, 0.72), 1.1, Role.PLAIN),
+    ("circle", (1.7, 0.72), 1.1, Role.PLAIN),
+    ("circle", (4.3, 2.05), 1.3, Role.BLUE),
+    ("rectangle", (4.2, 1.35), 1.6, Role.PLAIN),
+    ("triangle", (3.0, 0.7), 1.2, Role.RED),
+)
+NAMES: tuple[tuple[str, Point, Point, Point], ...] = (  # words, where they begin, a line to what they name
+    ("thruster: pushes along its nozzle", (0.25, 2.15), (0.9, 2.05), (1.08, 1.2)),
+    ("green: has to touch blue", (2.05, 1.78), (2.0, 1.74), (1.7, 1.4)),
+    ("motor", (2.06, 1.1), (2.02, 1.05), (1.77, 0.83)),
+    ("red: ends the episode", (2.3, 1.4), (3.0, 1.3), (3.0, 1.0)),
+    ("blue: the goal", (3.6, 2.85), (4.2, 2.75), (4.3, 2.25)),
+    ("cannot move: hatched", (3.42, 0.7), (4.2, 0.8), (4.2, 1.05)),
+)
+
+
+def level() -> Level:
+    one = empty_file("l").level
+    for shape, (x, y), factor, role in BODIES:
+        one = add_body(one, shape, x, y)
+        body = int(np.flatnonzero((one.state.position[..., 0] == np.float32((x, y))).all(-1))[0])
+        one = set_role(resize(one, body, factor), body, role)
+        if role == Role.PLAIN and shape == "rectangle":
+            one = fix(one, body, True)
+    one = add_joint(add_joint(one, 1.2, 0.78), 1.7, 0.78)
+    return add_thruster(bind(one, "joint", 1, 0), 1.12, 1.1, 0.0)
+
+
+def main() -> None:
+    prepare_jax()
+    one = level()
+    scene = scene_of(one, one.state, action=ACTION, caption=Caption("a level, under an action"))
+    names = "".join(
+        line([start, end], INK, 0.012) + text(place, words, INK, LETTERS) for words, place, start, end in NAMES
+    )
+    named = replace(scene, title="A level and what it is made of", parts=(*scene.parts, Part(names)))
+    DRAWING.write_text(svg_of([named], [1.0]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,28 @@
+"""Draws docs/solved-SIZE.png: the first levels of a split that were solved, each when its witness reaches the goal.
+
+levelproof generate size=s levels=96 budget=64k
+python docs/make_sheets.py data/64k/s
+"""
+
+import sys
+from pathlib import Path
+
+from experts.labels import Label
+from levelgen.pictures.raster import rasterised, sheet, write_png
+from pipeline.look.show import film_of
+from pipeline.store.manifest import read_manifest
+
+LEVELS, COLUMNS = 10, 5
+PIXELS = 220  # width of one level's picture
+
+
+def main(split: Path) -> None:
+    manifest = read_manifest(split, ["label"])
+    solved = manifest.level_ids[manifest.labels == Label.SOLVED][:LEVELS]
+    pictures = [rasterised(film_of(split, int(level_id)).scenes[-1], PIXELS) for level_id in solved]
+    write_png(sheet(pictures, COLUMNS), Path(__file__).with_name(f"solved-{split.name}.png"))
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        main(Path(name))
