@@ -16,7 +16,7 @@ from pipeline.store.columns import OF_THE_RUN
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import read_manifest
 from pipeline.store.shard import Shard
-from tests.pipeline.command import assert_refused, run
+from tests.pipeline.command import assert_refused, here
 
 SIZE = "5-3-2-2"
 SPLIT = f"data/5k/{SIZE}"
@@ -29,7 +29,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a real, tiny split of this size."""
     folder = tmp_path_factory.mktemp("custom")
     words = [f"size={SIZE}", "distribution=free", "levels=4", "budget=5k", "executor=inline"]
-    done = run(["generate", *words], folder)
+    done = here(["generate", *words], folder)
     assert done.returncode == 0, done.stderr
     assert f"of size {SIZE}" in done.stderr
     return folder
@@ -65,7 +65,7 @@ def test_every_question_is_answered(made: Path, capsys: pytest.CaptureFixture[st
 def test_a_rows_command_makes_the_row_again(made: Path) -> None:
     row = next(row for row in read_manifest(made / SPLIT).table.to_pylist() if row["shard"])
     words = shlex.split(row["command"])[1:]
-    done = run([*words, "executor=inline", "out=again"], made)
+    done = here([*words, "executor=inline", "out=again"], made)
     assert done.returncode == 0, done.stderr
     again = read_manifest(made / "again" / "5k" / SIZE).table.to_pylist()[0]
     assert repr({k: v for k, v in again.items() if k not in OF_THE_RUN}) == repr(
@@ -79,12 +79,12 @@ def test_a_rows_command_makes_the_row_again(made: Path) -> None:
 
 
 def test_another_distribution_needs_another_folder(made: Path) -> None:
-    done = run(["generate", f"size={SIZE}", "levels=4", "budget=5k", "executor=inline"], made)
+    done = here(["generate", f"size={SIZE}", "levels=4", "budget=5k", "executor=inline"], made)
     assert_refused(done, 2, "distribution.max_fixed_chance was 0", "out=NAME")
 
 
 def test_sample_draws_a_sheet(tmp_path: Path) -> None:
-    done = run(
+    done = here(
         ["sample", "size=6-2-1-1", "distribution=clutter", "levels=7", "first_level=3", "-o", "a/b.png"], tmp_path
     )
     assert done.returncode == 0, done.stderr
@@ -105,4 +105,4 @@ def test_sample_draws_a_sheet(tmp_path: Path) -> None:
     ],
 )
 def test_sample_says_what_is_wrong(tmp_path: Path, words: list[str], sentence: str) -> None:
-    assert_refused(run(["sample", *words], tmp_path), 2, sentence)
+    assert_refused(here(["sample", *words], tmp_path), 2, sentence)
