@@ -8,7 +8,7 @@ from pipeline.store.checksums import digests_of
 from pipeline.store.fragment import read_fragment
 from pipeline.store.layout import ATTEMPT, COMMIT_LOCK, EVENTS, WRITER_LOCK
 from pipeline.store.manifest import read_manifest
-from pipeline.store.schema import OF_THE_RUN
+from pipeline.store.columns import OF_THE_RUN
 
 Tree = dict[str, list[str]]  # of files: their paths, without what tells attempts apart, and what is in each
 Rows = dict[int, str]  # what lasts of a level's row
