@@ -88,7 +88,9 @@ def report_of(results: list[Results], whole: bool) -> Report:
         notes=[
             *([f"![How the unsolved share falls with budget]({PLOT})"] if curves else []),
             tables.variants_of(results),
-            "Success rates are of first episodes; where there is none (-), it was not measured so.",
+            "*An expert reaches the goal by itself* where attempts of its last evaluation do; a witness of the search "
+            "may stand in for its own, where that survives more replays. Success rates are of first episodes. Where "
+            "there is none (-), it was not measured so.",
         ],
         plots={PLOT: lambda path: plot.draw(curves, path)} if curves else {},
         made=made(results),

@@ -32,6 +32,7 @@ SCHEMA = pa.schema(
         ("search_steps", pa.int64()),
         ("witness", WORD),  # where it comes from; null: there is none, or it was not noted
         ("success_rate", pa.float64()),  # of the last evaluation's sampled episodes; null: none ended
+        ("most_probable_succeeds", pa.bool_()),  # in the last evaluation; null: it was not noted
         ("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: no witness
         ("core_seconds", pa.float64()),  # the level's part of what its unit took
         ("settings", WORD),  # of the procedure, as JSON
@@ -42,7 +43,7 @@ SCHEMA = pa.schema(
 )
 OF_LEVEL = (
     "label", "env_steps", "evaluation_steps", "scout_steps", "search_steps", "witness", "success_rate",
-    "steps_to_goal", "core_seconds",
+    "most_probable_succeeds", "steps_to_goal", "core_seconds",
 )  # fmt: skip
 OF_RUN = ("versions", "device", "date")
 

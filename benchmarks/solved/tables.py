@@ -12,8 +12,9 @@ from experts.labels import BY_EXPERT
 
 QUARTER = "alone"  # the variant whose quarter of the budget is compared with the reference's whole
 HEAD = (
-    "variant", "undecided levels", "solved (95% interval)", "by an expert's own witness", "at a quarter of the budget",
-    "env steps a level", "core-seconds a solved level", "success rate", "steps to goal",
+    "variant", "undecided levels", "solved (95% interval)", "by an expert's own witness",
+    "an expert reaches the goal by itself", "at a quarter of the budget", "env steps a level",
+    "core-seconds a solved level", "success rate", "steps to goal",
 )  # fmt: skip
 PAIRED_HEAD = ("variant", "against", "levels of both", "only the first solves", "only the other solves", "p")
 
@@ -55,20 +56,32 @@ def line(results: Results) -> list[str]:
     rows = [trained[level_id] for level_id in solved]
     seconds = sum(row["core_seconds"] for row in results.rows.values())
     quarter = len(results.solved(header.budget / 4))
-    sources = [row["witness"] for row in rows]
-    own = sum(source in BY_EXPERT for source in sources)
+    own = [row["witness"] and row["witness"] in BY_EXPERT for row in rows]
     rate = mean([row["success_rate"] for row in rows])
     return [
         f"`{header.variant}`",
         f"{len(trained)} of {len(results.rows)}",
         share(len(solved), len(trained)),
-        f"{own / len(rows):.1%}" if rows and all(sources) else "-",
+        known_share(own),
+        known_share([reaches(row) for row in rows]),
         share(quarter, len(trained)) if header.stops_early else "-",
         f"{mean([steps_of(row) for row in trained.values()]) or 0:,.0f}",
         f"{seconds / len(solved):.3g}" if solved else "-",
         f"{rate:.3f}" if rate is not None else "-",
         f"{statistics.median(row['steps_to_goal'] for row in rows):.0f}" if rows else "-",
     ]
+
+
+def reaches(row: Mapping[str, Any]) -> bool | None:
+    """Whether the expert of a solved level reaches the goal by itself, be the witness its own or not; None: unknown."""
+    if row["witness"] in BY_EXPERT or (row["success_rate"] or 0) > 0:
+        return True
+    return row["most_probable_succeeds"]
+
+
+def known_share(facts: Sequence[bool | None]) -> str:
+    """How many are true, where all are known."""
+    return f"{sum(map(bool, facts)) / len(facts):.1%}" if facts and None not in facts else "-"
 
 
 def steps_of(row: Mapping[str, Any]) -> int:

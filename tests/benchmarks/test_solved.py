@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from benchmarks import oracle
@@ -41,6 +42,7 @@ def row(level_id: int, label: str, env_steps: int, steps: int | None = None) -> 
     rate = 0.5 if label == "solved" else None
     values = {"label": label, "env_steps": env_steps, "success_rate": rate, "steps_to_goal": steps, "core_seconds": 1.5}
     values |= {"witness": "sampled" if rate else None, "evaluation_steps": 10, "scout_steps": 20, "search_steps": 30}
+    values |= {"most_probable_succeeds": False}
     return level_id, values | {"versions": '{"python": "3"}', "device": "cpu: none", "date": "2026-01-01"}
 
 
@@ -122,6 +124,7 @@ def test_table(ours: Results, theirs: Results) -> None:
         "9 of 10",
         share(6, 9),
         "100.0%",
+        "100.0%",
         share(3, 9),
         f"{mean_steps + 60:,.0f}",
         "2.5",
@@ -130,11 +133,30 @@ def test_table(ours: Results, theirs: Results) -> None:
     ]
     solved, paired = text.split("Level by level:")
     assert cells(solved, "`alone`") == of_ours
-    assert cells(solved, "`reference`")[1:4] == ["9 of 10", share(3, 9), "100.0%"]
+    assert cells(solved, "`reference`")[1:5] == ["9 of 10", share(3, 9), "100.0%", "100.0%"]
     assert cells(paired, "`alone`")[1:] == ["`reference`", "9", "4", "1", "0.38"]
     assert cells(paired, "`alone`, a quarter of the budget")[1:] == ["`reference`", "9", "3", "3", "1"]
     assert f"- `alone`: {VARIANTS['alone'].text}" in tables.variants_of([ours])
     assert text.index("| `reference` |") < text.index("| `alone` |")
+
+
+def test_an_expert_may_reach_the_goal_where_the_witness_is_the_search_s(ours: Results) -> None:
+    """By its sampled actions or its most probable ones; where it is not known of all, no share is."""
+    (i, other), rows = [*ours.solved()][:2], dict(ours.rows)
+    rows[i] = rows[i] | {"witness": "search", "success_rate": 0.0}
+
+    def shares() -> list[str]:
+        return cells(text_of([Results(ours.header, rows)]), "`alone`")[3:5]
+
+    assert shares() == ["83.3%", "83.3%"]
+    rows[i] |= {"most_probable_succeeds": None}
+    assert shares() == ["83.3%", "-"]
+    rows[i] |= {"most_probable_succeeds": True}
+    assert shares() == ["83.3%", "100.0%"]
+    rows[i] |= {"most_probable_succeeds": None, "success_rate": 0.1}
+    assert shares() == ["83.3%", "100.0%"]
+    rows[other] = rows[other] | {"witness": None}
+    assert shares() == ["-", "100.0%"]
 
 
 def test_a_variant_is_compared_with_several(ours: Results, theirs: Results) -> None:
@@ -173,6 +195,15 @@ class TestFile:
         other = Results(replace(ours.header, config=settings), dict([row(FIRST + 20, "solved", 1_024, 5)]))
         merge(other, file)
         assert read(file) == [other]
+
+    def test_what_was_not_noted_then_is_unknown(self, tmp_path: Path, ours: Results) -> None:
+        """A file without a column that came later."""
+        file = tmp_path / "solved.parquet"
+        merge(ours, file)
+        pq.write_table(pq.read_table(file).drop_columns(["most_probable_succeeds"]), file)
+        (back,) = read(file)
+        assert back.header == ours.header
+        assert all(row["most_probable_succeeds"] is None for row in back.rows.values())
 
     def test_something_else_is_told(self, tmp_path: Path) -> None:
         file = tmp_path / "solved.parquet"
