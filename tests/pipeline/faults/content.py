@@ -5,10 +5,10 @@ import re
 from pathlib import Path
 
 from pipeline.store.checksums import digests_of
+from pipeline.store.columns import OF_THE_RUN
 from pipeline.store.fragment import read_fragment
 from pipeline.store.layout import ATTEMPT, COMMIT_LOCK, EVENTS, WRITER_LOCK
 from pipeline.store.manifest import read_manifest
-from pipeline.store.columns import OF_THE_RUN
 
 Tree = dict[str, list[str]]  # of files: their paths, without what tells attempts apart, and what is in each
 Rows = dict[int, str]  # what lasts of a level's row
