@@ -131,13 +131,16 @@ def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) ->
 
 
 def test_a_success_of_training_is_a_witness_where_evaluation_has_none(levels: Level) -> None:
-    verdicts = label(levels, IDS, UPDATES * 512, untouched(replace(WHOLE, successes=4))).verdicts
-    for verdict in verdicts:
-        if verdict.steps_to_first_success is not None:
-            assert verdict.label is Label.SOLVED
-        if verdict.witness is Source.EXPLORATION:
-            assert verdict.success_rate == 0
-    assert Source.EXPLORATION in {verdict.witness for verdict in verdicts}
+    """Which level that is depends on the machine's rounding, so several budgets are looked at."""
+    found = set()
+    for updates in (2, 3, 4, 6, 8, 12):
+        for verdict in label(levels, IDS, updates * 512, untouched(replace(WHOLE, successes=4))).verdicts:
+            found.add(verdict.witness)
+            if verdict.steps_to_first_success is not None:
+                assert verdict.label is Label.SOLVED
+            if verdict.witness is Source.EXPLORATION:
+                assert verdict.success_rate == 0
+    assert Source.EXPLORATION in found
 
 
 @pytest.mark.campaign
