@@ -92,7 +92,7 @@ def searched(size: str, first: int, count: int, env_steps: int, kept: Path) -> I
             at = going[block]
             for i, row in zip(at, advanced(take(levels, at), ids[at], [rows[i] for i in at], most), strict=True):
                 rows[i] = row
-                write(folder, ids[i], row)
+                write(folder, int(ids[i]), row)
         tell(f"{size}: {sum(int(row.length[0]) == 0 for row in rows if row)} levels unsolved within {most:,}.")
     return steps_to_success(levels, [row for row in rows if row], env_steps)
 
