@@ -120,7 +120,8 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     """Experts of the split `job.continue_from` that can go on with these levels; others begin.
 
     A level that its expert solved ends the same with any larger budget, unless experts get their whole budget, or the
-    last evaluation alone solved it: those begin again.
+    last evaluation alone solved it: those begin again. The witness says that, or the expert's course where the witness
+    is a search's around its own.
 
     Raises:
         SourceUnseen: that split is not there for this process.
@@ -138,7 +139,7 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
     found: dict[int, Kept] = {}
     for path, ids in paths.items():
         experts = load_experts(data_path(source, path), job)
-        found |= {level_id: experts[level_id] for level_id in ids}
+        found |= {i: experts[i] for i in ids if not experts[i].begun.training.course.solved}
     return found
 
 

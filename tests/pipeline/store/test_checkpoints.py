@@ -8,35 +8,59 @@ import jax
 import numpy as np
 import pytest
 
+from configs.schema import JobConfig
 from experts.judge import Kept
-from experts.labels import Label
+from experts.labels import Label, Source
 from experts.slots import begin
 from experts.success import no_success
 from levelgen.level import SIZES
 from levelgen.sampling.sampler import sample_levels
-from pipeline.store import manifest
+from pipeline.store import checkpoints, manifest
 from pipeline.store.checkpoints import SourceUnseen, experts_for, load_experts, save_experts
 from pipeline.store.manifest import read_fragment
 from tests.pipeline.made import made_job, made_split
 
 UNITS = 3
+FILE = "experts/000000000000-000000000001-00000000.npz"
+SETTINGS = ("expert.width=8", "expert.environments=24", "expert.attempts=8")
 
 
-def test_each_unit_s_experts_come_back_bit_for_bit(tmp_path: Path) -> None:
-    job = made_job("data", "expert.width=8", "expert.environments=24", "expert.attempts=8")
+def some_experts(job: JobConfig) -> list[Kept]:
+    """Of any bits."""
     ids = np.arange(UNITS, dtype=np.int32)
     levels = sample_levels(ids, SIZES["s"], job.distribution)
     rng = np.random.default_rng(0)
     shapes = jax.eval_shape(lambda: begin(levels, ids, no_success(len(ids)), job.expert))
     random = lambda x: np.frombuffer(rng.bytes(x.size * x.dtype.itemsize), x.dtype).reshape(x.shape)
     begun = jax.tree.map(lambda x: rng.random(x.shape) < 0.5 if x.dtype == bool else random(x), shapes)
-    kept = [Kept(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(UNITS)]
+    return [Kept(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(UNITS)]
+
+
+def test_each_unit_s_experts_come_back_bit_for_bit(tmp_path: Path) -> None:
+    job = made_job("data", *SETTINGS)
+    kept = some_experts(job)
     for i in range(UNITS):
         save_experts(tmp_path / f"{i}.npz", {i: kept[i]})
     for i in range(UNITS):
         back = load_experts(tmp_path / f"{i}.npz", job)[i].begun
         pairs = zip(jax.tree.leaves(kept[i].begun), jax.tree.leaves(back), strict=True)
         assert all(np.asarray(before).tobytes() == np.asarray(after).tobytes() for before, after in pairs)
+
+
+@pytest.mark.parametrize("source", [Source.SEARCH, Source.SAMPLED])
+def test_an_expert_that_solved_its_level_begins_again_whoever_s_the_witness_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: Source
+) -> None:
+    """One whose witness was made steady, too; one that did not, whose witness is what was found before, goes on."""
+    job = made_job("data", *SETTINGS, f"continue_from={tmp_path}")
+    experts = {}
+    for i, kept in enumerate(some_experts(job)[:2]):
+        course = kept.begun.training.course._replace(solved=np.bool_(i == 0))
+        experts[i] = kept._replace(begun=kept.begun._replace(training=kept.begun.training._replace(course=course)))
+    save_experts(tmp_path / FILE, experts)
+    rows = {0: (source, FILE), 1: (Source.SEARCH, FILE)}
+    monkeypatch.setattr(checkpoints, "_kept_in", lambda *_: rows)
+    assert experts_for(job, [0, 1, 2]).keys() == {1}
 
 
 def test_a_worker_reads_the_fragments_of_its_levels_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
