@@ -4,6 +4,7 @@ And the reference's own environment, for the campaigns that compare with it; and
 """
 
 import os
+import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,9 +30,21 @@ TOGETHER = {
 }
 FIRST, BESIDE = "jobs", "tests/physics/"
 DESELECTED = pytest.StashKey[int]()
+BEGAN = time.monotonic()
 
 os.environ.setdefault(CACHE_VARIABLE, str(ROOT / ".pytest_cache" / "levelproof"))
 prepare_jax()  # before any test touches JAX; commands that tests start inherit the folder
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--within", type=float, help="seconds after which no test begins; what is left is skipped")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    within = item.config.getoption("within")
+    if within is not None and time.monotonic() - BEGAN > within:
+        pytest.skip(f"no time was left after {within:.0f} s")
 
 
 @pytest.fixture(autouse=True, scope="module")
