@@ -4,6 +4,7 @@ By the manifest's columns `content_hash` (the same content) and `signature` (nea
 DuckDB groups and joins, and each level is told with one partner only, so a split of many copies stays small to tell.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ COMPARED = ("content_hash", "signature")
 # The few that share a half of a signature; the same content has the same signature. Grouping hashes of 8 bytes takes a
 # tenth of the time and the memory that grouping strings takes.
 HALVES = ("signature[1]", "signature[2]")
+CONTENT = "content"  # the number of a content hash
+NUMBERS = (CONTENT, *HALVES)
 FACTORS = np.random.default_rng(0).integers(0, 2**63, 64, np.uint64) * 2 + 1  # of the words of a text; odd
 ALIKE_WITHIN = "CREATE TABLE alike AS SELECT * FROM levels WHERE " + " OR ".join(
     f"hash({half}) IN (SELECT hash({half}) AS half FROM levels GROUP BY half HAVING count(*) > 1)" for half in HALVES
@@ -53,30 +56,32 @@ def compared_of(split: Path, level_ids: np.ndarray) -> pa.Table:
     return compared(require_manifest(split, COMPARED, level_ids).table)
 
 
-def perhaps_alike(split: Path, level_ids: np.ndarray) -> pa.Table:
-    """The same of those of these levels (ascending ids) that share a half of a signature, with numbers for texts.
+def in_numbers(rows: pa.Table, asked: Sequence[str]) -> pa.Table:
+    """Rows of a manifest with numbers in the place of what is compared, which stays where it is asked for, too."""
+    half = lambda i: pc.list_element(rows["signature"], i)  # pyright: ignore[reportAttributeAccessIssue]
+    numbers = {CONTENT: _numbers(rows["content_hash"])} | {name: _numbers(half(i)) for i, name in enumerate(HALVES)}
+    for name, values in numbers.items():
+        rows = rows.append_column(name, pa.array(values))
+    return rows.drop_columns([name for name in COMPARED if name not in asked])
+
+
+def perhaps_alike(levels: pa.Table) -> pa.Table:
+    """What is compared, of those of these levels (`in_numbers`) that share a half of a signature.
 
     Two of 6 million levels have by chance one number for two contents once in a million splits.
     """
-    rows = require_manifest(split, COMPARED, each=_in_numbers).table
-    if rows.num_rows > len(level_ids):
-        rows = rows.filter(np.isin(rows["level_id"].to_numpy(), level_ids))
-    shared = np.zeros(rows.num_rows, bool)
-    for name in HALVES:
-        half = rows[name].to_numpy()
-        order = np.argsort(half)
-        same = np.flatnonzero(np.diff(half[order]) == 0)
-        shared[order[same]] = shared[order[same + 1]] = True
-    alike = rows.filter(shared)
+    alike = levels.filter(np.any([_shared(levels[name].to_numpy()) for name in HALVES], axis=0))
     halves = np.stack([alike[name].to_numpy() for name in HALVES], 1)
     signature = pa.FixedSizeListArray.from_arrays(pa.array(halves.reshape(-1)), len(HALVES)).cast(pa.list_(pa.int64()))
-    return pa.table({"name": alike["level_id"], "content_hash": alike["content_hash"], "signature": signature})
+    return pa.table({"name": alike["level_id"], "content_hash": alike[CONTENT], "signature": signature})
 
 
-def _in_numbers(rows: pa.Table) -> pa.Table:
-    half = lambda i: pc.list_element(rows["signature"], i)  # pyright: ignore[reportAttributeAccessIssue]
-    halves = {name: _numbers(half(i)) for i, name in enumerate(HALVES)}
-    return pa.table({"level_id": rows["level_id"], "content_hash": _numbers(rows["content_hash"]), **halves})
+def _shared(values: np.ndarray) -> np.ndarray:
+    """Which of them are there more than once."""
+    order, shared = np.argsort(values), np.zeros(len(values), bool)
+    same = np.flatnonzero(np.diff(values[order]) == 0)
+    shared[order[same]] = shared[order[same + 1]] = True
+    return shared
 
 
 def _numbers(texts: pa.ChunkedArray) -> np.ndarray:

@@ -6,6 +6,8 @@ Reads no shard's data.
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -63,16 +65,19 @@ def survey(
     """The facts that `inspect` prints, as JSON's types; `things`: which levels are solved by what they are made of."""
     asked.check()
     columns = [*READ, *cost.READ, *columns_in(asked.where), *columns_in(asked.sort)]
-    manifest = require_manifest(split, columns, compact=True)
+    numbered = partial(duplicates.in_numbers, asked=columns)
+    manifest = require_manifest(split, [*columns, *duplicates.COMPARED], compact=True, each=numbered)
     asked = asked._replace(limit=LIMIT if asked.limit is None else max(asked.limit, 0))
     chosen, shown = select(manifest.table, asked.where), asked.limit or 0
+    alike = duplicates.perhaps_alike(chosen)
+    table, chosen = (rows.drop_columns([*duplicates.NUMBERS]) for rows in (manifest.table, chosen))  # of millions, much
+    manifest = replace(manifest, table=table)
     ids, wanted = chosen["level_id"].to_numpy(), ids_of(chosen, asked)
     facts = _told(split, manifest, chosen, _counts(chosen, "label"))
     facts["solved_by"] = solved_by_things(manifest, ids) if things else None
-    del manifest, chosen  # of millions of rows, duplicates take as much memory
     others = {str(other): duplicates.compared_in(other) for other in against}
     levels = duplicates.compared_of(split, ids) if others else None
-    facts["duplicates"] = duplicates.within(duplicates.perhaps_alike(split, ids), shown)
+    facts["duplicates"] = duplicates.within(alike, shown)
     facts["against"] = {name: duplicates.between(levels, other, shown) for name, other in others.items()}
     rows = [row for block in rows_of(split, wanted, asked.columns) for row in block.to_pylist()]
     return facts | {"rows": rows}
