@@ -41,7 +41,7 @@ FIELDS: Mapping[str, Sequence[str] | None] = {
 }
 SECONDS = 0.7  # of the core's time for each measurement, at least
 # Of splits that are made for this: what experts find alone plays for longer than what a search finds
-BUDGET, LEVELS = "256k", {"s": 512, "m": 256, "l": 128}
+BUDGET, LEVELS = "256k", {"s": 256, "m": 128, "l": 96}
 ALONE = ("procedure=published", "stop.rule=solved")
 
 
@@ -50,8 +50,8 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> Report:
-    prepare_jax(own_cores()[0])
-    with _splits(given.split) as splits:
+    with _splits(given.split) as splits:  # on all cores
+        prepare_jax(own_cores()[0])
         results = [result for split in splits for result in measured(split)]
     head = (
         "size",
