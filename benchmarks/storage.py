@@ -68,11 +68,11 @@ def run(given: argparse.Namespace) -> Report:
         results=results,
         tables=[Table(head, [row(of) for of in results])],
         notes=[
-            "All trajectories of the splits, trivial ones among them. *bytes* per transition, of all files of one shard; "
-            "*published*: of the reference's 1M splits. *written/s* "
-            "and the columns after it: trajectories a second of a core's time, written all at once, and read in random "
-            f"batches of {BATCH} to arrays of {', '.join(FIELDS)}; the files are in the system's cache, and programs "
-            "are compiled before. Key frames of `witness` every 32 steps. Load of the machine meanwhile, with this: "
+            "All trajectories of the splits, trivial ones among them. *bytes* per transition, of all files of one "
+            "shard; *published*: of the reference's 1M splits. *written/s* and the columns after it: trajectories a "
+            "second of a core's time, written all at once, and read in random batches of "
+            f"{BATCH} to arrays of {', '.join(FIELDS)}; the files are in the system's cache, and programs are compiled "
+            "before. Key frames of `witness` every 32 steps. Load of the machine meanwhile, with this: "
             f"{os.getloadavg()[1]:.1f}; what others do slows this down.",
         ],
     )
