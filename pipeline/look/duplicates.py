@@ -70,7 +70,8 @@ def perhaps_alike(levels: pa.Table) -> pa.Table:
 
     Two of 6 million levels have by chance one number for two contents once in a million splits.
     """
-    alike = levels.filter(np.any([_shared(levels[name].to_numpy()) for name in HALVES], axis=0))
+    shared = [_shared(levels[name].to_numpy()) for name in HALVES]
+    alike = levels.select(["level_id", *NUMBERS]).filter(shared[0] | shared[1])
     halves = np.stack([alike[name].to_numpy() for name in HALVES], 1)
     signature = pa.FixedSizeListArray.from_arrays(pa.array(halves.reshape(-1)), len(HALVES)).cast(pa.list_(pa.int64()))
     return pa.table({"name": alike["level_id"], "content_hash": alike[CONTENT], "signature": signature})

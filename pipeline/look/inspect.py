@@ -68,11 +68,11 @@ def survey(
     numbered = partial(duplicates.in_numbers, asked=columns)
     manifest = require_manifest(split, [*columns, *duplicates.COMPARED], compact=True, each=numbered)
     asked = asked._replace(limit=LIMIT if asked.limit is None else max(asked.limit, 0))
+    alike = duplicates.perhaps_alike(manifest.table)
+    manifest = replace(manifest, table=manifest.table.drop_columns([*duplicates.NUMBERS]))  # of millions of rows, much
     chosen, shown = select(manifest.table, asked.where), asked.limit or 0
-    alike = duplicates.perhaps_alike(chosen)
-    table, chosen = (rows.drop_columns([*duplicates.NUMBERS]) for rows in (manifest.table, chosen))  # of millions, much
-    manifest = replace(manifest, table=table)
     ids, wanted = chosen["level_id"].to_numpy(), ids_of(chosen, asked)
+    alike = alike.filter(np.isin(alike["name"].to_numpy(), ids))
     facts = _told(split, manifest, chosen, _counts(chosen, "label"))
     facts["solved_by"] = solved_by_things(manifest, ids) if things else None
     others = {str(other): duplicates.compared_in(other) for other in against}
