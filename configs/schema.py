@@ -43,6 +43,7 @@ WITHOUT_EFFECT = frozenset(
         "continue_from",
         "density",
         "key_every",
+        "log",
     }
 )
 # In the results of levels that no id makes, where those of random levels have their distribution
@@ -68,6 +69,7 @@ class JobConfig:
     density: Density = "full"  # what is stored of a record: full (all), resume (states), witness (actions, key frames)
     key_every: int = KEY_EVERY  # env steps of an episode between key frames of density=witness: a power of 2 up to 256
     continue_from: str = ""  # a split made with keep_experts=true, whose experts go on; empty: none
+    log: Literal["none", "tensorboard", "wandb"] = "none"  # scalars of a run, for TensorBoard or Weights & Biases
     distribution: Distribution = field(default_factory=Distribution)  # what random levels are like
     task: TaskParams = field(default_factory=TaskParams)  # what a level asks for
     scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first

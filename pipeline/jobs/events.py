@@ -5,7 +5,6 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +59,8 @@ class Events:
             done=tally.done,
             solved=tally.solved,
             env_steps=tally.steps,
+            spent={kind: int(steps) for kind, steps in tally.spent._asdict().items()},
+            seconds={stage: round(float(seconds), 3) for stage, seconds in tally.seconds._asdict().items()},
             rate=round(rate),
             left=None if left is None else round(left),
             failures=self._failures,
@@ -73,13 +74,21 @@ def _event(event: str, **facts: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def telling(split: Path, board: Board, scheduler: Scheduler, command: str) -> Iterator[Events]:
-    """Tells what happens meanwhile, beside the split's data, and how it ended.
+def telling(
+    split: Path, board: Board, scheduler: Scheduler, command: str, log: Callable[[Sequence[Event]], None]
+) -> Iterator[Events]:
+    """Tells what happens meanwhile, beside the split's data and to `log`, and how it ended.
 
     Raises:
         OSError: the disk refuses.
     """
-    events = Events(board.tally, scheduler, command, partial(tell, new_run(split)))
+    run = new_run(split)
+
+    def tell_both(events: Sequence[Event]) -> None:
+        tell(run, events)
+        log(events)
+
+    events = Events(board.tally, scheduler, command, tell_both)
     events.look(0.0, None)
     board.watchers.append(events.look)
     how = "failed"

@@ -14,6 +14,7 @@ from experts.labels import Label
 from experts.steps import EnvSteps
 from pipeline.errors import Exit, Failure
 from pipeline.jobs.events import Events, telling
+from pipeline.jobs.log import logged, require_library
 from pipeline.jobs.progress import Board, Tally, say
 from pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, plan_units
 from pipeline.jobs.seal import Sealer, sealing
@@ -45,10 +46,11 @@ def generate(
     `origins` say where they are, if their ids do not make them; `repaired` is the split, where they are made again.
 
     Raises:
-        UserError, Failure: see `runtime.cache_folder`, `store.split.writing` and
+        UserError, Failure: see `log.require_library`, `runtime.cache_folder`, `store.split.writing` and
             `store.checkpoints.require_same_experts`; or the disk refuses.
         KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; what is committed stays.
     """
+    require_library(job.log)
     cache_folder()  # where workers refuse it, Ray makes many lines of the sentence
     require_same_experts(job)
     with writing(job, partial(say, console), repaired) as (split, manifest):
@@ -70,9 +72,10 @@ def generate(
             board.say(f"{each}, into {as_typed(split)}{there}")
             try:
                 with (
+                    logged(job, split, board.say) as log,
                     board.shown(),
                     sealing(split, manifest.counting, board.say) as sealer,
-                    telling(split, board, scheduler, shlex.join(command)) as events,
+                    telling(split, board, scheduler, shlex.join(command), log) as events,
                 ):
                     _work(job, split, scheduler, board, sealer, events)
             except KeyboardInterrupt:

@@ -112,7 +112,7 @@ def measured(job: JobConfig, console: Console, seconds: float = SECONDS) -> Samp
 
 def _made(job: JobConfig, folder: Path, count: int, workers: int) -> float:
     """Seconds in which `generate` makes those of a job's first levels that are not there."""
-    here, quiet = replace(job, out=str(folder), workers=workers), Console(quiet=True)
+    here, quiet = replace(job, out=str(folder), workers=workers, log="none"), Console(quiet=True)
     begun = time.monotonic()
     with redirect_stdout(io.StringIO()):
         generate(here, ["levelproof", "plan"], quiet, level_ids=job.level_ids[:count])

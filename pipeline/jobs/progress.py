@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from experts.steps import EnvSteps
+from experts.steps import NO_SECONDS, EnvSteps, Seconds
 from pipeline.jobs.schedule import Round, Summary, WorkUnit
 from pipeline.words import duration
 
@@ -27,6 +27,7 @@ class Tally:
     solved: int
     running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
     spent: EnvSteps = field(default_factory=EnvSteps)  # on this run's committed units
+    seconds: Seconds = NO_SECONDS  # of workers, on the same
 
     def follow(self, round: Round) -> None:
         """A worker reports. Units that ended are told to `ended`, too."""
@@ -45,6 +46,7 @@ class Tally:
             self.done += summary.levels
             self.solved += summary.solved
             self.spent = EnvSteps(*map(sum, zip(self.spent, summary.spent, strict=True)))
+            self.seconds = Seconds(*map(sum, zip(self.seconds, summary.seconds, strict=True)))
 
     @property
     def steps(self) -> int:

@@ -96,7 +96,16 @@ def test_any_text_is_a_setting_or_refused(text: str) -> None:
 
 def test_the_hash_follows_results_and_nothing_else() -> None:
     job = compose_job([])
-    for same in ("levels=7", "first_level=3", "out=x", "unit=2", "executor=inline", "workers=1", "budget=128000"):
+    for same in (
+        "levels=7",
+        "first_level=3",
+        "out=x",
+        "unit=2",
+        "executor=inline",
+        "workers=1",
+        "budget=128000",
+        "log=wandb",
+    ):
         assert compose_job([same]).hash == job.hash, same
     for other in (
         "size=m",

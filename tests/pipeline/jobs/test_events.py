@@ -35,6 +35,7 @@ def test_the_latest_events_and_the_state_are_told(monkeypatch: pytest.MonkeyPatc
     ]
     assert (state["event"], state["done"], state["solved"]) == ("progress", 6 * MOST, 3 * MOST)
     assert (state["rate"], state["left"], state["failures"], state["env_steps"]) == (1234, 60, 2, 300 * MOST)
+    assert (state["spent"]["trained"], state["seconds"]["training"]) == (300 * MOST, 1.5 * MOST)
     assert state["workers"]["here"]["count"] == 1
     assert sum(len(json.dumps(event)) for event in told[-1]) < 2**20
     events.over("stopped")

@@ -14,6 +14,7 @@ from pipeline.store.fields import same_bits
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard
 from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, listening, run, start, status, title, until
+from tests.pipeline.jobs.test_log import tensorboard_file
 from tests.pipeline.made import lasting
 
 LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
@@ -27,15 +28,19 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Without Ray."""
+    """Without Ray; with scalars, which change no bit."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    done = here([*COMMAND, "executor=inline"], folder)
+    done = here([*COMMAND, "executor=inline", "log=tensorboard"], folder)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     (run,) = runs_in(folder / SPLIT)
     told = events_of(run)
     assert [told[0]["event"], told[-1]["event"], told[-1]["how"]] == ["started", "ended", "done"]
     assert sum(of["levels"] for of in told if of["event"] == "committed") == told[-1]["done"] == told[0]["levels"]
+    plotted = list(tensorboard_file(folder / SPLIT / "log"))
+    assert plotted[0] == ("levels/committed", 0, 0.0)
+    assert ("levels/committed", LEVELS, LEVELS) in plotted
+    assert "env_steps/per_second_of_training" in {name for name, *_ in plotted}
     return folder / SPLIT
 
 

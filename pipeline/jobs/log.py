@@ -1,0 +1,145 @@
+"""Scalars of a run for TensorBoard or Weights & Biases, where `log` asks for them: made of the events that it tells."""
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol
+
+from configs.schema import JobConfig
+from pipeline.errors import UserError
+from pipeline.store.events import Event
+from pipeline.store.remote import is_remote
+
+LIBRARIES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+FOLDER, PROJECT = "log", "levelproof"
+# Env steps of these kinds took the seconds of these stages
+STAGES = {"search": ("scouted", "searched"), "training": ("trained",), "evaluation": ("evaluated",)}
+
+
+class ScalarWriter(Protocol):
+    place: str  # where people find them
+
+    def write(self, scalars: Mapping[str, float]) -> None: ...
+
+    def close(self, done: bool) -> None: ...
+
+
+def require_library(log: str) -> None:
+    """Raises UserError where the library is missing that `log` needs."""
+    try:
+        if log in LIBRARIES:
+            import_module(LIBRARIES[log])
+    except ImportError:
+        raise UserError(f"log={log} needs {LIBRARIES[log]}: pip install 'levelproof[log]', or log=none.") from None
+
+
+@contextmanager
+def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[Callable[[Sequence[Event]], None]]:
+    """Takes the events of a run, from `started` to how it is now, and logs scalars of the latest.
+
+    What the library or the disk refuses is said once, and the run goes on without.
+    """
+    writer: ScalarWriter | None = None
+    done = False
+
+    @contextmanager
+    def harmless() -> Iterator[None]:
+        nonlocal writer
+        try:
+            yield
+        except Exception as error:  # of any kind that libraries may raise
+            writer, reason = None, (str(error).strip().splitlines() or [type(error).__name__])[-1].rstrip(".")
+            say(f"Cannot log to {job.log} ({reason}): the run goes on without.")
+
+    def take(events: Sequence[Event]) -> None:
+        nonlocal done
+        done = events[-1].get("how") == "done"
+        if writer:
+            with harmless():
+                writer.write(scalars(events[0], events[-1]))
+
+    if job.log != "none":
+        # A store takes no files that grow
+        folder = Path(FOLDER, *split.parts[-2:]) if is_remote(split) else split / FOLDER
+        with harmless():
+            opened = (TensorBoardWriter if job.log == "tensorboard" else WandbWriter)(job, folder)
+            say(f"Scalars for {job.log}: {opened.place}")
+            writer = opened
+    try:
+        yield take
+    finally:
+        if writer:
+            with harmless():
+                writer.close(done)
+
+
+def scalars(began: Event, state: Event) -> dict[str, float]:
+    """Numbers to plot, by their names; what is not known yet is not among them."""
+    done, elapsed = state["done"], state["time"] - began["time"]
+    numbers = {
+        "levels/committed": done,
+        "levels/solved": state["solved"],
+        "levels/per_second": (done - began["done"]) / elapsed if elapsed > 0 else 0.0,  # since the run began
+        "env_steps/total": state["env_steps"],
+        "failures/attempts": state["failures"],
+        "failures/units_given_up": state["quarantined"],
+        "workers": sum(of["count"] for of in state["workers"].values()),
+    }
+    if done:
+        numbers["levels/solved_share"] = state["solved"] / done
+    if state["rate"]:
+        numbers["env_steps/per_second"] = state["rate"]
+    for stage, kinds in STAGES.items():
+        if seconds := state["seconds"][stage]:  # of one busy worker
+            numbers[f"env_steps/per_second_of_{stage}"] = sum(state["spent"][kind] for kind in kinds) / seconds
+    return numbers
+
+
+class TensorBoardWriter:
+    """A file of TensorBoard's events, against levels committed. Without tensorboardX' thread, which a full disk kills
+    and whose queue then holds whoever writes."""
+
+    def __init__(self, _: JobConfig, folder: Path) -> None:
+        writer, self._summary, self._events = (
+            import_module(f"tensorboardX.{name}") for name in ("event_file_writer", "summary", "proto.event_pb2")
+        )
+        run = folder / f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
+        run.mkdir(parents=True, exist_ok=True)
+        self._writer, self.place = writer.EventsWriter(str(run / "events")), str(run)
+
+    def write(self, scalars: Mapping[str, float]) -> None:
+        now, step = datetime.now(UTC).timestamp(), int(scalars["levels/committed"])
+        for name, value in scalars.items():
+            summary = self._summary.scalar(name, value)
+            self._writer.write_event(self._events.Event(wall_time=now, step=step, summary=summary))
+        self._writer.flush()
+
+    def close(self, done: bool) -> None:
+        self._writer.close()
+
+
+class WandbWriter:
+    """A run of Weights & Biases, against levels committed; WANDB_PROJECT, WANDB_MODE and the like are heeded."""
+
+    def __init__(self, job: JobConfig, folder: Path) -> None:
+        wandb = import_module("wandb")
+        folder.mkdir(parents=True, exist_ok=True)
+        self._run = wandb.init(
+            project=os.environ.get("WANDB_PROJECT", PROJECT),
+            name=f"{job.budget}/{job.size}",
+            config=job.results,
+            dir=folder.absolute(),
+            settings=wandb.Settings(console="off", silent=True, disable_git=True),
+        )
+        self._run.define_metric("*", step_metric="levels/committed")
+        here = str(Path(self._run.dir).parent)
+        self.place = here if self._run.offline else self._run.url or here
+
+    def write(self, scalars: Mapping[str, float]) -> None:
+        self._run.log(dict(scalars))
+
+    def close(self, done: bool) -> None:
+        self._run.finish(exit_code=0 if done else 1)
