@@ -15,7 +15,7 @@ from unittest.mock import patch
 from pipeline.cli.main import main
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 240  # s
+PATIENCE = 600  # s; three campaigns beside each other on two slow cores keep a worker waiting for minutes
 TINY = ("levels=4", "unit=1", "budget=5k")  # four real units with two updates each
 
 
@@ -43,7 +43,7 @@ def start(
 
 def run(arguments: Sequence[str], cwd: Path, **options: Any) -> subprocess.CompletedProcess[str]:
     process = start(arguments, cwd, **options)
-    out, err = process.communicate(timeout=300)
+    out, err = process.communicate(timeout=PATIENCE)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 

@@ -1,6 +1,6 @@
-"""The command `levelproof` with workers that die of a level: `python -m tests.pipeline.fragile LEVEL generate ...`.
+"""The command `levelproof` with workers that die of a level: `python -m tests.pipeline.fragile LEVEL SECONDS ...`.
 
-Of level -1 they die before they have started.
+Of level -1 they die before they have started. After so many seconds without a word they are given up.
 """
 
 import os
@@ -31,6 +31,6 @@ class Fragile(cluster.WorkerActor):
 
 
 if __name__ == "__main__":
-    cluster.MOST_SILENT = 90.0  # s
+    cluster.MOST_SILENT = float(sys.argv[2])
     cluster.WorkerActor = Fragile  # type: ignore[misc]
-    sys.exit(cli.main(sys.argv[2:]))
+    sys.exit(cli.main(sys.argv[3:]))

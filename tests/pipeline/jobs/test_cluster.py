@@ -22,10 +22,11 @@ from tests.pipeline.made import lasting, made_job
 LEVELS, DEADLY = 8, 2
 SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k")
 SPLIT = Path("data/5k/s")
+STALLED = 150  # s; compiling keeps a worker silent for less
 
 
 def fragile(deadly: int, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return run([str(deadly), *SETTINGS], cwd, module="tests.pipeline.fragile")
+    return run([str(deadly), str(PATIENCE), *SETTINGS], cwd, module="tests.pipeline.fragile")
 
 
 @pytest.mark.campaign
@@ -162,7 +163,7 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
 def test_a_worker_that_stalls_is_given_up_and_another_does_its_levels(tmp_path: Path) -> None:
     alone = ("scout.rounds=0", "search.env_steps=0", "stop.rule=budget")  # so that experts train long
     command = ["generate", f"levels={LEVELS}", "unit=1", "budget=1M", "workers=1", *alone]
-    process = start([str(LEVELS), *command], tmp_path, module="tests.pipeline.fragile")
+    process = start([str(LEVELS), str(STALLED), *command], tmp_path, module="tests.pipeline.fragile")
     split, at_work = tmp_path / "data/1M/s", "ray::Fragile.work"
     working = lambda: [pid for pid in descendants(process.pid) if title(pid).startswith(at_work)]
     until(lambda: fragment_paths(split) and working(), process)
