@@ -10,7 +10,7 @@ import pytest
 
 from tests.pipeline.command import ROOT
 
-EACH = 130
+EACH = 65
 
 
 def run(first: int, count: int) -> None:
@@ -26,6 +26,6 @@ def test_some_schedules_change_nothing() -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("first", range(0, 4 * EACH, EACH))
+@pytest.mark.parametrize("first", range(0, 8 * EACH, EACH))
 def test_five_hundred_schedules_change_nothing(first: int) -> None:
     run(first, EACH)
