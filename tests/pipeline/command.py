@@ -15,7 +15,7 @@ from unittest.mock import patch
 from pipeline.cli.main import main
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 600  # s; three campaigns beside each other on two slow cores keep a worker waiting for minutes
+PATIENCE = 600  # s; workers are niced, so what else runs on a slow machine keeps them waiting
 TINY = ("levels=4", "unit=1", "budget=5k")  # four real units with two updates each
 
 

@@ -13,7 +13,7 @@ from levelgen.task.environment import ActionType, Environment, EnvParams, make
 
 STEPS = 262_144
 EPISODES = 128  # of an evaluation
-SEEDS = 4  # at most
+SEEDS = 3
 
 
 class WithGymnaxSpace(Environment):
@@ -52,13 +52,9 @@ def test_it_learns() -> None:
         num_minibatches=4, learning_rate=1e-3, max_grad_norm=0.5, total_timesteps=STEPS, eval_freq=STEPS,
     )  # fmt: skip
     train = jax.jit(algo.replace(eval_callback=solved).train)
-    shares = []
-    for seed in range(SEEDS):
-        before, after = train(jax.random.key(seed))[1]
-        shares.append((float(before), float(after)))
-        if after > before + 0.15:
-            return
-    pytest.fail(f"none of {SEEDS} seeds learns: {shares}")
+    shares = np.array([train(jax.random.key(seed))[1] for seed in range(SEEDS)])
+    before, after = shares.mean(0)
+    assert after > before + 0.15, shares
 
 
 @pytest.mark.campaign

@@ -32,7 +32,7 @@ from tests.pipeline.faults import crew
 from tests.pipeline.faults.effects import Effects, Tell
 from tests.pipeline.faults.schedules import LEVELS
 
-PATIENCE = 180.0  # s after which a command hangs
+PATIENCE = 60.0  # s after which a command hangs
 HELD = 0.5  # s that a worker that has outlived its driver waits for the next command, at most
 SLOW, FOR = 0.02, 10  # s of each of so many effects
 DAY = 86_400.0  # s

@@ -13,19 +13,7 @@ from pipeline.store.events import events_of, runs_in
 from pipeline.store.fields import same_bits
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.shard import Shard
-from tests.pipeline.command import (
-    PATIENCE,
-    ROOT,
-    descendants,
-    heed_ctrl_c,
-    here,
-    listening,
-    run,
-    start,
-    status,
-    title,
-    until,
-)
+from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, listening, run, start, status, title, until
 from tests.pipeline.jobs.test_log import tensorboard_file
 from tests.pipeline.made import lasting
 
@@ -136,7 +124,7 @@ def test_kill_9_of_a_worker_then_stopped_and_again(undisturbed: Path, tmp_path: 
     until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before, process)
     family = descendants(process.pid)
     os.killpg(process.pid, number)  # as a terminal does
-    _, err = process.communicate(timeout=PATIENCE)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "trying again" in err
     assert "Stopped: " in err
