@@ -3,7 +3,7 @@
 What is looked at: how long the footer is, that the columns are those of a fragment, how many rows and groups of rows
 there are, and the headers of the pages that are read. Nothing of these is asked of Arrow: where a footer lies, some of
 its answers end the process. Texts come as dictionaries, so that a short file cannot name a long one a million times,
-and become whole texts where all of them together are small.
+and become whole texts where all of them together are small; those of which a file has none are as long as its pages.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,9 +18,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pipeline.store.checksums import TAIL
-from pipeline.store.columns import COLUMNS, schema_of
+from pipeline.store.columns import COLUMNS, OWN, schema_of
 from pipeline.store.remote import bytes_of, is_remote
-from pipeline.store.thrift import Column, footer_in, pages_in
+from pipeline.store.thrift import PLAIN, Column, footer_in, pages_in
 
 MOST_FOOTER = 2**24  # bytes; most of them are digests
 MOST_ROWS, MOST_GROUPS = 2**20, 2**9  # of a fragment; a sealed one has 100,000 rows, in groups of 16,384
@@ -64,7 +64,10 @@ class Bounded:
             raise ValueError("its groups have other numbers of rows than all of it")
         if not made_by.startswith(BY):
             raise ValueError("it was written by another library")
-        self._file = _open(source, _known(tuple(COLUMNS.names)).texts)  # the same in every version
+        # Where they stand is the same in every version
+        own = [i for i, leaf in enumerate(_known(tuple(COLUMNS.names)).leaves) if _column_of(leaf) in OWN]
+        self._are_plain = not any(group.columns[i].has_dictionary for group in self._groups for i in own)
+        self._file = _open(source, _known(tuple(COLUMNS.names), self._are_plain).texts)
         self.metadata: dict[bytes, bytes] = self._file.schema_arrow.metadata or {}
 
     def read(
@@ -79,7 +82,7 @@ class Bounded:
         Raises:
             One of DAMAGE: it is damaged, or would become too large.
         """
-        known = _known(tuple(all_names))
+        known = _known(tuple(all_names), self._are_plain)
         if not self._file.schema.equals(known.schema) or not self._file.schema_arrow.equals(known.as_read):
             raise ValueError("it has other columns than a fragment")
         groups = range(len(self._groups))
@@ -97,12 +100,12 @@ class Bounded:
         return pa.table(columns, schema=wanted.with_metadata(self.metadata))
 
     def _read(self, known: "_Known", groups: Sequence[int], names: Sequence[str]) -> pa.Table:
-        chosen = [(i, leaf) for i, leaf in enumerate(known.leaves) if leaf.path.partition(".")[0] in names]
+        chosen = [(i, leaf) for i, leaf in enumerate(known.leaves) if _column_of(leaf) in names]
         wanted = [self._groups[group] for group in groups]
         columns = [
-            (group.columns[i], group.rows, leaf.max_repetition_level > 0) for group in wanted for i, leaf in chosen
+            (group.columns[i], group.rows, leaf, leaf.path in known.plain) for group in wanted for i, leaf in chosen
         ]
-        self._require_room(sum(max(0, column.length) for column, _, _ in columns), names)
+        self._require_room(sum(max(0, column.length) for column, *_ in columns), names)
         self._require_room(sum(self._room(*each) for each in columns), names)
         # One by one: of several, Arrow now and then cannot read lists of texts as dictionaries
         parts = [self._file.read_row_groups([group], list(names), use_threads=False) for group in groups]
@@ -110,7 +113,7 @@ class Bounded:
         table.validate(full=True)  # indices into dictionaries, offsets and UTF-8, which others then rely on
         return table
 
-    def _room(self, column: Column, rows: int, of_lists: bool) -> int:
+    def _room(self, column: Column, rows: int, leaf: pq.ColumnSchema, is_plain: bool) -> int:
         """Bytes that a column of a group takes in memory, but for texts that stand in its dictionary."""
         if column.first < 0 or not 0 <= column.length <= self._source.size() - column.first:
             raise ValueError("its footer has a column where there is none")
@@ -118,8 +121,10 @@ class Bounded:
         chunk = self._source.read(column.length)
         found = list(pages_in(chunk)) if column.values else []  # of none, Arrow writes no place and reads no page
         values = sum(page.values for page in found if not page.is_dictionary)
-        if values != column.values or (values != rows and not of_lists):
+        if values != column.values or (values != rows and leaf.max_repetition_level == 0):
             raise ValueError("it has other numbers of values than its rows")
+        if is_plain and any(page.is_dictionary or page.encoding != PLAIN for page in found):
+            raise ValueError("it has texts that are not as they were written")
         return sum(page.bytes + A_VALUE * page.values for page in found)
 
     def _require_room(self, wanted: int, names: Sequence[str]) -> None:
@@ -140,11 +145,12 @@ def bounded(path: Path) -> Iterator[Bounded]:
 
 def _obeyed(column: pa.Array) -> bool:
     """Whether a text of an array has characters that control terminals."""
-    if pa.types.is_dictionary(column.type):
-        data = np.frombuffer(column.dictionary.buffers()[2] or b" ", np.uint8)
+    if pa.types.is_dictionary(column.type) or pa.types.is_string(column.type):
+        texts = column.dictionary if pa.types.is_dictionary(column.type) else column
+        data = np.frombuffer(texts.buffers()[2] or b" ", np.uint8)
         if data.min(initial=32) >= 32 and data.max(initial=32) < 127:  # nearly always, and soon known
             return False
-        found = pc.call_function("match_substring_regex", [column.dictionary], pc.MatchSubstringOptions(r"\p{Cc}"))
+        found = pc.call_function("match_substring_regex", [texts], pc.MatchSubstringOptions(r"\p{Cc}"))
         return found.true_count > 0
     nested = pa.types.is_list(column.type) or pa.types.is_struct(column.type)
     return nested and any(map(_obeyed, _inside(column)))
@@ -168,19 +174,31 @@ class _Known(NamedTuple):
     """What a file with some columns says of them."""
 
     schema: pq.ParquetSchema
-    as_read: pa.Schema  # with every text as a dictionary
+    as_read: pa.Schema  # with texts as dictionaries
     leaves: list[pq.ColumnSchema]
     texts: list[str]  # the leaves that are, by their paths
+    plain: list[str]  # and those that are texts as they stand
 
 
 @cache
-def _known(names: tuple[str, ...]) -> _Known:
+def _known(names: tuple[str, ...], own_are_plain: bool = False) -> _Known:
+    """`own_are_plain`: of OWN it has no dictionaries."""
     sink = pa.BufferOutputStream()
     pq.write_table(schema_of(names).empty_table(), sink)
     schema = pq.ParquetFile(pa.BufferReader(sink.getvalue())).schema
     leaves = [schema.column(i) for i in range(len(schema))]
-    texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
-    return _Known(schema, _open(pa.BufferReader(sink.getvalue()), texts).schema_arrow, leaves, texts)
+    plain = [leaf.path for leaf in leaves if own_are_plain and _column_of(leaf) in OWN]
+    texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY" and leaf.path not in plain]
+    return _Known(schema, _open(pa.BufferReader(sink.getvalue()), texts).schema_arrow, leaves, texts, plain)
+
+
+def _column_of(leaf: pq.ColumnSchema) -> str:
+    return leaf.path.partition(".")[0]
+
+
+def with_dictionaries() -> list[str]:
+    """The leaves of a fragment that are written with dictionaries, by their paths."""
+    return [leaf.path for leaf in _known(tuple(COLUMNS.names)).leaves if _column_of(leaf) not in OWN]
 
 
 def _open(source: pa.NativeFile, texts: list[str]) -> pq.ParquetFile:

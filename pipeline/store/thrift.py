@@ -16,7 +16,8 @@ COLUMN: Fields = {5: I64, 7: I64, 9: I64, 11: I64}
 VALUES, PACKED, FIRST, DICTIONARY = COLUMN  # how many; bytes of all pages; where they start; where a dictionary does
 GROUP: Fields = {1: [{3: COLUMN}], 3: I64}
 FOOTER: Fields = {3: I64, 4: [GROUP], 6: TEXT}
-PAGE: Fields = {1: I32, 2: I32, 3: I32, 5: {1: I32}, 7: {1: I32}}
+PAGE: Fields = {1: I32, 2: I32, 3: I32, 5: {1: I32, 2: I32}, 7: {1: I32, 2: I32}}
+PLAIN = 0  # the encoding in which values stand one after another
 COUNTED = {0: 5, 2: 7}  # kinds of pages, of data and dictionaries: where the number of values stands
 
 
@@ -26,6 +27,7 @@ class Column(NamedTuple):
     values: int
     first: int  # byte of the file
     length: int  # bytes
+    has_dictionary: bool
 
 
 class Group(NamedTuple):
@@ -49,6 +51,7 @@ class Page(NamedTuple):
     is_dictionary: bool
     bytes: int  # unpacked
     values: int
+    encoding: int
 
 
 def footer_in(data: bytes) -> Footer:
@@ -59,8 +62,9 @@ def footer_in(data: bytes) -> Footer:
 
 
 def _column(fields: Mapping[int, int]) -> Column:
-    starts = [fields[FIRST], *([fields[DICTIONARY]] if fields.get(DICTIONARY, 0) > 0 else [])]
-    return Column(fields[VALUES], min(starts), fields[PACKED])
+    has_dictionary = fields.get(DICTIONARY, 0) > 0
+    first = min(fields[FIRST], fields[DICTIONARY]) if has_dictionary else fields[FIRST]
+    return Column(fields[VALUES], first, fields[PACKED], has_dictionary)
 
 
 def pages_in(chunk: bytes) -> Iterator[Page]:
@@ -73,11 +77,12 @@ def pages_in(chunk: bytes) -> Iterator[Page]:
     while at < len(chunk):
         header, at = _struct(chunk, at, PAGE)
         kind, unpacked, packed = header[1], header[2], header[3]
-        values = header[COUNTED[kind]][1]
+        counted = header[COUNTED[kind]]
+        values = counted[1]
         at += packed
         if min(unpacked, packed, values) < 0 or at > len(chunk):
             raise ValueError("a header of its pages lies about sizes")
-        yield Page(kind == 2, unpacked, values)
+        yield Page(kind == 2, unpacked, values, counted[2])
 
 
 def _struct(data: bytes, at: int, wanted: Fields) -> tuple[dict[int, Any], int]:

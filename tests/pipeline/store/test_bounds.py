@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +17,7 @@ import pytest
 
 from experts.labels import Label
 from pipeline.errors import Failure
-from pipeline.store.columns import COLUMNS
+from pipeline.store.columns import COLUMNS, OWN
 from pipeline.store.manifest import fragment_paths, read_fragment, read_manifest
 from pipeline.store.thrift import footer_in, pages_in
 from tests.pipeline.command import ROOT
@@ -48,14 +49,14 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def with_column(good: Path, name: str, values: pa.Array, use_dictionary: bool = True) -> bytes:
+def with_column(good: Path, name: str, values: pa.Array, use_dictionary: bool = True, **how: Any) -> bytes:
     """The fragment with as many rows as there are values in one of its columns."""
     table = pq.read_table(good)
     rows = table.take(np.zeros(len(values), int))
     at = COLUMNS.names.index(name)
     sink = BytesIO()
     rows = rows.set_column(at, COLUMNS.field(at), values)
-    pq.write_table(rows, sink, compression="zstd", write_page_checksum=True, use_dictionary=use_dictionary)
+    pq.write_table(rows, sink, compression="zstd", write_page_checksum=True, use_dictionary=use_dictionary, **how)
     return sink.getvalue()
 
 
@@ -97,6 +98,18 @@ def long_pages(good: Path) -> bytes:
     return with_other_numbers(data, lambda _: 7, footer_of(data), {size for size in sizes if size > 10**6})
 
 
+def long_hashes(good: Path) -> bytes:
+    """120 MB of hashes that stand in no dictionary."""
+    text = pa.array([f"{i:03d}" + "x" * 1_200_000 for i in range(10)] * 10)
+    return with_column(good, "content_hash", text, use_dictionary=False)
+
+
+def shortened_hashes(good: Path) -> bytes:
+    """The same in an encoding that writes down how each differs from the one before."""
+    text = pa.array(["x" * 1_200_000] * 100)
+    return with_column(good, "content_hash", text, False, column_encoding={"content_hash": "DELTA_BYTE_ARRAY"})
+
+
 def long_lists(good: Path) -> bytes:
     """A learning curve of millions of zeros, of which a page takes a few bytes."""
     curve = pa.ListArray.from_arrays([0, 6_000_000], pa.array(np.zeros(6_000_000, np.float32)))
@@ -118,10 +131,19 @@ def other_values(good: Path) -> bytes:
 HOSTILE = {
     long_texts: "its rows would take more memory than those of any fragment",
     long_pages: "its rows would take more memory than those of any fragment",
+    long_hashes: "its rows would take more memory than those of any fragment",
+    shortened_hashes: "it has texts that are not as they were written",
     long_lists: "its rows would take more memory than those of any fragment",
     many_rows: "it has more rows than any fragment of its size",
     other_values: "it has other numbers of values than its rows",
 }
+
+
+def test_texts_that_no_rows_share_stand_in_no_dictionary(good: Path) -> None:
+    group = pq.read_metadata(good).row_group(0)
+    columns = [group.column(i) for i in range(group.num_columns)]
+    texts = [column for column in columns if column.physical_type == "BYTE_ARRAY"]
+    assert {of.path_in_schema.partition(".")[0] for of in texts if not of.has_dictionary_page} == {*OWN}
 
 
 def test_what_becomes_large_is_refused_before_it_does(good: Path, tmp_path: Path) -> None:
