@@ -1,5 +1,6 @@
 """Servers on loopback that splits are read from, and what can go wrong between them and a reader."""
 
+import hmac
 import json
 import os
 import re
@@ -7,7 +8,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from base64 import b64decode, b64encode
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from email.utils import formatdate
 from http.client import HTTPConnection
@@ -21,8 +23,14 @@ import pytest
 
 HOST = "127.0.0.1"
 PATIENCE = 60  # s
+# What Microsoft's emulator has one account for, the same everywhere: docs of Azurite, "default storage account"
+AZURE_NAME, AZURE_VERSION = "devstoreaccount1", "2021-08-06"
+AZURE_KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr/KBHBeksoGMGw=="
 PAGE = 10  # keys of a page of S3's lists
 SLOW = 1.0  # s
+
+
+KEPT = ("etag", "last-modified", "content-range", "content-length", "content-type")  # headers that stores' clients read
 
 
 class Answer(NamedTuple):
@@ -242,8 +250,7 @@ def before(host: str, port: int) -> Answers:
         try:
             connection.request(method, path, body, headers)
             given = connection.getresponse()
-            kept = {name: x for name, x in given.getheaders() if name.lower() in ("etag", "last-modified")}
-            kept |= {name: x for name, x in given.getheaders() if name.lower() in ("content-range", "content-length")}
+            kept = {name: x for name, x in given.getheaders() if name.lower() in KEPT}
             return Answer(given.status, kept, given.read())
         finally:
             connection.close()
@@ -254,14 +261,45 @@ def before(host: str, port: int) -> Answers:
 @contextmanager
 def s3_process() -> Iterator[tuple[str, int]]:
     """A process that serves S3, moto's, with a bucket named `bucket`; where it listens."""
+    port = _free_port()
+    words = [sys.executable, "-m", "moto.server", "-H", HOST, "-p", str(port)]
+    with _listening(words, port, AWS_ACCESS_KEY_ID="moto", AWS_SECRET_ACCESS_KEY="moto"):
+        keys = {"aws_access_key_id": "any", "aws_secret_access_key": "any", "region_name": "us-east-1"}
+        pytest.importorskip("boto3").client("s3", endpoint_url=f"http://{HOST}:{port}", **keys).create_bucket(
+            Bucket="bucket"
+        )
+        yield HOST, port
+
+
+@contextmanager
+def azure_process(azurite: str, folder: Path) -> Iterator[tuple[str, int]]:
+    """A process that serves Azure's blobs, Microsoft's emulator, with a container named `bucket`; where it listens."""
+    port = _free_port()
+    words = [azurite, "--location", str(folder), "--blobHost", HOST, "--blobPort", str(port), "--disableTelemetry"]
+    with _listening(words, port):
+        date = formatdate(usegmt=True)
+        path, about = f"/{AZURE_NAME}/bucket", f"x-ms-date:{date}\nx-ms-version:{AZURE_VERSION}\n"
+        signed = "PUT" + "\n" * 12 + f"{about}/{AZURE_NAME}{path}\nrestype:container"
+        signature = b64encode(hmac.digest(b64decode(AZURE_KEY), signed.encode(), "sha256")).decode()
+        connection = HTTPConnection(HOST, port, timeout=PATIENCE)
+        headers = {"x-ms-date": date, "x-ms-version": AZURE_VERSION, "Content-Length": "0"}
+        headers |= {"Authorization": f"SharedKey {AZURE_NAME}:{signature}"}
+        connection.request("PUT", f"{path}?restype=container", headers=headers)
+        assert connection.getresponse().status == 201
+        yield HOST, port
+
+
+def _free_port() -> int:
     with socket.socket() as probe:
         probe.bind((HOST, 0))
-        port = probe.getsockname()[1]
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def _listening(words: Sequence[str], port: int, **environment: str) -> Iterator[None]:
+    """A process, from when it listens."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "moto.server", "-H", HOST, "-p", str(port)],
-        env=os.environ | {"AWS_ACCESS_KEY_ID": "moto", "AWS_SECRET_ACCESS_KEY": "moto"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        words, env=os.environ | environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     try:
         end = time.monotonic() + PATIENCE
@@ -272,11 +310,7 @@ def s3_process() -> Iterator[tuple[str, int]]:
             except OSError:
                 assert time.monotonic() < end
                 time.sleep(0.05)
-        keys = {"aws_access_key_id": "any", "aws_secret_access_key": "any", "region_name": "us-east-1"}
-        pytest.importorskip("boto3").client("s3", endpoint_url=f"http://{HOST}:{port}", **keys).create_bucket(
-            Bucket="bucket"
-        )
-        yield HOST, port
+        yield
     finally:
         process.terminate()
         process.wait()

@@ -30,7 +30,7 @@ from pipeline.store.publish import ended
 from tests.pipeline.command import ROOT, TINY, run
 from tests.pipeline.command import here as command
 from tests.pipeline.driver import LEVELS, SPLIT, UNIT, commit_made, drive, require_same_content
-from tests.pipeline.servers import Server, bucket_of, s3_process, serving
+from tests.pipeline.servers import AZURE_KEY, AZURE_NAME, Server, azure_process, bucket_of, s3_process, serving
 from tests.pipeline.servers import before as before_it
 
 OUT = "s3://bucket/data"
@@ -345,6 +345,32 @@ def test_google_s_store_gets_what_a_folder_gets(
     monkeypatch.setenv("GOOGLE_SERVICE_ACCOUNT", str(tmp_path / "account.json"))
     drive("gs://bucket/data")
     require_same_content(Path("gs://bucket/data") / SPLIT, here)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(("every", "how"), [(0, ""), (3, "busy"), (4, "lost"), (4, "cut")])
+def test_azure_s_store_gets_what_a_folder_gets(
+    server: Server, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int, how: str
+) -> None:
+    azurite = os.environ.get("LEVELPROOF_TEST_AZURITE")
+    if not azurite:
+        pytest.skip("LEVELPROOF_TEST_AZURITE names no azurite-blob (npm install azurite)")
+    split = Path("az://bucket/data") / SPLIT
+    with azure_process(azurite, tmp_path) as there, serving(before_it(*there)) as between:
+        monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", AZURE_NAME)
+        monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_KEY", AZURE_KEY)
+        monkeypatch.setenv("AZURE_STORAGE_ENDPOINT", f"{between.url}/{AZURE_NAME}")
+        between.spoil(every, how)
+        drive("az://bucket/data")
+        between.spoil(0)
+        require_same_content(split, here)
+        count = between.count
+        drive("az://bucket/data")  # all is there
+        assert not [line for line in between.log[count:] if line.startswith("PUT") and "/shards/" in line]
+        between.spoil(1, "gone")
+        forget()
+        with pytest.raises(Failure, match="az://bucket"):
+            read_manifest(split)
 
 
 @pytest.mark.parametrize("out", ["https://host/data", "hf://datasets/me/data"])
