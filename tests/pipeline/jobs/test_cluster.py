@@ -1,11 +1,14 @@
 """Workers that die and clusters that shrink, on real Ray: everything that can be done is done."""
 
 import os
+import re
 import signal
 import socket
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import pytest
 from rich.console import Console
@@ -156,6 +159,39 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
         assert own.returncode == 0, own.stderr  # a cluster that RAY_ADDRESS does not name is let be
     finally:
         machines.shutdown()
+
+
+@pytest.mark.campaign
+@pytest.mark.slow
+def test_prometheus_gets_the_progress_from_ray(tmp_path: Path) -> None:
+    pytest.importorskip("aiohttp", reason="ray[default] is not there, which tells Prometheus")
+    from ray.cluster_utils import Cluster
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    node: dict[str, Any] = {"object_store_memory": 80 * 2**20, "num_cpus": 1, "metrics_export_port": port}
+    machines = Cluster(initialize_head=True, head_node_args=node | {"include_dashboard": False})
+    told: dict[str, float] = {}
+
+    def scraped() -> bool:
+        with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
+            for line in answer.read().decode().splitlines():
+                if found := re.fullmatch(r'ray_levelproof_(\w+)\{.*split="5k/s".*\} (\S+)', line):
+                    told[found[1]] = float(found[2])
+        return told.get("levels", 0) > 0
+
+    try:
+        process = start(("generate", "levels=1k", "unit=1", "budget=5k"), tmp_path, address=str(machines.address))
+        until(scraped, process)
+        committed = len(fragment_paths(tmp_path / SPLIT))
+        process.terminate()
+        process.communicate(timeout=PATIENCE)
+    finally:
+        machines.shutdown()
+    assert told.keys() == {"levels", "solved", "env_steps"}
+    assert 0 <= told["solved"] <= told["levels"] <= committed
+    assert told["env_steps"] > 0
 
 
 @pytest.mark.campaign
