@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from functools import cache
 
 import jax
+import llvmlite
 from jax.extend import core
 from llvmlite import binding, ir
 
 from physics.codegen.buffers import LANES, Buffer
 from physics.codegen.ffi import POINTER, add_handler
+from physics.codegen.kept import kept
 from physics.codegen.lower import Memory, lower
 from physics.codegen.values import INDEX
 
@@ -67,18 +69,28 @@ def _block(module: ir.Module, jaxpr: core.ClosedJaxpr, buffers: Sequence[Buffer]
 
 def _object_code(text: str) -> bytes:
     """Optimised machine code for this CPU."""
+    cpu, features = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
+
+    def optimised() -> bytes:
+        _initialize()
+        module = binding.parse_assembly(text)
+        triple = binding.Target.from_default_triple()
+        target = triple.create_target_machine(cpu=cpu, features=features, opt=3, jit=True)
+        passes = binding.create_pass_builder(target, binding.create_pipeline_tuning_options(speed_level=2))
+        passes.getModulePassManager().run(module, passes)
+        return target.emit_object(module)
+
+    return kept("\n".join([llvmlite.__version__, cpu, features, text]), optimised)
+
+
+def _initialize() -> None:
+    """Tell LLVM of this machine; again costs nothing."""
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
-    module = binding.parse_assembly(text)
-    target = binding.Target.from_default_triple().create_target_machine(
-        cpu=binding.get_host_cpu_name(), features=binding.get_host_cpu_features().flatten(), opt=3, jit=True
-    )
-    passes = binding.create_pass_builder(target, binding.create_pipeline_tuning_options(speed_level=2))
-    passes.getModulePassManager().run(module, passes)
-    return target.emit_object(module)
 
 
 @cache
 def _jit() -> binding.LLJIT:
     """LLVM's just-in-time linker (ORC), one for the process."""
+    _initialize()
     return binding.create_lljit_compiler()
