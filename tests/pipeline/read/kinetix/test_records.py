@@ -25,14 +25,14 @@ def assert_same_but_for_what_is_drawn(ours: np.ndarray, theirs: np.ndarray) -> N
     assert same.mean() > 0.4
 
 
-@pytest.mark.parametrize("size", ["s", "m"])
+@pytest.mark.parametrize("size", SIZES)
 def test_what_the_reference_stored_comes_back(size: str) -> None:
     theirs = trajectories_in(GOLDEN / size)
     assert theirs.dtype.itemsize == dtype_of(SIZES[size]).itemsize
     assert_same_but_for_what_is_drawn(trajectories_of(*ours_of(theirs)), theirs)
 
 
-@pytest.mark.parametrize("size", ["s", pytest.param("m", marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.campaign) for size in "ml")])
 def test_what_we_play_is_what_the_reference_played(size: str) -> None:
     """From its levels, under its actions: at the first steps every field is the same or nearly so."""
     level, record = ours_of(trajectories_in(GOLDEN / size))
