@@ -22,7 +22,7 @@ from pipeline.store.shard import stored_bytes
 
 BATCH = 64
 BUDGET = "64k"
-LEVELS = {"s": 512, "m": 192, "l": 96}  # that are tried; two thirds get a witness
+LEVELS = {"s": 512, "m": 192, "l": 128}  # that are tried; two thirds get a witness
 DENSITIES = ("full", "witness")
 TABLES = {
     "rate": "Trajectories/s",

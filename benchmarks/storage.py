@@ -41,7 +41,7 @@ FIELDS: Mapping[str, Sequence[str] | None] = {
 }
 SECONDS = 0.7  # of the core's time for each measurement, at least
 # Of splits that are made for this: what experts find alone plays for longer than what a search finds
-BUDGET, LEVELS = "256k", {"s": 256, "m": 128, "l": 96}
+BUDGET, LEVELS = "256k", {"s": 512, "m": 256, "l": 128}
 ALONE = ("procedure=published", "stop.rule=solved")
 
 
