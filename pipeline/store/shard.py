@@ -44,7 +44,8 @@ FORMAT = "levelproof.shard"
 DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError)
 PRESSED: dict[str | None, dict[str, Any]] = {  # how arrays are compressed
     FLAT: {"clevel": 9, "shuffle": "noshuffle"},  # a few kilobytes a level, bytes of all kinds
-    None: {"clevel": 5, "shuffle": "shuffle"},  # 9 saves 2% and encodes at 3 MB/s
+    # 9 saves 2% and encodes at 3 MB/s; one block a chunk saves 1%
+    None: {"clevel": 5, "shuffle": "shuffle", "blocksize": 2**19},
 }
 
 
