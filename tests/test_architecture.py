@@ -2,6 +2,7 @@
 
 import ast
 import re
+import subprocess
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
@@ -38,6 +39,7 @@ MAY_IMPORT = {
 RAY_IN = {"pipeline/jobs/cluster.py"}
 HYDRA_IN = {"configs/compose.py"}
 LONGEST = 400  # lines of a file
+FOLDERS = {*PRODUCT, *OUTSIDE, "manifests", "docs", ".ci"}
 
 
 def python_files(*folders: str) -> list[Path]:
@@ -98,6 +100,12 @@ def test_the_product_and_nothing_else_is_installed_and_checked() -> None:
     tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
     assert set(tools["hatch"]["build"]["targets"]["wheel"]["packages"]) == set(PRODUCT)
     assert set(tools["pyright"]["include"]) >= set(PRODUCT)
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="this is no clone")
+def test_no_run_has_left_a_folder_in_the_repository() -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    assert {path.partition("/")[0] for path in listed.splitlines() if "/" in path} == FOLDERS
 
 
 def test_measuring_does_not_import_the_tests() -> None:
