@@ -57,7 +57,7 @@ def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Itera
     """Of these levels those that are solved."""
     levels = jax.tree.map(np.asarray, sample_levels(level_ids, SIZES[size]))
     run = TrainingRun(pool, levels, level_ids)
-    while run.submission is None or not pool.step():
+    while not pool.step():
         run.look()
     result, submission = run.finish(), run.submission
     once = replace(pool.config, replays=0)

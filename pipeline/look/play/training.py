@@ -38,11 +38,12 @@ def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event) -> 
     level_id = level_id_for(content_hashes(file.level)[0])
     run = TrainingRun(pool, file.level, np.array([level_id]))
     while not stop.is_set():
+        ended = pool.step()
         if run.submission is None:
             run.look()
             yield {"stage": "searching", "env_steps": run.totals().env_steps}
             continue
-        if pool.step() or not run.submission.under_way:
+        if ended:
             yield verdict_of(run)
             return
         curve = run.submission.curves[0]
