@@ -166,9 +166,6 @@ def _part(path: Path) -> Part:
         fragment, rows = read_fragment(path, ["level_id", *COLUMNS])
     except OSError as error:
         raise Failure(f"The fragment {path} cannot be read ({error.strerror or type(error).__name__}).") from None
-    ids, (first, last) = rows.column("level_id").to_numpy(), ids_of(path)
-    if len(ids) and (ids.min() < first or ids.max() > last):
-        raise Failure(f"The fragment {path} has other levels than its name says.")
     return fragment, rows
 
 
