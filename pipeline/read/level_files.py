@@ -93,7 +93,7 @@ def _level_in(path: Path) -> LevelFile:
         return read_level_file(path)
     try:
         folder = open_folder(place.folder)
-        found = read_trajectories(folder.named(place.array), folder.size, place.row, place.row + 1)
+        found = read_trajectories(folder.named(place.array), place.row, place.row + 1)
     except FormatError as error:
         raise LevelFileError(f"Cannot use the level of {path}: {error}.") from None
     if found.wrong[0]:
