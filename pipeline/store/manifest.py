@@ -71,7 +71,7 @@ def write_fragment(
     """
     is_table = isinstance(rows, pa.Table)
     table: Any = rows if is_table else pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS)
-    names = named_by([table], "shard") | named_by([table], "experts")
+    names = data_named_by(table)
     metadata = {
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
         HASH_KEY: config_hash.encode(),
@@ -277,6 +277,11 @@ def each_once(parts: Sequence[tuple[Fragment, pa.Table]]) -> tuple[pa.Table, lis
 def named_by(tables: Sequence[pa.Table], column: str) -> frozenset[str]:
     """What rows name in a column: shards or experts."""
     return frozenset(path for table in tables for path in table.column(column).unique().to_pylist() if path)
+
+
+def data_named_by(rows: pa.Table) -> frozenset[str]:
+    """Shards and experts."""
+    return frozenset.union(*(named_by([rows], name) for name in DATA_COLUMNS))
 
 
 def require_manifest(

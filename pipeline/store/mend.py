@@ -18,6 +18,7 @@ from pipeline.store.leftovers import disown
 from pipeline.store.manifest import (
     DATA_COLUMNS,
     begin_fragment,
+    data_named_by,
     fragment_paths,
     named_by,
     read_fragment,
@@ -40,7 +41,7 @@ def take_out(split: Path, lost: Collection[int], unlike: Collection[str], damage
         OSError: the disk refuses.
     """
     sound = [path for path in fragment_paths(split) if path not in damaged]
-    named = {name for path in sound for name in _names(read_fragment(path, DATA_COLUMNS)[1])}
+    named = {name for path in sound for name in data_named_by(read_fragment(path, DATA_COLUMNS)[1])}
     for path in damaged:
         first, last = ids_of(path)
         theirs = [data for data in data_paths(split) if first <= unit_ids(data)[0] and unit_ids(data)[1] <= last]
@@ -65,8 +66,8 @@ def _mend(split: Path, path: Path, lost: np.ndarray, unlike: frozenset[str]) -> 
     for name, attempt in zip(sorted(stale), attempts, strict=False):
         rows = _moved(split, rows, name, attempt.shard)
     theirs = {path, attempts[-1].fragment} & {*fragment_paths(split)}  # two: somebody died between the two below
-    named = {name for of in theirs for name in _names(read_fragment(of, DATA_COLUMNS)[1])}
-    _disown_named(split, named - _names(rows))
+    named = {name for of in theirs for name in data_named_by(read_fragment(of, DATA_COLUMNS)[1])}
+    _disown_named(split, named - data_named_by(rows))
     if ids:
         write_fragment(attempts[-1], rows, fragment.config_hash, fragment.config, fragment.sealed, fragment.densities)
     if not ids or attempts[-1].fragment != path:
@@ -77,11 +78,6 @@ def _disown_named(split: Path, names: Collection[str]) -> None:
     for name in names:
         with suppress(Failure):  # of a name that leads elsewhere: what is there is not ours
             disown([data_path(split, name)])
-
-
-def _names(table: pa.Table) -> frozenset[str]:
-    """Shards and experts."""
-    return frozenset.union(*(named_by([table], name) for name in DATA_COLUMNS))
 
 
 def _moved(split: Path, rows: pa.Table, old: str, new: Path) -> pa.Table:
