@@ -284,6 +284,14 @@ def data_named_by(rows: pa.Table) -> frozenset[str]:
     return frozenset.union(*(named_by([rows], name) for name in DATA_COLUMNS))
 
 
+def with_places(rows: pa.Table, shards: Sequence[Any], places: Sequence[Any]) -> pa.Table:
+    """The same rows, whose data are in these shards now, in these of their rows."""
+    for name, values in ("shard", shards), ("row", places):
+        field = COLUMNS.field(name)
+        rows = rows.set_column(rows.schema.get_field_index(name), field, pa.array(values, field.type))
+    return rows
+
+
 def require_manifest(
     split: Path,
     columns: Sequence[str] | None = None,

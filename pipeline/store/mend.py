@@ -22,6 +22,7 @@ from pipeline.store.manifest import (
     fragment_paths,
     named_by,
     read_fragment,
+    with_places,
     write_fragment,
 )
 from pipeline.store.merge import Place, merge_shards
@@ -87,7 +88,4 @@ def _moved(split: Path, rows: pa.Table, old: str, new: Path) -> pa.Table:
     merge_shards(new, [Place(data_path(split, old), places[i], ids[i]) for i in moving])
     for row, i in enumerate(moving):
         names[i], places[i] = new.relative_to(split).as_posix(), row
-    for name, values in ("shard", names), ("row", places):
-        field = rows.schema.field(name)
-        rows = rows.set_column(rows.schema.names.index(name), field, pa.array(values, field.type))
-    return rows
+    return with_places(rows, names, places)
