@@ -43,6 +43,7 @@ from pipeline.store.layout import (
     data_paths,
     entries,
     ids_of,
+    made_within,
     unit_ids,
 )
 from pipeline.store.locks import is_written
@@ -269,7 +270,7 @@ def _damaged(split: Path, note: JobNote | None, there: np.ndarray, named: set[st
     unnamed = [path for path in data_paths(split) if path.relative_to(split).as_posix() not in named]
     for fragment, wrong in findings.fragments.items():
         first, last = ids_of(fragment)
-        mine = [path for path in unnamed if first <= unit_ids(path)[0] and unit_ids(path)[1] <= last]
+        mine = made_within(unnamed, fragment)
         unnamed = [path for path in unnamed if path not in mine]
         ids = _ids_in(mine) | {first, last} | _between(first, last, note, findings)
         findings.tell(wrong, ids - set(there.tolist()))

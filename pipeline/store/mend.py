@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import Failure
-from pipeline.store.layout import data_path, data_paths, ids_of, new_attempt, unit_ids, unit_name
+from pipeline.store.layout import data_path, data_paths, made_within, new_attempt, unit_name
 from pipeline.store.leftovers import disown
 from pipeline.store.manifest import (
     DATA_COLUMNS,
@@ -44,8 +44,7 @@ def take_out(split: Path, lost: Collection[int], unlike: Collection[str], damage
     sound = [path for path in fragment_paths(split) if path not in damaged]
     named = {name for path in sound for name in data_named_by(read_fragment(path, DATA_COLUMNS)[1])}
     for path in damaged:
-        first, last = ids_of(path)
-        theirs = [data for data in data_paths(split) if first <= unit_ids(data)[0] and unit_ids(data)[1] <= last]
+        theirs = made_within(data_paths(split), path)
         disown(data for data in theirs if data.relative_to(split).as_posix() not in named)
         path.unlink(missing_ok=True)
     for path in sound:
