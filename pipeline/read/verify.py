@@ -273,14 +273,18 @@ def _damaged(split: Path, note: JobNote | None, there: np.ndarray, named: set[st
         mine = made_within(unnamed, fragment)
         unnamed = [path for path in unnamed if path not in mine]
         ids = _ids_in(mine) | {first, last} | _between(first, last, note, findings)
-        findings.tell(wrong, ids - set(there.tolist()))
+        findings.tell(wrong, _not_in(there, ids))
     if is_written(split):
         return
     begun = {attempt_of(path) for path in entries(split, MANIFEST, BEGUN, DirEntry.is_file)}
     for path in unnamed:
-        lost = _ids_in([path]) - set(there.tolist())
+        lost = _not_in(there, _ids_in([path]))
         if lost and attempt_of(path) not in begun:
             findings.tell(f"No fragment names {path}: the one that did is missing.", lost)
+
+
+def _not_in(there: np.ndarray, ids: set[int]) -> set[int]:
+    return ids.difference(there[np.isin(there, list(ids))].tolist())
 
 
 def _between(first: int, last: int, note: JobNote | None, findings: Findings) -> set[int]:
