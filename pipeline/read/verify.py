@@ -9,6 +9,7 @@ import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from os import DirEntry
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from pipeline.read.findings import Findings
 from pipeline.read.level_files import level_at
 from pipeline.read.pace import Pace
 from pipeline.runtime import prepare_jax
-from pipeline.store.bounds import DAMAGE, bounded
+from pipeline.store.bounds import DAMAGE, MOST_ROWS, bounded
 from pipeline.store.checksums import digests_of, has_own
 from pipeline.store.job_note import JobNote, sound_note
 from pipeline.store.layout import (
@@ -54,7 +55,6 @@ from pipeline.store.runs import runs, told_levels, without
 from pipeline.store.shard import Shard, open_shard
 
 AT_ONCE = 4 * CHUNK  # rows that are looked at together, where fragments have fewer
-MOST_ROWS = 1_000_000  # of a fragment
 ATTEMPTS = 3  # at a split of which fragments are sealed meanwhile
 
 Part = tuple[Fragment, pa.Table]  # a fragment and its rows
@@ -291,8 +291,9 @@ def _between(first: int, last: int, note: JobNote | None, findings: Findings) ->
     """Which levels a fragment had that nobody can read any more: those that were wanted, or all, if ids make levels."""
     wanted = note.level_ids.tolist() if note else []
     if not from_files(findings.config or {}) and not any(a <= first <= last <= b for a, b in wanted):
-        wanted = [*wanted, (first, min(last, first + MOST_ROWS))]
-    return {i for a, b in wanted for i in range(max(a, first), min(b, last) + 1)}
+        wanted = [*wanted, (first, last)]
+    ids = (i for a, b in wanted for i in range(max(a, first), min(b, last) + 1))
+    return set(islice(ids, MOST_ROWS))  # which its name and a note may say are many more
 
 
 def _ids_in(data: Sequence[Path]) -> set[int]:

@@ -14,13 +14,16 @@ import pytest
 
 from experts.labels import WITNESSED, Label
 from experts.witness import replay
+from levelgen.identity.keys import MAX_LEVEL_ID
 from pipeline.read import evidence
 from pipeline.read.verify import examine
 from pipeline.store.checksums import digests_of, with_own
+from pipeline.store.job_note import note_job
+from pipeline.store.layout import MANIFEST, unit_name
 from pipeline.store.manifest import fragment_paths, read_manifest
 from pipeline.store.schema import DIGESTS_KEY
 from pipeline.store.shard import Shard, write_shard
-from tests.pipeline.made import honest_split
+from tests.pipeline.made import honest_split, made_job
 
 pytestmark = pytest.mark.slow
 UNIT, UNITS = 8, 6
@@ -181,6 +184,17 @@ def test_a_record_that_differs_in_one_bit(split: Path) -> None:
     assert_told(split, f"Level {row['level_id']} has a witness that does not replay: its reward differs.")
     forge(split, of_another_stack)
     assert_told(split)
+
+
+def test_of_a_damaged_fragment_no_more_levels_are_lost_than_one_has(
+    split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever its name and the note say."""
+    monkeypatch.setattr("pipeline.read.verify.MOST_ROWS", 100)
+    (split / MANIFEST / f"{unit_name(0, MAX_LEVEL_ID)}.parquet").write_bytes(b"PAR1")
+    assert len(examine(split).lost) <= 102
+    note_job(split, made_job(), ["levelproof", "generate"], [(0, MAX_LEVEL_ID)])
+    assert len(examine(split).lost) <= 102
 
 
 def test_a_hostile_shard_is_one_sentence_and_the_others_are_looked_at(split: Path) -> None:
