@@ -19,7 +19,7 @@ from pipeline.errors import UserError
 from pipeline.read.level_files import levels_at
 from pipeline.read.rows import read_rows
 from pipeline.runtime import prepare_jax
-from pipeline.store.contents import table_for
+from pipeline.store.contents import level_fields
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.origins import ASKED, origin_of
@@ -55,7 +55,7 @@ def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
     size = size_of(rows.column("size")[0].as_py())
     parts = []
     if stored.any():
-        names = [of.name for of in table_for(size) if of.name.startswith("level/")]
+        names = [field.name for field in level_fields(size)]
         parts.append(tree_of(Level, read_rows(manifest.split, rows.filter(stored), names), "level/"))
     if not stored.all():
         prepare_jax()

@@ -52,6 +52,11 @@ def none_of(size: Size) -> tuple[Level, Record]:
     return level, replace(record, state=in_time(record.state), manifold=in_time(record.manifold))
 
 
+def level_fields(size: Size) -> list[FieldSpec]:
+    """Those that tell what a level is, without its record."""
+    return [field for field in table_for(size) if field.constant]
+
+
 def size_of_levels(arrays: Mapping[str, np.ndarray]) -> Size:
     """The size of levels with these fields."""
     return Size(*(arrays[name].shape[0] for name in COUNTED))
