@@ -216,7 +216,7 @@ class RemoteFile:
     def _part(self, n: int, first: int, last: int) -> bytes:
         """Of a piece; fetched again where others needed its place in the cache."""
         part = self._cache.read(self._piece(n), first, min(last, PIECE))
-        return self._fetch([n])[first:last][: PIECE - first] if part is None else part
+        return self._fetch([n])[first:last] if part is None else part
 
     def _keep(self, run: Sequence[int]) -> None:
         self._fetch(run)
