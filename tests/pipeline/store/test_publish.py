@@ -24,8 +24,8 @@ from pipeline.store.layout import FRAGMENT, data_paths, new_attempt, unit_name
 from pipeline.store.leases import Lease, LeaseLost
 from pipeline.store.leftovers import clean
 from pipeline.store.locks import is_written
-from pipeline.store.manifest import read_manifest
-from pipeline.store.objects import put, remove
+from pipeline.store.manifest import fragment_paths, read_manifest
+from pipeline.store.objects import get, put, remove
 from pipeline.store.publish import ended
 from tests.pipeline.command import ROOT, TINY, run
 from tests.pipeline.command import here as command
@@ -292,6 +292,17 @@ def test_levels_that_an_attempt_of_which_nobody_has_heard_has_committed_are_left
     assert [fragment.path.stem for fragment in manifest.fragments] == [unit_name(0, 3), unit_name(1, 2)]
     assert manifest.level_ids.tolist() == [0, 1, 2, 3]
     assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
+
+
+@pytest.mark.parametrize(("first", "last"), [(4, 44), (40, None)], ids=["the first page's header", "its end"])
+def test_a_fragment_that_is_damaged_is_one_sentence(server: Server, first: int, last: int | None) -> None:
+    commit_made(THERE, WorkUnit((0, 1)))
+    (path,) = fragment_paths(THERE)
+    data = bytearray(get(path).data)
+    data[first:last] = bytes(40)
+    put(path, bytes(data))
+    with pytest.raises(Failure, match=r"fragment s3://bucket/data/128k/s/.* is damaged: remove it"):
+        commit_made(THERE, WorkUnit((0, 1)))
 
 
 def test_a_second_writer_is_refused_while_the_first_renews_its_lease(
