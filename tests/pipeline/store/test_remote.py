@@ -377,6 +377,15 @@ def test_a_split_on_the_hub(split: Path, tmp_path: Path, monkeypatch: pytest.Mon
             require_manifest(Path("hf://datasets/user/name/2M/s"))
 
 
+def test_a_hub_whose_lists_are_cut_off_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where they come in chunks, an answer that ends early is an error of HTTP's, and none of the system's."""
+    with serving(lambda *_: Answer(200, {"Transfer-Encoding": "chunked"}, b"ff\r\n[")) as server:
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+        with pytest.raises(Failure, match=r"The hub does not answer at .*IncompleteRead"):
+            read_manifest(Path("hf://datasets/user/name/1M/s"))
+        assert len(server.log) == hub.ATTEMPTS
+
+
 def test_commands_that_read_take_urls_and_others_say_what_they_need(
     bucket: Bucket, split: Path, tmp_path: Path
 ) -> None:
