@@ -25,7 +25,7 @@ from pipeline.store.leases import Lease, LeaseLost
 from pipeline.store.leftovers import clean
 from pipeline.store.locks import is_written
 from pipeline.store.manifest import fragment_paths, read_manifest
-from pipeline.store.objects import get, put, remove
+from pipeline.store.objects import get, put, remove, require_conditions
 from pipeline.store.publish import ended
 from tests.pipeline.command import ROOT, TINY, run
 from tests.pipeline.command import here as command
@@ -400,6 +400,16 @@ def test_a_store_that_heeds_no_conditions_is_refused(server: Server, tmp_path: P
         forget()
         with pytest.raises(UserError, match="does not heed the conditions"):
             drive(OUT)
+
+
+def test_a_store_that_is_busy_is_not_said_to_heed_no_conditions(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever numbers there are in the name of the file that it is tried with."""
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    server.spoil(1)
+    with pytest.raises(Failure, match=r"Cannot write .*501 \(503 Service Unavailable\)"):
+        require_conditions(THERE / ".job.json.501")
 
 
 @ALSO_MOTO
