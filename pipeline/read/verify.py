@@ -242,7 +242,7 @@ def _opened(name: str, making: Making, level_ids: set[int], findings: Findings) 
 def _unlike(split: Path, name: str, digests: Mapping[str, str]) -> list[str]:
     """The files of a shard or of experts that are not what they were: changed, missing or new."""
     try:
-        found = digests_of(data_path(split, name))
+        found = digests_of(data_path(split, name), digests)
     except (Failure, OSError):
         found = {}
     return sorted(file for file in {**found, **digests} if found.get(file) != digests.get(file))
