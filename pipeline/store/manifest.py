@@ -173,10 +173,13 @@ def read_manifest(
         each: what to keep of a fragment's rows, as they come and in threads; `level_id` has to be among it.
 
     Raises:
+        UserError: there is no such column.
         Failure: a fragment is damaged, or fragments of several configurations lie side by side.
     """
     split = Path(split)
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
+    if unknown := [name for name in names if name not in COLUMNS.names]:
+        raise UserError(f"There is no column {unknown[0]!r}: the manifest has {', '.join(COLUMNS.names)}.")
     asked = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))
     read = partial(_part, names=names, level_ids=asked, compact=compact, each=each)
     parts = _parts(split, asked, read)
