@@ -29,6 +29,7 @@ from pipeline.errors import Exit, Failure
 from pipeline.read.evidence import COLUMNS, Evidence, Making, same_stack
 from pipeline.read.findings import Findings
 from pipeline.read.level_files import level_at
+from pipeline.read.levels import recorded_settings
 from pipeline.read.pace import Pace
 from pipeline.runtime import prepare_jax
 from pipeline.store.bounds import DAMAGE, MOST_ROWS, bounded
@@ -173,16 +174,12 @@ def _part(path: Path) -> Part:
 def _making(split: Path, fragment: Fragment, findings: Findings) -> Making:
     """Raises Failure where this program makes other levels, or plays them by other rules."""
     findings.config = config = fragment.config
-    try:
+    with recorded_settings(split):
         if config["sampler_version"] != SAMPLER_VERSION:
             raise ConfigError(f"sampler version {config['sampler_version']}, here it is {SAMPLER_VERSION}")
         size_of(config["size"])
         rules = typed(TaskParams, config["task"], "task")
         distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
-    except (ValueError, KeyError, TypeError) as error:
-        raise Failure(
-            f"The split {split} was made by a levelproof with other settings ({error}): use that one."
-        ) from None
     return Making(split, config["size"], distribution, rules)
 
 
