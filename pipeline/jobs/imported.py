@@ -138,7 +138,7 @@ def _import(
 ) -> list[str]:
     """Commit a part; the reasons why some of it is left out."""
     ids = part.unit.level_ids
-    found = read_trajectories(part.array, folder.size, part.first, part.first + len(ids))
+    found = read_trajectories(part.array, part.first, part.first + len(ids))
     good = np.flatnonzero([not what for what in found.wrong])
     files = [_file(folder, part.array, part.first + i) for i in range(len(ids))]
     wrong = [(file, what) for file, what in zip(files, found.wrong, strict=True) if what]
