@@ -107,6 +107,18 @@ def test_there_are_as_many_workers_as_machines_have_room_for_now(monkeypatch: py
     assert there(crew) == ["b"]
 
 
+def test_a_machine_is_left_out_when_several_of_its_workers_are_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    why = "The worker on a has jax 0.1, and this command jax 0.2: install the same."
+    answers = {"a0": why, "a1": why, "b0": "", "b1": ""}
+    monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
+    monkeypatch.setattr(cluster.ray, "wait", lambda references, **_: (references, []))
+    monkeypatch.setattr(cluster.ray, "get", answers.__getitem__)
+    crew = cluster.Crew(made_job("data", "unit=1"), SPLIT, Scheduler([], 6), Board(Tally(1, 0, 0), Console()))
+    crew._handles = [cluster.WorkerHandle(answer[0], answer[0], answer=answer) for answer in answers]
+    assert crew.wait() == []
+    assert [(handle.node, handle.up) for handle in crew._handles] == [("b", True), ("b", True)]
+
+
 def test_a_worker_with_another_program_is_refused_in_a_sentence() -> None:
     job = made_job()
     program = program_of(job)
