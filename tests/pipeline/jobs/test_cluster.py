@@ -13,7 +13,9 @@ from urllib.request import urlopen
 import pytest
 from rich.console import Console
 
+from pipeline.errors import UserError
 from pipeline.jobs import cluster
+from pipeline.jobs.address import require_reachable
 from pipeline.jobs.likeness import program_of, unlike
 from pipeline.jobs.progress import Board, Tally
 from pipeline.jobs.schedule import COMPANY, Scheduler
@@ -63,6 +65,13 @@ def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
     assert_refused(
         done, 2, "There is no Ray cluster at RAY_ADDRESS=127.0.0.1:9 (Connection refused)", "ray start --head"
     )
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:99999", "a..b:6379"])
+def test_an_address_that_cannot_be_one_is_named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(UserError, match=f"There is no Ray cluster at RAY_ADDRESS={re.escape(address)} "):
+        require_reachable(address)
 
 
 def test_workers_read_no_relative_path() -> None:
