@@ -68,7 +68,7 @@ def card(splits: Sequence[Path], out: Path | None, wishes: Wishes) -> None:
 
 
 def _require_ours(out: Path) -> None:
-    if out.exists() and MARK not in out.read_text(encoding="utf-8", errors="replace"):
+    if out.exists() and not (out.is_file() and MARK in out.read_text(encoding="utf-8", errors="replace")):
         raise UserError(f"{out} is there already, and `levelproof card` did not write it: name another file with -o.")
 
 
