@@ -98,7 +98,7 @@ def readme(name: str, splits: Sequence[SplitFacts], wishes: Wishes, figures: Seq
         _picture(STEPS, figures, "How many steps solved levels take"),
         _loading(splits, wishes),
         _format(wishes),
-        _making(splits, wishes),
+        _making(splits),
         _licence(wishes),
         _citation(wishes, version),
     ]
@@ -197,7 +197,7 @@ Columns and fields: {_link("docs/columns.md", wishes.code, "/blob/main/docs/colu
 {_link("docs/shards.md", wishes.code, "/blob/main/docs/shards.md")}."""
 
 
-def _making(splits: Sequence[SplitFacts], wishes: Wishes) -> str:
+def _making(splits: Sequence[SplitFacts]) -> str:
     rows = ["| split | budget | levels are | configuration | stored as | made with |", "|---" * 6 + "|"]
     for of in splits:
         stored, stacks = f"`{of.stored_as}`", "; ".join(of.made_with)
