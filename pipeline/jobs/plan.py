@@ -62,7 +62,7 @@ def told(job: JobConfig, sample: Sample, of: Forecast) -> list[str]:
     lines = {
         "wall time": f"{of.wall.told(scale)} {unit} with {of.workers} workers",
         f"{sample.device}-hours": of.hours.told(),
-        "solved levels": of.solved.told(form=",.0f"),
+        "solved levels": of.solved.told(tell="{:,.0f}".format),
         f"{sample.device}-seconds a solved level": of.seconds_per_solved.told() if of.seconds_per_solved else "unknown",
         **{
             f"GB, density={name}": f"{of.bytes[name].told(1e9)} in {of.files[name]:,} files, sealed"

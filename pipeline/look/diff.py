@@ -22,6 +22,7 @@ from pipeline.look.inspect import QUANTILES, SPENT
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import differences, require_manifest, told
 from pipeline.store.remote import as_typed
+from pipeline.words import number
 
 READ = (*cost.READ, "content_hash", "signature", "steps_to_goal", *SPENT)
 LABELS = [label.value for label in Label]
@@ -180,7 +181,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     say(f"Settings that differ: {told(facts['settings']) or 'none'}.")
     for name, unit in (("env_steps", "env steps"), ("seconds", "seconds")):
         if (more := facts[f"{name}_for_one_more"]) is not None:
-            say(f"{more * gained:+,.0f} {unit} for {gained:+,} solved levels: {more:,.3g} for each one more.")
+            say(f"{more * gained:+,.0f} {unit} for {gained:+,} solved levels: {number(more)} for each one more.")
     if steps:
         say(
             f"Of {steps['levels']:,} levels that both solve, {steps['shorter']:,} take fewer steps in {other} and "

@@ -12,6 +12,7 @@ from rich.filesize import decimal
 from experts.config import RECORD_STEPS
 from experts.labels import Label
 from pipeline.look.figures import Share
+from pipeline.words import number
 
 MARK = "<!-- written by levelproof card: run it again rather than edit this -->"
 PREVIEW, FIGURES = "preview", "figures"  # folders beside the README
@@ -243,5 +244,5 @@ def _short(count: int) -> str:
     """1.5 billion, 320 million, 12,345."""
     for unit, word in ((10**9, "billion"), (10**6, "million")):
         if count >= unit:
-            return f"{count / unit:.3g} {word}"
+            return f"{number(count / unit)} {word}"
     return f"{count:,}"
