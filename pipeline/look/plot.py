@@ -9,6 +9,7 @@ from experts.labels import TRAINED, Label
 from pipeline.errors import UserError
 from pipeline.look.figures import draw_panels
 from pipeline.look.rows import Asked
+from pipeline.look.spread import spread
 from pipeline.read.levels import writing_to
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import require_manifest
@@ -45,6 +46,6 @@ def _curves(split: Path, table: pa.Table, label: Label) -> list[np.ndarray]:
     ids = table["level_id"].to_numpy()[np.array(table["label"].to_pylist()) == label]
     if not len(ids):
         return []
-    chosen = ids[np.unique(np.linspace(0, len(ids) - 1, min(CURVES, len(ids))).round().astype(int))]
+    chosen = ids[spread(len(ids), CURVES)]
     found = require_manifest(split, ["learning_curve"], chosen).table["learning_curve"].to_pylist()
     return [curve for rates in found if not np.isnan(curve := np.array(rates, np.float64)).all()]

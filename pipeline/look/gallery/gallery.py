@@ -23,6 +23,7 @@ from pipeline.errors import Failure, UserError
 from pipeline.look import cost
 from pipeline.look.gallery.columns import NOTHING, PAGE, columns_of, page_of
 from pipeline.look.gallery.worlds import drawn_bodies, states_of, text_of, world_of
+from pipeline.look.spread import spread
 from pipeline.look.things import THINGS, things_of
 from pipeline.read.created import new_folder
 from pipeline.read.levels import levels_of, rules_of
@@ -74,8 +75,7 @@ def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
     ids = select(everything.table, where).column("level_id").to_numpy()
     if not len(ids):
         raise UserError(f"No level of {split} fits {where}: choose others with --where.")
-    chosen = ids[np.unique(np.linspace(0, len(ids) - 1, min(most, len(ids))).round().astype(int))]
-    return require_manifest(split, level_ids=chosen), len(ids)
+    return require_manifest(split, level_ids=ids[spread(len(ids), most)]), len(ids)
 
 
 def _write_block(folder: Path, manifest: Manifest, first: int) -> dict[str, np.ndarray]:
