@@ -152,8 +152,8 @@ def _paired(left: pa.Table, right: pa.Table, both: np.ndarray) -> dict[str, Any]
 def _print(facts: dict[str, Any], console: Console) -> None:
     one, other = facts["splits"]
     table = Table("", one, other, "difference", box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    for name in table.columns[1:]:
-        name.justify = "right"
+    for column in table.columns[1:]:
+        column.justify = "right"
     shares = [f"{of['solved'] / of['tried']:.1%}" if of["tried"] else "-" for of in facts["solved"]]
     gained = facts["only"][1] - facts["only"][0]
     table.add_row("levels solved", *(f"{of['solved']:,}" for of in facts["solved"]), f"{gained:+,}")
@@ -187,12 +187,9 @@ def _print(facts: dict[str, Any], console: Console) -> None:
             f"Of {steps['levels']:,} levels that both solve, {steps['shorter']:,} take fewer steps in {other} and "
             f"{steps['longer']:,} more, p {_p(steps['p'])}."
         )
-    for split, ids in zip(facts["splits"], facts["only_rows"], strict=True):
+    for split, ids, count in zip(facts["splits"], facts["only_rows"], facts["only"], strict=True):
         if ids:
-            say(
-                f"Solved only in {split}: {', '.join(map(str, ids))}"
-                + ("" if len(ids) == facts["only"][facts["splits"].index(split)] else ", ...")
-            )
+            say(f"Solved only in {split}: {', '.join(map(str, ids))}{', ...' if len(ids) < count else ''}")
 
 
 def _p(p: float) -> str:
