@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key
 
 from experts.config import RECORD_STEPS, ScoutConfig
-from experts.rollout import repeat
 from experts.success import Success, no_success
-from experts.witness import at_once, blocks, take
+from experts.witness import at_once, blocks, repeat, take
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task import rules as task
