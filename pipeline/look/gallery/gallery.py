@@ -7,6 +7,7 @@ levels each, `data/levels/` a file a level with its row and what its witness doe
 
 import json
 import math
+import shlex
 import shutil
 import sys
 from collections.abc import Mapping
@@ -63,8 +64,8 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
         _write(folder, "about", _about(manifest, found, where, about))
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     some = f"{count:,} levels" if count == found else f"{count:,} of {found:,} levels, spread evenly over their ids,"
-    print(f"{out / 'index.html'}: {some} of {split}, {size / 1e6:,.1f} MB. Open it in a browser, or:")
-    print(f"{Path(sys.executable).name} -m webbrowser {out / 'index.html'}")
+    print(f"{out / 'index.html'}: {some} of {as_typed(split)}, {size / 1e6:,.1f} MB. Open it in a browser, or:")
+    print(f"{Path(sys.executable).name} -m webbrowser {shlex.quote(str(out / 'index.html'))}")
 
 
 def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
