@@ -40,7 +40,7 @@ def diff(one: Path, other: Path, where: str | None, rows: int, as_json: bool) ->
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)
         print()
     else:
-        _print(facts, Console(highlight=False))
+        _print(facts, Console(highlight=False, markup=False))
 
 
 def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) -> dict[str, Any]:
@@ -172,7 +172,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
             name = "median" if quantile == "50%" else quantile
             table.add_row(f"steps to goal, {name}", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
     console.print(table)
-    say = lambda text: console.print(text, markup=False, soft_wrap=not console.is_terminal)
+    say = lambda text: console.print(text, soft_wrap=not console.is_terminal)
     say("")
     alone = [
         f"{count:,} only in {split}" for count, split in zip(facts["alone"], facts["splits"], strict=True) if count

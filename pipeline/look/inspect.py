@@ -56,7 +56,7 @@ def inspect(split: Path, asked: Asked, as_json: bool, against: Sequence[Path] = 
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)
         print()
     else:
-        print_facts(facts, asked.columns or SHOWN, Console(highlight=False))
+        print_facts(facts, asked.columns or SHOWN, Console(highlight=False, markup=False))
 
 
 def survey(
