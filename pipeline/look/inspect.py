@@ -75,7 +75,7 @@ def survey(
     alike = alike.filter(np.isin(alike["name"].to_numpy(), ids))
     facts = _told(split, manifest, chosen, _counts(chosen, "label"))
     facts["solved_by"] = solved_by_things(manifest, ids) if things else None
-    others = {str(other): duplicates.compared_in(other) for other in against}
+    others = {as_typed(other): duplicates.compared_in(other) for other in against}
     levels = duplicates.compared_of(split, ids) if others else None
     facts["duplicates"] = duplicates.within(alike, shown)
     facts["against"] = {name: duplicates.between(levels, other, shown) for name, other in others.items()}
