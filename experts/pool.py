@@ -260,7 +260,7 @@ class Pool:
         else:
             submission.evaluated_rollouts[i] += 1
         if seen.evaluated[slot]:
-            submission.evaluations[i].append(evaluation_of(self._slots, slot, self.config))
+            submission.evaluations[i].append(evaluation_of(self._slots, slot))
         if seen.left[slot]:
             if submission.keep:
                 submission.experts[i] = Kept(expert_of(self._slots, slot, self.config), submission.curves[i])
@@ -287,7 +287,7 @@ def expert_of(slots: Slots, slot: int, config: ExpertConfig) -> Begun:
     return jax.device_get(Begun(_row(slots.slot.training, slot), take(slots.acting, lanes)))
 
 
-def evaluation_of(slots: Slots, slot: int, config: ExpertConfig) -> Evaluation:
+def evaluation_of(slots: Slots, slot: int) -> Evaluation:
     """What the evaluation that has just ended in a slot showed."""
     shown = slots.slot.trial, slots.slot.training.progress, slots.slot.training.success
     trial, progress, success = jax.device_get(_row(shown, slot))

@@ -31,7 +31,6 @@ class Searched(NamedTuple):
     env_steps: Int[Array, " level"]  # of all lanes, those that shorten a success included
     cells: Int[Array, " level"]  # that were reached; each as wide as cells were then
     grew: Int[Array, " level"]  # env steps when the last cell was reached
-    full: Bool[Array, " level"]  # whether there were ever more cells than the archive holds, so that they became wider
 
 
 class Sought:
@@ -139,7 +138,7 @@ def side_by_side(config: SearchConfig) -> int:
 @partial(jax.jit, static_argnames="config")
 def searched(search: Search, config: SearchConfig) -> tuple[Bool[Array, " level"], Searched]:
     """Levels that are done: they have a success, or have had their env steps; and what came of all of them so far."""
-    seen = Searched(successes(search), search.env_steps, search.archive.cells, search.grew, search.full)
+    seen = Searched(successes(search), search.env_steps, search.archive.cells, search.grew)
     return ~under_way(search, config), seen
 
 

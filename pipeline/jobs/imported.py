@@ -87,7 +87,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
             raise
         except FormatError as error:
             raise Failure(f"Cannot go on with {folder}: {error}; mend it, and the same command goes on.") from None
-        manifest = read_manifest(split, ["label", "label_reason"])
+        manifest = read_manifest(split, ["label"])
         note_job(split, job, command, runs(manifest.level_ids))
         _closing(found, split, manifest)
     return Exit.DONE

@@ -12,6 +12,7 @@ from rich.filesize import decimal
 from experts.config import RECORD_STEPS
 from experts.labels import Label
 from pipeline.look.figures import Share
+from pipeline.words import number
 
 MARK = "<!-- written by levelproof card: run it again rather than edit this -->"
 PREVIEW, FIGURES = "preview", "figures"  # folders beside the README
@@ -98,7 +99,7 @@ def readme(name: str, splits: Sequence[SplitFacts], wishes: Wishes, figures: Seq
         _picture(STEPS, figures, "How many steps solved levels take"),
         _loading(splits, wishes),
         _format(wishes),
-        _making(splits, wishes),
+        _making(splits),
         _licence(wishes),
         _citation(wishes, version),
     ]
@@ -197,7 +198,7 @@ Columns and fields: {_link("docs/columns.md", wishes.code, "/blob/main/docs/colu
 {_link("docs/shards.md", wishes.code, "/blob/main/docs/shards.md")}."""
 
 
-def _making(splits: Sequence[SplitFacts], wishes: Wishes) -> str:
+def _making(splits: Sequence[SplitFacts]) -> str:
     rows = ["| split | budget | levels are | configuration | stored as | made with |", "|---" * 6 + "|"]
     for of in splits:
         stored, stacks = f"`{of.stored_as}`", "; ".join(of.made_with)
@@ -243,5 +244,5 @@ def _short(count: int) -> str:
     """1.5 billion, 320 million, 12,345."""
     for unit, word in ((10**9, "billion"), (10**6, "million")):
         if count >= unit:
-            return f"{count / unit:.3g} {word}"
+            return f"{number(count / unit)} {word}"
     return f"{count:,}"

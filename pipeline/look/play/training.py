@@ -33,7 +33,7 @@ def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event) -> 
         budget: env steps of its expert.
         stop: set: end before the label is known.
     """
-    yield {"stage": "compiling", "budget": budget}
+    yield {"stage": "compiling"}
     pool, shown = Pool(budget, procedure, file.rules), monotonic()
     level_id = level_id_for(content_hashes(file.level)[0])
     run = TrainingRun(pool, file.level, np.array([level_id]))
