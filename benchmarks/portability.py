@@ -60,6 +60,7 @@ def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Itera
     while not pool.step():
         run.look()
     result, submission = run.finish(), run.submission
+    assert submission is not None
     once = replace(pool.config, replays=0)
     for at, i in enumerate(run.left.tolist()):
         verdict = result.verdicts[i]
