@@ -205,8 +205,8 @@ def _making(splits: Sequence[SplitFacts]) -> str:
         rows.append(f"| `{of.path}` | {of.budget} | {of.distribution} | `{of.config_hash}` | {stored} | {stacks} |")
     first = splits[0]
     return (
-        "## How it was made\n\nEvery level got an expert of its own, trained with PPO for at most the budget's steps, "
-        "after random play and a search had looked for a way; `witness` in the manifest says who found it. The "
+        "## How it was made\n\nAs its configuration says, each level was searched for a way to the goal, and got a PPO "
+        "expert of its own for at most the budget's env steps; `witness` in the manifest says who found the way. The "
         "manifests carry the whole configuration.\n\n" + "\n".join(rows) + "\n\n"
         "To make the levels and their experts again, or to check every byte and every witness:\n\n"
         f"    levelproof regenerate manifest=data/{first.path} budget={first.budget} out=again\n"
