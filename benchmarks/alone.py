@@ -31,7 +31,7 @@ def label(
     """
     pool = Pool(budget, procedure, rules)
     run = TrainingRun(pool, levels, level_ids, begun)
-    while run.submission is None or not pool.step():
+    while not pool.step():
         run.look()
         tell(*run.totals())
     result = run.finish()

@@ -17,6 +17,7 @@ from pipeline.errors import Failure
 from pipeline.look.cost import READ, cost_of
 from pipeline.store.manifest import read_manifest
 from pipeline.store.shard import stored_bytes
+from pipeline.words import number
 
 TARGET = 0.15  # by which wall time may be off
 SIZE, LEVELS, BUDGET = "s", "4k", "64k"
@@ -76,11 +77,10 @@ def compared(name: str, planned: Mapping[str, Any], value: float) -> dict[str, A
 
 
 def row(of: Mapping[str, Any]) -> Sequence[str]:
-    about = lambda value: f"{value:,.0f}" if value >= 1000 else f"{value:,.3g}"
     names = {"wall": "wall time, s", "hours": "core- or GPU-hours", "seconds_per_solved": "seconds a solved level"}
-    interval = f"{about(of['low'])} to {about(of['high'])}" if of["low"] < of["high"] else "-"
+    interval = f"{number(of['low'])} to {number(of['high'])}" if of["low"] < of["high"] else "-"
     name = names.get(str(of["what"]), str(of["what"]))
-    return [name, about(of["expected"]), interval, about(of["measured"]), f"{of['ratio']:.2f}"]
+    return [name, number(of["expected"]), interval, number(of["measured"]), f"{of['ratio']:.2f}"]
 
 
 def _levelproof(*words: str) -> str:

@@ -57,9 +57,10 @@ def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Itera
     """Of these levels those that are solved."""
     levels = jax.tree.map(np.asarray, sample_levels(level_ids, SIZES[size]))
     run = TrainingRun(pool, levels, level_ids)
-    while run.submission is None or not pool.step():
+    while not pool.step():
         run.look()
     result, submission = run.finish(), run.submission
+    assert submission is not None
     once = replace(pool.config, replays=0)
     for at, i in enumerate(run.left.tolist()):
         verdict = result.verdicts[i]

@@ -20,8 +20,9 @@ from experts.config import ExpertConfig
 from experts.policy import network_of
 from experts.pool import slot_count
 from experts.ppo import LevelConstants, Samples
-from experts.rollout import Manner, repeat, rollout, start
+from experts.rollout import Manner, rollout, start
 from experts.slots import empty_slots
+from experts.witness import repeat
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.actions import CHOICES, action_mask

@@ -2,8 +2,10 @@
 
 The first is the same job with `workers=1` and `workers=2`, in turns, from when its first worker has begun until
 everything is committed: the start of Ray and of Python is not in it, loading compiled programs and the end, when one
-worker has nothing left, are. The second is the scheduler alone, with workers that are simulated: as many seconds of
-its own, and bytes, as it takes to hand out all units and hear all reports.
+worker has nothing left, are. What two cores can give is measured beside it: a worker's loop alone, without Ray and
+without a driver, in one process and in two at once that share nothing; that they slow each other down is the machine's
+doing. The last is the scheduler alone, with workers that are simulated: as many seconds of its own, and bytes, as it
+takes to hand out all units and hear all reports.
 """
 
 import argparse
@@ -13,6 +15,7 @@ import tempfile
 import time
 import tracemalloc
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +26,15 @@ from benchmarks.report import Report, Table
 from configs.compose import compose_job
 from pipeline.errors import Failure
 from pipeline.jobs.progress import Board, Tally
-from pipeline.jobs.schedule import ROUND, Round, Scheduler, UnitOutcome, plan_units
+from pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, UnitOutcome, WorkUnit, plan_units
+from pipeline.runtime import own_cores, prepare_jax
 from pipeline.store.split import writing
 
 UNIT = 32  # levels
 WORKERS, UNITS = 1_000, (2_000, 20_000, 200_000)  # simulated
 SECONDS = 6.0  # that a simulated unit takes, on average; of each worker a rate of its own, so that some are slow
 POLL = 0.25  # s
+BESIDE = 8  # units of the job that a process works through alone, after one that loads its programs
 SPREAD = 0.5  # of the logarithm of those rates
 
 
@@ -55,9 +60,13 @@ def run(given: argparse.Namespace) -> Report:
     words = [f"size={given.size}", f"budget={given.budget}", f"levels={given.levels}", "first_level=1000000"]
     pairs = [tuple(given.levels / seconds_of(words, workers) for workers in (1, 2)) for _ in range(given.repeats)]
     ratios = [two / one for one, two in pairs]
+    shared = [tuple(beside(words, processes) for processes in (1, 2)) for _ in range(2 * given.repeats)]
+    most = [2 * one / two for one, two in shared]
     results = [{"workers": WORKERS, **of} for of in simulated]
     results += [{"size": given.size, "budget": given.budget, "one": one, "two": two} for one, two in pairs]
+    results += [{"size": given.size, "budget": given.budget, "alone": one, "beside": two} for one, two in shared]
     rows = [[f"{one:.2f}", f"{two:.2f}", f"{two / one:.2f}"] for one, two in pairs]
+    apart = [[f"{one:.1f}", f"{two:.1f}", f"{of:.2f}"] for (one, two), of in zip(shared, most, strict=True)]
     of_driver = [
         [
             f"{of['units']:,}",
@@ -73,13 +82,20 @@ def run(given: argparse.Namespace) -> Report:
         tables=[
             Table(("levels/s, one worker", "two workers", "ratio"), rows, f"A job of {given.levels} levels of size "
                   f"{given.size}, {given.budget} env steps each, on two cores"),
+            Table(("s, one process", "each of two at once", "two for one"), apart, f"{BESIDE} units of the job in "
+                  "processes that share nothing but the machine"),
             Table(
                 ("units", "µs of the driver a unit", "of one core, while they work", "most MB"),
                 of_driver,
                 f"The scheduler with {WORKERS:,} simulated workers, units of {UNIT} levels and {SECONDS:.0f} s",
             ),
         ],
-        notes=[f"Two workers are {np.median(ratios):.2f} times as fast as one (the median)."] if ratios else [],
+        notes=[
+            f"Two workers are {np.median(ratios):.2f} times as fast as one, two processes that share nothing "
+            f"{np.median(most):.2f} times (medians)."
+        ]
+        if ratios
+        else [],
     )  # fmt: skip
 
 
@@ -114,6 +130,47 @@ def work(words: Sequence[str], told: Any) -> None:
 
         cluster.run(job, split, scheduler, settle, board)
         told.put(time.monotonic() - scheduler.began)
+
+
+def beside(words: Sequence[str], processes: int) -> float:
+    """Seconds of each of so many processes at once, on average, each on a core of its own."""
+    context = multiprocessing.get_context("spawn")
+    told, ready = context.SimpleQueue(), context.Barrier(processes)
+    with tempfile.TemporaryDirectory() as folder:
+        each = [
+            context.Process(target=work_alone, args=([*words, f"out={folder}/{core}"], core, ready, told))
+            for core in own_cores()[:processes]
+        ]
+        for process in each:
+            process.start()
+        for process in each:
+            process.join()
+        if any(process.exitcode for process in each):
+            raise Failure("A process that works alone failed: see above.")
+    return float(np.mean([told.get() for _ in each]))
+
+
+def work_alone(words: Sequence[str], core: int, ready: Any, told: Any) -> None:
+    """The job's first units, by a worker's loop that nobody drives."""
+    prepare_jax(core)
+    from pipeline.jobs.worker import Worker  # imports what reads the settings just made
+
+    job = compose_job(words)
+    first, *units = islice(plan_units(job.level_ids, [], job.levels_per_unit), 1 + BESIDE)
+    with writing(job, print) as (split, _):
+        worker = Worker(job, split)
+        finish(worker, [first])
+        ready.wait()
+        begun = time.monotonic()
+        finish(worker, units)
+        told.put(time.monotonic() - begun)
+
+
+def finish(worker: Any, units: list[WorkUnit]) -> None:
+    """Work until these units are committed."""
+    round = worker.work(Order(units), ROUND)
+    while round.totals:
+        round = worker.work(Order([]), ROUND)
 
 
 def simulate(units: int) -> dict[str, float]:

@@ -20,10 +20,11 @@ from experts import ppo, progress, stop
 from experts.config import ExpertConfig
 from experts.policy import ActorCritic, network_of
 from experts.ppo import LevelConstants, Samples
-from experts.rollout import Acting, Manner, Trajectory, repeat, rollout, start
+from experts.rollout import Acting, Manner, Trajectory, rollout, start
 from experts.slots import LevelQueue, Mode, Report, Slot, Slots, Training, Trial, lanes_of
 from experts.stop import StopRules
 from experts.success import find, remember
+from experts.witness import repeat
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task.actions import action_mask

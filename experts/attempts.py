@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 from experts.config import ExpertConfig
 from experts.policy import network_of
-from experts.rollout import Manner, repeat, rollout, start
+from experts.rollout import Manner, rollout, start
+from experts.witness import repeat
 from levelgen.level import Level
 from levelgen.task.actions import CHOICES
 from levelgen.task.rules import TaskParams

@@ -29,8 +29,7 @@ def decide(levels: Level, rules: TaskParams) -> Before:
     falls = np.flatnonzero(facts.reaches)
     if len(falls):
         idle = replay(take(levels, falls), np.zeros((RECORD_STEPS, ACTIONS, len(falls)), np.int32), rules)
-        done = np.asarray(idle.done)
-        for i, solved, steps in zip(falls, succeeds(done, idle.goal), steps_to_goal(done), strict=True):
+        for i, solved, steps in zip(falls, succeeds(idle.done, idle.goal), steps_to_goal(idle.done), strict=True):
             if solved:
                 verdicts[i] = untrained(Label.TRIVIAL, trivial_reason(int(steps)), False, Source.NOTHING, int(steps))
     for i in np.flatnonzero(facts.proof != Proof.NONE):

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from experts.labels import Source
+from experts.ledger import Lap
 from experts.procedure import Procedure
 from experts.scout import scout
 from experts.search.search import Searched, Searching
@@ -53,7 +54,12 @@ class Looking:
     """Levels in which scouts have looked, and in which a search goes on where they found nothing."""
 
     def __init__(
-        self, levels: Level, level_ids: Int[np.ndarray, " level"], procedure: Procedure, rules: TaskParams
+        self,
+        levels: Level,
+        level_ids: Int[np.ndarray, " level"],
+        procedure: Procedure,
+        rules: TaskParams,
+        searching: Searching,
     ) -> None:
         """
         Args:
@@ -61,6 +67,7 @@ class Looking:
             level_ids: their ids, the seeds of all randomness.
             procedure: how long to look.
             rules: of the task.
+            searching: where levels are searched, perhaps beside others.
         """
         scouted = scout(levels, level_ids, procedure.scout, rules)
         source = [Source.SCOUT if length else Source.EXPLORATION for length in scouted.success.length]
@@ -69,24 +76,22 @@ class Looking:
         )
         self._left = np.flatnonzero(scouted.success.length == 0)
         some = take(levels, self._left), level_ids[self._left]
-        searches = procedure.search.env_steps and len(self._left)
-        self._searching = Searching(*some, procedure.search, rules) if searches else None
+        self._searching = searching
+        self._sought = searching.submit(*some) if procedure.search.env_steps and len(self._left) else None
+        self.took = self._sought.took if self._sought else Lap()  # so far, of the search
 
     @property
     def env_steps(self) -> int:
         """So far, of scouts and search."""
-        searched = self._searching.env_steps if self._searching else int(self.found.search_steps.sum())
+        searched = self._sought.env_steps if self._sought else int(self.found.search_steps.sum())
         return int(self.found.scout_steps.sum()) + searched
 
-    def step(self) -> bool:
-        """Search a little further; whether there is anything left to search."""
-        if self._searching is None:
-            return False
-        if self._searching.step():
-            return True
-        self._take(self._searching.result())
-        self._searching = None
-        return False
+    def ended(self) -> bool:
+        """Whether nothing is left to search: then `found` has what came of it."""
+        if self._sought and not self._sought.left:
+            self._take(self._searching.result(self._sought))
+            self._sought = None
+        return self._sought is None
 
     def _take(self, searched: Searched) -> None:
         """Put in what the search found."""

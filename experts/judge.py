@@ -24,7 +24,7 @@ class Evaluation(NamedTuple):
     done: Bool[np.ndarray, "256 environment"]
     goal: Bool[np.ndarray, "256 environment"]
     progress: Progress  # of training until then
-    success: Success  # the first of training
+    success: Success  # the first: a scout's or a search's, else training's
 
 
 class Kept(NamedTuple):
@@ -169,7 +169,7 @@ def shares(evaluation: Evaluation, config: ExpertConfig) -> tuple[float, float, 
     starts with other velocities. One that has not ended within the record did not succeed. NaN: no such attempts.
     """
     done, goal = evaluation.done, evaluation.goal
-    first = np.where(done.any(0), goal[np.argmax(done, 0), np.arange(done.shape[1])], False)
+    first = done.any(0) & goal[np.argmax(done, 0), np.arange(done.shape[1])]
     sampled = first[1 if config.attempts > 1 else 0 : config.attempts]
     sticky = first[config.attempts : config.attempts + config.sticky_attempts]
     moved = first[config.attempts + config.sticky_attempts :][: config.moved_attempts]

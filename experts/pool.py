@@ -23,6 +23,7 @@ from experts.ledger import Lap, Ledger, Steps, lap
 from experts.paused import Paused
 from experts.procedure import Procedure
 from experts.queue import GROUP, empty_queue, enter, next_indices
+from experts.search.search import Searching
 from experts.slots import Begun, LevelQueue, Mode, Pending, Report, Slots, empty_slots
 from experts.stop import rules_of
 from experts.witness import at_once, take
@@ -78,13 +79,14 @@ class Submission:
 
 
 class Pool:
-    """Slots and the queue before them. All that trains in it has one procedure and one budget."""
+    """Slots and the queue before them, and the search before that. All in it has one procedure and one budget."""
 
     def __init__(self, budget: int, procedure: Procedure, rules: TaskParams) -> None:
         """`budget` are env steps of an expert. Raises ValueError as `check_budget`."""
         check_budget(budget, procedure.expert, procedure.stop)
         self.procedure, self.config, self.rules = procedure, procedure.expert, rules
         self.updates = self.config.updates_in(budget)
+        self.searching = Searching(procedure.search, rules)
         self._stopping = rules_of(procedure.stop, self.config)
         self._shaped = replace(rules, dense_reward_scale=self.config.dense_reward_scale)
         self._slots: Slots | None = None  # these two are there once the first levels have come
@@ -122,19 +124,26 @@ class Pool:
         return submission
 
     def step(self) -> list[Submission]:
-        """Take every slot a rollout further, if there is a level; the submissions that have finished.
+        """Search a step further, if there is anything to search and too few levels wait for slots; else take every slot
+        a rollout further, if there is a level. The submissions that have finished.
 
         An exception leaves the pool useless: its slots were used up.
         """
-        if any(submission.under_way for submission in self._submissions):
+        searched = self._short and self.searching.step()
+        if not searched and any(submission.under_way for submission in self._submissions):
             self._advance()
         finished = [submission for submission in self._submissions if not submission.under_way]
         self._submissions = [submission for submission in self._submissions if submission.under_way]
         return finished
 
+    def wants(self, searched: int) -> int:
+        """Levels to submit or to search, so that no slot and no row of the search is empty for a while; of so many
+        that are searched, and those that wait for it, all may come to the slots."""
+        return max(self._short - searched, self.searching.wants, 0)
+
     @property
-    def wants(self) -> int:
-        """Levels by which as many would wait as there are slots: with them none is empty for a while."""
+    def _short(self) -> int:
+        """Levels by which as many would wait as there are slots."""
         come = int(self._queue.come) if self._queue else 0
         waiting = come - self._taken + sum(len(some) for _, some in self._coming)
         return max(0, slot_count(self.config) - waiting)
@@ -251,7 +260,7 @@ class Pool:
         else:
             submission.evaluated_rollouts[i] += 1
         if seen.evaluated[slot]:
-            submission.evaluations[i].append(evaluation_of(self._slots, slot, self.config))
+            submission.evaluations[i].append(evaluation_of(self._slots, slot))
         if seen.left[slot]:
             if submission.keep:
                 submission.experts[i] = Kept(expert_of(self._slots, slot, self.config), submission.curves[i])
@@ -278,7 +287,7 @@ def expert_of(slots: Slots, slot: int, config: ExpertConfig) -> Begun:
     return jax.device_get(Begun(_row(slots.slot.training, slot), take(slots.acting, lanes)))
 
 
-def evaluation_of(slots: Slots, slot: int, config: ExpertConfig) -> Evaluation:
+def evaluation_of(slots: Slots, slot: int) -> Evaluation:
     """What the evaluation that has just ended in a slot showed."""
     shown = slots.slot.trial, slots.slot.training.progress, slots.slot.training.success
     trial, progress, success = jax.device_get(_row(shown, slot))

@@ -4,20 +4,19 @@ Lane `i * environments + j` is environment j of level i.
 """
 
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from experts.policy import ActorCritic, forward, log_probability, most_probable, sample
+from experts.witness import repeat
 from levelgen.level import Level
 from levelgen.task import rules as task
 from levelgen.task.actions import CHOICES, action_mask
 from levelgen.task.observe.flat import state_features
 from levelgen.task.rules import TaskParams, TaskState
-
-T = TypeVar("T")
 
 
 class Acting(NamedTuple):
@@ -47,11 +46,6 @@ class Trajectory(NamedTuple):
     done: Bool[Array, "time level environment"]
     goal: Bool[Array, "time level environment"]
     timestep: Int[Array, "time level environment"]  # env steps of the episode before this one
-
-
-def repeat(tree: T, environments: int) -> T:
-    """Each level in as many neighbouring lanes."""
-    return jax.tree.map(lambda x: jnp.repeat(x, environments, axis=-1), tree)
 
 
 def start(lanes: Level) -> Acting:

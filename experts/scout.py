@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key
 
 from experts.config import RECORD_STEPS, ScoutConfig
-from experts.rollout import repeat
-from experts.success import Success, no_success
-from experts.witness import at_once, blocks, take
+from experts.success import Success, ending_at, no_success
+from experts.witness import at_once, blocks, repeat, take
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task import rules as task
@@ -105,6 +104,4 @@ def shortest(
     length = jnp.where(goal, timestep + 1, RECORD_STEPS + 1)
     time, lane = jnp.divmod(jnp.argmin(length.reshape(-1)), length.shape[1])
     steps = jnp.where(goal.any(), length[time, lane], 0)
-    row = jnp.arange(RECORD_STEPS)
-    taken = action[jnp.clip(time + 1 - steps + row, 0, RECORD_STEPS - 1), :, lane]
-    return Success(jnp.where((row < steps)[:, None], taken, 0).astype(jnp.int8), steps.astype(jnp.int32))
+    return ending_at(action, time, lane, steps)

@@ -17,9 +17,10 @@ from experts.config import RECORD_STEPS, ExpertConfig
 from experts.policy import Constant, network_of
 from experts.ppo import TrainState
 from experts.progress import Progress
-from experts.rollout import Acting, repeat, start
+from experts.rollout import Acting, start
 from experts.stop import Course
 from experts.success import Success
+from experts.witness import repeat
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task.actions import CHOICES

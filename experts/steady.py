@@ -17,6 +17,7 @@ from experts.search.play import arena, fresh_walk
 from experts.search.polish import varied
 from experts.search.shorten import Shortened, replayed
 from experts.success import Success
+from experts.witness import repeat
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task.actions import action_mask
@@ -53,7 +54,7 @@ def steady(
     level, lane, step = jnp.arange(count), jnp.arange(LANES), jnp.arange(RECORD_STEPS)
     live = action_mask(levels).T
     ring, crowd = arena(levels, LANES, (1.0,)), arena(levels, KEPT * STARTS, (1.0,))
-    few = arena(levels, STARTS, (1.0,)).lanes
+    few = repeat(levels, STARTS)
     keys = jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, Stream.SEARCH), 3))(level_ids)
 
     def one(now: Steadying) -> Steadying:

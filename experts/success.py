@@ -46,7 +46,13 @@ def find(
     at = jnp.argmax(usable.reshape(-1))
     time, environment = jnp.divmod(at, goal.shape[1])
     steps = jnp.where(usable.any(), length[time, environment], 0)
-    first = len(recent) - len(goal) + time + 1 - steps
+    return ending_at(recent, len(recent) - len(goal) + time, environment, steps)
+
+
+def ending_at(
+    action: Int[Array, "time 6 lane"], time: Int[Array, ""], lane: Int[Array, ""], steps: Int[Array, ""]
+) -> Success:
+    """So many actions of a lane, the last of them at this time; 0: there is no success."""
     row = jnp.arange(RECORD_STEPS)
-    action = recent[jnp.clip(first + row, 0, len(recent) - 1), :, environment]
-    return Success(jnp.where((row < steps)[:, None], action, 0).astype(jnp.int8), steps.astype(jnp.int32))
+    taken = action[jnp.clip(time + 1 - steps + row, 0, len(action) - 1), :, lane]
+    return Success(jnp.where((row < steps)[:, None], taken, 0).astype(jnp.int8), steps.astype(jnp.int32))

@@ -70,17 +70,18 @@ class TrainingRun:
         new = ~np.isin(self.level_ids[self.left], list(self._paused))
         self._order = np.argsort(np.r_[np.flatnonzero(new), np.flatnonzero(~new)])  # of new ones and others, as left
         with self.ledger.timing("search"):
-            self.looking = Looking(*self._some(self.left[new]), pool.procedure, pool.rules)
+            self.looking = Looking(*self._some(self.left[new]), pool.procedure, pool.rules, pool.searching)
         self.submission: Submission | None = None  # of those that an expert is asked for
         self._gone: set[int] = set()  # ids of levels that others label
         self.look()
 
     def look(self) -> None:
-        """Search a little further; submit to the pool once there is nothing left to search."""
+        """Let experts begin, once there is nothing left to search."""
         if self.submission is None:
             with self.ledger.timing("search"):
-                looking = self.looking.step()
-            if not looking:
+                ended = self.looking.ended()
+            if ended:
+                self.ledger.add("search", self.looking.took)
                 self._submit()
 
     def _submit(self) -> None:

@@ -91,6 +91,11 @@ def take(tree: T, lanes: np.ndarray) -> T:
     return jax.tree.map(lambda x: x[..., lanes], tree)
 
 
+def repeat(tree: T, lanes: int) -> T:
+    """Each level in as many neighbouring lanes."""
+    return jax.tree.map(lambda x: jnp.repeat(x, lanes, axis=-1), tree)
+
+
 @partial(jax.jit, static_argnames="rules")
 def _replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskParams) -> Record:
     def act(carry: tuple[TaskState, Manifold], action):

@@ -16,6 +16,7 @@ from pathlib import Path
 from loky import cpu_count
 
 from pipeline.compiled import remove_damaged
+from pipeline.errors import Exit
 from pipeline.owned import own_folder
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
@@ -29,7 +30,6 @@ XLA_FLAGS = (
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 GRACE = 20.0  # s that workers have, when a job is to end, to commit what they can
 LAST = 28.0  # s after which it has ended; batch systems kill after 30
-INTERRUPTED = 130  # exit code, as shells have it
 CLAIMING = 2.0  # s of trying to get a core
 CLAIMS: list[socket.socket] = []  # of this process
 MIN_COMPILE_SECONDS = 0.2  # what compiles faster is not worth a file
@@ -90,7 +90,7 @@ def stoppable() -> Iterator[threading.Event]:
     """Whether SIGTERM or Ctrl-C asked for the end. Asked twice, it comes at once; and after `LAST` s, come what may:
     what is compiled hears of no signal."""
     asked = threading.Event()
-    clock = threading.Timer(LAST, os._exit, [INTERRUPTED])
+    clock = threading.Timer(LAST, os._exit, [Exit.INTERRUPTED])
     clock.daemon = True
 
     def stop(*_: object) -> None:

@@ -1,6 +1,11 @@
 """How numbers are told to people."""
 
 
+def number(value: float) -> str:
+    """`0.383`, `12.3`, `12,345`: three digits, and all before the point."""
+    return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
+
+
 def duration(seconds: float) -> str:
     """`45 s`, `3 min`, `2.5 h`."""
     if seconds < 90:

@@ -74,10 +74,8 @@ def visit(archive: Archive, chosen: Int[Array, "level lane"], active: Bool[Array
     return archive._replace(visits=archive.visits + jnp.where(active[:, None], counts, 0))
 
 
-def insert(
-    archive: Archive, new: Reached, valid: Bool[Array, "level lane"], config: SearchConfig
-) -> tuple[Archive, Bool[Array, " level"]]:
-    """Put in what is new, or reached in fewer env steps; and whether all of it fitted. If not, cells become wider."""
+def insert(archive: Archive, new: Reached, valid: Bool[Array, "level lane"], config: SearchConfig) -> Archive:
+    """Put in what is new, or reached in fewer env steps. Where not all of it fits, cells become wider."""
     key = keys_of(new.feature, archive.width)
     slot, fits = jax.vmap(slots_for)(archive.used, archive.key, archive.entry.steps, key, new.steps, valid)
     level = jnp.arange(len(key))[:, None]
@@ -90,7 +88,7 @@ def insert(
         visits=put(archive.visits, 0),
         cells=archive.cells + (used & ~archive.used).sum(-1),
     )
-    return widen(archive, ~fits, config), fits
+    return widen(archive, ~fits, config)
 
 
 def slots_for(

@@ -33,7 +33,6 @@ class Search:
     archive: Archive
     env_steps: Int[Array, " level"]  # of all lanes
     grew: Int[Array, " level"]  # env steps when the last cell entered the archive
-    full: Bool[Array, " level"]  # whether cells have ever been made wider, because the archive was full
     code: UInt16[Array, "level step"]  # actions of the success, each as one number
     length: Int[Array, " level"]  # of the success, env steps; 0: there is none
 
@@ -68,7 +67,7 @@ def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, 
     )
     key = jax.vmap(lambda level_id: key_for(level_id, Stream.SEARCH))(level_ids)
     none, code = jnp.zeros(count, jnp.int32), jnp.zeros((count, room), jnp.uint16)
-    return Search(levels, key, new_archive(start, config), none, none, none.astype(bool), code, none)
+    return Search(levels, key, new_archive(start, config), none, none, code, none)
 
 
 @partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="search")
@@ -89,17 +88,17 @@ def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: Task
     drawn = jnp.where(ring.live, decode(chance.code.reshape(-1)), 0)
     walk = walk._replace(action=jnp.where(chance.anew.reshape(-1), drawn, walk.action))
 
-    def one(carry: tuple[Archive, Walk, Array, Array], bits: Array) -> tuple[tuple, None]:
-        archive, walk, code, full = carry
+    def one(carry: tuple[Archive, Walk, Array], bits: Array) -> tuple[tuple, None]:
+        archive, walk, code = carry
         before = walk.timestep
         walk, played = play(ring, walk, bits, rules)
         code = written(code, played, before // config.segment)
         come, valid = reached_by(walk, code, ring, config)
-        archive, fits = insert(archive, come, valid & active[:, None], config)
-        return (archive, walk, code, full | ~fits), None
+        archive = insert(archive, come, valid & active[:, None], config)
+        return (archive, walk, code), None
 
-    carry = visit(search.archive, chosen, active), walk, code, search.full
-    archive, walk, code, full = jax.lax.scan(one, carry, bits)[0]
+    carry = visit(search.archive, chosen, active), walk, code
+    archive, walk, code = jax.lax.scan(one, carry, bits)[0]
 
     env_steps = search.env_steps + jnp.where(active, config.steps_per_round, 0)
     level, length = jnp.arange(len(active)), length_of(walk, rules).reshape(len(active), -1)
@@ -111,7 +110,6 @@ def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: Task
         archive=archive,
         env_steps=env_steps,
         grew=jnp.where(archive.cells > search.archive.cells, env_steps, search.grew),
-        full=full,
         code=jnp.where(won[:, None], code.reshape(len(active), config.lanes, -1)[level, lane], search.code),
         length=jnp.where(won, length[level, lane], search.length),
     )

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
 from experts.config import RECORD_STEPS
 from experts.search.near import Goals, goals_of
+from experts.witness import repeat
 from levelgen.level import ACTIONS, Level, Role
 from levelgen.task.actions import CHOICES, action_mask, controls
 from levelgen.task.rules import TaskParams, has_nan, has_roles
@@ -51,7 +52,7 @@ def most_steps(rules: TaskParams) -> int:
 def arena(levels: Level, lanes: int, redrawn: tuple[float, ...]) -> Arena:
     """Each level in `lanes` neighbouring lanes, an equal share of them for each chance."""
     count = levels.role.shape[-1]
-    spread = jax.tree.map(lambda x: jnp.repeat(x, lanes, axis=-1), levels)
+    spread = repeat(levels, lanes)
     chance = jnp.tile(jnp.repeat(jnp.array(redrawn, jnp.float32), lanes // len(redrawn)), count)
     touching = contacts(spread, Role.BLUE), contacts(spread, Role.RED)
     return Arena(spread, action_mask(spread), *touching, goals_of(spread), chance)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from experts.config import RECORD_STEPS
 from experts.search.play import CODES, Arena, Walk, arena, decode
-from experts.search.shorten import Shortened, drawn, edited, replayed
+from experts.search.shorten import Shortened, below, drawn, edited, ended, replayed
 from experts.success import Success
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import ACTIONS, Level
@@ -77,8 +77,7 @@ def polish(
     none = jnp.zeros(count, jnp.int32)
     start = Polishing(success, jnp.full(count, jnp.inf, jnp.float32), none, jnp.int32(0))
     end = jax.lax.while_loop(lambda now: active(now).any(), one, start)
-    action = jnp.where((jnp.arange(RECORD_STEPS) < end.success.length[:, None])[:, :, None], end.success.action, 0)
-    return Shortened(Success(action, end.success.length), end.env_steps)
+    return Shortened(ended(*end.success), end.env_steps)
 
 
 def varied(
@@ -88,7 +87,6 @@ def varied(
 
     Only `live` entries are drawn, those that have an effect.
     """
-    below = lambda bits, bound: (bits % jnp.maximum(bound, 1).astype(jnp.uint32)).astype(jnp.int32)
     edit = drawn(bits[:6], length)
     redraws, edits = bits[6] >> 31 == 1, (bits[6] >> 29) % 4 > 0
     edit = jax.tree.map(lambda x: jnp.where(edits | ~redraws, x, 0), edit)

@@ -71,15 +71,22 @@ def shorten(
         return Success(kept, steps), env_steps + config.lanes * best.length
 
     best, env_steps = jax.lax.fori_loop(0, config.trials, trial, (success, jnp.zeros(count, jnp.int32)))
-    length = jnp.where(best.length > RECORD_STEPS, 0, best.length)
-    step = jnp.arange(RECORD_STEPS)
-    action = jnp.where((step < length[:, None])[:, :, None], best.action, 0)
-    return Shortened(Success(action, length), env_steps)
+    return Shortened(ended(best.action, jnp.where(best.length > RECORD_STEPS, 0, best.length)), env_steps)
+
+
+def ended(action: Int[Array, "level 256 6"], length: Int[Array, " level"]) -> Success:
+    """Successes of these lengths, with zeros after their ends."""
+    inside = jnp.arange(RECORD_STEPS) < length[:, None]
+    return Success(jnp.where(inside[:, :, None], action, 0), length)
+
+
+def below(bits: UInt32[Array, " lane"], bound: Int[Array, "*lane"]) -> Int[Array, " lane"]:
+    """Random numbers from 0 to below a bound, 0 where that is 0."""
+    return (bits % jnp.maximum(bound, 1).astype(jnp.uint32)).astype(jnp.int32)
 
 
 def drawn(bits: UInt32[Array, "6 lane"], length: Int[Array, ""]) -> Edit:
     """Random changes: a quarter leave out a beginning, half hold nothing."""
-    below = lambda bits, bound: (bits % jnp.maximum(bound, 1).astype(jnp.uint32)).astype(jnp.int32)
     stretch = lambda bits: jnp.maximum(length >> below(bits, jnp.int32(MOST_HALVINGS + 1)), 1)
     first = jnp.where(bits[0] >> 30 == 0, 0, below(bits[1], length))
     holds = bits[0] >> 31 == 1

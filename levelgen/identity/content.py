@@ -1,6 +1,6 @@
 """What a level consists of, and a hash of it that does not depend on how its things are numbered and named.
 
-What counts as content and what does not: docs/levels.md, Identity. Levels with the same hash have the same content,
+What counts as content and what does not: docs/levels.md. Levels with the same hash have the same content,
 but for the chance of 128 bits. Levels with the same content have the same hash, unless they have exact copies of a
 body, at one position with one motion, that are joined alike as well: their hash may depend on how the copies are
 numbered. No sampled and no handmade level has such copies. Numpy on the host.

@@ -1,4 +1,4 @@
-"""Which levels look nearly the same: a coarse hash of what a picture shows. docs/levels.md, Identity.
+"""Which levels look nearly the same: a coarse hash of what a picture shows. docs/levels.md.
 
 Two levels that differ by little may still lie on two sides of a border between steps. So there are two hashes, of two
 grids half a step apart: where one has a border, the other has none.

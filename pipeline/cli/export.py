@@ -56,6 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     split, level_id, where, out = arguments.split, arguments.level_id, arguments.where, arguments.out
+    if arguments.actions and arguments.format != "minari":
+        raise UserError(f"--actions is for --format minari: leave it out for {arguments.format}.")
     if arguments.format == JSON:
         if level_id is None or where is not None:
             raise UserError(
@@ -73,6 +75,4 @@ def run(arguments: argparse.Namespace) -> None:
         )
     if out is None:
         raise UserError(f"Where to? Name what to write with -o, as in -o {arguments.format}.")
-    if arguments.actions and arguments.format != "minari":
-        raise UserError(f"--actions is for --format minari: leave it out for {arguments.format}.")
     FORMATS[arguments.format](split, where, out, *filter(None, [arguments.actions]))

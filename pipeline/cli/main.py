@@ -26,8 +26,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; its exit code."""
     arguments = _parser().parse_args(argv)
     warnings.showwarning = lambda message, *_: print(f"Warning: {message}", file=sys.stderr)
+    code = int(Exit.DONE)
     try:
-        return int(arguments.run(arguments) or Exit.DONE)
+        code = int(arguments.run(arguments) or Exit.DONE)
+        sys.stdout.flush()  # here, where a pipe that is closed is no error
+        return code
     except (LevelproofError, ConfigError) as error:
         if arguments.debug:
             raise
@@ -36,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return Exit.INTERRUPTED
     except BrokenPipeError:  # `levelproof inspect ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return Exit.DONE
+        return code
     except Exception as error:
         if arguments.debug:
             raise

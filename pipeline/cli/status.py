@@ -24,6 +24,6 @@ def run(arguments: argparse.Namespace) -> None:
     from pipeline.look.watch import watch
 
     if arguments.watch:
-        watch(arguments.split, arguments.json, Console())
+        watch(arguments.split, arguments.json, Console(markup=False))
     else:
         status(arguments.split, arguments.json)

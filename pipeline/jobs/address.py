@@ -23,7 +23,7 @@ def require_reachable(address: str) -> None:
     if found := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
         try:
             socket.create_connection((found[1].strip("[]"), int(found[2])), REACH).close()
-        except (OSError, OverflowError) as error:
+        except (OSError, OverflowError, UnicodeError) as error:  # no such port, and what can be no host's name
             raise no_cluster(getattr(error, "strerror", None) or str(error)) from error
 
 

@@ -212,7 +212,10 @@ class Crew:
             return []
         ray.wait([*asked], timeout=POLL)  # for the first
         ready, _ = ray.wait([*asked], num_returns=len(asked), timeout=0)
-        outcomes = [outcome for reference in ready for outcome in self._hear(asked[reference])]
+        outcomes: list[UnitOutcome] = []
+        for handle in (asked[reference] for reference in ready):
+            if handle.answer is not None:  # else it has ended: one beside it was refused, and with it its machine
+                outcomes += self._hear(handle)
         for handle in self._scheduler.silent(time.monotonic() - MOST_SILENT):
             outcomes += self._lose(handle, f"The worker on {handle.host} was silent for {duration(MOST_SILENT)}")
         self._give_up()

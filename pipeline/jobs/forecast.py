@@ -5,6 +5,7 @@ replacement, and the scatter of those that are yet to come.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.store.merge import FILE_BYTES
 from pipeline.store.seal import ROWS
+from pipeline.words import number
 
 DRAWS = 2000
 LIKELY = 0.9  # of an interval
@@ -50,9 +52,8 @@ class Guess:
     low: float
     high: float
 
-    def told(self, scale: float = 1.0, form: str = ",.3g") -> str:
-        shown = (format(value / scale, form) for value in (self.expected, self.low, self.high))
-        return "{} ({} to {})".format(*shown)
+    def told(self, scale: float = 1.0, tell: Callable[[float], str] = number) -> str:
+        return "{} ({} to {})".format(*(tell(value / scale) for value in (self.expected, self.low, self.high)))
 
 
 @dataclass(frozen=True)

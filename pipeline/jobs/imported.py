@@ -87,7 +87,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
             raise
         except FormatError as error:
             raise Failure(f"Cannot go on with {folder}: {error}; mend it, and the same command goes on.") from None
-        manifest = read_manifest(split, ["label", "label_reason"])
+        manifest = read_manifest(split, ["label"])
         note_job(split, job, command, runs(manifest.level_ids))
         _closing(found, split, manifest)
     return Exit.DONE
@@ -138,7 +138,7 @@ def _import(
 ) -> list[str]:
     """Commit a part; the reasons why some of it is left out."""
     ids = part.unit.level_ids
-    found = read_trajectories(part.array, folder.size, part.first, part.first + len(ids))
+    found = read_trajectories(part.array, part.first, part.first + len(ids))
     good = np.flatnonzero([not what for what in found.wrong])
     files = [_file(folder, part.array, part.first + i) for i in range(len(ids))]
     wrong = [(file, what) for file, what in zip(files, found.wrong, strict=True) if what]

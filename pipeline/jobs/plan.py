@@ -15,7 +15,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from configs.numbers import parse_count
 from configs.schema import MOST_FRAME_SKIP, JobConfig
 from experts.labels import WITNESSED, Label
 from experts.steps import Seconds
@@ -48,7 +47,7 @@ def plan(job: JobConfig, as_json: bool, console: Console) -> None:
     if job.level_files:
         raise UserError("plan is for random levels: of level files, `generate` labels a few, and `inspect` tells more.")
     sample = measured(job, console)
-    found = forecast(sample, parse_count(job.levels, "levels"), job.workers or sample.workers)
+    found = forecast(sample, len(job.level_ids), job.workers or sample.workers)
     if as_json:
         of = {"levels": len(sample.busy), "workers": sample.workers, "wall": sample.wall, "once": sample.once}
         print(json.dumps(found.as_json() | {"device": sample.device, "sample": of, "likely": LIKELY}, indent=2))
@@ -62,7 +61,7 @@ def told(job: JobConfig, sample: Sample, of: Forecast) -> list[str]:
     lines = {
         "wall time": f"{of.wall.told(scale)} {unit} with {of.workers} workers",
         f"{sample.device}-hours": of.hours.told(),
-        "solved levels": of.solved.told(form=",.0f"),
+        "solved levels": of.solved.told(tell="{:,.0f}".format),
         f"{sample.device}-seconds a solved level": of.seconds_per_solved.told() if of.seconds_per_solved else "unknown",
         **{
             f"GB, density={name}": f"{of.bytes[name].told(1e9)} in {of.files[name]:,} files, sealed"
@@ -81,7 +80,7 @@ def told(job: JobConfig, sample: Sample, of: Forecast) -> list[str]:
 
 def measured(job: JobConfig, console: Console, seconds: float = SECONDS) -> Sample:
     """What some of a job's first levels take here: a few that say how many are made in so many seconds, then those."""
-    levels, unit = parse_count(job.levels, "levels"), job.levels_per_unit
+    levels, unit = len(job.level_ids), job.levels_per_unit
     here = 1 if job.executor == "inline" else min(job.workers or len(own_cores()), len(own_cores()))
     with TemporaryDirectory(prefix="levelproof-plan-") as folder, _told(console, seconds):
         split, begun = split_path(folder, job.budget, job.size), time.monotonic()

@@ -1,13 +1,15 @@
 """A split's levels again, at another budget: `levelproof regenerate manifest=data/256k/s budget=1M`."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from configs.compose import compose_job, words_for
 from configs.schema import from_files
+from experts.procedure import Procedure
 from levelgen.identity.keys import SAMPLER_VERSION
 from pipeline.errors import Exit, UserError
 from pipeline.jobs.generate import generate
@@ -17,6 +19,8 @@ from pipeline.store.origins import origins_of
 
 OWN = ("manifest", "where", "continue")  # words that are not settings of a job
 NOT_OURS = ("size", "levels", "first_level", "level_files")  # settings that the manifest decides
+# Presets, and the groups of settings that each decides
+PRESETS = {"procedure": {field.name for field in fields(Procedure)}, "distribution": {"distribution"}}
 HINT = "as in levelproof regenerate manifest=data/256k/s budget=1M where=\"label = 'unsolved'\""
 
 
@@ -43,7 +47,7 @@ def regenerate(words: Sequence[str], console: Console) -> Exit:
         raise UserError(f"The condition {own.get('where')!r} holds for none of the {len(manifest.level_ids)} levels.")
     goes_on = [f"continue_from={source}"] if own.get("continue") == "true" else []
     of_files = [f"level_files={source}"] if from_files(config) else []
-    job = replace(compose_job([*words_for(config), *settings, *goes_on, *of_files]), size=config["size"])
+    job = replace(compose_job([*kept_words(config, settings), *settings, *goes_on, *of_files]), size=config["size"])
     origins = origins_of(source, level_ids) if of_files else None
     return generate(job, ["levelproof", "regenerate", *words], console, level_ids, origins)
 
@@ -66,3 +70,10 @@ def split_words(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     if own.get("continue", "false") not in ("true", "false"):
         raise UserError(f"continue is {own['continue']}: it must be true or false.")
     return own, [word for word in words if word.partition("=")[0] not in OWN]
+
+
+def kept_words(config: Mapping[str, Any], settings: Sequence[str]) -> list[str]:
+    """The settings that the manifest was made with, but for the groups of which `settings` name a preset."""
+    named = {word.partition("=")[0] for word in settings}
+    replaced = set[str]().union(*(groups for preset, groups in PRESETS.items() if preset in named))
+    return [word for word in words_for(config) if word.partition(".")[0] not in replaced]

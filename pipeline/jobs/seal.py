@@ -143,5 +143,5 @@ class Sealer:
             return
         self._broken = True
         reason = str(error) if isinstance(error, LevelproofError) else f"{type(error).__name__}: {error}"
-        split = as_typed(self._split)
+        split = shlex.quote(as_typed(self._split))
         self._tell(f"Not sealed ({reason.rstrip('.')}): `levelproof seal {split}` seals it when this has ended.")

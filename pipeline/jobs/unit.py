@@ -100,7 +100,7 @@ def check_witnesses(result: UnitResult, task: TaskParams) -> None:
         Failure: one is not, or does not.
     """
     again = replay(result.levels, result.record.action, task)
-    wrong, reached = unlike_fields(result.record, again), succeeds(np.asarray(again.done), np.asarray(again.goal))
+    wrong, reached = unlike_fields(result.record, again), succeeds(again.done, again.goal)
     for i, (level_id, verdict) in enumerate(zip(result.level_ids, result.verdicts, strict=True)):
         if verdict.label not in WITNESSED:
             continue

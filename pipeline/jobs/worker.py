@@ -44,7 +44,7 @@ class Worker:
             return self.leave(outcomes, cuts)
         now = {unit: run.totals() for unit, run in self._runs.items()}
         plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}  # for a driver without JAX
-        wants = max(0, self._pool.wants - sum(run.searching for run in self._runs.values()))
+        wants = self._pool.wants(sum(run.searching for run in self._runs.values()))
         return Round(outcomes, plain, wants, sum(len(run.unbegun) for run in self._runs.values()), cuts)
 
     def leave(self, outcomes: Sequence[UnitOutcome] = (), cuts: Sequence[Cut] = ()) -> Round:
@@ -91,11 +91,11 @@ class Worker:
         return None
 
     def _step(self) -> list[UnitOutcome]:
-        """A step of every search and a rollout of every expert; the outcomes of the units that it finished."""
+        """A step of the search or a rollout of every expert; the outcomes of the units that it finished."""
         try:
+            finished = self._pool.step()
             for run in self._runs.values():
                 run.look()
-            finished = self._pool.step()
         except Exception as error:
             units = list(self._runs)
             self._runs, self._pool = {}, pool_for(self._job)

@@ -5,6 +5,7 @@ from its manifest; a person is asked only for what no program can decide, the li
 """
 
 import io
+import shlex
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -64,11 +65,11 @@ def card(splits: Sequence[Path], out: Path | None, wishes: Wishes) -> None:
     if not wishes.license:
         print("It names no licence: choose one with --license, such as cc-by-4.0 or mit.")
     excluded = '--exclude "*.lock" --exclude "*/job.json" --exclude "*/events/*" --exclude "*/.*"'
-    print(f"Next:  hf upload {wishes.repo or 'USER/NAME'} {folder} . --repo-type dataset {excluded}")
+    print(f"Next:  hf upload {wishes.repo or 'USER/NAME'} {shlex.quote(str(folder))} . --repo-type dataset {excluded}")
 
 
 def _require_ours(out: Path) -> None:
-    if out.exists() and MARK not in out.read_text(encoding="utf-8", errors="replace"):
+    if out.exists() and not (out.is_file() and MARK in out.read_text(encoding="utf-8", errors="replace")):
         raise UserError(f"{out} is there already, and `levelproof card` did not write it: name another file with -o.")
 
 

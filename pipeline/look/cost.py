@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from experts.labels import Label
 from experts.steps import Seconds
+from pipeline.words import number
 
 READ = ("label", "device", "seconds")  # columns that this is from
 
@@ -45,5 +46,5 @@ def cost_told(cost: dict[str, Any]) -> str:
     """In words, after `cost: `."""
     total, each = sum(cost["seconds"].values()), cost["per_solved"]
     shares = ", ".join(f"{part / total:.0%} {stage}" for stage, part in cost["seconds"].items() if total)
-    solved = "" if each is None else f", {each:.3g} a solved level"
+    solved = "" if each is None else f", {number(each)} a solved level"
     return f"{total:,.0f} {cost['of']}-seconds ({shares}){solved}"

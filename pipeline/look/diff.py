@@ -22,6 +22,7 @@ from pipeline.look.inspect import QUANTILES, SPENT
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import differences, require_manifest, told
 from pipeline.store.remote import as_typed
+from pipeline.words import number
 
 READ = (*cost.READ, "content_hash", "signature", "steps_to_goal", *SPENT)
 LABELS = [label.value for label in Label]
@@ -39,7 +40,7 @@ def diff(one: Path, other: Path, where: str | None, rows: int, as_json: bool) ->
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)
         print()
     else:
-        _print(facts, Console(highlight=False))
+        _print(facts, Console(highlight=False, markup=False))
 
 
 def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) -> dict[str, Any]:
@@ -151,8 +152,8 @@ def _paired(left: pa.Table, right: pa.Table, both: np.ndarray) -> dict[str, Any]
 def _print(facts: dict[str, Any], console: Console) -> None:
     one, other = facts["splits"]
     table = Table("", one, other, "difference", box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    for name in table.columns[1:]:
-        name.justify = "right"
+    for column in table.columns[1:]:
+        column.justify = "right"
     shares = [f"{of['solved'] / of['tried']:.1%}" if of["tried"] else "-" for of in facts["solved"]]
     gained = facts["only"][1] - facts["only"][0]
     table.add_row("levels solved", *(f"{of['solved']:,}" for of in facts["solved"]), f"{gained:+,}")
@@ -171,7 +172,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
             name = "median" if quantile == "50%" else quantile
             table.add_row(f"steps to goal, {name}", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
     console.print(table)
-    say = lambda text: console.print(text, markup=False, soft_wrap=not console.is_terminal)
+    say = lambda text: console.print(text, soft_wrap=not console.is_terminal)
     say("")
     alone = [
         f"{count:,} only in {split}" for count, split in zip(facts["alone"], facts["splits"], strict=True) if count
@@ -180,18 +181,15 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     say(f"Settings that differ: {told(facts['settings']) or 'none'}.")
     for name, unit in (("env_steps", "env steps"), ("seconds", "seconds")):
         if (more := facts[f"{name}_for_one_more"]) is not None:
-            say(f"{more * gained:+,.0f} {unit} for {gained:+,} solved levels: {more:,.3g} for each one more.")
+            say(f"{more * gained:+,.0f} {unit} for {gained:+,} solved levels: {number(more)} for each one more.")
     if steps:
         say(
             f"Of {steps['levels']:,} levels that both solve, {steps['shorter']:,} take fewer steps in {other} and "
             f"{steps['longer']:,} more, p {_p(steps['p'])}."
         )
-    for split, ids in zip(facts["splits"], facts["only_rows"], strict=True):
+    for split, ids, count in zip(facts["splits"], facts["only_rows"], facts["only"], strict=True):
         if ids:
-            say(
-                f"Solved only in {split}: {', '.join(map(str, ids))}"
-                + ("" if len(ids) == facts["only"][facts["splits"].index(split)] else ", ...")
-            )
+            say(f"Solved only in {split}: {', '.join(map(str, ids))}{', ...' if len(ids) < count else ''}")
 
 
 def _p(p: float) -> str:

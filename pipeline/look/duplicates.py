@@ -1,6 +1,6 @@
 """Levels that are there twice: within a split, in another split, or among level files.
 
-By the manifest's columns `content_hash` (the same content) and `signature` (nearly the same): docs/levels.md, Identity.
+By the manifest's columns `content_hash` (the same content) and `signature` (nearly the same): docs/levels.md.
 DuckDB groups and joins, and each level is told with one partner only, so a split of many copies stays small to tell.
 """
 

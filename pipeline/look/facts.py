@@ -22,7 +22,7 @@ def print_facts(facts: Mapping[str, Any], shown: Sequence[str], console: Console
             line = f"{(name + ':') * (not i):{NAMES - 1}} {text}"
             if console.is_terminal:  # elsewhere a line is a line
                 line = textwrap.fill(line, console.width, subsequent_indent=" " * NAMES, drop_whitespace=True)
-            console.print(line, markup=False, soft_wrap=True)
+            console.print(line, soft_wrap=True)
     table = Table(*shown, box=None, pad_edge=False, padding=(0, 1, 0, 0))  # fits 80 columns
     for row in facts["rows"]:
         table.add_row(*(_cell(row[name]) for name in shown))

@@ -56,7 +56,7 @@ def inspect(split: Path, asked: Asked, as_json: bool, against: Sequence[Path] = 
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)
         print()
     else:
-        print_facts(facts, asked.columns or SHOWN, Console(highlight=False))
+        print_facts(facts, asked.columns or SHOWN, Console(highlight=False, markup=False))
 
 
 def survey(
@@ -75,7 +75,7 @@ def survey(
     alike = alike.filter(np.isin(alike["name"].to_numpy(), ids))
     facts = _told(split, manifest, chosen, _counts(chosen, "label"))
     facts["solved_by"] = solved_by_things(manifest, ids) if things else None
-    others = {str(other): duplicates.compared_in(other) for other in against}
+    others = {as_typed(other): duplicates.compared_in(other) for other in against}
     levels = duplicates.compared_of(split, ids) if others else None
     facts["duplicates"] = duplicates.within(alike, shown)
     facts["against"] = {name: duplicates.between(levels, other, shown) for name, other in others.items()}

@@ -9,9 +9,11 @@ from experts.labels import TRAINED, Label
 from pipeline.errors import UserError
 from pipeline.look.figures import draw_panels
 from pipeline.look.rows import Asked
+from pipeline.look.spread import spread
 from pipeline.read.levels import writing_to
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import require_manifest
+from pipeline.store.remote import as_typed
 
 KINDS = (".svg", ".png")
 NUMBERS = ("steps_to_goal", "steps_to_first_success", "env_steps", "success_rate", "portability")
@@ -36,7 +38,7 @@ def plot(split: Path, asked: Asked, out: Path) -> None:
     if not values and not curves:
         raise UserError(f"There is nothing to draw of {split}: choose other rows with --where.")
     with writing_to(out):
-        draw_panels(values, curves, BINS, f"{split}: {table.num_rows:,} levels", out)
+        draw_panels(values, curves, BINS, f"{as_typed(split)}: {table.num_rows:,} levels", out)
     print(f"{out}: {', '.join([*values, *curves])}")
 
 
@@ -45,6 +47,6 @@ def _curves(split: Path, table: pa.Table, label: Label) -> list[np.ndarray]:
     ids = table["level_id"].to_numpy()[np.array(table["label"].to_pylist()) == label]
     if not len(ids):
         return []
-    chosen = ids[np.unique(np.linspace(0, len(ids) - 1, min(CURVES, len(ids))).round().astype(int))]
+    chosen = ids[spread(len(ids), CURVES)]
     found = require_manifest(split, ["learning_curve"], chosen).table["learning_curve"].to_pylist()
     return [curve for rates in found if not np.isnan(curve := np.array(rates, np.float64)).all()]

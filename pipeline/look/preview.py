@@ -5,7 +5,6 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from experts.config import RECORD_STEPS
@@ -15,6 +14,7 @@ from levelgen.pictures.scene import scene_of
 from levelgen.pictures.shapes import Scene
 from levelgen.pictures.words import Caption
 from pipeline.look.show import recorded_film
+from pipeline.look.spread import spread
 from pipeline.read.levels import levels_of, rules_of
 from pipeline.read.rows import read_rows
 from pipeline.store.columns import COLUMNS
@@ -46,7 +46,7 @@ def preview(manifest: Manifest, count: int) -> pa.Table:
         Failure: a shard is damaged, or a level's file is gone.
     """
     ids = manifest.level_ids
-    chosen = ids[np.unique(np.linspace(0, len(ids) - 1, count).round().astype(int))]
+    chosen = ids[spread(len(ids), count)]
     full = require_manifest(manifest.split, level_ids=chosen.tolist())
     blocks = shown(range(0, full.table.num_rows, BLOCK), f"pictures of {manifest.split}")
     rows = [row for first in blocks for row in _pictured(full, full.table.slice(first, BLOCK))]

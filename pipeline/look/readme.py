@@ -12,6 +12,7 @@ from rich.filesize import decimal
 from experts.config import RECORD_STEPS
 from experts.labels import Label
 from pipeline.look.figures import Share
+from pipeline.words import number
 
 MARK = "<!-- written by levelproof card: run it again rather than edit this -->"
 PREVIEW, FIGURES = "preview", "figures"  # folders beside the README
@@ -98,7 +99,7 @@ def readme(name: str, splits: Sequence[SplitFacts], wishes: Wishes, figures: Seq
         _picture(STEPS, figures, "How many steps solved levels take"),
         _loading(splits, wishes),
         _format(wishes),
-        _making(splits, wishes),
+        _making(splits),
         _licence(wishes),
         _citation(wishes, version),
     ]
@@ -197,15 +198,15 @@ Columns and fields: {_link("docs/columns.md", wishes.code, "/blob/main/docs/colu
 {_link("docs/shards.md", wishes.code, "/blob/main/docs/shards.md")}."""
 
 
-def _making(splits: Sequence[SplitFacts], wishes: Wishes) -> str:
+def _making(splits: Sequence[SplitFacts]) -> str:
     rows = ["| split | budget | levels are | configuration | stored as | made with |", "|---" * 6 + "|"]
     for of in splits:
         stored, stacks = f"`{of.stored_as}`", "; ".join(of.made_with)
         rows.append(f"| `{of.path}` | {of.budget} | {of.distribution} | `{of.config_hash}` | {stored} | {stacks} |")
     first = splits[0]
     return (
-        "## How it was made\n\nEvery level got an expert of its own, trained with PPO for at most the budget's steps, "
-        "after random play and a search had looked for a way; `witness` in the manifest says who found it. The "
+        "## How it was made\n\nAs its configuration says, each level was searched for a way to the goal, and got a PPO "
+        "expert of its own for at most the budget's env steps; `witness` in the manifest says who found the way. The "
         "manifests carry the whole configuration.\n\n" + "\n".join(rows) + "\n\n"
         "To make the levels and their experts again, or to check every byte and every witness:\n\n"
         f"    levelproof regenerate manifest=data/{first.path} budget={first.budget} out=again\n"
@@ -243,5 +244,5 @@ def _short(count: int) -> str:
     """1.5 billion, 320 million, 12,345."""
     for unit, word in ((10**9, "billion"), (10**6, "million")):
         if count >= unit:
-            return f"{count / unit:.3g} {word}"
+            return f"{number(count / unit)} {word}"
     return f"{count:,}"

@@ -22,6 +22,7 @@ from levelgen.pictures.words import Caption
 from levelgen.task.rules import TaskParams
 from physics.types import State
 from pipeline.errors import Failure, UserError
+from pipeline.look.spread import spread
 from pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of, writing_to
 from pipeline.read.rows import read_row
 from pipeline.runtime import prepare_jax
@@ -173,7 +174,7 @@ def _length(steps: int, rules: TaskParams) -> str:
 def write_sheet(film: Film, path: Path) -> None:
     """A few of the film's pictures, the first and the last among them."""
     columns, rows = SHEET
-    chosen = np.unique(np.linspace(0, len(film.scenes) - 1, columns * rows).round().astype(int))
+    chosen = spread(len(film.scenes), columns * rows)
     write_png(sheet([rasterised(film.scenes[i]) for i in chosen], columns), path)
 
 

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from configs.errors import readable
 from pipeline.errors import UserError
 from pipeline.look.status import look
 from pipeline.store.events import events_of, runs_in
@@ -22,6 +23,7 @@ EVERY = 2.0  # s between looks
 STALE = 30.0  # s after which a state is no more than the last that was told
 SHOWN = 5  # failures
 STATE = {"levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined", "workers"}
+FAILURE = {"unit", "cause"}
 
 
 def watch(split: Path, as_json: bool, console: Console, every: float = EVERY) -> None:
@@ -58,7 +60,8 @@ def now(split: Path) -> dict[str, Any]:
     states = [event for event in events if event["event"] in ("progress", "ended") and event.keys() >= STATE]
     if not states:
         raise UserError(f"No run has told anything in {split / EVENTS} yet: `levelproof status` tells what is there.")
-    state, failed = states[-1], [event for event in events if event["event"] in ("failed", "quarantined")]
+    state = states[-1]
+    failed = [event for event in events if event["event"] in ("failed", "quarantined") and event.keys() >= FAILURE]
     done, solved = state["done"], state["solved"]
     return {
         "split": as_typed(split),
@@ -89,5 +92,5 @@ def shown(facts: dict[str, Any]) -> Table:
         **{f"failure {number}": text for number, text in enumerate(facts["failed"], 1)},
     }
     for name, text in lines.items():
-        table.add_row(name, text)
+        table.add_row(readable(name), readable(text))
     return table

@@ -11,14 +11,14 @@ import pyarrow as pa
 from levelgen.level import Level, size_of
 from physics.types import Size
 from pipeline.errors import UserError
-from pipeline.store.contents import ContentsError, check_numbers, table_for
+from pipeline.store.contents import ContentsError, check_numbers, level_fields
 from pipeline.store.fields import arrays_of, tree_of
 from pipeline.store.schema import FieldSpec
 
 
 def column_fields(size: Size) -> dict[str, FieldSpec]:
     """The fields of a level of this size by the names of their columns; what a size has none of has no column."""
-    return {field.name.rpartition("/")[2]: field for field in _level_fields(size) if field.count}
+    return {field.name.rpartition("/")[2]: field for field in level_fields(size) if field.count}
 
 
 def columns_for(level: Level) -> dict[str, pa.Array]:
@@ -41,7 +41,7 @@ def levels_from(table: pa.Table) -> Level:
             raise UserError(f"The table has levels of the sizes {sizes}: choose rows of one size.")
         size = size_of(sizes[0])
         columns = {field.name: name for name, field in column_fields(size).items()}
-        arrays = {of.name: _array(table, columns.get(of.name), of) for of in _level_fields(size)}
+        arrays = {of.name: _array(table, columns.get(of.name), of) for of in level_fields(size)}
         check_numbers(arrays, size)
     except (KeyError, ContentsError, ValueError, TypeError) as error:  # pyarrow's errors are some of these
         reason = str(error).strip("'\"").splitlines()[0]
@@ -49,10 +49,6 @@ def levels_from(table: pa.Table) -> Level:
             f"The table has not the columns of levels ({reason}): read them as they were written."
         ) from None
     return tree_of(Level, arrays, "level/")
-
-
-def _level_fields(size: Size) -> list[FieldSpec]:
-    return [field for field in table_for(size) if field.name.startswith("level/")]
 
 
 def _nested(values: np.ndarray) -> pa.Array:

@@ -12,12 +12,13 @@ from configs.convert import flat, plain
 from configs.schema import JobConfig
 from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelgen.identity.content import content_hashes, level_id_for
-from levelgen.level import Level, name_of
+from levelgen.level import Level, name_of, size_of
 from levelgen.task.rules import DEFAULT_RULES
 from pipeline.errors import Failure, UserError
 from pipeline.read.kinetix.folder import open_folder, read_trajectories
 from pipeline.read.kinetix.zarr2 import FormatError
 from pipeline.read.rows import read_row
+from pipeline.store.contents import level_fields
 from pipeline.store.fields import tree_of
 from pipeline.store.origins import Origin, can_be_noted, place_of
 
@@ -93,7 +94,7 @@ def _level_in(path: Path) -> LevelFile:
         return read_level_file(path)
     try:
         folder = open_folder(place.folder)
-        found = read_trajectories(folder.named(place.array), folder.size, place.row, place.row + 1)
+        found = read_trajectories(folder.named(place.array), place.row, place.row + 1)
     except FormatError as error:
         raise LevelFileError(f"Cannot use the level of {path}: {error}.") from None
     if found.wrong[0]:
@@ -122,8 +123,8 @@ def level_at(origin: Origin) -> Level:
         Failure: its shard is damaged.
     """
     if origin.shard:
-        arrays = read_row(Path(origin.split), origin._asdict())
-        return tree_of(Level, {name: x for name, x in arrays.items() if name.startswith("level/")}, "level/")
+        names = [field.name for field in level_fields(size_of(origin.size))]
+        return tree_of(Level, read_row(Path(origin.split), origin._asdict(), names), "level/")
     try:
         level = _level_in(Path(origin.file)).level
     except LevelFileError as error:

@@ -15,11 +15,11 @@ from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelgen.level import Level, size_of
 from levelgen.sampling.sampler import Distribution, sample_levels
 from levelgen.task.rules import TaskParams
-from pipeline.errors import UserError
+from pipeline.errors import Failure, UserError
 from pipeline.read.level_files import levels_at
 from pipeline.read.rows import read_rows
 from pipeline.runtime import prepare_jax
-from pipeline.store.contents import table_for
+from pipeline.store.contents import level_fields
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.origins import ASKED, origin_of
@@ -49,13 +49,13 @@ def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
     As their shards have them, or made again from their ids or files where they have no shard.
 
     Raises:
-        Failure: a shard is damaged, or a file is gone or another one.
+        Failure: a shard is damaged, or a file is gone or another one; or as `recorded_settings`.
     """
     stored = rows.column("shard").is_valid().to_numpy()
     size = size_of(rows.column("size")[0].as_py())
     parts = []
     if stored.any():
-        names = [of.name for of in table_for(size) if of.name.startswith("level/")]
+        names = [field.name for field in level_fields(size)]
         parts.append(tree_of(Level, read_rows(manifest.split, rows.filter(stored), names), "level/"))
     if not stored.all():
         prepare_jax()
@@ -63,15 +63,32 @@ def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
         if from_files(config):
             parts.append(levels_at([origin_of(manifest.split, row) for row in others.to_pylist()]))
         else:
-            ids, distribution = others.column("level_id").to_numpy(), typed(Distribution, config["distribution"])
-            parts.append(sample_levels(ids, size, distribution))
+            with recorded_settings(manifest.split):
+                distribution = typed(Distribution, config["distribution"], "distribution")
+            parts.append(sample_levels(others.column("level_id").to_numpy(), size, distribution))
     back = np.argsort(np.concatenate([np.flatnonzero(stored), np.flatnonzero(~stored)]))
     return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1)[..., back], *parts)
 
 
 def rules_of(manifest: Manifest) -> TaskParams:
-    """The rules that a split's levels are played by."""
-    return typed(TaskParams, (manifest.config or {})["task"], "task")
+    """The rules that a split's levels are played by. Raises as `recorded_settings`."""
+    with recorded_settings(manifest.split):
+        return typed(TaskParams, (manifest.config or {})["task"], "task")
+
+
+@contextmanager
+def recorded_settings(split: Path) -> Iterator[None]:
+    """Settings that a split records are understood meanwhile.
+
+    Raises:
+        Failure: this program has other ones.
+    """
+    try:
+        yield
+    except (ValueError, KeyError, TypeError) as error:
+        raise Failure(
+            f"The split {split} was made by a levelproof with other settings ({error}): use that one."
+        ) from None
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from os import DirEntry
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,10 @@ from pipeline.errors import Exit, Failure
 from pipeline.read.evidence import COLUMNS, Evidence, Making, same_stack
 from pipeline.read.findings import Findings
 from pipeline.read.level_files import level_at
+from pipeline.read.levels import recorded_settings
 from pipeline.read.pace import Pace
 from pipeline.runtime import prepare_jax
-from pipeline.store.bounds import DAMAGE, bounded
+from pipeline.store.bounds import DAMAGE, MOST_ROWS, bounded
 from pipeline.store.checksums import digests_of, has_own
 from pipeline.store.job_note import JobNote, sound_note
 from pipeline.store.layout import (
@@ -43,6 +45,7 @@ from pipeline.store.layout import (
     data_paths,
     entries,
     ids_of,
+    made_within,
     unit_ids,
 )
 from pipeline.store.locks import is_written
@@ -53,7 +56,6 @@ from pipeline.store.runs import runs, told_levels, without
 from pipeline.store.shard import Shard, open_shard
 
 AT_ONCE = 4 * CHUNK  # rows that are looked at together, where fragments have fewer
-MOST_ROWS = 1_000_000  # of a fragment
 ATTEMPTS = 3  # at a split of which fragments are sealed meanwhile
 
 Part = tuple[Fragment, pa.Table]  # a fragment and its rows
@@ -166,25 +168,18 @@ def _part(path: Path) -> Part:
         fragment, rows = read_fragment(path, ["level_id", *COLUMNS])
     except OSError as error:
         raise Failure(f"The fragment {path} cannot be read ({error.strerror or type(error).__name__}).") from None
-    ids, (first, last) = rows.column("level_id").to_numpy(), ids_of(path)
-    if len(ids) and (ids.min() < first or ids.max() > last):
-        raise Failure(f"The fragment {path} has other levels than its name says.")
     return fragment, rows
 
 
 def _making(split: Path, fragment: Fragment, findings: Findings) -> Making:
     """Raises Failure where this program makes other levels, or plays them by other rules."""
     findings.config = config = fragment.config
-    try:
+    with recorded_settings(split):
         if config["sampler_version"] != SAMPLER_VERSION:
             raise ConfigError(f"sampler version {config['sampler_version']}, here it is {SAMPLER_VERSION}")
         size_of(config["size"])
         rules = typed(TaskParams, config["task"], "task")
         distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
-    except (ValueError, KeyError, TypeError) as error:
-        raise Failure(
-            f"The split {split} was made by a levelproof with other settings ({error}): use that one."
-        ) from None
     return Making(split, config["size"], distribution, rules)
 
 
@@ -244,7 +239,7 @@ def _opened(name: str, making: Making, level_ids: set[int], findings: Findings) 
 def _unlike(split: Path, name: str, digests: Mapping[str, str]) -> list[str]:
     """The files of a shard or of experts that are not what they were: changed, missing or new."""
     try:
-        found = digests_of(data_path(split, name))
+        found = digests_of(data_path(split, name), digests)
     except (Failure, OSError):
         found = {}
     return sorted(file for file in {**found, **digests} if found.get(file) != digests.get(file))
@@ -272,25 +267,30 @@ def _damaged(split: Path, note: JobNote | None, there: np.ndarray, named: set[st
     unnamed = [path for path in data_paths(split) if path.relative_to(split).as_posix() not in named]
     for fragment, wrong in findings.fragments.items():
         first, last = ids_of(fragment)
-        mine = [path for path in unnamed if first <= unit_ids(path)[0] and unit_ids(path)[1] <= last]
+        mine = made_within(unnamed, fragment)
         unnamed = [path for path in unnamed if path not in mine]
         ids = _ids_in(mine) | {first, last} | _between(first, last, note, findings)
-        findings.tell(wrong, ids - set(there.tolist()))
+        findings.tell(wrong, _not_in(there, ids))
     if is_written(split):
         return
     begun = {attempt_of(path) for path in entries(split, MANIFEST, BEGUN, DirEntry.is_file)}
     for path in unnamed:
-        lost = _ids_in([path]) - set(there.tolist())
+        lost = _not_in(there, _ids_in([path]))
         if lost and attempt_of(path) not in begun:
             findings.tell(f"No fragment names {path}: the one that did is missing.", lost)
+
+
+def _not_in(there: np.ndarray, ids: set[int]) -> set[int]:
+    return ids.difference(there[np.isin(there, list(ids))].tolist())
 
 
 def _between(first: int, last: int, note: JobNote | None, findings: Findings) -> set[int]:
     """Which levels a fragment had that nobody can read any more: those that were wanted, or all, if ids make levels."""
     wanted = note.level_ids.tolist() if note else []
     if not from_files(findings.config or {}) and not any(a <= first <= last <= b for a, b in wanted):
-        wanted = [*wanted, (first, min(last, first + MOST_ROWS))]
-    return {i for a, b in wanted for i in range(max(a, first), min(b, last) + 1)}
+        wanted = [*wanted, (first, last)]
+    ids = (i for a, b in wanted for i in range(max(a, first), min(b, last) + 1))
+    return set(islice(ids, MOST_ROWS))  # which its name and a note may say are many more
 
 
 def _ids_in(data: Sequence[Path]) -> set[int]:

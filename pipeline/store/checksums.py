@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 
-from pipeline.store.remote import at_once, bytes_of, is_remote, stored_in
+from pipeline.store.remote import at_once, bytes_of, is_listed, is_remote, stored_in
 
 MARK = b"levelproof.sha256:"  # before a fragment's own digest
 OWN = len(MARK) + hashlib.sha256().digest_size
@@ -19,16 +19,18 @@ BLOCK = 2**20  # bytes read at once
 TAIL = 8  # bytes at the end of parquet: how long its footer is, and PAR1
 
 
-def digests_of(path: Path) -> dict[str, str]:
+def digests_of(path: Path, known: Iterable[str] = ()) -> dict[str, str]:
     """SHA-256 of all files below a folder, by their paths there; of a file, its own without a path.
 
-    Links are not followed: they, and whatever else is no ordinary file, have what no file has.
+    Links are not followed: they, and whatever else is no ordinary file, have what no file has. On a server that lists
+    no files these are the `known` ones.
 
     Raises:
         OSError: it cannot be read.
     """
     if is_remote(path):
-        files = [*stored_in(path)] or [path]
+        below = stored_in(path) if is_listed(path) else [path / name for name in known if _is_below(name)]
+        files = [*below] or [path]
         found = at_once(path, lambda file: hashlib.sha256(bytes_of(file)).hexdigest(), files)
         return {
             "" if file == path else file.relative_to(path).as_posix(): of for file, of in zip(files, found, strict=True)
@@ -45,6 +47,11 @@ def digests_below(
     """Of the files of shards and checkpoints with these names, as they are on the disk now, or `elsewhere`."""
     there = {name: digests_of(split / name) for name in names if (split / name).exists()}
     return dict(sorted(({name: elsewhere[name] for name in names if name in elsewhere} | there).items()))
+
+
+def _is_below(name: str) -> bool:
+    """Whether it is the path of nothing that is elsewhere."""
+    return not (name.startswith("/") or ".." in name.split("/"))
 
 
 def _digest(path: Path) -> str:

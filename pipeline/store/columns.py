@@ -186,9 +186,9 @@ def schema_of(names: Sequence[str], compact: bool = False) -> pa.Schema:
     return pa.schema([of.with_type(as_dictionary) if compact and of.name in REPETITIVE else of for of in fields])
 
 
-def completed(table: pa.Table, asked: Sequence[str] | None) -> pa.Table:
-    """A fragment's rows with all columns that were asked for (None: all), also if it is of a version before."""
+def completed(table: pa.Table, asked: Sequence[str]) -> pa.Table:
+    """A fragment's rows with all columns that were asked for, also if it is of a version before."""
     for of in DESCRIBED:
-        if of.since > OLDEST_VERSION and of.name not in table.column_names and (asked is None or of.name in asked):
+        if of.name in asked and of.name not in table.column_names:
             table = table.append_column(COLUMNS.field(of.name), pa.nulls(table.num_rows, of.type))
     return table

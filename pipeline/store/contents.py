@@ -6,6 +6,7 @@ engines and pictures look things up by these numbers and check no bounds.
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -38,12 +39,22 @@ FULL = Encoding()
 @cache
 def table_for(size: Size, encoding: Encoding = FULL) -> tuple[FieldSpec, ...]:
     """The field table of a shard of this size; by default, all the fields that any shard gives back."""
-    empty = lambda buffer: np.zeros((*buffer.shape, 0), buffer.dtype)  # of no level
+    level, record = none_of(size)
+    arrays = arrays_of(level, "level/") | arrays_of(record, "record/")
+    return tuple(field_table(kept(arrays, encoding), encoding.density))
+
+
+def none_of(size: Size) -> tuple[Level, Record]:
+    """No level of this size and no record, with all their shapes and types."""
+    empty = lambda buffer: np.zeros((*buffer.shape, 0), buffer.dtype)
     level, record = (jax.tree.map(empty, buffers_of(of, size)) for of in (Level, Record))
-    level, record = arrays_of(level, "level/"), arrays_of(record, "record/")
-    for name in ("record/state/", "record/manifold/"):  # of the engine, which knows one moment only
-        record |= {of: np.stack([x] * RECORD_STEPS) for of, x in record.items() if of.startswith(name)}
-    return tuple(field_table(kept(level | record, encoding), encoding.density))
+    in_time = lambda tree: jax.tree.map(lambda x: np.stack([x] * RECORD_STEPS), tree)  # the engine's are of one moment
+    return level, replace(record, state=in_time(record.state), manifold=in_time(record.manifold))
+
+
+def level_fields(size: Size) -> list[FieldSpec]:
+    """Those that tell what a level is, without its record."""
+    return [field for field in table_for(size) if field.constant]
 
 
 def size_of_levels(arrays: Mapping[str, np.ndarray]) -> Size:

@@ -61,11 +61,11 @@ def events_of(path: Path) -> list[dict[str, Any]]:
     try:
         if not is_remote(path) and path.stat().st_size > MOST_BYTES:
             return []
-        data = get(path).data if is_remote(path) else path.read_bytes()
+        data = get(path, MOST_BYTES).data if is_remote(path) else path.read_bytes()
     except OSError:
         return []
     found = []
-    for line in data[:MOST_BYTES].decode(errors="replace").splitlines():
+    for line in data.decode(errors="replace").splitlines():
         with suppress(ValueError, RecursionError):
             event = json.loads(line)
             if isinstance(event, dict) and isinstance(event.get("time"), float) and isinstance(event.get("event"), str):

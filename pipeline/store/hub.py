@@ -6,9 +6,10 @@ import random
 import re
 import time
 from collections.abc import Sequence
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.error import HTTPError, URLError
+from urllib.error import HTTPError
 from urllib.parse import quote
 from urllib.request import Request, urlopen
 
@@ -93,7 +94,7 @@ def _page(url: str) -> tuple[dict[str, tuple[str, int]], str]:
             if error.code not in (408, 429) and error.code < 500:
                 raise Failure(f"The hub refuses {url} ({error.code} {error.reason}): check the URL.") from None
             reason = str(error.code)
-        except (URLError, OSError, ValueError, RecursionError) as error:
+        except (OSError, HTTPException, ValueError, RecursionError) as error:
             reason = str(getattr(error, "reason", error))
         if attempt < ATTEMPTS - 1:
             time.sleep(random.uniform(0.5, 1) * PAUSE * 2**attempt)

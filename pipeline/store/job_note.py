@@ -69,14 +69,15 @@ def read_note(split: Path) -> JobNote:
 
 
 def _bytes(path: Path) -> bytes:
-    if is_remote(path):
-        return get(path).data
-    if not path.exists():
-        raise FileNotFoundError(path)
-    if path.is_symlink() or not path.is_file() or path.stat().st_size > MOST_BYTES:
-        raise NoteError("it is no ordinary file of a few megabytes")
+    if not is_remote(path):
+        if not path.exists():
+            raise FileNotFoundError(path)
+        if path.is_symlink() or not path.is_file() or path.stat().st_size > MOST_BYTES:
+            raise NoteError("it is no ordinary file of a few megabytes")
     try:
-        return path.read_bytes()
+        return get(path, MOST_BYTES).data if is_remote(path) else path.read_bytes()
+    except FileNotFoundError:
+        raise
     except OSError as error:
         raise NoteError(type(error).__name__) from None
 

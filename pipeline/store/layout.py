@@ -3,7 +3,7 @@
 import os
 import re
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from os import DirEntry
 from pathlib import Path
 from typing import NamedTuple
@@ -68,6 +68,12 @@ def unit_ids(data: Path) -> tuple[int, int]:
 def data_paths(split: Path) -> list[Path]:
     """All shards and experts of a split, whoever names them."""
     return [*entries(split, SHARDS, DATA, DirEntry.is_dir), *entries(split, EXPERTS, DATA, DirEntry.is_file)]
+
+
+def made_within(data: Iterable[Path], fragment: Path) -> list[Path]:
+    """Shards and experts of units that have no level beyond those that a fragment can have, all by their names."""
+    first, last = ids_of(fragment)
+    return [path for path in data if first <= unit_ids(path)[0] and unit_ids(path)[1] <= last]
 
 
 def attempt_of(path: Path) -> str:

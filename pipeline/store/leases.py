@@ -28,6 +28,7 @@ SILENCE = 60.0  # s without a renewal after which a writer counts as dead
 RENEWAL = 5.0  # s between renewals
 NOTICE = 2.0  # s of waiting after which people are told for what
 POLL = 0.5  # s between two looks
+MOST_BYTES = 2**16  # of a lock file
 
 _served: dict[Path, str] = {}  # the writer of each split for whom this process works
 
@@ -144,8 +145,8 @@ def require_served(split: Path) -> None:
 def is_leased(split: Path) -> bool:
     """Whether a writer has renewed its lease a short while ago."""
     try:
-        found = get(split / WRITER_LOCK)
-    except FileNotFoundError:
+        found = get(split / WRITER_LOCK, MOST_BYTES)
+    except OSError:  # there is none, or what is there is none
         return False
     return "writer" in _said(found.data) and time.time() - found.written.timestamp() < SILENCE
 

@@ -8,7 +8,7 @@ from pipeline.store.disk import flush_entry
 from pipeline.store.files import remove, remove_data
 from pipeline.store.layout import BEGUN, JOB_BEGUN, MANIFEST, begun_path, data_path, data_paths, entries
 from pipeline.store.locks import nobody_commits
-from pipeline.store.manifest import DATA_COLUMNS, Manifest, named_by, read_fragment, read_manifest
+from pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_fragment, read_manifest
 from pipeline.store.objects import put
 from pipeline.store.publish import OVER, ended
 from pipeline.store.remote import is_remote
@@ -29,8 +29,7 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
         manifest = read_manifest(split, ["label", *DATA_COLUMNS], compact=True)
         named = manifest.shards | manifest.named["experts"]
         for fragment in manifest.superseded:
-            _, table = read_fragment(fragment.path, DATA_COLUMNS)
-            theirs = frozenset.union(*(named_by([table], name) for name in DATA_COLUMNS))
+            theirs = data_named_by(read_fragment(fragment.path, DATA_COLUMNS)[1])
             disown(data_path(split, name) for name in theirs - named)
             remove(fragment.path)
         unnamed = [path for path in data_paths(split) if path.relative_to(split).as_posix() not in named]

@@ -71,7 +71,7 @@ def write_fragment(
     """
     is_table = isinstance(rows, pa.Table)
     table: Any = rows if is_table else pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS)
-    names = named_by([table], "shard") | named_by([table], "experts")
+    names = data_named_by(table)
     metadata = {
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
         HASH_KEY: config_hash.encode(),
@@ -173,10 +173,13 @@ def read_manifest(
         each: what to keep of a fragment's rows, as they come and in threads; `level_id` has to be among it.
 
     Raises:
+        UserError: there is no such column.
         Failure: a fragment is damaged, or fragments of several configurations lie side by side.
     """
     split = Path(split)
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
+    if unknown := [name for name in names if name not in COLUMNS.names]:
+        raise UserError(f"There is no column {unknown[0]!r}: the manifest has {', '.join(COLUMNS.names)}.")
     asked = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))
     read = partial(_part, names=names, level_ids=asked, compact=compact, each=each)
     parts = _parts(split, asked, read)
@@ -277,6 +280,19 @@ def each_once(parts: Sequence[tuple[Fragment, pa.Table]]) -> tuple[pa.Table, lis
 def named_by(tables: Sequence[pa.Table], column: str) -> frozenset[str]:
     """What rows name in a column: shards or experts."""
     return frozenset(path for table in tables for path in table.column(column).unique().to_pylist() if path)
+
+
+def data_named_by(rows: pa.Table) -> frozenset[str]:
+    """Shards and experts."""
+    return frozenset.union(*(named_by([rows], name) for name in DATA_COLUMNS))
+
+
+def with_places(rows: pa.Table, shards: Sequence[Any], places: Sequence[Any]) -> pa.Table:
+    """The same rows, whose data are in these shards now, in these of their rows."""
+    for name, values in ("shard", shards), ("row", places):
+        field = COLUMNS.field(name)
+        rows = rows.set_column(rows.schema.get_field_index(name), field, pa.array(values, field.type))
+    return rows
 
 
 def require_manifest(

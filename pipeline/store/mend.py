@@ -13,14 +13,16 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import Failure
-from pipeline.store.layout import data_path, data_paths, ids_of, new_attempt, unit_ids, unit_name
+from pipeline.store.layout import data_path, data_paths, made_within, new_attempt, unit_name
 from pipeline.store.leftovers import disown
 from pipeline.store.manifest import (
     DATA_COLUMNS,
     begin_fragment,
+    data_named_by,
     fragment_paths,
     named_by,
     read_fragment,
+    with_places,
     write_fragment,
 )
 from pipeline.store.merge import Place, merge_shards
@@ -40,10 +42,9 @@ def take_out(split: Path, lost: Collection[int], unlike: Collection[str], damage
         OSError: the disk refuses.
     """
     sound = [path for path in fragment_paths(split) if path not in damaged]
-    named = {name for path in sound for name in _names(read_fragment(path, DATA_COLUMNS)[1])}
+    named = {name for path in sound for name in data_named_by(read_fragment(path, DATA_COLUMNS)[1])}
     for path in damaged:
-        first, last = ids_of(path)
-        theirs = [data for data in data_paths(split) if first <= unit_ids(data)[0] and unit_ids(data)[1] <= last]
+        theirs = made_within(data_paths(split), path)
         disown(data for data in theirs if data.relative_to(split).as_posix() not in named)
         path.unlink(missing_ok=True)
     for path in sound:
@@ -65,8 +66,8 @@ def _mend(split: Path, path: Path, lost: np.ndarray, unlike: frozenset[str]) -> 
     for name, attempt in zip(sorted(stale), attempts, strict=False):
         rows = _moved(split, rows, name, attempt.shard)
     theirs = {path, attempts[-1].fragment} & {*fragment_paths(split)}  # two: somebody died between the two below
-    named = {name for of in theirs for name in _names(read_fragment(of, DATA_COLUMNS)[1])}
-    _disown_named(split, named - _names(rows))
+    named = {name for of in theirs for name in data_named_by(read_fragment(of, DATA_COLUMNS)[1])}
+    _disown_named(split, named - data_named_by(rows))
     if ids:
         write_fragment(attempts[-1], rows, fragment.config_hash, fragment.config, fragment.sealed, fragment.densities)
     if not ids or attempts[-1].fragment != path:
@@ -79,11 +80,6 @@ def _disown_named(split: Path, names: Collection[str]) -> None:
             disown([data_path(split, name)])
 
 
-def _names(table: pa.Table) -> frozenset[str]:
-    """Shards and experts."""
-    return frozenset.union(*(named_by([table], name) for name in DATA_COLUMNS))
-
-
 def _moved(split: Path, rows: pa.Table, old: str, new: Path) -> pa.Table:
     """The rows, of which those of one shard have been copied to a new one, one after another."""
     names, places, ids = (rows.column(name).to_pylist() for name in ("shard", "row", "level_id"))
@@ -91,7 +87,4 @@ def _moved(split: Path, rows: pa.Table, old: str, new: Path) -> pa.Table:
     merge_shards(new, [Place(data_path(split, old), places[i], ids[i]) for i in moving])
     for row, i in enumerate(moving):
         names[i], places[i] = new.relative_to(split).as_posix(), row
-    for name, values in ("shard", names), ("row", places):
-        field = rows.schema.field(name)
-        rows = rows.set_column(rows.schema.names.index(name), field, pa.array(values, field.type))
-    return rows
+    return with_places(rows, names, places)

@@ -6,11 +6,12 @@ was first looks whether it was itself. Knows nothing of what is in the files.
 
 from collections.abc import Iterable
 from datetime import datetime
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.errors import UserError
-from pipeline.store.remote import BUCKETS, StoreFailure, as_typed, ask, obstore_module, place
+from pipeline.store.remote import BUCKETS, StoreFailure, as_typed, ask, data_of, obstore_module, place
 
 PART = 2**25  # bytes; larger files are sent in parts
 
@@ -38,11 +39,12 @@ class StoredFile(NamedTuple):
     written: datetime  # by the store's clock
 
 
-def get(path: Path) -> StoredFile:
-    """A small file as the store has it now, past any cache.
+def get(path: Path, most: float = inf) -> StoredFile:
+    """A file as the store has it now, past any cache.
 
     Raises:
         FileNotFoundError: it is not there.
+        OSError: it has more than `most` bytes.
         UserError: there is no such bucket, or we may not.
         StoreFailure: the store does not answer.
     """
@@ -50,9 +52,13 @@ def get(path: Path) -> StoredFile:
 
     def request() -> StoredFile:
         answer = obstore_module().get(store, key)
-        return StoredFile(bytes(answer.bytes()), Version.of(answer.meta), answer.meta["last_modified"])
+        about = answer.meta
+        return StoredFile(data_of(answer, most), Version.of(about), about["last_modified"])
 
-    return ask(path, request)
+    found = ask(path, request)
+    if len(found.data) > most:
+        raise OSError(f"{as_typed(path)} is larger than it can be")
+    return found
 
 
 def put(path: Path, data: bytes | Path) -> None:
@@ -111,7 +117,7 @@ def require_conditions(probe: Path) -> None:
     except (NotImplementedError, obstore_module().exceptions.NotSupportedError):
         heeded = False
     except StoreFailure as failure:
-        if "501" not in str(failure):
+        if "(501" not in str(failure):  # in its URL there may be any number
             raise
         heeded = False
     if not heeded:

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 
 from configs.schema import hash_of
 from pipeline.errors import Failure
+from pipeline.store.bounds import DAMAGE
 from pipeline.store.files import remove_data
 from pipeline.store.fragment import read_fragment
 from pipeline.store.layout import MANIFEST, attempt_of, begun_path, data_paths, fragment_path, new_attempt, unit_name
@@ -121,7 +122,7 @@ def _at(fragment: Path) -> _There:
         return _There(frozenset(), None)
     try:
         return _There(_ids(found.data), found.version)
-    except pa.ArrowException:
+    except DAMAGE:
         raise Failure(f"The fragment {fragment} is damaged: remove it, and run the same command again.") from None
 
 

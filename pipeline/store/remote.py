@@ -155,13 +155,13 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
         return found
     store, key = place(folder / INDEX)
     try:
-        text = ask(folder / INDEX, lambda: _body(obstore_module().get(store, key), MOST_INDEX)).decode(errors="replace")
+        text = ask(folder / INDEX, lambda: data_of(obstore_module().get(store, key), MOST_INDEX))
     except FileNotFoundError:
         raise UserError(
             f"There is no split at {as_typed(folder.parent)}, or its server was not told what it has: a split on a web "
             f"server needs {folder.name}/{INDEX}, which `levelproof seal` writes."
         ) from None
-    return {folder / name: Stored("", 0) for name in text.split() if "/" not in name}
+    return {folder / name: Stored("", 0) for name in text.decode(errors="replace").split() if "/" not in name}
 
 
 def bytes_of(path: Path, most: int = MOST_WHOLE) -> bytes:
@@ -216,7 +216,7 @@ class RemoteFile:
     def _part(self, n: int, first: int, last: int) -> bytes:
         """Of a piece; fetched again where others needed its place in the cache."""
         part = self._cache.read(self._piece(n), first, min(last, PIECE))
-        return self._fetch([n])[first:last][: PIECE - first] if part is None else part
+        return self._fetch([n])[first:last] if part is None else part
 
     def _keep(self, run: Sequence[int]) -> None:
         self._fetch(run)
@@ -230,7 +230,7 @@ class RemoteFile:
 
         def request() -> tuple[Any, bytes]:
             answer = obstore_module().get(store, key, options=options)
-            return answer.meta, _body(answer, last - first)
+            return answer.meta, data_of(answer, last - first)
 
         about, data = ask(self.path, request)
         tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's servers have others
@@ -337,7 +337,7 @@ def _cache_in(folder: Path, most: int) -> PieceCache:
     return PieceCache(folder, most)
 
 
-def _body(answer: Any, most: int) -> bytes:
+def data_of(answer: Any, most: float) -> bytes:
     """The bytes of an answer; of one that is longer than it should be, one more than so many, or a few."""
     found = bytearray()
     for part in answer.stream(min_chunk_size=PIECE):

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import pyarrow as pa
 
 from configs.schema import Density, stored_as
-from pipeline.store.columns import COLUMNS
 from pipeline.store.convert import convert
 from pipeline.store.files import remove
 from pipeline.store.layout import (
@@ -37,6 +36,7 @@ from pipeline.store.manifest import (
     fragment_paths,
     named_by,
     read_fragment,
+    with_places,
     write_fragment,
 )
 from pipeline.store.merge import Place, merge_shards
@@ -222,7 +222,4 @@ def _moved(table: pa.Table, merged: Mapping[Path, Sequence[Place]]) -> pa.Table:
         for row, of in enumerate(places)
     }
     found = [now.get(level_id, (None, None)) for level_id in table.column("level_id").to_pylist()]
-    for name, values in zip(("shard", "row"), zip(*found, strict=True), strict=True):
-        field = COLUMNS.field(name)
-        table = table.set_column(COLUMNS.names.index(name), field, pa.array(values, field.type))
-    return table
+    return with_places(table, *zip(*found, strict=True))

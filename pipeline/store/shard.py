@@ -1,4 +1,4 @@
-"""A work unit's solved levels as one zarr v3 group of packed arrays, as docs/storage.md shows them.
+"""A work unit's solved levels as one zarr v3 group of packed arrays, as docs/shards.md shows them.
 
 One trajectory is one chunk: larger chunks save under 1% and cost random reads a factor of 3.
 """

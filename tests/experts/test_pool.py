@@ -127,15 +127,15 @@ def test_totals_grow_to_the_whole(levels: Level) -> None:
 
 def test_a_pool_wants_levels_while_fewer_wait_than_there_are_slots(levels: Level) -> None:
     pool = new_pool()
-    assert pool.wants == 2
+    assert [pool.wants(searched) for searched in (0, 1, 5)] == [2, 1, 0]
     pool.submit(*part(levels, range(5)))
-    assert pool.wants == 0
+    assert pool.wants(0) == 0
     wanted: list[int] = []
     while not pool.step():
-        wanted.append(pool.wants)
+        wanted.append(pool.wants(0))
     assert wanted[0] == 0  # three wait
     assert wanted == sorted(wanted)
-    assert pool.wants == 2
+    assert pool.wants(0) == 2
 
 
 def test_entries_of_a_queue_go_round(levels: Level) -> None:

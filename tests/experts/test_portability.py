@@ -14,12 +14,11 @@ from experts.judge import Witness, repeating
 from experts.labels import Label, Source
 from experts.portability import LATE, choose, moved, survival
 from experts.procedure import Procedure
-from experts.rollout import repeat
 from experts.scout import scout
 from experts.search.config import SearchConfig
 from experts.success import Success
 from experts.train import UnitResult
-from experts.witness import replay, take
+from experts.witness import repeat, replay, take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES

@@ -16,6 +16,7 @@ from experts.judge import Trained
 from experts.labels import Label, Source
 from experts.pool import Pool, Submission, capacity_of
 from experts.queue import empty_queue, enter
+from experts.search.search import Searching
 from experts.slots import LevelQueue, Mode, empty_slots
 from experts.stop import rules_of
 from experts.success import Success, no_success
@@ -173,7 +174,7 @@ def test_going_on_equals_having_trained_through(levels: Level, stopping: StopCon
 def test_a_success_before_training_is_rehearsed_from_the_first_update(levels: Level, whole: list[Trained]) -> None:
     """It ends at its goal, so the first of its episodes does; and those lanes do not count as the expert's own."""
     looks = replace(untouched(WHOLE), scout=ScoutConfig(rounds=1))
-    found = Looking(levels, IDS, looks, DEFAULT_RULES).found
+    found = Looking(levels, IDS, looks, DEFAULT_RULES, Searching(looks.search, DEFAULT_RULES)).found
     trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=found)
     assert 0 < (found.success.length > 0).sum() < len(IDS)
     for i, of in enumerate(trained):

@@ -7,6 +7,7 @@ levels each, `data/levels/` a file a level with its row and what its witness doe
 
 import json
 import math
+import shlex
 import shutil
 import sys
 from collections.abc import Mapping
@@ -23,6 +24,7 @@ from pipeline.errors import Failure, UserError
 from pipeline.look import cost
 from pipeline.look.gallery.columns import NOTHING, PAGE, columns_of, page_of
 from pipeline.look.gallery.worlds import drawn_bodies, states_of, text_of, world_of
+from pipeline.look.spread import spread
 from pipeline.look.things import THINGS, things_of
 from pipeline.read.created import new_folder
 from pipeline.read.levels import levels_of, rules_of
@@ -62,8 +64,8 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
         _write(folder, "about", _about(manifest, found, where, about))
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     some = f"{count:,} levels" if count == found else f"{count:,} of {found:,} levels, spread evenly over their ids,"
-    print(f"{out / 'index.html'}: {some} of {split}, {size / 1e6:,.1f} MB. Open it in a browser, or:")
-    print(f"{Path(sys.executable).name} -m webbrowser {out / 'index.html'}")
+    print(f"{out / 'index.html'}: {some} of {as_typed(split)}, {size / 1e6:,.1f} MB. Open it in a browser, or:")
+    print(f"{Path(sys.executable).name} -m webbrowser {shlex.quote(str(out / 'index.html'))}")
 
 
 def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
@@ -74,8 +76,7 @@ def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
     ids = select(everything.table, where).column("level_id").to_numpy()
     if not len(ids):
         raise UserError(f"No level of {split} fits {where}: choose others with --where.")
-    chosen = ids[np.unique(np.linspace(0, len(ids) - 1, min(most, len(ids))).round().astype(int))]
-    return require_manifest(split, level_ids=chosen), len(ids)
+    return require_manifest(split, level_ids=ids[spread(len(ids), most)]), len(ids)
 
 
 def _write_block(folder: Path, manifest: Manifest, first: int) -> dict[str, np.ndarray]:

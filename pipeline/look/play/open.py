@@ -25,7 +25,7 @@ def play(source: Path | None, level_id: int | None, size: str, budget: str, port
     """Serve the page until Ctrl-C; `browser`: and open it.
 
     Raises:
-        UserError: no such level, size or budget, a file that cannot be read, or a port that is taken.
+        UserError: no such level, size or budget, a file that cannot be read, or a port that is none or taken.
         Failure: the split is damaged.
     """
     prepare_jax()

@@ -48,7 +48,7 @@ def serving(
         port: 0: any that is free.
 
     Raises:
-        UserError: the port is taken.
+        UserError: the port is taken, or there is none of this number.
     """
 
     def handler(connection: ServerConnection) -> None:
@@ -56,8 +56,9 @@ def serving(
 
     try:
         server = serve(handler, HOST, port, process_request=_file, max_size=MOST_BYTES, compression=None)
-    except OSError as error:
-        raise UserError(f"Cannot listen on port {port} ({error.strerror}): choose another one with --port.") from None
+    except (OSError, OverflowError) as error:  # the latter: no port has this number
+        reason = getattr(error, "strerror", None) or str(error).rstrip(".")
+        raise UserError(f"Cannot listen on port {port} ({reason}): choose another one with --port.") from None
     with server:
         Thread(target=server.serve_forever, daemon=True).start()
         yield server

@@ -33,16 +33,17 @@ def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event) -> 
         budget: env steps of its expert.
         stop: set: end before the label is known.
     """
-    yield {"stage": "compiling", "budget": budget}
+    yield {"stage": "compiling"}
     pool, shown = Pool(budget, procedure, file.rules), monotonic()
     level_id = level_id_for(content_hashes(file.level)[0])
     run = TrainingRun(pool, file.level, np.array([level_id]))
     while not stop.is_set():
+        ended = pool.step()
         if run.submission is None:
             run.look()
             yield {"stage": "searching", "env_steps": run.totals().env_steps}
             continue
-        if pool.step() or not run.submission.under_way:
+        if ended:
             yield verdict_of(run)
             return
         curve = run.submission.curves[0]

@@ -35,7 +35,6 @@ from pipeline.read.levels import rules_of
 from pipeline.read.rows import COLUMNS, moved_rows, read_placed, same_places
 from pipeline.read.select import columns_in, select
 from pipeline.runtime import own_cores
-from pipeline.store.columns import COLUMNS as ALL_COLUMNS
 from pipeline.store.columns import schema_of
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import require_manifest
@@ -68,8 +67,6 @@ class Dataset:
     """Made by `levelproof.open`. Trajectories are numbered from 0 in the order of their level ids."""
 
     def __init__(self, split: Path, where: str | None, columns: Sequence[str], validation: float) -> None:
-        if unknown := [name for name in columns if name not in ALL_COLUMNS.names]:
-            raise UserError(f"There is no column {unknown[0]!r}: the manifest has {', '.join(ALL_COLUMNS.names)}.")
         self.split, self._opened_with = split, (split, where, columns, validation)
         manifest = require_manifest(split, [*READ, *columns, *columns_in(where)], compact=True)
         rows = select(manifest.table.filter(pc.is_valid(manifest.table["shard"])), where)  # pyright: ignore[reportAttributeAccessIssue]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline.errors import UserError
+from pipeline.errors import Failure, UserError
 
 PARTS = TRAIN, VALIDATION = "train", "validation"
 DIGITS = 8  # at the end of a content hash; its first ones make ids of level files
@@ -24,10 +24,16 @@ def in_part(content_hashes: Sequence[str], part: str | None, share: float) -> Bo
 
     Raises:
         UserError: there is no such part.
+        Failure: a hash is none.
     """
     if part is None:
         return np.ones(len(content_hashes), bool)
     if part not in PARTS:
         raise UserError(f"There is no part {part!r}: choose {' or '.join(PARTS)}, or None for both.")
-    drawn = np.frombuffer(bytes.fromhex("".join(of[-DIGITS:] for of in content_hashes)), ">u4")
+    try:
+        drawn = np.frombuffer(bytes.fromhex("".join(of[-DIGITS:] for of in content_hashes)), ">u4")
+    except ValueError:
+        drawn = np.zeros(0, ">u4")
+    if len(drawn) != len(content_hashes):
+        raise Failure("The manifest has content hashes that are none: run `levelproof verify` on its split.")
     return (drawn < share * 16**DIGITS) == (part == VALIDATION)

@@ -13,6 +13,7 @@ from pipeline.read.select import SOLVED, witnessed
 from pipeline.runtime import prepare_jax
 from pipeline.store.fields import tree_of
 from pipeline.store.remote import as_typed
+from pipeline.store.shard import stored_bytes
 from pipeline.store.shown import shown
 
 BLOCK = 4 * ROWS  # trajectories in memory at a time
@@ -40,10 +41,9 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
         for first in range(0, count, ARRAY):
             write_array(folder / name_of_array(first // ARRAY), min(ARRAY, count - first), dtype)
         write_group(folder)
-    stored = sum(path.stat().st_size for path in out.rglob("*"))
     print(
         f"{out}: {count} trajectories of {as_typed(split)}, "
-        f"{stored / (count * RECORD_STEPS):.0f} bytes per transition.\n"
+        f"{stored_bytes(out) / (count * RECORD_STEPS):.0f} bytes per transition.\n"
         f'Next:  kinetix.data.TrajectoryDatasetManager("{out}", batch_size=64)'
     )
 

@@ -70,7 +70,7 @@ def open_folder(path: Path) -> Folder:
     return folder
 
 
-def read_trajectories(array: StoredArray, size: Size, first: int, last: int) -> Trajectories:
+def read_trajectories(array: StoredArray, first: int, last: int) -> Trajectories:
     """Rows `first` to `last - 1`. Of their states the first alone is kept: the others follow from it.
 
     Raises:

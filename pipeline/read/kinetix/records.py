@@ -26,8 +26,8 @@ from levelgen.files.kinetix import (
 )
 from levelgen.level import Level
 from levelgen.task.actions import action_mask
-from physics.buffers import buffers_of
 from physics.types import Size
+from pipeline.store.contents import none_of
 
 T = TypeVar("T")
 
@@ -94,11 +94,7 @@ def trajectories_of(level: Level, record: Record) -> np.ndarray:
 @cache
 def dtype_of(size: Size) -> np.dtype:
     """A step of a trajectory."""
-    empty = lambda buffer: np.zeros((*buffer.shape, 0), buffer.dtype)
-    level, record = (jax.tree.map(empty, buffers_of(of, size)) for of in (Level, Record))
-    in_time = lambda tree: jax.tree.map(lambda x: np.stack([x] * RECORD_STEPS), tree)
-    record = Record(**vars(record) | {"state": in_time(record.state), "manifold": in_time(record.manifold)})
-    fields = fields_of(level, record)
+    fields = fields_of(*none_of(size))
     return np.dtype([(name, fields[name].dtype, (1, *fields[name].shape[2:])) for name in sorted(fields)])
 
 

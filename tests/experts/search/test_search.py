@@ -16,7 +16,7 @@ from experts.scout import STEPS_PER_ROUND
 from experts.search.config import SearchConfig
 from experts.search.explore import Search, begin, draw, explore
 from experts.search.play import arena, fresh_walk, play
-from experts.search.search import Searched, Searching, side_by_side
+from experts.search.search import AHEAD, Searched, Searching, side_by_side
 from experts.search.shorten import shorten
 from experts.steps import EnvSteps
 from experts.success import Success
@@ -37,10 +37,11 @@ SOLVABLE = np.flatnonzero(KINDS != BROKEN)
 
 def search(levels: Level, level_ids: np.ndarray, config: SearchConfig, rules: TaskParams) -> Searched:
     """Every level until it has a success or has had its env steps."""
-    searching = Searching(levels, level_ids, config, rules)
+    searching = Searching(config, rules)
+    sought = searching.submit(levels, level_ids)
     while searching.step():
         pass
-    return searching.result()
+    return searching.result(sought)
 
 
 @cache
@@ -96,6 +97,26 @@ def test_a_level_alone_gives_what_it_gives_among_others() -> None:
     for some in ([4], [8, 3, 2], list(range(len(KINDS)))[::-1]):
         alone = search(take(levels(), np.array(some)), IDS[some], CONFIG, DEFAULT_RULES)
         same(alone, jax.tree.map(lambda x, some=some: x[some], found()))
+
+
+def test_units_share_rows() -> None:
+    """Levels that come later take the rows that others leave; each gives what it gives alone."""
+    searching, units = Searching(CONFIG, DEFAULT_RULES), [np.arange(3), np.arange(3, 4), np.arange(4, len(KINDS))]
+    assert not searching.step()
+    assert searching.wants == AHEAD * side_by_side(CONFIG)
+    seen, sought = [], []
+    for some in units:
+        sought.append(searching.submit(take(levels(), some), IDS[some]))
+        assert searching.step()
+        seen.append(sum(of.env_steps for of in sought))
+    assert searching.wants < AHEAD * side_by_side(CONFIG)
+    assert seen == sorted(set(seen))
+    while searching.step():
+        pass
+    for some, of in zip(units, sought, strict=True):
+        assert not of.left
+        assert of.took.seconds > 0
+        same(searching.result(of), jax.tree.map(lambda x, some=some: x[some], found()))
 
 
 def test_another_id_is_another_search() -> None:
@@ -169,12 +190,11 @@ def test_a_full_archive_goes_on() -> None:
     for _ in range(4):
         now = explore(now, CONFIG, DEFAULT_RULES)
     archive = jax.device_get(now.archive)
-    full = np.flatnonzero(now.full)
-    assert len(full)
-    assert (archive.width[full] > CONFIG.width * CONFIG.growth / 1.01).all()
-    assert (archive.cells[full] > CONFIG.entries).all()
-    assert not np.asarray(now.full)[KINDS[: len(now.full)] == BROKEN].any()
-    for level in range(len(now.full)):
+    full = archive.cells > CONFIG.entries
+    assert full.any()
+    np.testing.assert_array_equal(archive.width > CONFIG.width * CONFIG.growth / 1.01, full)
+    assert not full[KINDS[: len(full)] == BROKEN].any()
+    for level in range(len(full)):
         keys = archive.key[level][archive.used[level]]
         assert len(set(keys.tolist())) == len(keys)
         assert archive.used[level].any()

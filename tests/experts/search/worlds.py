@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from levelgen.level import Level, Role
-from levelgen.sampling.scenery import empty_level
+from levelgen.sampling.scenery import FLOOR_TOP, empty_level
 from physics.types import FIXED_POLYGONS, Size
 
 SIZE = Size(polygons=6, circles=2, joints=1, thrusters=2)
@@ -38,6 +38,25 @@ def valley() -> Level:
         thrust=0.4,
     )
     level.model.friction[:] = 0
+    return level
+
+
+def tower() -> Level:
+    """A ball beside a tower of two boxes, green on top, and blue at its foot on the ball's side: the ball has to fly
+    over the tower and topple it from behind. From this side green falls off the other one, out of reach for good."""
+    boxes = [((3.2, FLOOR_TOP + 0.5), (0.2, 0.5)), ((3.2, FLOOR_TOP + 1.2), (0.25, 0.2))]
+    level = world(
+        bars=[(centre, half, 0.0) for centre, half in boxes],
+        bar_role=Role.PLAIN,
+        ball=(0.6, 0.6),
+        goal=(2.6, FLOOR_TOP + 0.2),
+        angles=(np.pi / 3, 2 * np.pi / 3),
+        thrust=0.9,
+    )
+    for i, (_, (x, y)) in enumerate(boxes, FIXED_POLYGONS):
+        mass = 4 * x * y  # kg, at 1 kg/m^2
+        level.model.inverse_mass[i], level.model.inverse_inertia[i] = 1 / mass, 3 / (mass * (x * x + y * y))
+    level.role[BALL], level.role[FIXED_POLYGONS + 1] = Role.PLAIN, Role.GREEN
     return level
 
 

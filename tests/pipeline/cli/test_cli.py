@@ -255,6 +255,15 @@ def test_a_closed_pipe_is_no_error(made: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_a_pipe_that_is_closed_before_little_is_written_is_no_error(tmp_path: Path) -> None:
+    command = f"{sys.executable} -m levelproof columns steps | true; exit ${{PIPESTATUS[0]}}"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def answers(split: Path) -> dict[str, object]:
     """What commands say of a split, but for the bytes that it takes."""
     folder, name, level = split.parents[2], "data/5k/s", str(solved_level(split))

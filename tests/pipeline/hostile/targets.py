@@ -133,7 +133,7 @@ def kinetix_folders(folder: Path) -> Target:
                 put(path, blosc.compress(bytes(inside), b"zstd", 1, 0), random)
         opened = open_folder(folder / "theirs")
         for array in [array for array in opened.arrays if array.path.name in {name.parts[0] for name in names}]:
-            found = read_trajectories(array, opened.size, 0, min(array.rows, 3))
+            found = read_trajectories(array, 0, min(array.rows, 3))
             good = [i for i, what in enumerate(found.wrong) if not what]
             level = jax.tree.map(lambda x: x[..., good], found.level)  # noqa: B023
             require_possible(arrays_of(level, "level/"), opened.size)
@@ -332,7 +332,7 @@ def origins(folder: Path) -> Target:
         if found is not None:
             assert str(found) == file
             opened = open_folder(found.folder)
-            read_trajectories(opened.named(found.array), opened.size, 0, 1)
+            read_trajectories(opened.named(found.array), 0, 1)
 
     return target
 

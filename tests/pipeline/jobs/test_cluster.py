@@ -13,7 +13,9 @@ from urllib.request import urlopen
 import pytest
 from rich.console import Console
 
+from pipeline.errors import UserError
 from pipeline.jobs import cluster
+from pipeline.jobs.address import require_reachable
 from pipeline.jobs.likeness import program_of, unlike
 from pipeline.jobs.progress import Board, Tally
 from pipeline.jobs.schedule import COMPANY, Scheduler
@@ -65,6 +67,13 @@ def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("address", ["127.0.0.1:99999", "a..b:6379"])
+def test_an_address_that_cannot_be_one_is_named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(UserError, match=f"There is no Ray cluster at RAY_ADDRESS={re.escape(address)} "):
+        require_reachable(address)
+
+
 def test_workers_read_no_relative_path() -> None:
     """They run in another folder than the command."""
     job = cluster._seen_from_elsewhere(made_job("data", "continue_from=data/5k/s"))
@@ -105,6 +114,18 @@ def test_there_are_as_many_workers_as_machines_have_room_for_now(monkeypatch: py
     crew._refuse(crew._handles[-1], "The worker on c has jax 0.1, and this command jax 0.2: install the same.")
     crew.follow_cluster()
     assert there(crew) == ["b"]
+
+
+def test_a_machine_is_left_out_when_several_of_its_workers_are_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    why = "The worker on a has jax 0.1, and this command jax 0.2: install the same."
+    answers = {"a0": why, "a1": why, "b0": "", "b1": ""}
+    monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
+    monkeypatch.setattr(cluster.ray, "wait", lambda references, **_: (references, []))
+    monkeypatch.setattr(cluster.ray, "get", answers.__getitem__)
+    crew = cluster.Crew(made_job("data", "unit=1"), SPLIT, Scheduler([], 6), Board(Tally(1, 0, 0), Console()))
+    crew._handles = [cluster.WorkerHandle(answer[0], answer[0], answer=answer) for answer in answers]
+    assert crew.wait() == []
+    assert [(handle.node, handle.up) for handle in crew._handles] == [("b", True), ("b", True)]
 
 
 def test_a_worker_with_another_program_is_refused_in_a_sentence() -> None:

@@ -8,7 +8,7 @@ from rich.console import Console
 from experts.steps import EnvSteps
 from pipeline.jobs.progress import Board, Tally
 from pipeline.jobs.schedule import Summary, WorkUnit
-from pipeline.words import duration
+from pipeline.words import duration, number
 
 UNIT = WorkUnit(tuple(range(16)))
 
@@ -117,3 +117,19 @@ def test_a_bar_on_a_terminal() -> None:
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (89, "89 s"), (90, "2 min"), (5400, "1.5 h")])
 def test_durations(seconds: float, text: str) -> None:
     assert duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (0.38251, "0.383"),
+        (12.0, "12"),
+        (999.4, "999"),
+        (999.6, "1,000"),
+        (12_345.6, "12,346"),
+        (-2e6, "-2,000,000"),
+    ],
+)
+def test_numbers(value: float, text: str) -> None:
+    assert number(value) == text

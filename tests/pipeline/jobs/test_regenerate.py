@@ -7,9 +7,10 @@ import jax
 import numpy as np
 import pytest
 
+from configs.compose import compose_job
 from experts.labels import Label
 from pipeline.errors import Failure, UserError
-from pipeline.jobs.regenerate import split_words
+from pipeline.jobs.regenerate import kept_words, split_words
 from pipeline.read.verify import examine
 from pipeline.store.checkpoints import load_experts, require_same_experts
 from pipeline.store.layout import new_attempt
@@ -125,6 +126,16 @@ def test_experts_that_a_dead_attempt_left_are_removed(folder: Path, tmp_path: Pa
 def test_mistakes_are_named(words: list[str], sentence: str) -> None:
     with pytest.raises(UserError, match=sentence):
         split_words(words)
+
+
+def test_a_preset_that_is_named_replaces_all_settings_of_its_kind() -> None:
+    made = made_job("data", "procedure=label", "expert.width=64", "distribution=vehicles", "task.max_timesteps=100")
+    again = lambda *settings: compose_job([*kept_words(made.results, settings), *settings])
+    same, masters, plain = again(), again("procedure=masters"), again("distribution=kinetix", "procedure=default")
+    assert (same.procedure, same.distribution, same.task) == (made.procedure, made.distribution, made.task)
+    assert masters.procedure == made_job("data", "procedure=masters").procedure
+    assert (masters.distribution, masters.task) == (made.distribution, made.task)
+    assert (plain.procedure, plain.distribution) == (made_job().procedure, made_job().distribution)
 
 
 def test_a_manifest_that_is_not_there_is_named(tmp_path: Path) -> None:

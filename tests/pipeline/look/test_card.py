@@ -100,10 +100,12 @@ def test_again_overwrites_its_own_card_and_nobody_elses(dataset: Path, tmp_path:
     out.write_text("mine")
     assert main(["card", str(split), "-o", str(out)]) == 2
     assert out.read_text() == "mine"
+    assert main(["card", str(split), "-o", str(dataset / "64k")]) == 2
     assert main(["card", str(split), "-o", str(tmp_path / "README.md")]) == 2
     assert main(["card", str(tmp_path / "128k/s")]) == 2
-    *_, mine, below, nothing = capsys.readouterr().err.splitlines()
+    *_, mine, folder, below, nothing = capsys.readouterr().err.splitlines()
     assert mine.endswith("`levelproof card` did not write it: name another file with -o.")
+    assert folder == mine.replace(str(out), str(dataset / "64k"))
     assert "is not below" in below
     assert "There is no split at" in nothing
     assert not list(tmp_path.iterdir())

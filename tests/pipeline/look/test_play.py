@@ -137,6 +137,7 @@ def test_what_cannot_be_played_is_one_sentence(split: Path, tmp_path: Path, addr
     assert_refused(here(["play", str(split)], tmp_path), 2, "Add its id")
     assert_refused(here(["play", "--size", "giant"], tmp_path), 2, "giant")
     assert_refused(here(["play", "--port", address.rpartition(":")[2]], tmp_path), 2, "--port")
+    assert_refused(here(["play", "--port", "65536"], tmp_path), 2, "port 65536", "must be 0-65535", "--port")
     level = tmp_path / "level.json"
     write_level_file(empty_file("m"), level)
     with pytest.raises(UserError, match="leave out"):

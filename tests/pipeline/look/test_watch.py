@@ -58,6 +58,15 @@ def test_a_run_that_died_is_not_at_work_and_a_silent_one_is_told(split: Path) ->
     assert "2, the most silent for 10 min" in text
 
 
+def test_a_cause_is_told_as_it_is_and_no_terminal_obeys_it(split: Path) -> None:
+    failed = {"time": 1.0, "event": "failed", "unit": "0-1", "cause": "KeyError: [b] of [/a]\x1b[2J"}
+    damaged = {"time": 1.0, "event": "failed"}
+    tell(new_run(split), [failed, damaged, state("ended")])
+    done = here(["status", str(split), "--watch"], split)
+    assert done.returncode == 0, done.stderr
+    assert "0-1: KeyError: [b] of [/a]?[2J" in done.stdout
+
+
 def test_where_nothing_is_told_a_sentence_says_so(split: Path) -> None:
     assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has told anything")
     tell(new_run(split), [{"time": 1.0, "event": "progress"}])  # damaged

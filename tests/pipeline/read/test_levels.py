@@ -1,15 +1,16 @@
 """One level that a user names: found without reading the others."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from experts.labels import Label
-from pipeline.errors import UserError
-from pipeline.read.levels import COLUMNS, find_level
+from pipeline.errors import Failure, UserError
+from pipeline.read.levels import COLUMNS, find_level, rules_of
 from pipeline.store import manifest
-from pipeline.store.manifest import read_fragment
+from pipeline.store.manifest import read_fragment, read_manifest
 from tests.pipeline.made import made_split
 
 
@@ -29,3 +30,11 @@ def test_one_fragment_and_few_columns_are_read(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(UserError, match=r"^There is no level 8 in .*: it has 8 levels, from 0 to 7\.$"):
         find_level(split, 8)
     assert [columns for _, columns in read] == [{"level_id"}] * 4
+
+
+@pytest.mark.parametrize("config", [{}, {"task": 3}, {"task": {"no_setting": 1}}])
+def test_settings_of_another_program_are_a_sentence(tmp_path: Path, config: dict[str, Any]) -> None:
+    found = read_manifest(made_split(tmp_path, [[Label.SOLVED]]), [])
+    (fragment,) = found.fragments
+    with pytest.raises(Failure, match="was made by a levelproof with other settings"):
+        rules_of(replace(found, fragments=(replace(fragment, config=config),)))

@@ -48,4 +48,4 @@ def test_pickle_is_not_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(Failure, match="cannot be read"):
         load_experts(theirs, made_job())
     folder = open_folder(GOLDEN / "s")
-    assert read_trajectories(folder.arrays[0], folder.size, 0, 1).wrong == [""]
+    assert read_trajectories(folder.arrays[0], 0, 1).wrong == [""]

@@ -14,13 +14,18 @@ import pytest
 
 from experts.labels import WITNESSED, Label
 from experts.witness import replay
+from levelgen.identity.keys import MAX_LEVEL_ID
 from pipeline.read import evidence
 from pipeline.read.verify import examine
+from pipeline.store import remote
 from pipeline.store.checksums import digests_of, with_own
-from pipeline.store.manifest import fragment_paths, read_manifest
+from pipeline.store.job_note import note_job
+from pipeline.store.layout import MANIFEST, unit_name
+from pipeline.store.manifest import fragment_paths, read_manifest, write_index
 from pipeline.store.schema import DIGESTS_KEY
 from pipeline.store.shard import Shard, write_shard
-from tests.pipeline.made import honest_split
+from tests.pipeline.made import honest_split, made_job
+from tests.pipeline.servers import files_of, serving
 
 pytestmark = pytest.mark.slow
 UNIT, UNITS = 8, 6
@@ -98,6 +103,23 @@ def test_an_honest_split_has_nothing_wrong(honest: Path, monkeypatch: pytest.Mon
     assert (found.levels, found.shards) == (UNIT * UNITS, len(read_manifest(honest).shards))
     assert found.witnesses == found.same_bits == len(of_label(honest, *WITNESSED))
     assert counts == [found.witnesses]
+
+
+def test_an_honest_split_on_a_web_server_has_nothing_wrong(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It lists no files; those that fragments name are looked at."""
+    monkeypatch.setattr(remote, "_cache", lambda: remote.PieceCache(tmp_path / "cache", 10**9))
+    write_index(split)
+    shard = split / sorted(read_manifest(split, ["shard"]).shards)[0]
+    with serving(files_of(split.parent)) as server:
+        found = examine(Path(f"{server.url}/{split.name}"))
+        assert found.sentences == []
+        assert found.witnesses == found.same_bits == len(of_label(split, *WITNESSED))
+        with (shard / "zarr.json").open("a") as file:
+            file.write(" ")
+        (sentence,) = examine(Path(f"{server.url}/{split.name}")).sentences
+        assert f"{shard.name}/zarr.json is not what was committed" in sentence
 
 
 @pytest.mark.parametrize("adapts", [False, True])
@@ -181,6 +203,17 @@ def test_a_record_that_differs_in_one_bit(split: Path) -> None:
     assert_told(split, f"Level {row['level_id']} has a witness that does not replay: its reward differs.")
     forge(split, of_another_stack)
     assert_told(split)
+
+
+def test_of_a_damaged_fragment_no_more_levels_are_lost_than_one_has(
+    split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever its name and the note say."""
+    monkeypatch.setattr("pipeline.read.verify.MOST_ROWS", 100)
+    (split / MANIFEST / f"{unit_name(0, MAX_LEVEL_ID)}.parquet").write_bytes(b"PAR1")
+    assert len(examine(split).lost) <= 102
+    note_job(split, made_job(), ["levelproof", "generate"], [(0, MAX_LEVEL_ID)])
+    assert len(examine(split).lost) <= 102
 
 
 def test_a_hostile_shard_is_one_sentence_and_the_others_are_looked_at(split: Path) -> None:

@@ -99,6 +99,12 @@ def test_columns_asked_for_are_enough(tmp_path: Path, job: JobConfig) -> None:
     assert read_manifest(tmp_path, ["label"]).table.column_names == ["level_id", "label"]
 
 
+def test_a_column_that_is_none_is_named(tmp_path: Path, job: JobConfig) -> None:
+    commit(tmp_path, job, [0])
+    with pytest.raises(UserError, match="There is no column 'lable': the manifest has level_id, "):
+        read_manifest(tmp_path, ["lable"])
+
+
 def test_nothing_committed_is_an_empty_manifest(tmp_path: Path) -> None:
     manifest = read_manifest(tmp_path)
     assert len(manifest.level_ids) == 0

@@ -24,8 +24,8 @@ from pipeline.store.layout import FRAGMENT, data_paths, new_attempt, unit_name
 from pipeline.store.leases import Lease, LeaseLost
 from pipeline.store.leftovers import clean
 from pipeline.store.locks import is_written
-from pipeline.store.manifest import read_manifest
-from pipeline.store.objects import put, remove
+from pipeline.store.manifest import fragment_paths, read_manifest
+from pipeline.store.objects import get, put, remove, require_conditions
 from pipeline.store.publish import ended
 from tests.pipeline.command import ROOT, TINY, run
 from tests.pipeline.command import here as command
@@ -294,6 +294,17 @@ def test_levels_that_an_attempt_of_which_nobody_has_heard_has_committed_are_left
     assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
 
 
+@pytest.mark.parametrize(("first", "last"), [(4, 44), (40, None)], ids=["the first page's header", "its end"])
+def test_a_fragment_that_is_damaged_is_one_sentence(server: Server, first: int, last: int | None) -> None:
+    commit_made(THERE, WorkUnit((0, 1)))
+    (path,) = fragment_paths(THERE)
+    data = bytearray(get(path).data)
+    data[first:last] = bytes(40)
+    put(path, bytes(data))
+    with pytest.raises(Failure, match=r"fragment s3://bucket/data/128k/s/.* is damaged: remove it"):
+        commit_made(THERE, WorkUnit((0, 1)))
+
+
 def test_a_second_writer_is_refused_while_the_first_renews_its_lease(
     server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -389,6 +400,16 @@ def test_a_store_that_heeds_no_conditions_is_refused(server: Server, tmp_path: P
         forget()
         with pytest.raises(UserError, match="does not heed the conditions"):
             drive(OUT)
+
+
+def test_a_store_that_is_busy_is_not_said_to_heed_no_conditions(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever numbers there are in the name of the file that it is tried with."""
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    server.spoil(1)
+    with pytest.raises(Failure, match=r"Cannot write .*501 \(503 Service Unavailable\)"):
+        require_conditions(THERE / ".job.json.501")
 
 
 @ALSO_MOTO

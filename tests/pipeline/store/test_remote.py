@@ -25,12 +25,16 @@ import levelproof
 from experts.labels import Label
 from pipeline.errors import Failure, LevelproofError, UserError
 from pipeline.read.rows import read_rows
-from pipeline.store import hub, remote
+from pipeline.store import events, hub, job_note, leases, remote
+from pipeline.store.events import events_of
 from pipeline.store.fields import same_bits
+from pipeline.store.job_note import NoteError, note_job, read_note
+from pipeline.store.layout import WRITER_LOCK
+from pipeline.store.leases import is_leased
 from pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
 from tests.pipeline.command import ROOT, assert_refused
 from tests.pipeline.command import here as command
-from tests.pipeline.made import made_split, played_split
+from tests.pipeline.made import made_job, made_split, played_split
 from tests.pipeline.servers import HOST, Answer, Server, before, bucket_of, files_of, hub_of, s3_process, serving
 
 UNITS = [[Label.SOLVED] * 2, [Label.UNSOLVED, Label.SOLVED, Label.SOLVED], [Label.SOLVED] * 4]
@@ -296,6 +300,25 @@ def test_who_has_a_split_open_that_is_sealed_goes_on(
         assert all(same_bits(found[name], true[name]).all() for name in true)
 
 
+def test_what_is_longer_than_it_can_be_is_not_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What tells of a run: its note, its lease, its events."""
+    (tmp_path / "s").mkdir()
+    note_job(tmp_path / "s", made_job(), ["levelproof", "generate"], [(0, 7)])
+    (tmp_path / "s" / WRITER_LOCK).write_text('{"writer": "somebody"}')
+    (tmp_path / "s/run.jsonl").write_text('{"time": 1.0, "event": "started"}\n')
+    with serving(files_of(tmp_path)) as server:
+        there = Path(f"{server.url}/s")
+        assert read_note(there).intact
+        assert is_leased(there)
+        assert len(events_of(there / "run.jsonl")) == 1
+        for module in (job_note, leases, events):
+            monkeypatch.setattr(module, "MOST_BYTES", 20)
+        with pytest.raises(NoteError, match="OSError"):
+            read_note(there)
+        assert not is_leased(there)
+        assert events_of(there / "run.jsonl") == []
+
+
 def test_a_server_that_lies_about_sizes_is_one_sentence() -> None:
     def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
         if path.endswith("index.txt"):
@@ -375,6 +398,15 @@ def test_a_split_on_the_hub(split: Path, tmp_path: Path, monkeypatch: pytest.Mon
         assert [line for line in server.log if "/resolve/" in line] == []
         with pytest.raises(UserError, match="There is no split at hf://datasets/user/name/2M/s"):
             require_manifest(Path("hf://datasets/user/name/2M/s"))
+
+
+def test_a_hub_whose_lists_are_cut_off_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where they come in chunks, an answer that ends early is an error of HTTP's, and none of the system's."""
+    with serving(lambda *_: Answer(200, {"Transfer-Encoding": "chunked"}, b"ff\r\n[")) as server:
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+        with pytest.raises(Failure, match=r"The hub does not answer at .*IncompleteRead"):
+            read_manifest(Path("hf://datasets/user/name/1M/s"))
+        assert len(server.log) == hub.ATTEMPTS
 
 
 def test_commands_that_read_take_urls_and_others_say_what_they_need(

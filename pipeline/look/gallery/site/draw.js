@@ -114,7 +114,7 @@ window.levelproof = window.levelproof || {};
 
   let hatching = null;
 
-  // Diagonal lines over what cannot move, 0.4 of 1 dark.
+  // Diagonal lines over what cannot move.
   function hatch(context) {
     if (!hatching) {
       const tile = document.createElement("canvas");

@@ -5,10 +5,10 @@
   const { drawCurve, drawWorld } = window.levelproof;
   const at = (id) => document.getElementById(id);
   const STAGES = {
-    compiling: "Loading the programs of this size; the first time takes a minute.",
+    compiling: "Loading the programs of this size; the first time takes a minute",
     searching: "Random play and a search look for a first success",
     training: "The expert trains",
-    stopped: "Stopped.",
+    stopped: "Stopped",
   };
   const SMALL = 160; // pixels of an attempt
 
@@ -43,8 +43,7 @@
       if (message.attempts) return this.attempts(message);
       const { stage } = message;
       const steps = message.env_steps === undefined ? "" : `: ${message.env_steps.toLocaleString("en")} env steps`;
-      if (message.budget) this.budget = message.budget;
-      at("stage-of-training").textContent = stage === "training" ? `${STAGES[stage]}${steps}.` : stage === "searching" ? `${STAGES[stage]}${steps}.` : STAGES[stage] || "";
+      at("stage-of-training").textContent = STAGES[stage] ? `${STAGES[stage]}${steps}.` : "";
       if (message.curve) drawCurve(at("curve"), message.curve);
       if (stage === "done") {
         at("stage-of-training").textContent = `${message.label}: ${message.reason} (${message.env_steps.toLocaleString("en")} env steps).`;

@@ -12,8 +12,8 @@
   const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowUp: "↑", ArrowDown: "↓", a: "A", d: "D", w: "W", s: "S" };
 
   class Player {
-    constructor(link, stage, changed) {
-      Object.assign(this, { link, stage, changed, playing: false, held: new Set(), busy: false });
+    constructor(link, stage) {
+      Object.assign(this, { link, stage, playing: false, held: new Set(), busy: false });
       at("play").addEventListener("click", () => this.play(!this.playing));
       at("step").addEventListener("click", () => { this.play(false); this.step(); });
       at("restart").addEventListener("click", () => this.restart());

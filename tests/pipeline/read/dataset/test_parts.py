@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from pipeline.errors import UserError
+from pipeline.errors import Failure, UserError
 from pipeline.read.dataset.parts import check_share, in_part
 
 HASHES = [f"c1:{hashlib.sha256(str(i).encode()).hexdigest()[:32]}" for i in range(5000)]
@@ -31,3 +31,9 @@ def test_what_is_no_part_is_refused() -> None:
         in_part(HASHES, "test", 0.1)
     with pytest.raises(UserError, match=r"The share of validation is 1\.5"):
         check_share(1.5)
+
+
+@pytest.mark.parametrize("odd", ["c1:no number", "c1:12 4567", ""])
+def test_a_hash_that_is_none_is_a_sentence(odd: str) -> None:
+    with pytest.raises(Failure, match="content hashes that are none"):
+        in_part([HASHES[0], odd], "train", 0.1)

@@ -118,6 +118,7 @@ def test_a_folder_appears_whole_or_not_at_all(split: Path, tmp_path: Path, monke
 def test_what_a_format_is_for(split: Path, tmp_path: Path) -> None:
     assert_refused(here(["export", str(split)], tmp_path), 2, "give its id", "--format")
     assert_refused(here(["export", str(split), "0", "--where", "true"], tmp_path), 2, "without --where")
+    assert_refused(here(["export", str(split), "0", "--actions", "combined"], tmp_path), 2, "leave it out for json")
     assert_refused(here(["export", str(split), "0", "--format", "kinetix"], tmp_path), 2, "--where", "level_id = 0")
     assert_refused(here(["export", str(split), "--format", "kinetix"], tmp_path), 2, "with -o")
     assert_refused(here(["export", "nothing", "--format", "kinetix", "-o", "k"], tmp_path), 2, "There is no split")

@@ -29,7 +29,7 @@ def read(folder: Path) -> None:
     """All that is read of a folder."""
     found = open_folder(folder)
     for array in found.arrays:
-        read_trajectories(array, found.size, 0, array.rows)
+        read_trajectories(array, 0, array.rows)
 
 
 @pytest.mark.parametrize("size", ["s", "m"])
@@ -39,7 +39,7 @@ def test_chunks_of_any_cut_are_read(size: str) -> None:
     first, second = folder.arrays
     assert (first.chunks, second.chunks) == ((4, 256), (2, 100))
     for array, start, stop, offset in ((first, 0, 3, 0), (second, 1, 4, first.rows), (second, 3, 4, first.rows)):
-        found = read_trajectories(array, folder.size, start, stop)
+        found = read_trajectories(array, start, stop)
         at = slice(offset + start, offset + stop)
         assert found.wrong == [""] * (stop - start)
         np.testing.assert_array_equal(found.action, record.action[..., at])
