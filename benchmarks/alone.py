@@ -1,6 +1,7 @@
-"""Levels labelled in a pool of their own: what a worker does with a unit, in one call."""
+"""Levels labelled without a worker: what it does with a unit, in one call, or with one unit after another."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from levelgen.level import Level
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
 
 Tell = Callable[[int, float, int], None]  # totals so far: env steps, levels (parts count), solved levels
+Name = TypeVar("Name")
 
 
 def label(
@@ -38,3 +40,34 @@ def label(
     solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
     tell(result.spent.shown, len(result.verdicts), solved)
     return result
+
+
+def side_by_side(
+    pool: Pool,
+    units: Iterable[tuple[Name, Level, np.ndarray]],
+    tell: Callable[[Mapping[Name, TrainingRun]], None] = lambda _: None,
+) -> Iterator[tuple[Name, UnitResult]]:
+    """Label units, each when the pool wants levels; what came of each, as it is done.
+
+    Args:
+        pool: where their experts train.
+        units: of each a name, its levels and their ids.
+        tell: called after each step with all that is under way.
+    """
+    runs: dict[Name, TrainingRun] = {}
+    waiting = iter(units)
+    while True:
+        while pool.wants(sum(run.searching for run in runs.values())):
+            unit = next(waiting, None)
+            if unit is None:
+                break
+            name, levels, level_ids = unit
+            runs[name] = TrainingRun(pool, levels, level_ids)
+        if not runs:
+            return
+        finished = pool.step()
+        for run in runs.values():
+            run.look()
+        tell(runs)
+        for name in [name for name, run in runs.items() if run.submission in finished]:
+            yield name, runs.pop(name).finish()

@@ -78,7 +78,7 @@ class Looking:
         some = take(levels, self._left), level_ids[self._left]
         self._searching = searching
         self._sought = searching.submit(*some) if procedure.search.env_steps and len(self._left) else None
-        self.took = self._sought.took if self._sought else Lap()  # so far, of the search
+        self.took, self.idle = Lap(), 0.0  # of the search, once it has ended; `idle` is seconds of rows without a level
 
     @property
     def env_steps(self) -> int:
@@ -90,6 +90,7 @@ class Looking:
         """Whether nothing is left to search: then `found` has what came of it."""
         if self._sought and not self._sought.left:
             self._take(self._searching.result(self._sought))
+            self.took, self.idle = self._sought.took, self._sought.idle
             self._sought = None
         return self._sought is None
 

@@ -25,7 +25,7 @@ class Seconds(NamedTuple):
     search: float = 0.0  # of scouts, too
     training: float = 0.0
     evaluation: float = 0.0
-    idle: float = 0.0  # of slots that had no level
+    idle: float = 0.0  # of slots and of rows of the search that had no level
     replay: float = 0.0  # of witnesses: choosing, recording and checking them
     writing: float = 0.0  # of shards, experts and rows; not of the fragment itself
     compiling: float = 0.0  # or reading what was compiled before

@@ -7,9 +7,11 @@ import multiprocessing
 import queue
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from pipeline.jobs.schedule import Summary, WorkUnit, plan_units
 from pipeline.runtime import cache_folder, interruptible, own_cores, prepare_jax
 from pipeline.store.provenance import device, versions
 
-UNIT = 64  # levels that a process trains at a time: slots are rarely empty, as in a job
+UNIT = 32  # levels, as in a job
 POLL = 0.5  # s between looks at the processes
 DIGITS = 4  # of a share or of seconds in a file
 
@@ -170,38 +172,49 @@ def rows_in(scratch: Path) -> dict[int, dict[str, Any]]:
 
 
 def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> None:
-    """One process: train units until none is left. Compiling is not measured."""
+    """One process: train units until none is left. Compiling is not measured, nor what is empty at the end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the first process ends the others
     prepare_jax(core)
     import jax.numpy as jnp
     import numpy as np
 
-    from benchmarks.alone import label
-    from levelgen.level import size_of
+    from benchmarks.alone import side_by_side
+    from experts.pool import Pool
+    from experts.train import TrainingRun
+    from levelgen.level import Level, size_of
     from levelgen.sampling.distribution import Distribution
     from levelgen.sampling.sampler import sample_levels
+    from levelgen.task.rules import DEFAULT_RULES
 
-    warm = False
-    while (unit := tasks.get()) is not None:
-        ids = np.asarray(unit.level_ids, np.int32)
-        levels = sample_levels(jnp.asarray(ids), size_of(header.size), Distribution())
+    pools = lambda budget: Pool(budget, variant.procedure, DEFAULT_RULES)
+    told_at = time.monotonic()
 
-        def report(*totals: Any, unit: WorkUnit = unit) -> None:
-            told.put(Progress(unit, totals))
+    def sampled(units: Iterable[WorkUnit]) -> Iterator[tuple[WorkUnit, Level, np.ndarray]]:
+        for unit in units:
+            ids = np.asarray(unit.level_ids, np.int32)
+            yield unit, sample_levels(jnp.asarray(ids), size_of(header.size), Distribution()), ids
 
-        if not warm:
-            label(levels, ids, variant.procedure.expert.steps_per_update, variant.procedure)
-            warm = True
-        before = time.process_time()
-        result = label(levels, ids, header.budget, variant.procedure, tell=report)
-        seconds = (time.process_time() - before) / len(ids)
-        rows = [row_of(int(i), v, seconds) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
+    def tell(runs: Mapping[WorkUnit, TrainingRun]) -> None:
+        nonlocal told_at
+        if time.monotonic() - told_at > POLL:
+            told_at = time.monotonic()
+            for unit, run in runs.items():
+                told.put(Progress(unit, run.totals()))
+
+    first = tasks.get()  # there is one for each process
+    deque(side_by_side(pools(variant.procedure.expert.steps_per_update), sampled([first])), maxlen=0)
+    units = sampled(chain([first], iter(tasks.get, None)))
+    for unit, result in side_by_side(pools(header.budget), units, tell):
+        assert result.ledger is not None
+        cost = [result.ledger.of(i) for i in range(len(result.level_ids))]
+        seconds = [sum(of) - of.idle - of.compiling for of in cost]
+        rows = [row_of(int(i), *of) for i, *of in zip(result.level_ids, result.verdicts, seconds, strict=True)]
         solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
-        told.put(Trained(unit, rows, Summary(len(ids), solved, result.spent), versions(), device()))
+        told.put(Trained(unit, rows, Summary(len(rows), solved, result.spent), versions(), device()))
 
 
 def row_of(level_id: int, verdict: Verdict, seconds: float) -> dict[str, Any]:
-    """A level's line. Its core-seconds are its part of what its unit took."""
+    """A level's line."""
     values = {name: getattr(verdict, name) for name in OF_LEVEL if name != "core_seconds"}
     return {"level_id": level_id} | {name: short(x) for name, x in (values | {"core_seconds": seconds}).items()}
 

@@ -34,7 +34,7 @@ SCHEMA = pa.schema(
         ("success_rate", pa.float64()),  # of the last evaluation's sampled episodes; null: none ended
         ("most_probable_succeeds", pa.bool_()),  # in the last evaluation; null: it was not noted
         ("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: no witness
-        ("core_seconds", pa.float64()),  # the level's part of what its unit took
+        ("core_seconds", pa.float64()),  # without compiling, and without slots and rows that are empty at the end
         ("settings", WORD),  # of the procedure, as JSON
         ("versions", WORD),  # as JSON
         ("device", WORD),

@@ -40,6 +40,7 @@ class Sought:
         self.levels, self.level_ids, self.known = levels, level_ids, nothing
         self.left = len(level_ids)  # levels that are searched, or wait for it
         self.took = Lap()  # their part of what the search took
+        self.idle = 0.0  # s, of rows that had no level: the last submission's, so that it is counted once
 
     @property
     def env_steps(self) -> int:
@@ -91,8 +92,10 @@ class Searching:
             self._search = explore(self._search, self._scaled, self._rules)
             left, seen = jax.device_get(searched(self._search, self._scaled))
         busy = [(row, *at) for row, at in enumerate(self._at) if at]
+        of_row = took.seconds / len(self._at)
+        busy[-1][1].idle += of_row * (len(self._at) - len(busy))
         for row, sought, i in busy:
-            sought.took.seconds += took.seconds / len(busy)
+            sought.took.seconds += of_row
             sought.took.compiling += took.compiling / len(busy)
             for known, now in zip(jax.tree.leaves(sought.known), jax.tree.leaves(seen), strict=True):
                 known[i] = now[row]
