@@ -86,6 +86,16 @@ class Looking:
         searched = self._sought.env_steps if self._sought else int(self.found.search_steps.sum())
         return int(self.found.scout_steps.sum()) + searched
 
+    @property
+    def waiting(self) -> Int[np.ndarray, " index"]:
+        """Indices of its levels whose search has not begun."""
+        return self._left[self._searching.waiting(self._sought)] if self._sought else self._left[:0]
+
+    def withdraw(self, indices: Int[np.ndarray, " index"]) -> None:
+        """Do not search levels whose search has not begun."""
+        if self._sought:
+            self._searching.withdraw(self._sought, np.flatnonzero(np.isin(self._left, indices)).tolist())
+
     def ended(self) -> bool:
         """Whether nothing is left to search: then `found` has what came of it."""
         if self._sought and not self._sought.left:

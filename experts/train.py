@@ -70,7 +70,8 @@ class TrainingRun:
         new = ~np.isin(self.level_ids[self.left], list(self._paused))
         self._order = np.argsort(np.r_[np.flatnonzero(new), np.flatnonzero(~new)])  # of new ones and others, as left
         with self.ledger.timing("search"):
-            self.looking = Looking(*self._some(self.left[new]), pool.procedure, pool.rules, pool.searching)
+            self._looked = self.left[new]
+            self.looking = Looking(*self._some(self._looked), pool.procedure, pool.rules, pool.searching)
         self.submission: Submission | None = None  # of those that an expert is asked for
         self._gone: set[int] = set()  # ids of levels that others label
         self.look()
@@ -91,18 +92,20 @@ class TrainingRun:
         of = lambda known: {i: known[one] for i, one in enumerate(level_ids.tolist()) if one in known}
         found = joined([self.looking.found, *(one.found for one in self._paused.values())], self._order)
         self.submission = self.pool.submit(levels, level_ids, found, of(self._begun), self._keep, of(self._paused))
+        self.leave_out(self._gone)
 
     @property
     def searching(self) -> int:
         """Levels that will come to the pool."""
-        return 0 if self.submission else len(self.left)
+        return 0 if self.submission else len(self.left) - len(self._gone)
 
     @property
     def unbegun(self) -> list[int]:
-        """Ids of levels that wait for an expert to begin."""
-        waiting = (
-            self.submission.level_ids[self.pool.waiting(self.submission)] if self.submission else self.level_ids[:0]
-        )
+        """Ids of levels that wait for their search to begin, or for their expert."""
+        if self.submission is None:
+            waiting = self.level_ids[self._looked[self.looking.waiting]]
+        else:
+            waiting = self.submission.level_ids[self.pool.waiting(self.submission)]
         return [level_id for level_id in waiting.tolist() if level_id not in self._paused]
 
     def paused(self, in_slots: Iterable[tuple[Submission, int, Paused]]) -> dict[int, Paused]:
@@ -122,9 +125,11 @@ class TrainingRun:
     def leave_out(self, level_ids: Collection[int]) -> None:
         """Have others label some of these levels: any that are `unbegun`, or all that are `undecided` at the end."""
         self._gone.update(level_ids)
-        if self.submission:
-            indices = np.flatnonzero(np.isin(self.submission.level_ids, list(level_ids)))
-            self.pool.withdraw(self.submission, indices.tolist())
+        indices = lambda of: np.flatnonzero(np.isin(of, list(self._gone)))
+        if self.submission is None:
+            self.looking.withdraw(indices(self.level_ids[self._looked]))
+        else:
+            self.pool.withdraw(self.submission, indices(self.submission.level_ids).tolist())
 
     def totals(self) -> Totals:
         """How far all levels are, those that need no expert included."""

@@ -1,6 +1,7 @@
 """From levels to what was found: some are searched side by side, and when one leaves the next comes in."""
 
 from collections import deque
+from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -76,6 +77,16 @@ class Searching:
         sought = Sought(levels, level_ids, nothing)
         self._waiting.extend((sought, i) for i in range(len(level_ids)))
         return sought
+
+    def waiting(self, sought: Sought) -> list[int]:
+        """Indices of its levels that have had no row, ascending."""
+        return [i for of, i in self._waiting if of is sought]
+
+    def withdraw(self, sought: Sought, indices: Collection[int]) -> None:
+        """Take levels out that have had no row."""
+        staying = [(of, i) for of, i in self._waiting if of is not sought or i not in indices]
+        sought.left -= len(self._waiting) - len(staying)
+        self._waiting = deque(staying)
 
     @property
     def wants(self) -> int:

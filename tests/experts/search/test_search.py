@@ -109,7 +109,11 @@ def test_units_share_rows() -> None:
         sought.append(searching.submit(take(levels(), some), IDS[some]))
         assert searching.step()
         seen.append(sum(of.env_steps for of in sought))
-    assert searching.wants < AHEAD * side_by_side(CONFIG)
+    waiting = searching.waiting(sought[-1])
+    assert searching.wants == AHEAD * side_by_side(CONFIG) - len(waiting)
+    left_out, left = searching.submit(levels(), IDS), sought[-1].left
+    searching.withdraw(left_out, range(len(KINDS)))
+    assert (left_out.left, sought[-1].left, searching.waiting(sought[-1])) == (0, left, waiting)
     assert seen == sorted(set(seen))
     while searching.step():
         pass

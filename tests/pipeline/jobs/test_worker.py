@@ -137,6 +137,24 @@ def test_levels_given_back_and_levels_left_undecided_are_made_by_another_to_the_
     assert repr(lasting(tmp_path / "alone")) == repr(lasting(tmp_path / "cut"))
 
 
+def test_levels_that_wait_for_their_search_are_made_by_another_to_the_same_bits(tmp_path: Path, job: JobConfig) -> None:
+    job, unit = replace(job, scout=ScoutConfig(0)), WorkUnit(range(16))
+    for name in ("cut", "alone"):
+        (tmp_path / name).mkdir()
+    outcomes(Worker(job, tmp_path / "alone"), [unit])
+    worker = Worker(job, tmp_path / "cut")
+    spare = worker.work(Order([unit]), 0.0).spare
+    assert spare > 4
+    round = worker.work(Order([], give=spare // 2), 0.0)
+    ((before, kept, back),) = round.cuts
+    assert back
+    assert (before, len(back.level_ids), round.spare) == (unit, spare // 2, spare - spare // 2)
+    assert outcomes(worker, []).keys() == {kept}
+    assert not worker.work(Order([]), 0.0).spare
+    outcomes(Worker(job, tmp_path / "cut"), [back])
+    assert repr(lasting(tmp_path / "alone")) == repr(lasting(tmp_path / "cut"))
+
+
 def test_experts_that_are_kept_go_on_where_they_were(tmp_path: Path, job: JobConfig) -> None:
     job = replace(job, scout=ScoutConfig(0), search=SearchConfig(env_steps=0), checkpoint="1h")
     unit = WorkUnit(range(8))
