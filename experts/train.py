@@ -92,7 +92,8 @@ class TrainingRun:
         of = lambda known: {i: known[one] for i, one in enumerate(level_ids.tolist()) if one in known}
         found = joined([self.looking.found, *(one.found for one in self._paused.values())], self._order)
         self.submission = self.pool.submit(levels, level_ids, found, of(self._begun), self._keep, of(self._paused))
-        self.leave_out(self._gone)
+        if self._gone:
+            self.leave_out(self._gone)
 
     @property
     def searching(self) -> int:

@@ -205,10 +205,11 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
     deque(side_by_side(pools(variant.procedure.expert.steps_per_update), sampled([first])), maxlen=0)
     units = sampled(chain([first], iter(tasks.get, None)))
     for unit, result in side_by_side(pools(header.budget), units, tell):
-        assert result.ledger is not None
-        cost = [result.ledger.of(i) for i in range(len(result.level_ids))]
-        seconds = [sum(of) - of.idle - of.compiling for of in cost]
-        rows = [row_of(int(i), *of) for i, *of in zip(result.level_ids, result.verdicts, seconds, strict=True)]
+        rows = []
+        for i, (level_id, verdict) in enumerate(zip(result.level_ids.tolist(), result.verdicts, strict=True)):
+            assert result.ledger is not None
+            cost = result.ledger.of(i)
+            rows.append(row_of(level_id, verdict, sum(cost) - cost.idle - cost.compiling))
         solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
         told.put(Trained(unit, rows, Summary(len(rows), solved, result.spent), versions(), device()))
 

@@ -41,7 +41,7 @@ class Sought:
         self.levels, self.level_ids, self.known = levels, level_ids, nothing
         self.left = len(level_ids)  # levels that are searched, or wait for it
         self.took = Lap()  # their part of what the search took
-        self.idle = 0.0  # s, of rows that had no level: the last submission's, so that it is counted once
+        self.idle = 0.0  # s, of rows that had no level, of whichever units: each second is one unit's
 
     @property
     def env_steps(self) -> int:
