@@ -34,3 +34,7 @@ class UserError(LevelproofError):
 
 class Failure(LevelproofError):
     """The command was fine; the disk, the data or the machine was not."""
+
+
+class StoreFailure(LevelproofError):
+    """A store does not answer, or refuses. No `Failure`, which would say of what it stores that it is damaged."""

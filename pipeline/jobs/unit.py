@@ -27,7 +27,7 @@ from levelgen.identity.signature import signatures
 from levelgen.level import Level, size_of
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import TaskParams
-from pipeline.errors import Failure
+from pipeline.errors import Failure, StoreFailure
 from pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
 from pipeline.read.level_files import LevelUnseen, levels_at
 from pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
@@ -41,7 +41,7 @@ from pipeline.store.origins import RECORD, Origin
 from pipeline.store.paused import drop_paused, load_paused
 from pipeline.store.provenance import device, versions
 from pipeline.store.publish import committed_levels
-from pipeline.store.remote import StoreFailure, is_remote
+from pipeline.store.remote import is_remote
 from pipeline.store.schema import Encoding
 from pipeline.store.shard import write_shard
 

@@ -13,7 +13,7 @@ from urllib.error import HTTPError
 from urllib.parse import quote
 from urllib.request import Request, urlopen
 
-from pipeline.errors import Failure, UserError
+from pipeline.errors import StoreFailure, UserError
 
 ATTEMPTS = 6
 PAUSE = 0.5  # s before the second attempt, at most; twice that before each further one
@@ -62,7 +62,7 @@ def files_below(repository: Repository, folder: str) -> dict[str, tuple[str, int
 
     Raises:
         UserError: there is no such repository, or it may not be read.
-        Failure: the hub does not answer.
+        StoreFailure: the hub does not answer.
     """
     revision = quote(repository.revision, safe="")
     url = f"{_endpoint()}/api/datasets/{repository.name}/tree/{revision}/{quote(folder)}?recursive=true"
@@ -92,13 +92,13 @@ def _page(url: str) -> tuple[dict[str, tuple[str, int]], str]:
                     f"There is no dataset at {url}, or not for you: check the URL, and set HF_TOKEN if it needs one."
                 ) from None
             if error.code not in (408, 429) and error.code < 500:
-                raise Failure(f"The hub refuses {url} ({error.code} {error.reason}): check the URL.") from None
+                raise StoreFailure(f"The hub refuses {url} ({error.code} {error.reason}): check the URL.") from None
             reason = str(error.code)
         except (OSError, HTTPException, ValueError, RecursionError) as error:
             reason = str(getattr(error, "reason", error))
         if attempt < ATTEMPTS - 1:
             time.sleep(random.uniform(0.5, 1) * PAUSE * 2**attempt)
-    raise Failure(f"The hub does not answer at {url} ({reason}): check the network, and try again.")
+    raise StoreFailure(f"The hub does not answer at {url} ({reason}): check the network, and try again.")
 
 
 def _files(text: bytes) -> dict[str, tuple[str, int]]:

@@ -10,8 +10,8 @@ from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.errors import UserError
-from pipeline.store.remote import BUCKETS, StoreFailure, as_typed, ask, data_of, obstore_module, place
+from pipeline.errors import StoreFailure, UserError
+from pipeline.store.remote import BUCKETS, as_typed, ask, data_of, obstore_module, place
 
 PART = 2**25  # bytes; larger files are sent in parts
 

@@ -18,7 +18,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from pipeline.errors import Failure, LevelproofError, UserError
+from pipeline.errors import LevelproofError, StoreFailure, UserError
 from pipeline.runtime import cache_folder
 from pipeline.store import hub
 from pipeline.store.pieces import PieceCache
@@ -55,10 +55,6 @@ CLOUD = re.compile(r"latest/api/token|computeMetadata")  # where a cloud's machi
 COPY = {"s3:": "aws s3 sync", "gs:": "gcloud storage rsync -r", "az:": "azcopy sync", "hf:": "hf download"}
 
 T = TypeVar("T")
-
-
-class StoreFailure(Failure):
-    """A store does not answer, or refuses."""
 
 
 class Stored(NamedTuple):
@@ -116,7 +112,7 @@ def stored_in(folder: Path) -> dict[Path, Stored]:
 
     Raises:
         UserError: there is no such bucket, or it may not be read.
-        Failure: the store does not answer.
+        StoreFailure: the store does not answer.
     """
     store, key = place(folder)
     if folder.parts[0] in HUB:
@@ -145,7 +141,7 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
     """What may be a fragment in the manifest's folder; what was known of the split's other files is forgotten.
 
     Raises:
-        UserError, Failure: as `stored_in`; or there is no index on a web server.
+        UserError, StoreFailure: as `stored_in`; or there is no index on a web server.
     """
     for known in list(_known):
         if folder.parent in known.parents:
@@ -169,7 +165,7 @@ def bytes_of(path: Path, most: int = MOST_WHOLE) -> bytes:
 
     Raises:
         OSError: it is not there, or larger.
-        UserError, Failure: as `stored_in`.
+        UserError, StoreFailure: as `stored_in`.
     """
     file = RemoteFile(path)
     if file.size > most:
@@ -185,7 +181,7 @@ class RemoteFile:
 
         Raises:
             FileNotFoundError: nothing.
-            UserError, Failure: as `stored_in`.
+            UserError, StoreFailure: as `stored_in`.
         """
         self.path, self._about = path, _look_up(path)
         self.size = self._about.size
@@ -197,7 +193,7 @@ class RemoteFile:
 
         Raises:
             OSError: the file has changed.
-            UserError, Failure: as `stored_in`; or the cache's folder cannot be written.
+            UserError, StoreFailure: as `stored_in`; or the cache's folder cannot be written.
         """
         wanted = {n for first, length in places for n in range(first // PIECE, -(-(first + length) // PIECE))}
         missing = [n for n in sorted(wanted) if not self._cache.has(self._piece(n))]

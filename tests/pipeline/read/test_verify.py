@@ -4,6 +4,7 @@ import itertools
 import json
 import shutil
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 from experts.labels import WITNESSED, Label
 from experts.witness import replay
 from levelgen.identity.keys import MAX_LEVEL_ID
+from pipeline.errors import StoreFailure
 from pipeline.read import evidence
 from pipeline.read.verify import examine
 from pipeline.store import remote
@@ -120,6 +122,26 @@ def test_an_honest_split_on_a_web_server_has_nothing_wrong(
             file.write(" ")
         (sentence,) = examine(Path(f"{server.url}/{split.name}")).sentences
         assert f"{shard.name}/zarr.json is not what was committed" in sentence
+
+
+def test_a_server_that_gives_out_is_no_damage(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever was to be read next."""
+    write_index(split)
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    remote._store.cache_clear()
+    with serving(files_of(split.parent)) as server:
+        for share in (1.0, 0.3, 0.5, 0.7, 0.95):
+            cache = remote.PieceCache(tmp_path / str(share), 10**9)
+            monkeypatch.setattr(remote, "_cache", lambda cache=cache: cache)
+            if share == 1.0:
+                assert not examine(Path(f"{server.url}/{split.name}")).sentences
+                requests = server.count
+                continue
+            last = server.count + share * requests
+            server.meanwhile = lambda number, last=last: server.spoil(int(number > last))
+            with pytest.raises(StoreFailure, match="503"):
+                examine(Path(f"{server.url}/{split.name}"))
+            server.spoil(0)
 
 
 @pytest.mark.parametrize("adapts", [False, True])

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import Failure, UserError
+from pipeline.errors import Failure, StoreFailure, UserError
 from pipeline.jobs.schedule import WorkUnit
 from pipeline.store import leases, remote
 from pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
@@ -150,7 +150,7 @@ def test_a_store_that_is_gone_is_one_sentence_and_the_same_command_goes_on(
     requests = requests_of_a_run(server)
     for request in sorted(random.Random(some).sample(range(1, requests), some)):
         dies_at(server, request)
-        with pytest.raises(Failure, match=r"^Cannot (read|write) s3://bucket/data.* \(it does not answer\)"):
+        with pytest.raises(StoreFailure, match=r"^Cannot (read|write) s3://bucket/data.* \(it does not answer\)"):
             drive(OUT)
         server.meanwhile = lambda _: None
         server.spoil(0)
@@ -380,7 +380,7 @@ def test_azure_s_store_gets_what_a_folder_gets(
         assert not [line for line in between.log[count:] if line.startswith("PUT") and "/shards/" in line]
         between.spoil(1, "gone")
         forget()
-        with pytest.raises(Failure, match="az://bucket"):
+        with pytest.raises(StoreFailure, match="az://bucket"):
             read_manifest(split)
 
 
@@ -408,7 +408,7 @@ def test_a_store_that_is_busy_is_not_said_to_heed_no_conditions(
     """Whatever numbers there are in the name of the file that it is tried with."""
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
     server.spoil(1)
-    with pytest.raises(Failure, match=r"Cannot write .*501 \(503 Service Unavailable\)"):
+    with pytest.raises(StoreFailure, match=r"Cannot write .*501 \(503 Service Unavailable\)"):
         require_conditions(THERE / ".job.json.501")
 
 

@@ -23,7 +23,7 @@ from obstore.store import MemoryStore, S3Store
 
 import levelproof
 from experts.labels import Label
-from pipeline.errors import Failure, LevelproofError, UserError
+from pipeline.errors import Failure, LevelproofError, StoreFailure, UserError
 from pipeline.read.rows import read_rows
 from pipeline.store import events, hub, job_note, leases, remote
 from pipeline.store.events import events_of
@@ -223,7 +223,7 @@ def test_a_store_that_dies_is_one_sentence_in_bounded_time(bucket: Bucket, monke
     remote._store.cache_clear()
     bucket.server.spoil(1)
     start = time.monotonic()
-    with pytest.raises(Failure, match=r"Cannot read s3://bucket/data/s/.* \(503 Service Unavailable\)"):
+    with pytest.raises(StoreFailure, match=r"Cannot read s3://bucket/data/s/.* \(503 Service Unavailable\)"):
         read_rows(S3, rows)
     assert time.monotonic() - start < 15
 
@@ -233,7 +233,7 @@ def test_a_store_that_dies_is_one_sentence_in_bounded_time(bucket: Bucket, monke
     [
         ("s3://bucket/data/none", {}, UserError, "There is no split at s3://bucket/data/none"),
         ("s3://nobody/data/s", {}, UserError, "There is no bucket 'nobody': check s3://nobody/data/s"),
-        ("s3://bucket/data/s", {"AWS_ENDPOINT_URL": f"http://{HOST}:1"}, Failure, r"\(it does not answer\)"),
+        ("s3://bucket/data/s", {"AWS_ENDPOINT_URL": f"http://{HOST}:1"}, StoreFailure, r"\(it does not answer\)"),
         ("hf://models/user/name", {}, UserError, "hf://models/user/name/manifest is none of a dataset"),
         ("s3://bucket/data/s", {"LEVELPROOF_CACHE_GB": "much"}, UserError, "LEVELPROOF_CACHE_GB is 'much'"),
     ],
@@ -404,7 +404,7 @@ def test_a_hub_whose_lists_are_cut_off_is_one_sentence(monkeypatch: pytest.Monke
     """Where they come in chunks, an answer that ends early is an error of HTTP's, and none of the system's."""
     with serving(lambda *_: Answer(200, {"Transfer-Encoding": "chunked"}, b"ff\r\n[")) as server:
         monkeypatch.setenv("HF_ENDPOINT", server.url)
-        with pytest.raises(Failure, match=r"The hub does not answer at .*IncompleteRead"):
+        with pytest.raises(StoreFailure, match=r"The hub does not answer at .*IncompleteRead"):
             read_manifest(Path("hf://datasets/user/name/1M/s"))
         assert len(server.log) == hub.ATTEMPTS
 
