@@ -17,12 +17,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--density", choices=("full", "resume", "witness"), help="how much of each record is stored then"
     )
     every = "env steps between key frames of --density witness (default: 32)"
-    parser.add_argument("--key-every", type=int, default=32, metavar="K", help=every)
+    parser.add_argument("--key-every", type=int, metavar="K", help=every)
 
 
 def run(arguments: argparse.Namespace) -> None:
     from rich.console import Console
 
+    from configs.schema import KEY_EVERY
+    from pipeline.errors import UserError
     from pipeline.jobs.seal import seal_split
 
-    seal_split(arguments.split, arguments.rows, Console(stderr=True), arguments.density, arguments.key_every)
+    every = arguments.key_every
+    if every is not None and arguments.density != "witness":
+        raise UserError("--key-every is of key frames, which only --density witness has: give both, or neither.")
+    every = KEY_EVERY if every is None else every
+    seal_split(arguments.split, arguments.rows, Console(stderr=True), arguments.density, every)

@@ -6,7 +6,7 @@ A page asks and is answered (`Session.ask`); while an expert trains it is told a
 import json
 import mimetypes
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
 from threading import Event, Thread
@@ -112,7 +112,8 @@ class Visit:
         except ConnectionClosed:
             pass
         except Exception as error:  # a page has to hear of it; there is nobody else to tell
-            self._send({"training": {"stage": "failed", "reason": f"{type(error).__name__}: {error}"}})
+            with suppress(ConnectionClosed):
+                self._send({"training": {"stage": "failed", "reason": f"{type(error).__name__}: {error}"}})
 
     def _send(self, message: Message) -> None:
         self._connection.send(json.dumps(message))

@@ -298,6 +298,7 @@ def test_commands_say_the_same_of_a_split_that_is_sealed_and_it_grows(
 def test_what_cannot_be_sealed_is_refused(tmp_path: Path, split: Path) -> None:
     assert_refused(here(["seal", "data/1k/s"], tmp_path), 2, "no split at data/1k/s")
     assert_refused(here(["seal", "data/5k/s", "--rows", "0"], tmp_path), 2, "--rows a number from 1")
+    assert_refused(here(["seal", "data/5k/s", "--key-every", "16"], tmp_path), 2, "only --density witness has")
     with only_writer(split, print):
         assert_refused(here(["seal", "data/5k/s"], tmp_path), 2, "Another", "is writing to data/5k/s")
     shard = split / sorted(read_manifest(split).shards)[0]
