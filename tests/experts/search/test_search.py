@@ -24,7 +24,7 @@ from experts.witness import replay, take
 from levelgen.identity.keys import GENERATOR
 from levelgen.level import Level
 from levelgen.task.rules import DEFAULT_RULES, TaskParams
-from tests.experts.search.worlds import broken, switchback, valley
+from tests.experts.search.worlds import broken, switchback, tower, valley
 from tests.experts.search.worlds import side_by_side as together
 
 CONFIG = SearchConfig(env_steps=262_144, lanes=32, entries=128)
@@ -79,6 +79,16 @@ def test_what_random_play_does_not_find() -> None:
     episodes = CONFIG.env_steps // 256 // 256
     wins = sum(random_play(both, jax.random.key(i)).sum(-1) for i in range(episodes))
     np.testing.assert_array_equal(wins, 0)
+
+
+def test_a_tower_is_toppled() -> None:
+    """Not by every search, nor by more random play than they all have."""
+    four = take(tower(), np.zeros(4, int))
+    searched = search(four, IDS[:4], replace(CONFIG, bodies=0), DEFAULT_RULES)
+    assert (searched.success.length > 0).any()
+    wins = sum(random_play(four, jax.random.key(i)).sum(-1) for i in range(4))
+    assert wins.sum() == 0
+    assert 4 * 4 * 256 * 256 > searched.env_steps.sum()
 
 
 def test_what_is_found_replays() -> None:

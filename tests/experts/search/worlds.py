@@ -9,9 +9,9 @@ from levelgen.level import Level, Role
 from levelgen.sampling.scenery import FLOOR_TOP, empty_level
 from physics.types import FIXED_POLYGONS, Size
 
-SIZE = Size(polygons=6, circles=2, joints=1, thrusters=2)
-BARS = slice(FIXED_POLYGONS, 6)
-BALL, GOAL = 6, 7
+SIZE = Size(polygons=7, circles=2, joints=1, thrusters=2)
+BARS = slice(FIXED_POLYGONS, SIZE.polygons)
+BALL, GOAL = SIZE.polygons, SIZE.polygons + 1
 WEIGHT = 0.16 * 9.81  # N, of the ball
 
 
@@ -42,11 +42,11 @@ def valley() -> Level:
 
 
 def tower() -> Level:
-    """A ball beside a tower of two boxes, green on top, and blue at its foot on the ball's side: the ball has to fly
-    over the tower and topple it from behind. From this side green falls off the other one, out of reach for good."""
+    """Two heavy boxes on each other, green on top, and blue between them and a wall. A ball has to fly over wall and
+    tower and to topple it from behind, at some speed. From this side green falls off the other one, out of reach."""
     boxes = [((3.2, FLOOR_TOP + 0.5), (0.2, 0.5)), ((3.2, FLOOR_TOP + 1.2), (0.25, 0.2))]
     level = world(
-        bars=[(centre, half, 0.0) for centre, half in boxes],
+        bars=[*((centre, half, 0.0) for centre, half in boxes), ((1.8, FLOOR_TOP + 1.6), (0.1, 1.6), 0.0)],
         bar_role=Role.PLAIN,
         ball=(0.6, 0.6),
         goal=(2.6, FLOOR_TOP + 0.2),
@@ -54,7 +54,7 @@ def tower() -> Level:
         thrust=0.9,
     )
     for i, (_, (x, y)) in enumerate(boxes, FIXED_POLYGONS):
-        mass = 4 * x * y  # kg, at 1 kg/m^2
+        mass = 8 * x * y  # kg, at 2 kg/m^2
         level.model.inverse_mass[i], level.model.inverse_inertia[i] = 1 / mass, 3 / (mass * (x * x + y * y))
     level.role[BALL], level.role[FIXED_POLYGONS + 1] = Role.PLAIN, Role.GREEN
     return level
@@ -76,6 +76,7 @@ def world(*, bars, bar_role, ball, goal, angles, thrust) -> Level:
     level = jax.tree.map(np.array, empty_level(SIZE, 1))
     m = level.model
     m.active[:] = True
+    m.active[FIXED_POLYGONS + len(bars) : SIZE.polygons] = False
     for i, (centre, (x, y), angle) in enumerate(bars, FIXED_POLYGONS):
         m.vertices[i, ..., 0] = [(x, y), (x, -y), (-x, -y), (-x, y)]
         level.state.position[i, :, 0], level.state.rotation[i] = centre, angle
