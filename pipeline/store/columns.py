@@ -165,8 +165,8 @@ DESCRIBED = (
         "seconds",
         pa.struct([pa.field(stage, pa.float32()) for stage in Seconds._fields]),
         "What the level cost the run that made it, of a core, or of a GPU where `device` is one: sampling (and what "
-        "needs no expert), search (and scouts), training, evaluation, empty slots, replay of witnesses, writing, "
-        "compiling",
+        "needs no expert), search (and scouts), training, evaluation, idle slots and rows, replay of witnesses, "
+        "writing, compiling",
         "s",
         "nobody has counted",
         since=7,
