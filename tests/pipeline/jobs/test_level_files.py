@@ -84,7 +84,7 @@ def folder(once: Path, tmp_path: Path) -> Path:
 def test_rows_are_named_by_file_and_content(once: Path) -> None:
     rows = rows_of(once / "data/5k/s")
     assert {name: row["label"] for name, row in rows.items()} == {"a.json": "trivial", "b c.json": "unsolvable"}
-    assert rows_of(once / "data/5k/6-2-1-2").keys() == {"larger.json"}
+    assert rows_of(once / "data/5k/7-2-1-2").keys() == {"larger.json"}
     for row in rows.values():
         assert row["content_hash"] == content_hashes(read_level_file(Path(row["file"])).level)[0]
         assert row["level_id"] == level_id_for(row["content_hash"])
