@@ -14,7 +14,7 @@ import multiprocessing
 import tempfile
 import time
 import tracemalloc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ UNIT = 32  # levels
 WORKERS, UNITS = 1_000, (2_000, 20_000, 200_000)  # simulated
 SECONDS = 6.0  # that a simulated unit takes, on average; of each worker a rate of its own, so that some are slow
 POLL = 0.25  # s
+PATIENCE = 600.0  # s that a process waits for another to load its programs
 BESIDE = 8  # units of the job that a process works through alone, after one that loads its programs
 SPREAD = 0.5  # of the logarithm of those rates
 
@@ -101,15 +102,23 @@ def run(given: argparse.Namespace) -> Report:
 
 def seconds_of(words: Sequence[str], workers: int) -> float:
     """Of a job with so many workers, in a process of its own."""
+    with tempfile.TemporaryDirectory() as out:
+        (seconds,) = told_by(work, [([*words, f"workers={workers}", f"out={out}"],)])
+    return seconds
+
+
+def told_by(target: Callable[..., None], each: Sequence[tuple[Any, ...]]) -> list[float]:
+    """What processes tell that run at once, one with each of these arguments."""
     context = multiprocessing.get_context("spawn")
     told = context.SimpleQueue()
-    with tempfile.TemporaryDirectory() as out:
-        process = context.Process(target=work, args=([*words, f"workers={workers}", f"out={out}"], told))
+    processes = [context.Process(target=target, args=(*arguments, told)) for arguments in each]
+    for process in processes:
         process.start()
+    for process in processes:
         process.join()
-        if process.exitcode:
-            raise Failure(f"A job with workers={workers} failed: see above.")
-    return told.get()
+    if any(process.exitcode for process in processes):
+        raise Failure("A process of this benchmark failed: see above.")
+    return [told.get() for _ in processes]
 
 
 def work(words: Sequence[str], told: Any) -> None:
@@ -123,10 +132,9 @@ def work(words: Sequence[str], told: Any) -> None:
         board = Board(Tally(count, 0, 0), Console(file=nowhere))
 
         def settle(outcomes: Sequence[UnitOutcome]) -> None:
+            require_done(outcomes)
             for outcome in outcomes:
                 board.ended(outcome.unit, outcome.summary)
-                if not outcome.summary:
-                    raise Failure(outcome.reason)
 
         cluster.run(job, split, scheduler, settle, board)
         told.put(time.monotonic() - scheduler.began)
@@ -134,20 +142,10 @@ def work(words: Sequence[str], told: Any) -> None:
 
 def beside(words: Sequence[str], processes: int) -> float:
     """Seconds of each of so many processes at once, on average, each on a core of its own."""
-    context = multiprocessing.get_context("spawn")
-    told, ready = context.SimpleQueue(), context.Barrier(processes)
+    ready = multiprocessing.get_context("spawn").Barrier(processes, timeout=PATIENCE)
     with tempfile.TemporaryDirectory() as folder:
-        each = [
-            context.Process(target=work_alone, args=([*words, f"out={folder}/{core}"], core, ready, told))
-            for core in own_cores()[:processes]
-        ]
-        for process in each:
-            process.start()
-        for process in each:
-            process.join()
-        if any(process.exitcode for process in each):
-            raise Failure("A process that works alone failed: see above.")
-    return float(np.mean([told.get() for _ in each]))
+        each = [([*words, f"out={folder}/{core}"], core, ready) for core in own_cores()[:processes]]
+        return float(np.mean(told_by(work_alone, each)))
 
 
 def work_alone(words: Sequence[str], core: int, ready: Any, told: Any) -> None:
@@ -169,8 +167,17 @@ def work_alone(words: Sequence[str], core: int, ready: Any, told: Any) -> None:
 def finish(worker: Any, units: list[WorkUnit]) -> None:
     """Work until these units are committed."""
     round = worker.work(Order(units), ROUND)
+    require_done(round.outcomes)
     while round.totals:
         round = worker.work(Order([]), ROUND)
+        require_done(round.outcomes)
+
+
+def require_done(outcomes: Sequence[UnitOutcome]) -> None:
+    """Raises Failure where an attempt has failed: its seconds would count for nothing."""
+    for outcome in outcomes:
+        if not outcome.summary:
+            raise Failure(outcome.reason)
 
 
 def simulate(units: int) -> dict[str, float]:
