@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from experts.labels import Source
-from experts.ledger import Lap
+from experts.ledger import Ledger
 from experts.procedure import Procedure
 from experts.scout import scout
 from experts.search.search import Searched, Searching
@@ -78,7 +78,7 @@ class Looking:
         some = take(levels, self._left), level_ids[self._left]
         self._searching = searching
         self._sought = searching.submit(*some) if procedure.search.env_steps and len(self._left) else None
-        self.took, self.idle = Lap(), 0.0  # of the search, once it has ended; `idle` is seconds of rows without a level
+        self.ledger = Ledger(len(level_ids))  # of the search, once it has ended
 
     @property
     def env_steps(self) -> int:
@@ -100,7 +100,7 @@ class Looking:
         """Whether nothing is left to search: then `found` has what came of it."""
         if self._sought and not self._sought.left:
             self._take(self._searching.result(self._sought))
-            self.took, self.idle = self._sought.took, self._sought.idle
+            self.ledger.take(self._sought.ledger, self._left)
             self._sought = None
         return self._sought is None
 

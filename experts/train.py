@@ -12,7 +12,7 @@ from experts.config import RECORD_STEPS, ExpertConfig, Rule
 from experts.found import Found, Looking, joined
 from experts.judge import Kept, Trained, Witness, judge, repeating
 from experts.labels import WITNESSED, Source, Verdict
-from experts.ledger import Lap, Ledger, lap
+from experts.ledger import Ledger, lap
 from experts.paused import Paused
 from experts.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Submission, Totals
 from experts.portability import choose
@@ -82,8 +82,7 @@ class TrainingRun:
             with self.ledger.timing("search"):
                 ended = self.looking.ended()
             if ended:
-                self.ledger.add("search", self.looking.took)
-                self.ledger.add("idle", Lap(self.looking.idle))
+                self.ledger.take(self.looking.ledger, self._looked)
                 self._submit()
 
     def _submit(self) -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from experts.ledger import Lap, lap
+from experts.ledger import Lap, Ledger, lap
 from experts.search.config import SearchConfig
 from experts.search.explore import Search, begin, explore, successes, under_way
 from experts.search.shorten import shorten
@@ -40,8 +40,7 @@ class Sought:
     def __init__(self, levels: Level, level_ids: Int[np.ndarray, " level"], nothing: Searched) -> None:
         self.levels, self.level_ids, self.known = levels, level_ids, nothing
         self.left = len(level_ids)  # levels that are searched, or wait for it
-        self.took = Lap()  # their part of what the search took
-        self.idle = 0.0  # s, of rows that had no level, of whichever units: each second is one unit's
+        self.ledger = Ledger(len(level_ids))
 
     @property
     def env_steps(self) -> int:
@@ -104,10 +103,10 @@ class Searching:
             left, seen = jax.device_get(searched(self._search, self._scaled))
         busy = [(row, *at) for row, at in enumerate(self._at) if at]
         of_row = took.seconds / len(self._at)
-        busy[-1][1].idle += of_row * (len(self._at) - len(busy))
+        # Empty rows are those of one that is there, so that their cost is counted once
+        busy[-1][1].ledger.add("idle", Lap(of_row * (len(self._at) - len(busy)), took.compiling))
         for row, sought, i in busy:
-            sought.took.seconds += of_row
-            sought.took.compiling += took.compiling / len(busy)
+            sought.ledger.put("search", i, of_row)
             for known, now in zip(jax.tree.leaves(sought.known), jax.tree.leaves(seen), strict=True):
                 known[i] = now[row]
             if left[row]:
