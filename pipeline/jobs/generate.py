@@ -54,12 +54,12 @@ def generate(
     cache_folder()  # where workers refuse it, Ray makes many lines of the sentence
     require_same_experts(job)
     with writing(job, partial(say, console), repaired) as (split, manifest):
-        asked = origins or (job.level_ids if level_ids is None else level_ids)
+        asked = [*origins] if origins else (job.level_ids if level_ids is None else level_ids)
         wanted = ascending(np.fromiter(asked, np.int64, len(asked)))
         is_done = np.isin(manifest.level_ids, wanted)
         done = manifest.level_ids[is_done]
         require_same_levels(split, origins or {}, done)
-        units = plan_units(wanted, done, job.levels_per_unit, origins)
+        units = plan_units(asked, done, job.levels_per_unit, origins)
         scheduler = Scheduler(units, len(wanted) - len(done), job.levels_per_unit)
         prune_paused(split, manifest.level_ids)
         if not repaired:

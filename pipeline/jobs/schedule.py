@@ -15,7 +15,7 @@ import numpy as np
 from experts.steps import NO_SECONDS, EnvSteps, Seconds
 from pipeline.store.layout import unit_name
 from pipeline.store.origins import Origin
-from pipeline.store.runs import runs, told_levels
+from pipeline.store.runs import ascending, runs, told_levels, without
 
 # How many units a worker may have at once, those included that failed as often: a unit that kills its worker takes
 # fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.
@@ -44,20 +44,20 @@ class WorkUnit:
 
 
 def plan_units(
-    wanted: Collection[int] | np.ndarray,
+    wanted: Sequence[int] | np.ndarray,
     done: Collection[int] | np.ndarray,
     unit: int,
     origins: Mapping[int, Origin] | None = None,
 ) -> Iterator[WorkUnit]:
-    """Units that cover what is wanted (ascending) and not done, ascending; made as they are asked for.
+    """Units that cover what is wanted and not done, ascending; made as they are asked for.
 
     A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same ids. Ids of levels
     with origins lie far apart: of those a unit has as many as it may.
     """
-    there = np.fromiter(wanted, np.int64, len(wanted))
-    left = there[~np.isin(there, np.fromiter(done, np.int64, len(done)))]
+    there = ascending(np.fromiter(done, np.int64, len(done)))
     if origins is None:
-        return _by_multiple(runs(left), unit)
+        return _by_multiple(without(runs(wanted), there), unit)
+    left = np.setdiff1d(np.asarray(wanted, np.int64), there)
     parts = (left[i : i + unit].tolist() for i in range(0, len(left), unit))
     return (WorkUnit(tuple(part), tuple(origins[i] for i in part)) for part in parts)
 

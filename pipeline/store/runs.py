@@ -15,6 +15,8 @@ def ascending(numbers: np.ndarray) -> np.ndarray:
 
 def runs(numbers: Sequence[int] | np.ndarray) -> list[tuple[int, int]]:
     """First and last of each run of consecutive numbers, ascending."""
+    if isinstance(numbers, range) and numbers.step == 1:  # of any length, in no memory
+        return [(numbers[0], numbers[-1])] if numbers else []
     ordered = ascending(np.asarray(numbers, np.int64))
     ends = np.flatnonzero(np.diff(ordered) != 1)
     firsts, lasts = (ordered[i] for i in (np.r_[0, ends + 1], np.r_[ends, -1])) if len(ordered) else (ordered, ordered)
@@ -33,9 +35,10 @@ def without(runs: Iterable[Sequence[int]], level_ids: np.ndarray) -> list[tuple[
     """What of the runs is left when these ids (ascending) are taken out."""
     left = []
     for first, last in runs:
-        there = level_ids[np.searchsorted(level_ids, first) : np.searchsorted(level_ids, last, "right")].tolist()
-        starts, ends = [first, *(i + 1 for i in there)], [*(i - 1 for i in there), last]
-        left += [(start, end) for start, end in zip(starts, ends, strict=True) if start <= end]
+        there = level_ids[np.searchsorted(level_ids, first) : np.searchsorted(level_ids, last, "right")]
+        starts, ends = np.r_[first, there + 1], np.r_[there - 1, last]
+        some = starts <= ends
+        left += zip(starts[some].tolist(), ends[some].tolist(), strict=True)
     return left
 
 
