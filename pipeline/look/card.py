@@ -16,17 +16,15 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from configs.compose import identified
-from configs.convert import typed
-from configs.schema import FROM_RECORDS, from_files
+from configs.schema import FROM_RECORDS
 from experts.config import RECORD_STEPS
 from experts.labels import Label
 from levelgen.pictures.raster import sheet, write_png
-from levelgen.sampling.distribution import Distribution
 from pipeline.errors import UserError
 from pipeline.look.figures import draw_panels, draw_shares
 from pipeline.look.preview import preview
 from pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, SplitFacts, Wishes, readme
-from pipeline.read.levels import writing_to
+from pipeline.read.levels import distribution_of, writing_to
 from pipeline.store.layout import SHARDS
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.shard import stored_bytes
@@ -82,7 +80,7 @@ def _below(folder: Path, split: Path) -> str:
 
 
 def _facts(path: str, manifest: Manifest) -> SplitFacts:
-    table, config = manifest.table, manifest.config or {}
+    table = manifest.table
     labels = {entry["values"]: entry["counts"] for entry in table.column("label").value_counts().to_pylist()}
     solved = table.filter(manifest.labels == Label.SOLVED)
     shards = manifest.split / SHARDS
@@ -95,17 +93,18 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
         split_bytes=stored_bytes(manifest.split),
         shard_bytes=stored_bytes(shards) if shards.is_dir() else 0,
         budget=table.column("budget")[0].as_py(),
-        distribution=_distribution(config),
+        distribution=_distribution(manifest),
         config_hash=manifest.config_hash or "",
         stored_as=", ".join(sorted(set[str]().union(*(of.densities for of in manifest.counting)))),
         made_with=_made_with(table),
     )
 
 
-def _distribution(config: dict) -> str:
-    if from_files(config):
-        return "imported" if config["distribution"] == FROM_RECORDS else "level files"
-    name, short = identified(typed(Distribution, config["distribution"], "distribution"))
+def _distribution(manifest: Manifest) -> str:
+    distribution = distribution_of(manifest)
+    if distribution is None:
+        return "imported" if (manifest.config or {})["distribution"] == FROM_RECORDS else "level files"
+    name, short = identified(distribution)
     return f"random, `{name}`" if name else f"random, of a distribution of its own (`{short}`)"
 
 

@@ -17,17 +17,15 @@ import pyarrow.compute as pc
 from rich.console import Console
 
 from configs.compose import identified
-from configs.convert import typed
-from configs.schema import from_files
 from experts.config import RECORD_STEPS
 from experts.labels import DIVERGED, Label
-from levelgen.sampling.distribution import Distribution
 from pipeline.look import cost, duplicates
 from pipeline.look.facts import print_facts
 from pipeline.look.figures import Share
 from pipeline.look.reasons import kinds_of_reasons
 from pipeline.look.rows import EVERYTHING, SHOWN, Asked, ids_of, rows_of
 from pipeline.look.shares import solved_by_things
+from pipeline.read.levels import distribution_of
 from pipeline.read.select import columns_in, select
 from pipeline.store.layout import data_path
 from pipeline.store.manifest import Manifest, require_manifest
@@ -94,8 +92,7 @@ def _told(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str, i
     tried = solved.num_rows + unsolved.num_rows
     stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards) if is_listed(split) else None
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
-    config = manifest.config or {}
-    distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
+    distribution = distribution_of(manifest)
     return {
         "split": as_typed(split),
         "config_hash": manifest.config_hash,

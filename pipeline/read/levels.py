@@ -59,15 +59,20 @@ def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
         parts.append(tree_of(Level, read_rows(manifest.split, rows.filter(stored), names), "level/"))
     if not stored.all():
         prepare_jax()
-        others, config = rows.filter(~stored), manifest.config or {}
-        if from_files(config):
+        others, distribution = rows.filter(~stored), distribution_of(manifest)
+        if distribution is None:
             parts.append(levels_at([origin_of(manifest.split, row) for row in others.to_pylist()]))
         else:
-            with recorded_settings(manifest.split):
-                distribution = typed(Distribution, config["distribution"], "distribution")
             parts.append(sample_levels(others.column("level_id").to_numpy(), size, distribution))
     back = np.argsort(np.concatenate([np.flatnonzero(stored), np.flatnonzero(~stored)]))
     return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1)[..., back], *parts)
+
+
+def distribution_of(manifest: Manifest) -> Distribution | None:
+    """What a split's levels are sampled from; None: they come from files. Raises as `recorded_settings`."""
+    config = manifest.config or {}
+    with recorded_settings(manifest.split):
+        return None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
 
 
 def rules_of(manifest: Manifest) -> TaskParams:

@@ -21,7 +21,7 @@ from pipeline.read.levels import levels_of
 from pipeline.read.pace import Pace
 from pipeline.read.select import columns_in, select
 from pipeline.store.columns import COLUMNS
-from pipeline.store.manifest import Manifest, read_fragment, require_manifest
+from pipeline.store.manifest import Manifest, require_manifest, settings_metadata
 
 GROUP = 16 * CHUNK  # rows: what is in memory at once, and what a query reads or skips
 FILE = 25 * GROUP  # rows of a file, about as many as a sealed manifest's files have
@@ -43,7 +43,7 @@ def export_parquet(split: Path, where: str | None, out: Path) -> None:
     ids = select(manifest.table, where).column("level_id").to_numpy()
     if not len(ids):
         raise UserError(f"No level of {split} is {where}: choose another condition with --where.")
-    metadata = read_fragment(manifest.fragments[0].path, [])[1].schema.metadata
+    metadata = settings_metadata(manifest.fragments[0].config_hash, manifest.fragments[0].config)
     written = 0
     with new_folder(out) as folder:
         for number, first in enumerate(range(0, len(ids), FILE)):
@@ -81,7 +81,7 @@ def with_worlds(manifest: Manifest, rows: pa.Table) -> pa.Table:
 
 
 def _write(path: Path, groups: Iterator[pa.Table], metadata: dict[bytes, bytes]) -> int:
-    """The number of rows; `metadata` tells the split's configuration, and with it the rules, as its fragments do."""
+    """The number of rows."""
     first, count = next(groups), 0
     with pq.ParquetWriter(
         path,

@@ -72,10 +72,7 @@ def write_fragment(
     is_table = isinstance(rows, pa.Table)
     table: Any = rows if is_table else pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS)
     names = data_named_by(table)
-    metadata = {
-        VERSION_KEY: str(MANIFEST_VERSION).encode(),
-        HASH_KEY: config_hash.encode(),
-        CONFIG_KEY: json.dumps(config, sort_keys=True).encode(),
+    metadata = settings_metadata(config_hash, config) | {
         DENSITIES_KEY: json.dumps(sorted(densities)).encode(),
         DIGESTS_KEY: json.dumps(digests_below(attempt.fragment.parent.parent, names, elsewhere or {})).encode(),
     }
@@ -88,6 +85,15 @@ def write_fragment(
     flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
     flush_entry(attempt.fragment.parent)  # the new name itself
+
+
+def settings_metadata(config_hash: str, config: Mapping[str, Any]) -> dict[bytes, bytes]:
+    """What tells the settings, and with them the rules, in a parquet file's schema."""
+    return {
+        VERSION_KEY: str(MANIFEST_VERSION).encode(),
+        HASH_KEY: config_hash.encode(),
+        CONFIG_KEY: json.dumps(config, sort_keys=True).encode(),
+    }
 
 
 def fragment_paths(split: Path) -> list[Path]:

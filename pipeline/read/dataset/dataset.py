@@ -114,7 +114,7 @@ class Dataset:
         """These trajectories, or a window of each.
 
         Args:
-            numbers: of trajectories, one after another.
+            numbers: of trajectories, one after another; one alone is as a list of one.
             length: steps of a window; None: whole records.
             first: step at which each window starts.
             fields: names of other fields, or what they are below, such as `record/state`.
@@ -125,7 +125,7 @@ class Dataset:
             Failure: the data is damaged.
         """
         windows, kind, chosen = Windows.of(length), kind_of(observation), named(fields, self.size)
-        numbers = np.asarray(numbers, np.int64)
+        numbers = np.atleast_1d(np.asarray(numbers, np.int64))
         starts = np.broadcast_to(np.asarray(first, np.int64), numbers.shape)
         _require_steps(starts)
         needed = [*chosen, *ALWAYS, *named(["level", *(["record/state"] if kind else [])], self.size)]
@@ -212,7 +212,7 @@ class Dataset:
 
     def levels(self, numbers: ArrayLike) -> Level:
         """The levels of these trajectories as `levelproof.make` takes them, level axis last."""
-        arrays = self._arrays(np.asarray(numbers, np.int64), named(["level"], self.size))
+        arrays = self._arrays(np.atleast_1d(np.asarray(numbers, np.int64)), named(["level"], self.size))
         return jax.tree.map(lambda x: np.ascontiguousarray(np.moveaxis(x, 0, -1)), tree_of(Level, arrays, "level/"))
 
     def state(self, number: ArrayLike, step: ArrayLike = 0) -> EnvState:

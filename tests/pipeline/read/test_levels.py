@@ -1,5 +1,6 @@
 """One level that a user names: found without reading the others."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,9 +9,9 @@ import pytest
 
 from experts.labels import Label
 from pipeline.errors import Failure, UserError
-from pipeline.read.levels import COLUMNS, find_level, rules_of
+from pipeline.read.levels import COLUMNS, distribution_of, find_level, rules_of
 from pipeline.store import manifest
-from pipeline.store.manifest import read_fragment, read_manifest
+from pipeline.store.manifest import Manifest, read_fragment, read_manifest
 from tests.pipeline.made import made_split
 
 
@@ -32,9 +33,13 @@ def test_one_fragment_and_few_columns_are_read(tmp_path: Path, monkeypatch: pyte
     assert [columns for _, columns in read] == [{"level_id"}] * 4
 
 
-@pytest.mark.parametrize("config", [{}, {"task": 3}, {"task": {"no_setting": 1}}])
-def test_settings_of_another_program_are_a_sentence(tmp_path: Path, config: dict[str, Any]) -> None:
+@pytest.mark.parametrize("settings", [None, 3, {"no_setting": 1}])
+@pytest.mark.parametrize(("group", "read"), [("task", rules_of), ("distribution", distribution_of)])
+def test_settings_of_another_program_are_a_sentence(
+    tmp_path: Path, group: str, read: Callable[[Manifest], Any], settings: Any
+) -> None:
     found = read_manifest(made_split(tmp_path, [[Label.SOLVED]]), [])
     (fragment,) = found.fragments
+    config = {group: settings} if settings else {}
     with pytest.raises(Failure, match="was made by a levelproof with other settings"):
-        rules_of(replace(found, fragments=(replace(fragment, config=config),)))
+        read(replace(found, fragments=(replace(fragment, config=config),)))

@@ -74,10 +74,11 @@ def test_windows_are_parts_of_trajectories(data: Dataset) -> None:
     late = data.read([3], first=200, fields=["record/state"], observation=None)
     assert_same(late.state.position[0, :56], whole.state.position[0, 200:])
     assert late.mask.sum() == 56
+    assert_same(data.read(3, first=200, fields=["record/state"], observation=None).fields, late.fields)
 
 
 def test_an_observation_is_that_of_the_environment(data: Dataset) -> None:
-    shown = make(data.levels([2]))[0].get_obs(data.state(2, 30))
+    shown = jax.jit(make(data.levels([2]))[0].get_obs)(data.state(2, 30))
     np.testing.assert_allclose(data[2].observation[30], shown, rtol=1e-6, atol=1e-6)
 
 
