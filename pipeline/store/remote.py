@@ -48,7 +48,7 @@ SIGN_IN = {
 }
 # In what obstore says of a request that failed:
 STATUS = re.compile(r"status code: (\d{3}[A-Za-z ]*)")
-PASSING = re.compile(r"status code: (408|409|429|5\d\d)")
+PASSING = re.compile(r"status code: (408|409|429|50[02-4])")
 NO_BUCKET = "NoSuchBucket"
 CUT_OFF, SILENT = "response body error", "HTTP error"  # of an answer that ends early, and where there is none
 CLOUD = re.compile(r"latest/api/token|computeMetadata")  # where a cloud's machines get credentials
