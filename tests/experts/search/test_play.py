@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experts.search.play import arena, decode, encode, fresh_walk, play
+from experts.search.play import Arena, Walk, arena, decode, encode, fresh_walk, play
 from experts.search.rows import from_rows, to_rows
 from experts.witness import take
 from levelgen.task import rules as task
@@ -19,6 +19,21 @@ CHANCES = (0.02, 0.3)
 RULES = replace(DEFAULT_RULES, max_timesteps=200)
 
 
+def ring_of_all() -> Arena:
+    return jax.jit(arena, static_argnums=(1, 2))(side_by_side(switchback(), valley(), broken()), LANES, CHANCES)
+
+
+def random_bits(seed: int) -> jax.Array:
+    return jax.random.bits(jax.random.key(seed), (STEPS, 6, 3 * LANES))
+
+
+@jax.jit
+def played(ring: Arena, bits: jax.Array) -> tuple[Walk, jax.Array]:
+    """All lanes from their starts, and the actions."""
+    walk, code = play(ring, fresh_walk(ring.lanes), bits, RULES)
+    return walk, decode(code)
+
+
 def test_codes() -> None:
     code = jnp.arange(np.prod(CHOICES), dtype=jnp.uint16)
     np.testing.assert_array_equal(encode(decode(code)), code)
@@ -26,51 +41,49 @@ def test_codes() -> None:
 
 
 def test_rows_are_exact() -> None:
-    state = task.reset(take(side_by_side(switchback(), valley()), np.array([0, 1, 1]))).state
-    noisy = jax.tree.map(lambda x: x + np.arange(3, dtype=x.dtype) if x.dtype == jnp.float32 else ~x, state)
-    jax.tree.map(np.testing.assert_array_equal, from_rows(to_rows(noisy), state), noisy)
+    state = jax.device_get(jax.jit(task.reset)(take(side_by_side(switchback(), valley()), np.array([0, 1, 1]))).state)
+    noisy = jax.tree.map(lambda x: x + np.arange(3, dtype=x.dtype) if x.dtype == np.float32 else ~x, state)
+    back = jax.jit(lambda state: from_rows(to_rows(state), state))(noisy)
+    jax.tree.map(np.testing.assert_array_equal, back, noisy)
 
 
 def test_play_ends_as_the_task_says() -> None:
     """Goal, failure, time limit and broken worlds at the same env step, and the same states until then."""
-    ring = arena(side_by_side(switchback(), valley(), broken()), LANES, CHANCES)
-    bits = jax.random.bits(jax.random.key(3), (STEPS, 6, 3 * LANES))
-    walk, code = jax.jit(play, static_argnums=3)(ring, fresh_walk(ring.lanes), bits, RULES)
-    actions = decode(code)
+    ring, bits = ring_of_all(), random_bits(3)
+    walk, actions = played(ring, bits)
 
     @jax.jit
-    def judged(now):
+    def judged(lanes, actions):
         def step(now, action):
-            after, result = task.advance(ring.lanes, now, action, RULES)
+            after, result = task.advance(lanes, now, action, RULES)
             return after, (result.done, result.goal)
 
-        return jax.lax.scan(step, now, jnp.moveaxis(actions, 0, 1))
+        return jax.lax.scan(step, task.reset(lanes), jnp.moveaxis(actions, 0, 1))
 
-    last, (done, goal) = judged(task.reset(ring.lanes))
+    last, (done, goal) = judged(ring.lanes, actions)
     first, lane = np.argmax(done, axis=0), np.arange(3 * LANES)
     assert np.asarray(done).any(0).all()
     assert np.asarray(walk.ended).all()
     expected = np.where(np.asarray(goal)[first, lane], first + 1, 0)
     np.testing.assert_array_equal(walk.reached, expected)
     jax.tree.map(np.testing.assert_array_equal, walk.state, last.state)
-    short = jax.jit(play, static_argnums=3)(ring, fresh_walk(ring.lanes), bits[:100], RULES)[0]
+    short, _ = played(ring, bits[:100])
     np.testing.assert_array_equal(short.ended, np.asarray(done)[:100].any(0))
 
 
 def test_chances() -> None:
     """How often an entry stays, and that every choice comes."""
-    ring = arena(side_by_side(switchback(), valley()), LANES, CHANCES)
-    ring = ring._replace(live=jnp.ones_like(ring.live))
-    bits = jax.random.bits(jax.random.key(0), (4 * STEPS, 6, 2 * LANES))
-    actions = np.asarray(decode(jax.jit(play, static_argnums=3)(ring, fresh_walk(ring.lanes), bits, RULES)[1]))
+    ring = ring_of_all()
+    ring = ring._replace(live=np.ones_like(ring.live))
+    parts = [played(ring, random_bits(i))[1] for i in range(4)]
+    actions = np.concatenate(jax.device_get(parts), -1)
     for entry, choices in enumerate(CHOICES):
         assert set(np.unique(actions[entry])) == set(range(choices))
-        moves = (actions[entry, 1:] != actions[entry, :-1]).mean(0).reshape(2, 2, -1).mean((0, 2))
+        moves = (actions[entry, 1:] != actions[entry, :-1]).mean(0).reshape(-1, 2, LANES // 2).mean((0, 2))
         np.testing.assert_allclose(moves, np.array(CHANCES) * (1 - 1 / choices), rtol=0.25)
 
 
 def test_dead_entries_stay_zero() -> None:
-    ring = arena(side_by_side(switchback(), valley()), LANES, CHANCES)
-    bits = jax.random.bits(jax.random.key(0), (STEPS, 6, 2 * LANES))
-    actions = np.asarray(decode(jax.jit(play, static_argnums=3)(ring, fresh_walk(ring.lanes), bits, RULES)[1]))
-    np.testing.assert_array_equal(actions.any((1, 2)), np.asarray(ring.live).any(1))
+    ring = ring_of_all()
+    _, actions = played(ring, random_bits(0))
+    np.testing.assert_array_equal(np.asarray(actions).any((1, 2)), np.asarray(ring.live).any(1))
