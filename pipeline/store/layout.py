@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.errors import Failure
-from pipeline.store.remote import BUCKETS, fragments_in, is_remote, names_in
+from pipeline.store.remote import BUCKETS, INDEX, fragments_in, is_remote, names_in
 
 MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS = "manifest", "shards", "experts", "quarantine", "checkpoints"
 FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS
@@ -25,6 +25,7 @@ DATA = re.compile(rf"{SHARDS}/{ATTEMPT}\.zarr|{EXPERTS}/{ATTEMPT}\.npz")
 CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.npz")  # of experts under way
 CHECKPOINT_BEGUN = re.compile(rf"{CHECKPOINTS}/\.{UNIT}\.npz\.[0-9]+")
 JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # by the process of this number
+INDEX_BEGUN = re.compile(rf"{MANIFEST}/\.{re.escape(INDEX)}\.[0-9]+")
 
 
 class Attempt(NamedTuple):

@@ -1,12 +1,13 @@
 """What attempts that died have left in a split, and what of it may go; and what was merged into sealed fragments."""
 
 from collections.abc import Callable, Iterable
+from itertools import chain
 from os import DirEntry
 from pathlib import Path
 
 from pipeline.store.disk import flush_entry
 from pipeline.store.files import remove, remove_data
-from pipeline.store.layout import BEGUN, JOB_BEGUN, MANIFEST, begun_path, data_path, data_paths, entries
+from pipeline.store.layout import BEGUN, INDEX_BEGUN, JOB_BEGUN, MANIFEST, begun_path, data_path, data_paths, entries
 from pipeline.store.locks import nobody_commits
 from pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_fragment, read_manifest
 from pipeline.store.objects import put
@@ -41,7 +42,8 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
         for path in dead:
             remove_data(path)
         stuck = {begun_path(path) for path in dead if path.exists()}
-        for path in [*(over - stuck), *entries(split, "", JOB_BEGUN, DirEntry.is_file)]:
+        half = (entries(split, *of, DirEntry.is_file) for of in (("", JOB_BEGUN), (MANIFEST, INDEX_BEGUN)))
+        for path in [*(over - stuck), *chain(*half)]:
             remove(path)
     if kept := sorted(path for path in set(unnamed) - set(dead) if begun_path(path) not in begun):
         more = f" and {len(kept) - 1} more like it" if kept[1:] else ""

@@ -180,7 +180,7 @@ def _leave(world: World) -> None:
         if path.is_file() and "000000000004-" in str(there):
             there.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, there)
-    for name in (".job.json.123", "checkpoints/.000000000004-000000000005.npz.123"):
+    for name in (".job.json.123", "manifest/.index.txt.123", "checkpoints/.000000000004-000000000005.npz.123"):
         (split / name).parent.mkdir(exist_ok=True)
         (split / name).write_bytes(b"half")
 

@@ -69,10 +69,12 @@ def said() -> list[str]:
 
 
 def test_what_a_dead_attempt_left_goes_and_what_is_committed_stays(split: Path, dead: str, said: list[str]) -> None:
-    (split / ".job.json.123").touch()
+    half = {split / ".job.json.123", split / "manifest/.index.txt.123"}
+    for path in half:
+        path.touch()
     before = everything(split)
     assert clean(split, said.append).level_ids.tolist() == [0, 1]
-    gone = {path for path in before if dead in path.as_posix()} | {split / ".job.json.123"}
+    gone = {path for path in before if dead in path.as_posix()} | half
     assert everything(split) == before - gone
     assert not said
 
