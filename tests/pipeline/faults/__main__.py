@@ -38,7 +38,7 @@ def run() -> int:
                 missed += not campaign.run(schedule)
             except Exception:
                 failed += 1
-                print(f"FAILED {schedule}\n{traceback.format_exc(limit=-3)}", flush=True)
+                print(f"FAILED {schedule}\n{traceback.format_exc(limit=-3)}\n", flush=True)
             print(f"{schedule} ({cpu_seconds() - begun:.1f} s of a core)", flush=True)
     print(table(schedules))
     print(f"{len(schedules)} schedules, {failed} failed; in {missed} the command ended before its fault.")
