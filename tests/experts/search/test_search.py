@@ -168,16 +168,22 @@ def test_env_steps_add_up() -> None:
     assert (found().grew <= found().env_steps).all()
 
 
-def test_rungs_and_larger_worlds() -> None:
-    """One cell, and it is over at the first rung; as many as a rung asks for, and it goes on to the next, up to the
-    fewer env steps of a larger world."""
+def test_a_level_with_few_cells_leaves_at_a_rung() -> None:
+    """One cell, and it is over at the first rung; as many as a rung asks for, and it goes on to the next."""
     assert (found().env_steps[KINDS == BROKEN] == CONFIG.first_rung).all()
+    broken = take(levels(), np.flatnonzero(KINDS == BROKEN)[:1])
+    config = replace(CONFIG, env_steps=40_960, first_rung=4096, per_cell=4096)
+    assert search(broken, IDS[:1], config, DEFAULT_RULES).env_steps == 16_384
+
+
+def test_larger_worlds_are_searched_for_fewer_env_steps() -> None:
+    """The level has one cell, and where no level leaves at a rung it is searched to the end."""
     given = SearchConfig(env_steps=100_000, bodies=8)
     assert [given.scaled(bodies).env_steps for bodies in (7, 8, 16)] == [100_000, 100_000, 25_000]
     assert replace(given, bodies=0).scaled(16).env_steps == 100_000
-    four = replace(CONFIG, bodies=4, env_steps=207_360, first_rung=4096, per_cell=16_384)  # 40,960 of 9 bodies
+    four = replace(CONFIG, bodies=4, env_steps=207_360, per_cell=0)
     at = np.flatnonzero(KINDS == BROKEN)[:1]
-    assert search(take(levels(), at), IDS[:1], four, DEFAULT_RULES).env_steps == 40_960
+    assert search(take(levels(), at), IDS[:1], four, DEFAULT_RULES).env_steps == 40_960  # of 9 bodies
 
 
 def test_a_level_that_has_a_success_stays_as_it_is() -> None:

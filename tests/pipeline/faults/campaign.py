@@ -13,21 +13,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from configs import compose
-from pipeline.store import remote
 from tests.pipeline.faults.content import Rows, Tree, content_of, differences, require_sound, rows_of
 from tests.pipeline.faults.effects import lose_power
-from tests.pipeline.faults.process import (
-    DRIVER,
-    DRIVER_PID,
-    HAPPENED,
-    IMPATIENT,
-    PATIENT,
-    ROLES,
-    WORKER,
-    WORKER_PID,
-    Command,
-    Happening,
-)
+from tests.pipeline.faults.process import DRIVER, DRIVER_PID, HAPPENED, ROLES, WORKER, WORKER_PID, Command, Happening
 from tests.pipeline.faults.schedules import GENERATE, OPERATIONS, Schedule
 from tests.pipeline.servers import Server
 
@@ -37,7 +25,6 @@ NOTHING = Happening()
 PAGE = 4096  # bytes
 PLENTY = 2**28  # bytes
 FULL, ORPHAN, SECOND = "a disk that is really full", "a kill of the driver, the worker goes on", "a second command"
-GONE = "a store that is gone from then on"
 
 
 class Undisturbed(NamedTuple):
@@ -241,13 +228,11 @@ def _in_its_store(world: World, schedule: Schedule, whole: Undisturbed) -> Comma
     every = {"lost answers": "lost", "a busy store": "busy"}.get(fault)
     if every:
         server.spoil(3 + int(3 * schedule.when), every)
-    remote.RETRIES["retry_timeout"] = IMPATIENT if fault == GONE else PATIENT
     command = world.start()
-    remote.RETRIES["retry_timeout"] = PATIENT
     command.shared[HAPPENED] = bool(every)
 
     def meanwhile(count: int) -> None:
-        if fault == GONE and count - begun >= at:
+        if fault == "a store that is gone from then on" and count - begun >= at:
             server.spoil(1, "gone")
         if count - begun != at:
             return

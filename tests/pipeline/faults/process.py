@@ -33,7 +33,6 @@ from tests.pipeline.faults.effects import Effects, Tell
 from tests.pipeline.faults.schedules import LEVELS
 
 PATIENCE = 60.0  # s after which a command hangs
-PATIENT, IMPATIENT = timedelta(seconds=20), timedelta(seconds=0.5)  # with a store; one that is gone stays so
 HELD = 0.5  # s that a worker that has outlived its driver waits for the next command, at most
 SLOW, FOR = 0.02, 10  # s of each of so many effects
 DAY = 86_400.0  # s
@@ -253,7 +252,7 @@ def set_up() -> None:
         arrays = unit.shard_arrays(result.levels, result.record, [0, 1])
         stored |= {arrays["record/action"][..., i].tobytes(): (arrays, i) for i in (0, 1)}
     shard.restored = _looked_up(stored)
-    remote.RETRIES |= {"retry_timeout": PATIENT, "backoff": {"init_backoff": timedelta(milliseconds=5)}}
+    remote.RETRIES |= {"retry_timeout": timedelta(seconds=0.5), "backoff": {"init_backoff": timedelta(milliseconds=5)}}
     leases.POLL, leases.RENEWAL, leases.SILENCE = 0.02, 0.2, 3.0
 
 

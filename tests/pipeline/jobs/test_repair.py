@@ -16,7 +16,7 @@ from pipeline.jobs.seal import seal_split
 from pipeline.read.verify import examine
 from pipeline.store import mend
 from pipeline.store.fields import same_bits
-from pipeline.store.layout import JOB, new_attempt
+from pipeline.store.layout import JOB, WRITER_LOCK, new_attempt
 from pipeline.store.manifest import begin_fragment, fragment_paths, read_fragment, read_manifest, write_fragment
 from pipeline.store.shard import Shard
 from tests.pipeline.command import assert_refused, here, run
@@ -98,8 +98,8 @@ def untouched(split: Path, fragment: Path) -> set[tuple[Path, int, int]]:
 
 
 def data_files(split: Path) -> set[tuple[Path, int]]:
-    """All but the note and the locks, in which a repair writes its name."""
-    files = (file for file in split.rglob("[!.]*") if file.name != JOB and file.is_file())
+    """All but the note and the writer's lock, in which a repair writes its name."""
+    files = (file for file in split.rglob("*") if file.name not in (JOB, WRITER_LOCK) and file.is_file())
     return {(file, file.stat().st_mtime_ns) for file in files}
 
 
