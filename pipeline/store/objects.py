@@ -5,7 +5,9 @@ was first looks whether it was itself. Knows nothing of what is in the files.
 """
 
 from collections.abc import Iterable
+from contextlib import suppress
 from datetime import datetime
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -97,7 +99,12 @@ def remove(paths: Iterable[Path]) -> None:
     """These files of one store, as far as they are there. Raises as `get`."""
     if places := [(path, *place(path)) for path in paths]:
         first, store, _ = places[0]
-        ask(first, lambda: obstore_module().delete(store, [key for _, _, key in places]), "write")
+        try:
+            ask(first, lambda: obstore_module().delete(store, [key for _, _, key in places]), "write")
+        except FileNotFoundError:  # of one of them: Google's and Microsoft's stores say so, and others may be left
+            for path, _, key in places:
+                with suppress(FileNotFoundError):
+                    ask(path, partial(obstore_module().delete, store, key), "write")
 
 
 def require_conditions(probe: Path) -> None:

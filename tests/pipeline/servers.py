@@ -191,6 +191,8 @@ def _changed(method: str, file: Path, headers: dict[str, str], body: bytes, new:
         told = "".join(f"<Deleted><Key>{key}</Key></Deleted>" for key in keys)
         return Answer(200, {}, f"<DeleteResult>{told}</DeleteResult>".encode())
     if method == "DELETE":
+        if not file.exists() and "x-amz-content-sha256" not in headers:
+            return Answer(404, {}, b"<Error><Code>NoSuchKey</Code></Error>")  # Google's, where Amazon's says 204
         file.unlink(missing_ok=True)
         return Answer(204, {}, b"")
     wanted, generation = headers.get("if-match", "").strip('"'), headers.get("x-goog-if-generation-match")  # Google's

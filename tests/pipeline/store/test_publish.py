@@ -348,14 +348,23 @@ def test_a_writer_that_is_silent_is_waited_for_and_replaced_and_notices(
     assert "still writes to s3://bucket/data/128k/s: after 0 s" in sentence
 
 
+@pytest.mark.parametrize(("every", "how"), [(0, ""), (2, "lost")])
 def test_google_s_store_gets_what_a_folder_gets(
-    server: Server, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: Server, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int, how: str
 ) -> None:
+    """Which says of a file that is removed again that it is not there."""
     account = {"client_email": "", "private_key": "", "private_key_id": "", "disable_oauth": True}
     (tmp_path / "account.json").write_text(json.dumps(account | {"gcs_base_url": server.url}))
     monkeypatch.setenv("GOOGLE_SERVICE_ACCOUNT", str(tmp_path / "account.json"))
+    server.spoil(every, how)
     drive("gs://bucket/data")
-    require_same_content(Path("gs://bucket/data") / SPLIT, here)
+    server.spoil(0)
+    split = Path("gs://bucket/data") / SPLIT
+    require_same_content(split, here)
+    kept, *gone = fragment_paths(split)
+    remove(gone[:1])
+    remove(gone)
+    assert [*fragment_paths(split)] == [kept]
 
 
 @pytest.mark.campaign
