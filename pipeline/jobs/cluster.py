@@ -274,9 +274,13 @@ class Crew:
         if was_up and gone:
             units = self._scheduler.workers[handle].units
             self._board.say(f"{handle.host} is gone; others go on with {levels_text(units) if units else 'its work'}.")
-            self._board.tally.forget(units)
-            self._scheduler.leave(handle)
+            self._hand_on(handle)
         return self._scheduler.lost(handle, reason) if was_up and not gone else []
+
+    def _hand_on(self, handle: WorkerHandle) -> None:
+        """Let others go on with what a worker has that is gone."""
+        self._board.tally.forget(self._scheduler.workers[handle].units)
+        self._scheduler.leave(handle)
 
     def _refuse(self, handle: WorkerHandle, why: str) -> None:
         """No worker on this machine, which has another program.
@@ -287,6 +291,8 @@ class Crew:
         handle.end()
         self._refused.add(handle.node)
         for other in [other for other in self._handles if other.node == handle.node]:
+            if other.up:
+                self._hand_on(other)
             other.end()
             self._handles.remove(other)
         if not self._handles:

@@ -24,6 +24,7 @@ from pipeline.jobs.generate import generate
 from pipeline.jobs.progress import say
 from pipeline.read.rows import read_rows
 from pipeline.runtime import own_cores, prepare_jax
+from pipeline.store.events import events_of, runs_in
 from pipeline.store.layout import split_path
 from pipeline.store.manifest import read_manifest
 from pipeline.store.schema import Encoding
@@ -86,6 +87,7 @@ def measured(job: JobConfig, console: Console, seconds: float = SECONDS) -> Samp
         split, begun = split_path(folder, job.budget, job.size), time.monotonic()
         some = min(levels, here * unit)
         first = _made(job, Path(folder), some, here)
+        here = _workers_of(split)  # fewer where each has a GPU
         _, busy, _ = costs_of(split)
         more = int(seconds * here / max(busy.mean(), 1e-6)) // unit * unit
         count, wall = min(levels, MOST, max(some, more)), first
@@ -116,6 +118,12 @@ def _made(job: JobConfig, folder: Path, count: int, workers: int) -> float:
     with redirect_stdout(io.StringIO()):
         generate(here, ["levelproof", "plan"], quiet, level_ids=job.level_ids[:count])
     return time.monotonic() - begun
+
+
+def _workers_of(split: Path) -> int:
+    """How many the latest run had."""
+    (*_, last) = events_of(runs_in(split)[-1])
+    return max(1, sum(of["count"] for of in last["workers"].values()))
 
 
 def costs_of(split: Path) -> tuple[pa.Table, np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from pipeline.jobs import cluster
 from pipeline.jobs.address import require_reachable
 from pipeline.jobs.likeness import program_of, unlike
 from pipeline.jobs.progress import Board, Tally
-from pipeline.jobs.schedule import COMPANY, Scheduler
+from pipeline.jobs.schedule import COMPANY, Scheduler, WorkUnit
 from pipeline.store.layout import JOB
 from pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import PATIENCE, assert_refused, descendants, run, start, title, until
@@ -126,6 +126,22 @@ def test_a_machine_is_left_out_when_several_of_its_workers_are_refused_at_once(m
     crew._handles = [cluster.WorkerHandle(answer[0], answer[0], answer=answer) for answer in answers]
     assert crew.wait() == []
     assert [(handle.node, handle.up) for handle in crew._handles] == [("b", True), ("b", True)]
+
+
+def test_others_go_on_with_what_a_worker_has_whose_machine_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It began before somebody installed another program there."""
+    monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
+    scheduler = Scheduler([WorkUnit((0, 1, 2))], 6)
+    crew = cluster.Crew(made_job("data", "unit=1"), SPLIT, scheduler, Board(Tally(3, 0, 0), Console()))
+    at_work, late, elsewhere = crew._handles = [cluster.WorkerHandle(node, node) for node in "aab"]
+    at_work.up = elsewhere.up = True
+    for worker in (at_work, elsewhere):
+        scheduler.join(worker, 0.0)
+    assert scheduler.order(at_work, 0.0).units == [WorkUnit((0, 1, 2))]
+    crew._refuse(late, "The worker on a has jax 0.1, and this command jax 0.2: install the same.")
+    assert crew._handles == [elsewhere]
+    assert scheduler.order(elsewhere, 0.0).units == [WorkUnit((0, 1, 2))]
+    assert [*scheduler.workers] == [elsewhere]
 
 
 def test_a_worker_with_another_program_is_refused_in_a_sentence() -> None:
