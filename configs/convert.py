@@ -7,6 +7,7 @@ module's callers.
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from enum import StrEnum
 from typing import Any, Literal, TypeVar, get_args, get_origin
@@ -16,6 +17,7 @@ from cattrs.errors import AttributeValidationNote
 from cattrs.gen import make_dict_structure_fn
 
 from configs.errors import ConfigError, suggestion
+from configs.numbers import SCALES, parse_count
 
 T = TypeVar("T")
 CONVERTER = Converter()
@@ -109,6 +111,9 @@ def _one_of(choices: Sequence[Any], value: Any) -> Any:
 
 def _scalar(value: Any, kind: type) -> Any:
     wanted, types = SCALARS[kind]
+    if kind is int and isinstance(value, str) and value[-1:] in SCALES:
+        with suppress(ConfigError):
+            value = parse_count(value, "")
     if type(value) not in types or (kind is float and not abs(value) <= sys.float_info.max):
         raise ValueError(f"is {value!r}: it must be {wanted}")
     return kind(value)

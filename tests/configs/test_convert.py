@@ -56,9 +56,15 @@ def test_plain_and_back(value: Outer) -> None:
     assert typed(Outer, plain(value)) == value
 
 
+def test_whole_numbers_as_people_type_them() -> None:
+    assert typed(Outer, {"count": "1.5k", "limit": "10M"}) == Outer(1500, limit=10_000_000)
+
+
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
+        ({"count": "1.0005k"}, "count is '1.0005k': it must be a whole number"),
+        ({"count": ""}, "count is '': it must be a whole number"),
         ({"count": "7"}, "count is '7': it must be a whole number"),
         ({"count": True}, "count is True: it must be a whole number"),
         ({"count": 1.0}, "count is 1.0: it must be a whole number"),
