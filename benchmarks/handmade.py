@@ -46,13 +46,14 @@ HEAD = ("level", "size", "label", "seconds", *KINDS, "witness", "steps to goal",
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=SIZES, default=list(SIZES), help="default: all")
     parser.add_argument("--budget", default="256k", help="env steps an expert may use (default: 256k)")
+    parser.add_argument("--search", default="16M", help="search.env_steps (default: 16M, as the levels are few)")
 
 
 def run(given: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
     python = oracle.oracle_python()
     folder = oracle.handmade_levels(python)
-    job = compose_job([f"level_files={folder}", f"budget={given.budget}"])
+    job = compose_job([f"level_files={folder}", f"budget={given.budget}", f"search.env_steps={given.search}"])
     listing = levels_below(folder, job)
     if listing.refused:
         raise UserError(listing.refused[0])
@@ -69,7 +70,8 @@ def run(given: argparse.Namespace) -> Report:
         results,
         [Table(HEAD, rows), Table(sizes, totals(results), "By size")],
         notes=[
-            "Each level is labelled alone, on one core, by the default procedure; seconds are without compiling. The "
+            "Each level is labelled alone, on one core, by the default procedure, with up to "
+            f"`search.env_steps={given.search}`; seconds are without compiling. The "
             "slots beside its expert are empty, so a job that labels many levels takes fewer seconds for each. The "
             "columns named after them are env steps.",
             f"*PPO*: the reference's hyperparameters for {PPO.expert.updates_in(PPO_BUDGET):,} updates of "

@@ -21,7 +21,7 @@ UNITS = {
     "rotation": "rad",
     "velocity": "m/s",
     "angular_velocity": "rad/s",
-    **dict.fromkeys((*CONTACT_IMPULSES, *JOINT_IMPULSES), "1 + |x|"),
+    **dict.fromkeys((*CONTACT_IMPULSES, *JOINT_IMPULSES), "relative"),
     "normal": "1",
     "penetration": "m",
     "point": "m",

@@ -65,7 +65,7 @@ def fields(sizes: Sequence[SizeReport]) -> Table:
     of_size = [{row.field: row for row in one.one_step.fields} for one in sizes]
     rows = []
     for name, first in of_size[0].items():
-        cells = [f"{of[name].median:.0e} / {of[name].p999:.0e} / {of[name].above}" for of in of_size]
+        cells = [f"{of[name].median:.1g} / {of[name].p999:.1g} / {of[name].above}" for of in of_size]
         rows.append([name.replace("_", " "), first.unit, *cells])
     head = ("field", "unit", *(one.size for one in sizes))
     return Table(head, rows, "By field: median / 99.9% / states off by more than 1e-3")
@@ -86,7 +86,7 @@ def defect(sizes: Sequence[SizeReport]) -> Table:
     rows = []
     for one in sizes:
         of = one.one_step.defect
-        rows.append([one.size, f"{of.states:,}", *map(str, of.differ), f"{of.largest:.2g}"])
+        rows.append([one.size, f"{of.states:,}", *map(str, of.differ), f"{of.largest:,.0f}"])
     head = ("size", "states", *(f"other by {limit:.0e}" for limit in DEFECT_OFF), "largest")
     return Table(head, rows, "What the fix of the padding defect changes in one step of ours (m, rad, m/s, rad/s)")
 
