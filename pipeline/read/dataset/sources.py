@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -13,8 +13,12 @@ from pipeline.errors import UserError
 from pipeline.read.dataset.batch import Batch
 from pipeline.read.dataset.windows import Windows
 
-if TYPE_CHECKING:
-    from pipeline.read.dataset.dataset import Dataset
+
+class Readable(Protocol):
+    """What a source needs of a `Dataset`, which makes it."""
+
+    def read(self, numbers: Any, length: Any, first: Any, fields: Any, observation: Any, /) -> Batch: ...
+    def grain(self, part: Any, length: Any, fields: Any, observation: Any, /) -> "TrajectorySource": ...
 
 
 class TrajectorySource:
@@ -26,7 +30,7 @@ class TrajectorySource:
 
     def __init__(
         self,
-        data: "Dataset",
+        data: Readable,
         numbers: Int[np.ndarray, " number"],
         part: str | None,
         length: int | None,
