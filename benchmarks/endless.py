@@ -20,7 +20,7 @@ def endless_queue(levels: Level, config: ExpertConfig) -> LevelQueue:
     queue = empty_queue(levels, levels.role.shape[-1], config)
     for first in range(0, queue.capacity, GROUP):
         some = np.arange(first, min(first + GROUP, queue.capacity))
-        queue = enter(queue, take(levels, some), some, no_success(len(some)), config, UPDATES)
+        queue = enter(queue, some.tolist(), take(levels, some), some, no_success(len(some)), config, UPDATES)
     return queue
 
 

@@ -84,7 +84,7 @@ def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
     one whose evaluation was under way when it was kept."""
     free = slots.slot.mode == Mode.EMPTY
     number = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
-    takes, index = free & (number < queue.come), number % queue.capacity
+    takes, index = free & (number < queue.come), queue.order[number % queue.capacity]
 
     def fill() -> tuple[Slot, Acting]:
         begun = jax.tree.map(lambda x: x[index], queue.begun)

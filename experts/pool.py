@@ -22,7 +22,7 @@ from experts.judge import Evaluation, Kept, Trained, Witness, candidates_of
 from experts.ledger import Lap, Ledger, Steps, lap
 from experts.paused import Paused
 from experts.procedure import Procedure
-from experts.queue import GROUP, empty_queue, enter, next_indices
+from experts.queue import GROUP, empty_queue, enter
 from experts.search.search import Searching
 from experts.slots import Begun, LevelQueue, Mode, Pending, Report, Slots, empty_slots
 from experts.stop import rules_of
@@ -31,7 +31,7 @@ from levelgen.level import Level
 from levelgen.task.rules import TaskParams
 
 IN_CACHE = 128  # lanes: their physics and one minibatch fit the cache of a core
-QUEUED_PER_SLOT = 4  # levels: one that stays long keeps none from coming that could have a slot
+QUEUED_PER_SLOT = 4  # levels: with those in the slots, and while the next group does not fit yet, enough wait
 T = TypeVar("T")
 NOTHING_BEGUN: Mapping[int, Kept] = MappingProxyType({})
 NONE_PAUSED: Mapping[int, Paused] = MappingProxyType({})
@@ -234,14 +234,15 @@ class Pool:
             if self._queue is None:
                 self._queue = empty_queue(submission.levels, capacity_of(self.config), self.config)
                 self._slots = empty_slots(slot_count(self.config), self._queue, self.config)
-            indices = next_indices(self._queue, len(some))
-            if not self._at.keys().isdisjoint(indices):
+            free = [index for index in range(self._queue.capacity) if index not in self._at]
+            if len(free) < len(some):
                 return
+            indices = free[: len(some)]
             begun = {row: self._goes_on(submission, i) for row, i in enumerate(some) if i in submission.begun}
             at = np.array(some)
             success = jax.tree.map(lambda x, at=at: x[at], submission.found.success)
             levels, level_ids = take(submission.levels, at), submission.level_ids[at]
-            self._queue = enter(self._queue, levels, level_ids, success, self.config, self.updates, begun)
+            self._queue = enter(self._queue, indices, levels, level_ids, success, self.config, self.updates, begun)
             self._at.update({index: (submission, i) for index, i in zip(indices, some, strict=True)})
             self._coming.popleft()
 

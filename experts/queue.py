@@ -1,6 +1,6 @@
 """The queue before the slots: levels enter it in groups, with experts that have seen nothing or that go on."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 
@@ -25,20 +25,16 @@ def empty_queue(levels: Level, capacity: int, config: ExpertConfig) -> LevelQueu
     return LevelQueue(
         jax.tree.map(lambda x: np.zeros((*x.shape[:-1], capacity), x.dtype), one),
         np.zeros(capacity, np.int32),
+        np.zeros(capacity, np.int32),
         np.int32(0),
         jax.tree.map(lambda x: np.zeros((capacity, *x.shape[1:]), x.dtype), begun),
         Pending(np.zeros(capacity, bool), np.zeros(capacity, bool), np.zeros(capacity, np.int32)),
     )
 
 
-def next_indices(queue: LevelQueue, count: int) -> list[int]:
-    """Indices that the next levels will have."""
-    come = int(queue.come)
-    return [number % queue.capacity for number in range(come, come + count)]
-
-
 def enter(
     queue: LevelQueue,
+    indices: Sequence[int],
     levels: Level,
     level_ids: Int[np.ndarray, " level"],
     success: Success,
@@ -50,6 +46,7 @@ def enter(
 
     Args:
         queue: before.
+        indices: that they get, of none that is there.
         levels: on the host, as are the others.
         level_ids: their ids.
         success: what their experts rehearse from the start, level first.
@@ -57,7 +54,7 @@ def enter(
         updates: that an expert may use.
         begun: experts that go on, by index among these levels; they have their own success.
     """
-    count = len(level_ids)
+    count, come = len(level_ids), int(queue.come)
     fill = np.minimum(np.arange(GROUP), count - 1)  # a group that is not full has its last level several times
     group, ids = take(levels, fill), level_ids[fill]
     no = np.zeros(GROUP, bool)
@@ -68,9 +65,10 @@ def enter(
         for i, expert in begun.items():
             for rows, row in zip(jax.tree.leaves(experts), jax.tree.leaves(expert), strict=True):
                 rows[i] = row
+    numbers = [number % queue.capacity for number in range(come, come + count)]
     nowhere = [queue.capacity] * (GROUP - count)
-    queue = _put(queue, group, ids, *experts, np.array(next_indices(queue, count) + nowhere))
-    return queue._replace(come=np.int32(int(queue.come) + count))
+    queue = _put(queue, group, ids, *experts, np.array([*indices, *nowhere]), np.array(numbers + nowhere))
+    return queue._replace(come=np.int32(come + count))
 
 
 @partial(jax.jit, donate_argnames="queue")
@@ -81,11 +79,13 @@ def _put(
     experts: Begun,
     pending: Pending,
     indices: Int[Array, "16"],
+    numbers: Int[Array, "16"],
 ) -> LevelQueue:
     put = lambda old, new: old.at[indices].set(new, mode="drop")
     return queue._replace(
         levels=jax.tree.map(lambda old, new: old.at[..., indices].set(new, mode="drop"), queue.levels, levels),
         level_ids=put(queue.level_ids, level_ids),
+        order=queue.order.at[numbers].set(indices, mode="drop"),
         begun=jax.tree.map(put, queue.begun, experts),
         pending=jax.tree.map(put, queue.pending, pending),
     )

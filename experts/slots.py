@@ -89,13 +89,11 @@ class Slots(NamedTuple):
 
 
 class LevelQueue(NamedTuple):
-    """Levels that wait, in order: a ring, in which the level that came as number n has index n modulo capacity.
-
-    A level keeps its index until it leaves its slot.
-    """
+    """Levels that wait, and those in slots: each keeps its index, which is any, until it leaves its slot."""
 
     levels: Level  # [..., index]
     level_ids: Int[Array, " index"] | Int[np.ndarray, " index"]
+    order: Int[Array, " number"] | Int[np.ndarray, " number"]  # indices of levels, as they came, modulo capacity
     come: Int[Array, ""] | np.int32  # levels that have come, ever
     begun: Begun  # where their experts go on, index first
     pending: Pending  # index first

@@ -4,15 +4,18 @@ import jax
 import numpy as np
 import pytest
 
-from experts.judge import Trained
+from experts.found import nothing_found
+from experts.judge import Kept, Trained
+from experts.paused import Paused
 from experts.pool import Pool, Submission, capacity_of
-from experts.queue import empty_queue, enter, next_indices
+from experts.queue import empty_queue, enter
+from experts.slots import Pending, begin
 from experts.success import no_success
 from experts.witness import take
 from levelgen.level import SIZES, Level
 from levelgen.sampling.sampler import sample_levels
 from levelgen.task.rules import DEFAULT_RULES
-from tests.experts.small import CONFIG, untouched
+from tests.experts.small import CONFIG, WHOLE, untouched
 from tests.experts.test_slots import SOLVED, same
 
 IDS = np.arange(100, 136)
@@ -138,14 +141,35 @@ def test_a_pool_wants_levels_while_fewer_wait_than_there_are_slots(levels: Level
     assert pool.wants(0) == 2
 
 
-def test_entries_of_a_queue_go_round(levels: Level) -> None:
+def test_indices_of_a_queue_are_used_again_in_any_order(levels: Level) -> None:
     capacity = capacity_of(CONFIG)
     queue = empty_queue(levels, capacity, CONFIG)
-    for at in (range(12), range(12, 24), range(24, 36)):
-        some, ids = part(levels, at)
-        assert next_indices(queue, len(ids)) == [i % capacity for i in at]
-        queue = enter(queue, some, ids, no_success(len(ids)), CONFIG, UPDATES)
+    at = np.random.default_rng(0).permutation(capacity)
+    expected = np.zeros(capacity, int)
+    for first in range(0, 36, 12):
+        some, ids = part(levels, range(first, first + 12))
+        indices = [int(at[i % capacity]) for i in range(first, first + 12)]
+        queue = enter(queue, indices, some, ids, no_success(len(ids)), CONFIG, UPDATES)
+        expected[indices] = ids
     assert int(queue.come) == 36 > capacity
-    expected = [*IDS[capacity:], *IDS[36 - capacity : capacity]]
     np.testing.assert_array_equal(queue.level_ids, expected)
-    same(jax.device_get(queue.levels), take(levels, np.array(expected) - IDS[0]))
+    same(jax.device_get(queue.levels), take(levels, expected - IDS[0]))
+    np.testing.assert_array_equal(
+        np.asarray(queue.level_ids)[queue.order], [*IDS[capacity:], *IDS[36 - capacity : capacity]]
+    )
+
+
+def test_a_level_that_stays_long_keeps_no_slot_empty(levels: Level) -> None:
+    """More others come and go meanwhile than the queue has room for."""
+    pool = Pool(400 * CONFIG.steps_per_update, untouched(WHOLE), DEFAULT_RULES)
+    experts = jax.device_get(begin(levels, IDS, no_success(len(IDS)), CONFIG))
+    soon, no = np.int32(1), np.bool_(False)  # they leave after an update
+    paused = {
+        i: Paused(Kept(jax.tree.map(lambda x, i=i: x[i], experts), []), Pending(no, no, soon), 0, [], nothing_found(1))
+        for i in range(1, len(IDS))
+    }
+    submission = pool.submit(levels, IDS, paused=paused)
+    while pool.waiting(submission):
+        assert pool.step() == []
+    assert 0 in submission.under_way
+    assert submission.idle_rollouts == 0

@@ -43,7 +43,8 @@ def train(
 
 def queue_of(levels: Level, updates: int) -> LevelQueue:
     """As in a pool, so that it uses the same program."""
-    return enter(empty_queue(levels, capacity_of(CONFIG), CONFIG), levels, IDS, no_success(len(IDS)), CONFIG, updates)
+    queue = empty_queue(levels, capacity_of(CONFIG), CONFIG)
+    return enter(queue, range(len(IDS)), levels, IDS, no_success(len(IDS)), CONFIG, updates)
 
 
 @pytest.fixture(scope="module")
