@@ -111,9 +111,10 @@ def _one_of(choices: Sequence[Any], value: Any) -> Any:
 
 def _scalar(value: Any, kind: type) -> Any:
     wanted, types = SCALARS[kind]
-    if kind is int and isinstance(value, str) and value[-1:] in SCALES:
+    text = value if isinstance(value, str) else ""
+    if kind is int and text[-1:] in SCALES:
         with suppress(ConfigError):
-            value = parse_count(value, "")
+            return parse_count(text, "")
     if type(value) not in types or (kind is float and not abs(value) <= sys.float_info.max):
         raise ValueError(f"is {value!r}: it must be {wanted}")
     return kind(value)

@@ -42,7 +42,7 @@ def attempts(
     """
     network, lanes = network_of(level.size, config), repeat(level, count)
     no, never = jnp.zeros(count, bool), jnp.zeros(count)
-    manner = Manner(no, never, no, jnp.zeros((rules.max_timesteps, len(CHOICES), 1), jnp.int8))
+    manner = Manner(no, never, no, jnp.zeros((1, len(CHOICES), 1), jnp.int8))
     params = jax.tree.map(lambda x: x[None], params)
 
     def act(carry, key):

@@ -66,7 +66,7 @@ class ExpertConfig:
     moved_attempts: int = 8  # lanes that start with other velocities
     # witness
     witness: Choice = Choice.RECORD  # which successes of its evaluations can be a level's witness
-    exploration: bool = True  # a success of scout, search or training is a witness, too, where evaluation has none
+    exploration: bool = True  # of trained levels, a success found otherwise is a witness where evaluation has none
     replays: int = 32  # of each candidate, from starts moved by a rounding error; 0: the first candidate is the witness
     # machine
     slots: int = 0  # experts that train side by side in one program; 0: as many as suit the device
@@ -155,6 +155,11 @@ def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> Non
         )
     if budget > MOST_COUNTED:
         raise ValueError(f"budget is {budget}: an expert can count no more than {MOST_COUNTED} env steps")
+    if stopping.rule in (Rule.SOLVED, Rule.HALVING) and stopping.successes > config.attempts:
+        raise ValueError(
+            f"stop.successes is {stopping.successes}: with expert.attempts={config.attempts} give at most "
+            f"{config.attempts}, or more attempts"
+        )
     updates = config.updates_in(budget)
     waits = {
         "wait": config.updates_in(stopping.wait) << MOST_DOUBLINGS,

@@ -170,7 +170,7 @@ def shares(evaluation: Evaluation, config: ExpertConfig) -> tuple[float, float, 
     """
     done, goal = evaluation.done, evaluation.goal
     first = done.any(0) & goal[np.argmax(done, 0), np.arange(done.shape[1])]
-    sampled = first[1 if config.attempts > 1 else 0 : config.attempts]
+    sampled = first[1 : config.attempts]  # the first is the most probable one
     sticky = first[config.attempts : config.attempts + config.sticky_attempts]
     moved = first[config.attempts + config.sticky_attempts :][: config.moved_attempts]
     mean = lambda x: float(x.mean()) if len(x) else float("nan")

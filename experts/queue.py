@@ -85,7 +85,7 @@ def _put(
     return queue._replace(
         levels=jax.tree.map(lambda old, new: old.at[..., indices].set(new, mode="drop"), queue.levels, levels),
         level_ids=put(queue.level_ids, level_ids),
-        order=queue.order.at[numbers].set(indices, mode="drop"),
+        order=jnp.asarray(queue.order).at[numbers].set(indices, mode="drop"),
         begun=jax.tree.map(put, queue.begun, experts),
         pending=jax.tree.map(put, queue.pending, pending),
     )

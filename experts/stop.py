@@ -126,7 +126,8 @@ def fails(
     config: ExpertConfig,
 ) -> Bool[Array, ""]:
     """Whether an evaluation can no longer solve its level, after so many steps: too many attempts have failed."""
-    failed = (done & ~goal & (jnp.arange(len(done)) < steps)[:, None])[:, : config.attempts].any(0)
+    done, goal = (x[:RECORD_STEPS, : config.attempts] for x in (done, goal))
+    failed = (done & ~goal & (jnp.arange(len(done)) < steps)[:, None]).any(0)
     return config.attempts - failed.sum() < rules.enough
 
 

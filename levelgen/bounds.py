@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from math import inf, isfinite
 from typing import Any
 
+import numpy as np
+
 
 def require(settings: Any, names: Iterable[str], least: float, most: float = inf, above: bool = False) -> None:
     """Refuse settings that are not finite, below `least` (if `above`: or equal to it) or beyond `most`.
@@ -13,7 +15,7 @@ def require(settings: Any, names: Iterable[str], least: float, most: float = inf
     """
     for name in names:
         value = getattr(settings, name)
-        if not isfinite(value) or not least <= value <= most or (above and value == least):
+        if not isfinite(value) or not least <= value <= most or (above and np.float32(value) == np.float32(least)):
             within = f"at least {least}" if most == inf else f"between {least} and {most}"
             wanted = "a finite number" if not isfinite(value) else f"above {least}" if above else within
             raise ValueError(f"{name} is {value}: it must be {wanted}")

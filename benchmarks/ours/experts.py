@@ -46,7 +46,7 @@ def main() -> None:
 
     def of_batch(queue: LevelQueue, batch: np.ndarray) -> LevelQueue:
         begun, pending = jax.tree.map(lambda x: x[batch], (queue.begun, queue.pending))
-        some = take(queue.levels, batch), queue.level_ids[batch], np.int32(len(batch))
+        some = take(queue.levels, batch), queue.level_ids[batch], np.arange(len(batch)), np.int32(len(batch))
         return jax.device_put(LevelQueue(*some, begun, pending))
 
     def train_batch(queue: LevelQueue, updates: int) -> tuple[Training, float]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from experts.config import MOST_COUNTED
 from levelgen.bounds import require
 
+MOST_ROUNDS = 1024  # of what a success gets afterwards
 MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are counted in 32 bits
 
 
@@ -41,10 +42,11 @@ class SearchConfig:
     rounds: int = 2  # between looks of the host
 
     def __post_init__(self) -> None:
-        require(self, ("env_steps", "bodies", "per_cell"), 0, MOST_COUNTED)
-        require(self, ("polish",), 0, MOST_COUNTED // 2)
-        require(self, ("steady",), 0)
-        require(self, ("lanes", "segment", "stretch", "trials", "rounds", "first_rung"), 1)
+        require(self, ("bodies", "per_cell"), 0, MOST_COUNTED)
+        require(self, ("env_steps", "polish"), 0, MOST_COUNTED // 2)  # and what the last round has too many
+        require(self, ("steady",), 0, MOST_ROUNDS)
+        require(self, ("trials",), 1, MOST_ROUNDS)
+        require(self, ("lanes", "segment", "stretch", "rounds", "first_rung"), 1)
         require(self, ("entries",), 1, MOST_ENTRIES)
         require(self, ("nearer", "anew"), 0, 1)
         require(self, ("width",), 0, above=True)
@@ -54,6 +56,8 @@ class SearchConfig:
             raise ValueError(f"redrawn is {self.redrawn}: give chances above 0 and at most 1")
         if self.lanes % len(self.redrawn):
             raise ValueError(f"lanes is {self.lanes}: give a multiple of {len(self.redrawn)}, the chances in redrawn")
+        if self.steps_per_round > MOST_COUNTED // 4:
+            raise ValueError(f"lanes is {self.lanes}: a round, with stretch and segment, is too long; give less")
 
     def scaled(self, bodies: int) -> "SearchConfig":
         """For worlds of so many bodies: about the time that a small one takes, where env steps cost as their square."""

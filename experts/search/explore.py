@@ -122,7 +122,8 @@ def under_way(search: Search, config: SearchConfig) -> Bool[Array, " level"]:
     """
     going = (search.length == 0) & (search.env_steps < config.env_steps)
     at_rung = jnp.isin(search.env_steps // config.steps_per_round, jnp.array(config.rungs, jnp.int32))
-    return going & ~(at_rung & (search.archive.cells * config.per_cell < search.env_steps) & (config.per_cell > 0))
+    least = -(-search.env_steps // max(config.per_cell, 1))  # rounded up; nothing here outgrows 32 bits
+    return going & ~(at_rung & (search.archive.cells < least) & (config.per_cell > 0))
 
 
 def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> Chance:

@@ -46,12 +46,13 @@ class LevelFile:
     rules: TaskParams
 
 
-def read_level_file(path: Path) -> LevelFile:
+def read_level_file(path: str | os.PathLike[str]) -> LevelFile:
     """The level in a file that Kinetix or its editor wrote, or `write_level_file`.
 
     Raises:
         LevelFileError: there is no such file, or it has no level that can be used.
     """
+    path = Path(path)
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):  # a pipe or a device may never end

@@ -110,6 +110,9 @@ def make(
     Raises:
         ValueError: no such type.
     """
+    for kinds, given in (ActionType, action_type), (ObservationType, observation_type):
+        if given not in [*kinds]:
+            raise ValueError(f"there is no {kinds.__name__} {given!r}: choose one of {', '.join(kinds)}")
     count = max(x.shape[-1] for x in jax.tree.leaves(levels))
     levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], count)), levels)
     env = Environment(levels, ActionType(action_type), ObservationType(observation_type), rules, auto_reset)

@@ -18,6 +18,7 @@ from physics.step import step as physics_step
 from physics.types import Params, State
 from physics.vector import rows, select, vec
 
+MOST_STEPS = 2**31 - 1  # are counted in 32 bits
 NO_DISTANCE = -1.0  # last_distance before the first step of an episode
 
 
@@ -31,7 +32,7 @@ class TaskParams:
     physics: Params = field(default_factory=Params)  # constants of the engine
 
     def __post_init__(self) -> None:
-        require(self, ("frame_skip", "max_timesteps"), 1)
+        require(self, ("frame_skip", "max_timesteps"), 1, MOST_STEPS)
         require(self, ("dense_reward_scale",), 0)
 
 

@@ -9,25 +9,31 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 
 from configs.errors import ConfigError, readable
 from pipeline.cli.command import EXITS
-from pipeline.errors import Exit, LevelproofError
+from pipeline.errors import Exit, LevelproofError, UserError
+from pipeline.urls import require_here, require_known
 from pipeline.version import __version__
 
 NAMES = (
     "generate regenerate settings sample inspect columns plan diff show gallery play export import_ card status verify "
     "seal"
 )
+WRITTEN = ("out", "plot")  # what is written on this machine
 COMMANDS = [import_module(f"pipeline.cli.{name}") for name in NAMES.split()]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; its exit code."""
-    arguments = _parser().parse_args(argv)
+    arguments, unknown = _parser().parse_known_args(argv)
     warnings.showwarning = lambda message, *_: print(f"Warning: {message}", file=sys.stderr)
     code = int(Exit.DONE)
     try:
+        if unknown:
+            raise UserError(_no_option(unknown[0], takes_settings=bool({"settings", "words"} & vars(arguments).keys())))
+        _look_at_paths(arguments)
         code = int(arguments.run(arguments) or Exit.DONE)
         sys.stdout.flush()  # here, where a pipe that is closed is no error
         return code
@@ -47,6 +53,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(
             f"{type(error).__name__}: {what[0] if what else 'no message'} (--debug shows where)", Exit.FAILED
         )
+
+
+def _no_option(word: str, takes_settings: bool) -> str:
+    """A sentence for a word that the command does not take."""
+    how = "write settings as NAME=VALUE, as in size=m" if takes_settings else "--help lists those that there are"
+    return f"There is no option {word}: {how}."
+
+
+def _look_at_paths(arguments: argparse.Namespace) -> None:
+    """Raises UserError for one that stands for a URL of another kind than can be used there."""
+    for name, value in vars(arguments).items():
+        for path in value if isinstance(value, list) else [value]:
+            if isinstance(path, Path):
+                (require_here if name in WRITTEN else require_known)(path)
 
 
 def _refuse(sentence: str, code: int) -> int:

@@ -28,7 +28,7 @@ from pipeline.store.manifest import Manifest, read_manifest
 from pipeline.store.origins import Origin, require_same_levels
 from pipeline.store.paused import prune_paused
 from pipeline.store.remote import as_typed
-from pipeline.store.runs import ascending, runs
+from pipeline.store.runs import ascending, merged, runs
 from pipeline.store.split import writing
 
 
@@ -63,7 +63,7 @@ def generate(
         scheduler = Scheduler(units, len(wanted) - len(done), job.levels_per_unit)
         prune_paused(split, manifest.level_ids)
         if not repaired:
-            note_job(split, job, command, runs(wanted))
+            note_job(split, job, command, merged(runs(wanted), runs(manifest.level_ids)))
         if scheduler.waiting:
             solved = manifest.counts(is_done).get(Label.SOLVED, 0)
             board = Board(Tally(len(wanted), len(done), solved), console)

@@ -18,9 +18,9 @@ from pipeline.store.manifest import require_manifest
 from pipeline.store.origins import origins_of
 
 OWN = ("manifest", "where", "continue")  # words that are not settings of a job
-NOT_OURS = ("size", "levels", "first_level", "level_files")  # settings that the manifest decides
+NOT_OURS = ("size", "levels", "first_level", "level_files", "distribution")  # settings that the manifest decides
 # Presets, and the groups of settings that each decides
-PRESETS = {"procedure": {field.name for field in fields(Procedure)}, "distribution": {"distribution"}}
+PRESETS = {"procedure": {field.name for field in fields(Procedure)}}
 HINT = "as in levelproof regenerate manifest=data/256k/s budget=1M where=\"label = 'unsolved'\""
 
 
@@ -65,7 +65,7 @@ def split_words(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     if "budget" not in values:
         raise UserError(f"Which budget? Give one, {HINT}.")
     for name in NOT_OURS:
-        if name in values:
+        if any(word.partition(".")[0] == name for word in values):
             raise UserError(f"{name} cannot be changed here, it is that of the manifest: choose levels with where=SQL.")
     if own.get("continue", "false") not in ("true", "false"):
         raise UserError(f"continue is {own['continue']}: it must be true or false.")

@@ -18,6 +18,7 @@ from pipeline.jobs.schedule import WorkUnit
 from pipeline.runtime import prepare_jax
 from pipeline.store import seal as store
 from pipeline.store.disk import told_of
+from pipeline.store.job_note import note_density
 from pipeline.store.layout import fragment_path, unit_name
 from pipeline.store.manifest import Fragment, require_manifest, write_index
 from pipeline.store.remote import as_typed
@@ -59,6 +60,8 @@ def seal_split(
                 seal(split, group, density=wanted, converted=partial(bar.advance, task))
                 bar.update(task, completed=done)
             write_index(split)
+            if density:
+                note_density(split, density, key_every)
     merged = sum(map(len, groups))
     levels, fragments = sum(piece.rows for piece in pieces), len(pieces) - merged + len(groups)
     done = f"{merged:,} fragments were merged into {len(groups):,}" if groups else "there was nothing to seal"

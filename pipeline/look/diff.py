@@ -157,7 +157,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     shares = [f"{of['solved'] / of['tried']:.1%}" if of["tried"] else "-" for of in facts["solved"]]
     gained = facts["only"][1] - facts["only"][0]
     table.add_row("levels solved", *(f"{of['solved']:,}" for of in facts["solved"]), f"{gained:+,}")
-    table.add_row("of levels that could use an expert", *shares, f"p {_p(facts['p'])}")
+    table.add_row("of undecided levels", *shares, f"p {_p(facts['p'])}")
     table.add_row("solved only there", *(f"{count:,}" for count in facts["only"]), "")
     for name in SPENT:
         here, there = (of[name] for of in facts["env_steps"])

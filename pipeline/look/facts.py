@@ -43,7 +43,7 @@ def _lines(facts: Mapping[str, Any]) -> dict[str, str | list[str]]:
         **{f"{label}, because": _reasons(kinds) for label, kinds in facts["reasons"].items()},
         "experts that diverged": str(facts["diverged"]) if facts["diverged"] else None,
         "failed by doing nothing": str(facts["failed_by_noop"]),
-        "solve rate of experts": f"{rate:.1%} ({_interval(interval)})" if rate is not None else None,
+        "solved of undecided levels": f"{rate:.1%} ({_interval(interval)})" if rate is not None else None,
         **_by_things(facts["solved_by"]),
         "witnesses": ", ".join(f"{count} {name}" for name, count in facts["witness"].items()) or None,
         "steps to goal": _told(facts["steps_to_goal"]),

@@ -170,7 +170,8 @@ def require_same_experts(job: JobConfig) -> None:
     require_own(source.split / EXPERTS, COPY)
     if source.table.column("experts").null_count == source.table.num_rows:
         raise UserError(
-            f"{source.split} has kept no experts: make it with keep_experts=true, or leave out continue_from."
+            f"{source.split} has kept no experts: make it in another folder, with out=NAME keep_experts=true, or train "
+            "from the start."
         )
     config = source.config or {}
     changes = differences(config, job.results)

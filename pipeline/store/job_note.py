@@ -1,4 +1,4 @@
-"""`job.json`: what the last command wanted of a split, so that anybody can tell what is not there."""
+"""`job.json`: what the last command wanted of a split, and what was there before: so that a loss is seen."""
 
 import hashlib
 import json
@@ -26,16 +26,16 @@ class NoteError(ValueError):
 
 @dataclass(frozen=True)
 class JobNote:
-    """What the last command wanted."""
+    """What a split should have."""
 
-    command: str
+    command: str  # the last one
     level_ids: np.ndarray  # (run, 2): first and last of each run of ids, ascending
     config: dict[str, Any] | None  # the settings that decide results, as in every fragment
     intact: bool  # every byte is as it was written
 
 
 def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[tuple[int, int]]) -> None:
-    """Write down which runs of level ids this command wants, first and last of each."""
+    """Write down which runs of level ids there should be after this command, first and last of each."""
     note = {
         "command": shlex.join(command),
         "level_ids": [list(run) for run in wanted],
@@ -43,6 +43,17 @@ def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequen
         "config": job.results,
     }
     write(split / JOB, _text(note).encode())
+
+
+def note_density(split: Path, density: str, key_every: int) -> None:
+    """Let the command that goes on ask for what is stored now."""
+    if (note := sound_note(split)) is None or shlex.split(note.command)[1:2] not in (["generate"], ["regenerate"]):
+        return
+    words = [word for word in shlex.split(note.command) if word.partition("=")[0] not in ("density", "key_every")]
+    words += [f"density={density}", f"key_every={key_every}"]
+    said = json.loads(_bytes(split / JOB)) | {"command": shlex.join(words)}
+    del said[DIGEST]
+    write(split / JOB, _text(said).encode())
 
 
 def read_note(split: Path) -> JobNote:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.errors import Failure
-from pipeline.store.remote import BUCKETS, INDEX, fragments_in, is_remote, names_in
+from pipeline.store.remote import INDEX, fragments_in, is_remote, names_in
+from pipeline.urls import BUCKETS
 
 MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS = "manifest", "shards", "experts", "quarantine", "checkpoints"
 FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS

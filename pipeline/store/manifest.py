@@ -26,10 +26,11 @@ from pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of
 from pipeline.store.disk import flush, flush_entry
 from pipeline.store.fragment import FULL, Fragment, read_fragment
 from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
-from pipeline.store.remote import INDEX
+from pipeline.store.remote import INDEX, is_remote
 from pipeline.store.runs import ascending
 from pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from pipeline.store.shown import shown
+from pipeline.urls import require_known
 
 SHOWN = 6  # differing settings that an error lists
 # Fragments read at once: more than cores, because a shared folder takes its time for each; not many more, because what
@@ -317,9 +318,20 @@ def require_manifest(
     """
     manifest = read_manifest(split, columns, level_ids, compact=compact, each=each)
     if not manifest.fragments and (level_ids is None or not fragment_paths(split)):
-        what = f"Nothing is committed in {split} yet" if split.is_dir() else f"There is no split at {split}"
-        raise UserError(f"{what}: give a folder such as data/128k/s that `levelproof generate` made.")
+        raise UserError(_nothing_at(split))
     return manifest
+
+
+def _nothing_at(split: Path) -> str:
+    """Why a folder is no split, in a sentence."""
+    require_known(split)
+    here = [] if is_remote(split) else [f"{above}{MANIFEST}" for above in ("*/", "*/*/", "*/*/*/")]
+    below = [found.parent for pattern in here for found in split.glob(pattern)]
+    if below:
+        names = ", ".join(map(str, sorted(below)[:SHOWN]))
+        return f"{split} is no split, but the folder of {len(below)}: name one of them, such as {names}."
+    what = f"Nothing is committed in {split} yet" if split.is_dir() else f"There is no split at {split}"
+    return f"{what}: give a folder such as data/128k/s that `levelproof generate` made."
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

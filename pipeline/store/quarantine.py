@@ -4,7 +4,8 @@ from pathlib import Path
 
 from pipeline.store.files import write
 from pipeline.store.layout import QUARANTINE, quarantine_path
-from pipeline.store.remote import BUCKETS, is_remote, names_in
+from pipeline.store.remote import is_remote, names_in
+from pipeline.urls import BUCKETS
 
 
 def give_up(split: Path, unit: str, reason: str) -> Path:

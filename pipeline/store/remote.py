@@ -1,8 +1,6 @@
 """Splits in object stores and on web servers, read in pieces through a cache on this machine.
 
-A path whose first part is `s3:`, `gs:`, `az:`, `https:`, `http:` or `hf:` stands for the URL:
-`Path("s3://bucket/split")` is such a one, whatever becomes of its slashes. So whoever reads a split has a Path, and
-only this knows where it lies.
+Whoever reads a split has a Path, which may stand for a URL, and only this knows where it lies.
 """
 
 import os
@@ -22,11 +20,11 @@ from pipeline.errors import LevelproofError, StoreFailure, UserError
 from pipeline.runtime import cache_folder
 from pipeline.store import hub
 from pipeline.store.pieces import PieceCache
+from pipeline.urls import BUCKETS, HUB, WEB
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
-BUCKETS, WEB, HUB = ("s3:", "gs:", "az:"), ("https:", "http:"), ("hf:",)
 INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for servers that do not list
 MOST_INDEX = 2**25  # bytes of it; a name takes 34
 PIECE = 2**20  # bytes; of 4 MB, random trajectories of 10 kB would fetch four times as much

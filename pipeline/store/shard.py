@@ -112,13 +112,13 @@ def _require_given_back(
 class Shard:
     """One shard on disk, opened lazily for reading. What it says is checked before anything of it is given out."""
 
-    def __init__(self, path: Path, size: str | None = None) -> None:
+    def __init__(self, path: str | os.PathLike[str], size: str | None = None) -> None:
         """Open the group at `path`, whose levels are to be of `size`, if that is known.
 
         Raises:
             Failure: it is missing, damaged, no shard of that or any size, or of another version.
         """
-        self.path = path
+        self.path = path = Path(path)
         try:
             about = json.loads(read_whole(path, "zarr.json"))
             if (about["zarr_format"], about["node_type"]) != (3, "group"):

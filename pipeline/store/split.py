@@ -15,6 +15,7 @@ from pipeline.store.locks import committing, only_writer
 from pipeline.store.manifest import Manifest, differences, told
 from pipeline.store.objects import require_conditions
 from pipeline.store.remote import is_remote
+from pipeline.urls import require_known
 
 
 @contextmanager
@@ -27,6 +28,7 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
         Failure: a fragment is damaged.
     """
     split = split or split_path(job.out, job.budget, job.size)
+    require_known(split)
     with taken(split, say) as manifest:
         if manifest.config_hash not in (None, job.hash):
             changes = told(differences(manifest.config or {}, job.results))

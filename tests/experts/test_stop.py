@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experts import progress, stop
-from experts.config import ExpertConfig, Rule, StopConfig
+from experts.config import ExpertConfig, Rule, StopConfig, check_budget
 from experts.stop import rules_of
 
 CONFIG = ExpertConfig(
@@ -119,3 +119,19 @@ def test_solving_takes_enough_attempts() -> None:
     assert bool(stop.fails(done, goal, 256, rules, CONFIG))
     assert not bool(stop.fails(done, goal, 255, rules, CONFIG)), "what follows is of an earlier evaluation"
     assert not bool(stop.solves(done & False, goal & False, rules, CONFIG)), "no episode has ended"
+
+
+def test_what_follows_the_record_decides_nothing() -> None:
+    """Rollouts of an evaluation go on behind it where the horizon does not divide it."""
+    done, goal = np.zeros((2, 300, 16), bool)
+    done[50] = goal[50] = done[280] = True  # all reach the goal, and fail behind the record
+    rules = rules_of(StopConfig(successes=8), CONFIG)
+    assert bool(stop.solves(done, goal, rules, CONFIG))
+    assert not bool(stop.fails(done, goal, 300, rules, CONFIG))
+
+
+def test_more_successes_than_attempts_are_refused() -> None:
+    for rule in (Rule.SOLVED, Rule.HALVING):
+        with pytest.raises(ValueError, match=r"stop.successes is 9: with expert.attempts=8 give at most 8"):
+            check_budget(10_000, CONFIG, StopConfig(rule=rule, successes=9))
+    check_budget(10_000, CONFIG, StopConfig(rule=Rule.BUDGET, successes=9))

@@ -14,7 +14,7 @@ from experts.labels import Label, Source
 from experts.procedure import Procedure
 from experts.scout import STEPS_PER_ROUND
 from experts.search.config import SearchConfig
-from experts.search.explore import Search, begin, draw, explore
+from experts.search.explore import Search, begin, draw, explore, under_way
 from experts.search.play import arena, fresh_walk, play
 from experts.search.search import AHEAD, Searched, Searching, side_by_side
 from experts.search.shorten import shorten
@@ -176,6 +176,15 @@ def test_a_level_with_few_cells_leaves_at_a_rung() -> None:
     assert search(broken, IDS[:1], config, DEFAULT_RULES).env_steps == 16_384
 
 
+def test_a_rung_that_asks_for_next_to_nothing_lets_all_go_on() -> None:
+    """Cells times the env steps for each would not fit 32 bits."""
+    now = begun()
+    steps, cells = jnp.full_like(now.env_steps, CONFIG.first_rung), jnp.full_like(now.archive.cells, 3000)
+    reached = replace(now, env_steps=steps, archive=now.archive._replace(cells=cells))
+    assert under_way(reached, replace(CONFIG, per_cell=1_000_000)).all()
+    assert not under_way(reached, replace(CONFIG, per_cell=1)).any()
+
+
 def test_larger_worlds_are_searched_for_fewer_env_steps() -> None:
     """The level has one cell, and where no level leaves at a rung it is searched to the end."""
     given = SearchConfig(env_steps=100_000, bodies=8)
@@ -256,7 +265,8 @@ def test_shortening() -> None:
     "wrong",
     [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"anew": -0.5},
      {"redrawn": (0.5, 2.0)}, {"redrawn": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"velocity_seconds": -1.0},
-     {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}],
+     {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000}, {"steady": 2000}, {"width": 1e-46},
+     {"growth": 1.00000001}, {"lanes": 2**28}],
 )  # fmt: skip
 def test_settings_that_cannot_be(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):

@@ -8,11 +8,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 from pipeline.cli import main
 from pipeline.store import seal
+from pipeline.store.layout import data_paths
 from pipeline.store.locks import only_writer
 from pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import ROOT, TINY, assert_refused, here, run
@@ -94,6 +96,44 @@ def test_a_command_that_is_none_gets_the_usage(tmp_path: Path, arguments: list[s
     assert done.stderr.startswith("usage: levelproof")
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["generate", "--size", "m"], "There is no option --size: write settings as NAME=VALUE, as in size=m"),
+        (["inspect", "x", "--were", "a"], "There is no option --were: --help lists those that there are"),
+        (["generate", "out=gcs://bucket/x"], "gcs:/bucket/x/128k/s looks like a URL"),
+        (["status", "ftp://host/split"], "ftp:/host/split looks like a URL"),
+        (["show", "x", "7", "-o", "s3://bucket/level.gif"], "Nothing can be written to s3://bucket/level.gif here"),
+        (["inspect", "x", "--plot", "gs://bucket/plot.svg"], "Nothing can be written to gs://bucket/plot.svg here"),
+    ],
+)
+def test_what_looks_like_an_option_or_a_url_is_not_taken_for_a_folder(
+    tmp_path: Path, words: list[str], told: str
+) -> None:
+    assert_refused(here(words, tmp_path), 2, told)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_folder_of_splits_is_told_from_a_split(made: Path) -> None:
+    for above in ("data", "."):
+        assert_refused(here(["inspect", above], made), 2, f"{above} is no split", "name one of them, such as")
+
+
+@pytest.mark.slow
+def test_a_later_command_forgets_nothing_that_is_there(split: Path) -> None:
+    """What it does not ask for is missed, too, once it is lost."""
+    folder = split.parent.parent.parent
+    words = [word for word in TINY if not word.startswith("levels=")]
+    assert here(["generate", *words, "levels=1", "executor=inline"], folder).returncode == 0
+    assert json.loads(here(["status", "data/5k/s", "--json"], folder).stdout)["wanted"] == 4
+    for path in fragment_paths(split)[1:]:
+        path.unlink()
+    for path in data_paths(split):
+        shutil.rmtree(path)
+    assert here(["verify", "data/5k/s"], folder).returncode == 1
+
+
 @pytest.mark.parametrize("command", [["inspect"], ["status"], ["verify"]])
 def test_a_split_that_is_not_there_is_named(tmp_path: Path, command: list[str]) -> None:
     assert_refused(here([*command, "data/1k/s"], tmp_path), 2, "no split at data/1k/s")
@@ -173,7 +213,7 @@ def test_inspect_tells_what_is_there(made: Path) -> None:
     manifest = read_manifest(made / "data/5k/s")
     done = here(["inspect", "data/5k/s"], made)
     assert done.returncode == 0, done.stderr
-    for word in ("solve rate", "steps to goal", "bytes per transition", "level_id", "solved"):
+    for word in ("solved of undecided levels", "steps to goal", "bytes per transition", "level_id", "solved"):
         assert word in done.stdout
     facts = json.loads(here(["inspect", "data/5k/s", "--json", "--rows", "2"], made).stdout)
     assert facts["levels"] == 4
@@ -233,9 +273,14 @@ def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(tmp_p
 
 
 @pytest.mark.slow
-def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path) -> None:
-    """Steps that a 32-bit counter cannot count: every attempt fails, the command says so and ends with 3."""
-    done = here(["generate", "levels=1", "budget=5k", "task.max_timesteps=3000000000", "executor=inline"], tmp_path)
+def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every attempt fails; the command says so and ends with 3."""
+
+    def broken(*_: object) -> NoReturn:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr("pipeline.jobs.unit.sample_levels", broken)
+    done = here(["generate", "levels=1", "budget=5k", "executor=inline"], tmp_path)
     assert done.returncode == 3, done.stderr
     assert done.stderr.count("trying again") == 2
     assert "given up" in done.stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.store.job_note import NoteError, note_job, read_note
+from pipeline.store.job_note import NoteError, note_density, note_job, read_note
 from pipeline.store.layout import JOB
 from tests.pipeline.made import made_job
 
@@ -25,6 +25,19 @@ def test_what_was_wanted(split: Path) -> None:
     assert note.level_ids.tolist() == [[0, 7], [9, 9]]
     assert note.config == made_job().results
     assert note.intact
+
+
+def test_the_command_asks_for_what_is_stored(split: Path) -> None:
+    note_density(split, "witness", 16)
+    note_density(split, "resume", 32)
+    note = read_note(split)
+    assert note.command.endswith(" density=resume key_every=32")
+    assert "witness" not in note.command
+    assert note.intact
+    assert note.level_ids.tolist() == [[0, 7], [9, 9]]
+    note_job(split, made_job(), ["levelproof", "import", "there"], [(0, 7)])
+    note_density(split, "witness", 16)
+    assert read_note(split).command == "levelproof import there"
 
 
 def test_every_byte_counts(split: Path) -> None:
