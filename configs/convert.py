@@ -109,12 +109,17 @@ def _one_of(choices: Sequence[Any], value: Any) -> Any:
     return value
 
 
+def _counted(value: Any) -> Any:
+    """The number that people mean by 64k; anything else as it is."""
+    if isinstance(value, str) and value[-1:] in SCALES:
+        with suppress(ConfigError):
+            return parse_count(value, "")
+    return value
+
+
 def _scalar(value: Any, kind: type) -> Any:
     wanted, types = SCALARS[kind]
-    text = value if isinstance(value, str) else ""
-    if kind is int and text[-1:] in SCALES:
-        with suppress(ConfigError):
-            return parse_count(text, "")
+    value = _counted(value) if kind is int else value
     if type(value) not in types or (kind is float and not abs(value) <= sys.float_info.max):
         raise ValueError(f"is {value!r}: it must be {wanted}")
     return kind(value)

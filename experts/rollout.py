@@ -85,7 +85,7 @@ def rollout(
     lanes = repeat(levels, environments)
     constant, live = network.constant(levels), action_mask(lanes)
     per_level = lambda x: x.reshape(*x.shape[:-1], level_count, environments)
-    flat = lambda x: x.reshape(*x.shape[:-2], -1)
+    flat = lambda x: x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
     each = jax.vmap(partial(forward, network), in_axes=(0, -1, 1), out_axes=(-2, 0))
 
     def look(world: TaskState):

@@ -143,9 +143,10 @@ def empty_slots(count: int, queue: LevelQueue, config: ExpertConfig) -> Slots:
 
 def lanes_of(tree: Any) -> Any:
     """[slot, ..., environment] -> [..., lane]."""
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1), tree)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1]), tree)
 
 
 def _by_slot(tree: Any, environments: int) -> Any:
     """[..., lane] -> [slot, ..., environment]."""
-    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, environments), -2, 0), tree)
+    apart = lambda x: x.reshape(*x.shape[:-1], x.shape[-1] // environments, environments)
+    return jax.tree.map(lambda x: jnp.moveaxis(apart(x), -2, 0), tree)

@@ -129,6 +129,8 @@ def record_of(level: Level, now: TaskState, manifold: Any, action: Int[Array, "6
 
 def _points(state: State, body: Int[Array, "thing lane"], point: Float[Array, "thing 2 lane"]) -> Array:
     """Points given in the frames of bodies, in the world."""
+    if not len(body):
+        return jnp.zeros_like(point)
     pick = lambda x: jnp.stack([select(x, b) for b in body])
     rotation = pick(state.rotation)
     centre = vec(state.position).map(pick)

@@ -65,8 +65,8 @@ def move(level: Level, body: int, x: float, y: float) -> Level:
     """A body's centre there, and what is joined to it along."""
 
     def change(one: Level) -> None:
-        shift = np.array((x, y), np.float32) - one.state.position[_movable(one, body)]
-        one.state.position[_joined(one, body)] += shift
+        together = _together(one, body)
+        one.state.position[together] += np.array((x, y), np.float32) - one.state.position[body]
 
     return _edited(level, change)
 
@@ -75,7 +75,8 @@ def turn(level: Level, body: int, angle: float) -> Level:
     """A body turned by so many radians, and what is joined to it around its centre."""
 
     def change(one: Level) -> None:
-        centre, together = one.state.position[_movable(one, body)].copy(), _joined(one, body)
+        together = _together(one, body)
+        centre = one.state.position[body].copy()
         one.state.position[together] = centre + turned(one.state.position[together] - centre, angle)
         one.state.rotation[together] += angle
 
@@ -86,7 +87,8 @@ def resize(level: Level, body: int, factor: float) -> Level:
     """A body so many times as large; what is joined to it moves with its joints."""
 
     def change(one: Level) -> None:
-        circle = _movable(one, body) - one.size.polygons
+        _together(one, body)
+        circle = body - one.size.polygons
         shape = one.model.radius[circle : circle + 1] if circle >= 0 else one.model.vertices[body]
         reach = factor * np.abs(shape).max()
         if not SMALLEST <= reach <= LARGEST:
@@ -238,6 +240,14 @@ def _movable(one: Level, body: int) -> int:
     if _there(one.model.active, body, "body") < FIXED_POLYGONS:
         raise EditError("That belongs to the scenery, of which only the role can change.")
     return body
+
+
+def _together(one: Level, body: int) -> list[int]:
+    """A body that can be moved, and all that moves with it."""
+    found = _joined(one, _movable(one, body))
+    if min(found) < FIXED_POLYGONS:
+        raise EditError("A joint holds it to the scenery, which stays where it is: delete that joint first.")
+    return found
 
 
 def _weigh(one: Level, body: int, fixed: bool) -> None:

@@ -10,16 +10,19 @@ Units: metres, radians, seconds, kilograms. Facts about the reference are those 
 (`jax2d.sim_state`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import jax
 from jaxtyping import Array, Bool, Float, Int
 
+from physics.bounds import require
+
 FIXED_POLYGONS = 4  # floor, left wall, right wall, ceiling; pairs among them are never tested
 MAX_VERTICES = 4  # of a polygon; a triangle leaves its fourth vertex unused
 SOLVER_BATCH = 16  # pairs that read the same velocities; part of the reference's result
 SOLVER_ITERATIONS = 10
+MOST = 1e6  # of a constant of the engine
 
 
 class Size(NamedTuple):
@@ -57,6 +60,10 @@ class Params:
     thruster_power: float = 10.0  # N, of a thruster whose power is 1
     base_friction: float = 0.4  # times the friction of each body, in every contact
     faithful_padding: bool = True  # reproduce the reference's padding defect, see docs/physics.md
+
+    def __post_init__(self) -> None:
+        require(self, [field.name for field in fields(self) if field.type is float], 0, MOST)
+        require(self, ("dt",), 1e-6, 1)
 
 
 DEFAULT_PARAMS = Params()

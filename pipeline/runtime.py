@@ -66,6 +66,7 @@ def prepare_jax(core: int | None = None) -> None:
 
     programs = own_folder(cache_folder() / "jax", "delete it")
     remove_damaged(programs)
+    jax.config.update("jax_enable_x64", False)
     jax.config.update("jax_compilation_cache_dir", str(programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

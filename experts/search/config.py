@@ -4,7 +4,7 @@ import itertools
 from dataclasses import dataclass, replace
 
 from experts.config import MOST_COUNTED
-from levelgen.bounds import require
+from physics.bounds import require
 
 MOST_ROUNDS = 1024  # of what a success gets afterwards
 MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are counted in 32 bits

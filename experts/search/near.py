@@ -69,7 +69,8 @@ def _shape(model: Model, body: Int[Array, "pair lane"]) -> Shape:
     triangle = _pick(model.n_vertices, polygon) == MAX_VERTICES - 1
     local = jnp.where(is_round[:, None, None], 0.0, _pick(model.vertices, polygon))
     local = local.at[:, -1].set(jnp.where(triangle[:, None], local[:, 0], local[:, -1]))
-    radius = jnp.where(is_round, _pick(model.radius, jnp.maximum(body - polygons, 0)), 0.0)
+    circle = jnp.maximum(body - polygons, 0)
+    radius = jnp.where(is_round, _pick(model.radius, circle), 0.0) if len(model.radius) else jnp.zeros(body.shape)
     return Shape(body, vec(jnp.swapaxes(local, 0, 1)), radius)
 
 

@@ -18,6 +18,6 @@ def from_rows(rows: Float[Array, "lane word"], like: State) -> State:
     leaves, first, words = [], 0, rows.T
     for x in jax.tree.leaves(like):
         count = x[..., 0].size
-        leaves.append(words[first : first + count].reshape(*x.shape[:-1], -1).astype(x.dtype))
+        leaves.append(words[first : first + count].reshape(*x.shape[:-1], words.shape[-1]).astype(x.dtype))
         first += count
     return jax.tree.unflatten(jax.tree.structure(like), leaves)

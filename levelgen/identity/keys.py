@@ -32,9 +32,11 @@ def level_id_array(level_ids: ArrayLike) -> Int[np.ndarray, " level"]:
     """Level ids as every array of them has them: int32 on the host.
 
     Raises:
-        ValueError: an id is not 0 .. MAX_LEVEL_ID.
+        ValueError: they are no list of whole numbers, or one is not 0 .. MAX_LEVEL_ID.
     """
     ids = np.asarray(level_ids)
+    if ids.ndim != 1 or (len(ids) and not np.issubdtype(ids.dtype, np.integer)):
+        raise ValueError(f"level ids are a list of whole numbers, and these are {ids.dtype} of shape {ids.shape}")
     if len(ids) and not 0 <= ids.min() <= ids.max() <= MAX_LEVEL_ID:
         raise ValueError(f"level ids {ids.min()} to {ids.max()} do not fit: they run from 0 to {MAX_LEVEL_ID}")
     return ids.astype(np.int32)

@@ -7,8 +7,8 @@ The defaults are the reference's random-level distribution, Kinetix 3.0.2: names
 import math
 from dataclasses import dataclass, fields
 
-from levelgen.bounds import require
 from levelgen.level import HALF_WORLD
+from physics.bounds import require
 
 # m, largest reach of a free body from its centre: green and blue may have to fit into one half of the world
 MAX_REACH = HALF_WORLD / 2
@@ -92,7 +92,7 @@ class Distribution:
     def __post_init__(self) -> None:
         names = [field.name for field in fields(self)]
         require(self, [name for name in names if name.endswith("_chance")], 0, 1)
-        require(self, names, 0)
+        require(self, names, 0, 1e9)
         require(self, ("proposals", "min_half_side", "min_radius"), 0, above=True)
         self._check_sums()
         for low, high in (

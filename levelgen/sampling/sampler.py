@@ -26,6 +26,7 @@ from levelgen.sampling.overlap import WorldCircles, count_contacts
 from levelgen.sampling.proposal import BodyDraws, Flag, Lane, Proposal, corners_in_world, insert
 from levelgen.sampling.scenery import empty_level
 from levelgen.sampling.shuffle import OrderDraws, shuffle, shuffled_rows
+from physics.bounds import require_32_bits
 from physics.types import FIXED_POLYGONS, Size
 
 CHUNK = 256  # levels sampled by one call of the compiled program, however many are asked for
@@ -75,8 +76,10 @@ def sample_levels(level_ids: ArrayLike, size: Size, distribution: Distribution =
         distribution: what random levels are like.
 
     Raises:
-        ValueError: the size has no room for the scenery, a green and a blue body; an id is not 0 .. MAX_LEVEL_ID.
+        ValueError: the size has no room for the scenery, a green and a blue body; an id is not 0 .. MAX_LEVEL_ID; or
+            `jax_enable_x64` is on.
     """
+    require_32_bits()
     check_size(size)
     ids = level_id_array(level_ids)
     padded = np.resize(ids, (max(1, -(-len(ids) // CHUNK)), CHUNK))

@@ -25,6 +25,7 @@ from levelgen.task.observe.pixels import SIDE, pixels
 from levelgen.task.rules import TaskParams, TaskState
 from levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete, Space
 from levelgen.task.vmapped import single
+from physics.bounds import require_32_bits
 from physics.types import Size
 
 
@@ -108,12 +109,15 @@ def make(
         auto_reset: whether a step that ends an episode gives the first state of the next one.
 
     Raises:
-        ValueError: no such type.
+        ValueError: no such type, no level, or `jax_enable_x64` is on.
     """
+    require_32_bits()
     for kinds, given in (ActionType, action_type), (ObservationType, observation_type):
         if given not in [*kinds]:
             raise ValueError(f"there is no {kinds.__name__} {given!r}: choose one of {', '.join(kinds)}")
     count = max(x.shape[-1] for x in jax.tree.leaves(levels))
+    if not levels.role.shape[-1]:
+        raise ValueError("there are no levels to reset to: give at least one")
     levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], count)), levels)
     env = Environment(levels, ActionType(action_type), ObservationType(observation_type), rules, auto_reset)
     return env, env.default_params
@@ -173,6 +177,7 @@ class Environment:
         next episode's start; the reward is always that of the step. `info` has the reference's entries: GoalR
         (green touched blue) and distance (of green and blue at the end of the step, m).
         """
+        self._check(action)
         if not self.auto_reset:
             return self.step_env(key, state, action, params)
         table, index, override = self._restart(key, params, override_reset_state)
@@ -181,7 +186,13 @@ class Environment:
     def step_env(self, key: Key[Array, ""], state: EnvState, action: Array, params: EnvParams | None = None) -> Step:
         """One env step without reset."""
         del key, params  # the world has no chance in it
+        self._check(action)
         return single(self._step_lanes)((), 0, (None, *_detached(state, action)))
+
+    def _check(self, action: Array) -> None:
+        """Raises ValueError for an action of another kind."""
+        if (shape := jnp.shape(action)) != (wanted := () if self.action_type == ActionType.DISCRETE else (ACTIONS,)):
+            raise ValueError(f"an action has shape {shape}: of action_type={str(self.action_type)!r} it is {wanted}")
 
     def reset_env(self, key: Key[Array, ""], params: EnvParams | None = None) -> tuple[Any, EnvState]:
         return self.reset(key, params)

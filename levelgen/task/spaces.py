@@ -1,6 +1,7 @@
 """Spaces of actions and observations, with the attributes and methods of gymnax's."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -53,8 +54,10 @@ class Dict:
         keys = jax.random.split(key, len(self.spaces))
         return {name: space.sample(one) for one, (name, space) in zip(keys, self.spaces.items(), strict=True)}
 
-    def contains(self, x: Mapping[str, Any]) -> Bool[Array, ""]:
-        return jnp.stack([space.contains(x[name]) for name, space in self.spaces.items()]).all()
+    def contains(self, x: Any) -> Bool[Array, ""]:
+        """Whether a mapping, or an observation with these names, lies within."""
+        of = x.__getitem__ if isinstance(x, Mapping) else partial(getattr, x)
+        return jnp.stack([space.contains(of(name)) for name, space in self.spaces.items()]).all()
 
 
 Space = Box | Dict

@@ -48,4 +48,4 @@ def single(on_lanes: OnLanes) -> Callable[[Any, Int[Array, ""] | int, Any], Any]
 
 def _merge(x: Array) -> Array:
     """[batch, ..., lane] -> [..., batch * lane]."""
-    return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)
+    return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1])

@@ -36,8 +36,9 @@ class Events:
             self._latest.append(_event("committed", unit=outcome.unit.name, **about))
             return
         self._failures += 1
-        cause = (outcome.reason.strip().splitlines() or [outcome.fatal])[-1][:200]
-        self._latest.append(_event("quarantined" if given_up else "failed", unit=outcome.unit.name, cause=cause))
+        self._latest.append(
+            _event("quarantined" if given_up else "failed", unit=outcome.unit.name, cause=outcome.cause[:200])
+        )
 
     def look(self, rate: float, left: float | None) -> None:
         """Tell how it is, if that is due: at `rate` env steps/s, with `left` s to go."""

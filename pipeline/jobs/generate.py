@@ -115,7 +115,7 @@ def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, seale
                 continue
             last = scheduler.failed(unit)
             events.ended(outcome, last)
-            failed.setdefault((outcome.reason.strip().splitlines()[-1], last), []).append(unit)
+            failed.setdefault((outcome.cause, last), []).append(unit)
             if last:
                 reason = f"Failed {scheduler.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n"
                 quarantine.give_up(split, unit.name, reason)

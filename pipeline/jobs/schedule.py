@@ -22,6 +22,7 @@ from pipeline.store.runs import ascending, runs, told_levels, without
 COMPANY = (64, 8, 1)
 ROUND = 1.0  # s that a worker trains between reports; a step that is compiled takes longer
 PARTS = 8  # of a unit, below which it is not cut where there are too few for all workers
+JAX_NOTE = "\n--------------------\n"  # begins what JAX adds to an error about tracebacks
 LEAST_SHARE = 2  # levels that a worker has not begun, below which it is not asked to share them
 
 
@@ -92,6 +93,12 @@ class UnitOutcome:
     summary: Summary | None = None  # None: it failed
     reason: str = ""  # of the failure, for the quarantine file
     fatal: str = ""  # a sentence, where no further attempt can succeed
+
+    @property
+    def cause(self) -> str:
+        """The last line of the reason that is about the failure; JAX adds some about itself."""
+        lines = self.reason.split(JAX_NOTE)[0].strip().splitlines()
+        return lines[-1] if lines else self.fatal
 
 
 Settle = Callable[[Sequence[UnitOutcome]], None]  # takes note of attempts that ended together

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from math import inf, isfinite
 from typing import Any
 
+import jax
 import numpy as np
 
 
@@ -19,3 +20,9 @@ def require(settings: Any, names: Iterable[str], least: float, most: float = inf
             within = f"at least {least}" if most == inf else f"between {least} and {most}"
             wanted = "a finite number" if not isfinite(value) else f"above {least}" if above else within
             raise ValueError(f"{name} is {value}: it must be {wanted}")
+
+
+def require_32_bits() -> None:
+    """Raises ValueError where JAX makes numbers of 64 bits: levels would be others, and no kernel is for them."""
+    if jax.dtypes.canonicalize_dtype(np.int64) == np.int64:
+        raise ValueError("jax_enable_x64 is on, and levels and physics are of 32 bits: turn it off")
