@@ -53,7 +53,7 @@ def _lines(facts: Mapping[str, Any]) -> dict[str, str | list[str]]:
         "cost": cost.cost_told(facts["cost"]) if facts["cost"] else None,
         "duplicates": duplicates.told(facts["duplicates"]),
         **{f"duplicates in {other}": duplicates.told(found) for other, found in facts["against"].items()},
-        "shards": f"{facts['split_bytes']:,} bytes" if facts["split_bytes"] is not None else None,
+        "shards of the split": f"{facts['split_bytes']:,} bytes" if facts["split_bytes"] is not None else None,
         "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
     }
     return {name: text for name, text in lines.items() if text}

@@ -3,6 +3,7 @@
 import math
 from contextlib import suppress
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -52,6 +53,18 @@ def gap(level: Level) -> float:
         turned = np.array(((np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle)))) @ anchors[0]
         ends.append(one.state.position[bodies[0]] + turned)
     return float(np.abs(ends[0] - ends[1]).max())
+
+
+def test_what_is_joined_to_the_scenery_stays() -> None:
+    """The scenery stays where it is, whatever holds it; only the joint may go."""
+    level = one_of(joined())
+    level.model.joint_b[0] = 2  # the right wall
+    held = int(level.model.joint_a[0])
+    level = jax.tree.map(lambda x: x[..., None], level)
+    for edit in (lambda: move(level, held, 1, 1), lambda: turn(level, held, 0.3), lambda: resize(level, held, 1.5)):
+        with pytest.raises(EditError, match="A joint holds it to the scenery"):
+            edit()
+    fix(level, held, True)
 
 
 def test_a_new_body_has_the_mass_of_its_shape() -> None:

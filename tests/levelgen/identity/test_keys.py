@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION, Stream, key_for
+from levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION, Stream, key_for, level_id_array
 
 
 def data(level_id: int, stream: Stream) -> tuple[int, ...]:
@@ -24,6 +24,12 @@ def test_keys_are_those_of_version_1(level_id: int, stream: Stream, expected: tu
     """Integer arithmetic alone: they hold on every machine. If they change, raise SAMPLER_VERSION."""
     assert SAMPLER_VERSION == 1
     assert data(level_id, stream) == expected
+
+
+@pytest.mark.parametrize("wrong", [[[0, 1], [2, 3]], [0.7], 5, [-1], [2**31], [True]])
+def test_what_is_no_list_of_ids(wrong: object) -> None:
+    with pytest.raises(ValueError, match="level ids"):
+        level_id_array(wrong)  # pyright: ignore[reportArgumentType]
 
 
 def test_no_key_is_used_twice() -> None:

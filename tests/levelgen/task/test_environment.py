@@ -12,6 +12,7 @@ from levelgen.task.actions import CHOICES
 from levelgen.task.environment import ActionType, Environment, EnvParams, EnvState, ObservationType, make, starts
 from levelgen.task.observe.flat import symbolic_flat
 from levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete
+from physics.types import Size
 
 LEVELS, STEPS = 24, 12
 
@@ -173,6 +174,7 @@ def test_observations_are_in_their_space(levels: Level, observation_type: str) -
     space = env.observation_space(params)
     shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)
     if isinstance(space, Dict):
+        assert space.contains(seen)
         seen = vars(seen)
         assert {name: (x.shape, x.dtype) for name, x in space.spaces.items()} == shapes(seen)
     else:
@@ -208,8 +210,45 @@ def test_spaces_know_what_is_not_in_them() -> None:
 
 
 def test_unknown_types_are_refused(levels: Level) -> None:
-    with pytest.raises(ValueError, match="symbols"):
+    with pytest.raises(ValueError, match="no ObservationType 'symbols': choose one of symbolic_flat"):
         make(levels, observation_type="symbols")
+    with pytest.raises(ValueError, match="no ActionType 'Discrete': choose one of discrete"):
+        make(levels, action_type="Discrete")
+
+
+def test_an_action_of_another_kind_is_refused(levels: Level) -> None:
+    for kind, wrong in ("multi_discrete", ()), ("discrete", (6,)), ("continuous", (11,)):
+        env, params = make(levels, kind)
+        _, state = jax.eval_shape(env.reset, jax.random.key(0), params)
+        for step in env.step, env.step_env:
+            with pytest.raises(ValueError, match=rf"an action has shape .*: of action_type='{kind}' it is "):
+                jax.eval_shape(step, jax.random.key(0), state, jnp.zeros(wrong), params)
+
+
+def test_no_levels_are_refused(levels: Level) -> None:
+    with pytest.raises(ValueError, match="there are no levels to reset to"):
+        make(jax.tree.map(lambda x: x[..., :0], levels))
+
+
+def test_numbers_of_64_bits_are_refused(levels: Level) -> None:
+    with jax.enable_x64(True):
+        for what in (lambda: make(levels), lambda: sample_levels(np.arange(2), SIZES["s"])):
+            with pytest.raises(ValueError, match="jax_enable_x64 is on"):
+                what()
+
+
+@pytest.mark.parametrize(
+    "size",
+    [Size(6, 0, 1, 0), *(pytest.param(of, marks=pytest.mark.campaign) for of in (Size(4, 2, 0, 1), Size(6, 0, 0, 1)))],
+)
+def test_sizes_without_things_of_a_kind(size: Size) -> None:
+    env, params = make(sample_levels(np.arange(3), size))
+    keys = jax.random.split(jax.random.key(0), 3)
+    _, state = jax.vmap(env.reset, (0, None))(keys, params)
+    seen, state, reward, done, _ = jax.vmap(env.step, (0, 0, 0, None))(keys, state, jnp.ones((3, 6), int), params)
+    assert seen.shape == (3, *env.observation_space(params).shape)
+    assert reward.shape == done.shape == (3,)
+    assert np.isfinite(state.now.state.position).all()
 
 
 def test_nothing_is_differentiated_through_the_world(levels: Level) -> None:

@@ -45,6 +45,14 @@ def test_the_manifest_names_size_and_distribution(made: Path, capsys: pytest.Cap
     assert f"free ({mark})" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("size", ["4-2-0-1", "6-0-1-1", "5-2-1-0"])
+def test_a_size_without_things_of_a_kind(tmp_path: Path, size: str) -> None:
+    done = here(["generate", f"size={size}", "levels=4", "unit=4", "budget=5k", "executor=inline"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = here(["verify", f"data/5k/{size}"], tmp_path)
+    assert done.returncode == 0, done.stdout
+
+
 def test_every_question_is_answered(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     split, level, picture = made / SPLIT, made / "level.json", made / "level.png"
     facts = look(split)

@@ -22,7 +22,8 @@ def test_the_latest_events_and_the_state_are_told(monkeypatch: pytest.MonkeyPatc
     for unit in units:
         tally.ended(unit, summary := Summary(2, 1, EnvSteps(trained=100), Seconds(training=0.5)))
         events.ended(UnitOutcome(unit, summary))
-    events.ended(UnitOutcome(units[0], reason="Traceback\n\nValueError: of this one\n"))
+    jax_s = "\n--------------------\nFor simplicity, JAX has removed its internal frames.\n"
+    events.ended(UnitOutcome(units[0], reason=f"Traceback\n\nValueError: of this one{jax_s}"))
     events.ended(UnitOutcome(units[0], reason="ValueError: again"), given_up=True)
     events.look(1234.4, 60.2)
     (began, *latest, state) = told[-1]
