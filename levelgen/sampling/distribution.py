@@ -92,7 +92,8 @@ class Distribution:
     def __post_init__(self) -> None:
         names = [field.name for field in fields(self)]
         require(self, [name for name in names if name.endswith("_chance")], 0, 1)
-        require(self, names, 0, 1e9)
+        require(self, names, 0)
+        require(self, [field.name for field in fields(self) if field.type is int], 0, 10**9)
         require(self, ("proposals", "min_half_side", "min_radius"), 0, above=True)
         self._check_sums()
         for low, high in (
