@@ -30,6 +30,7 @@ from pipeline.store.paused import prune_paused
 from pipeline.store.remote import as_typed
 from pipeline.store.runs import ascending, merged, runs
 from pipeline.store.split import writing
+from pipeline.words import many
 
 
 def generate(
@@ -68,7 +69,7 @@ def generate(
             solved = manifest.counts(is_done).get(Label.SOLVED, 0)
             board = Board(Tally(len(wanted), len(done), solved), console)
             there = f", {len(done)} are there already" if len(done) else ""
-            each = f"{len(wanted)} levels of size {job.size}, {job.budget} env steps each"
+            each = f"{many(len(wanted), 'level')} of size {job.size}, {job.budget} env steps each"
             board.say(f"{each}, into {as_typed(split)}{there}")
             try:
                 with (
@@ -79,15 +80,14 @@ def generate(
                 ):
                     _work(job, split, scheduler, board, sealer, events)
             except KeyboardInterrupt:
-                board.say(
-                    f"Stopped: {board.tally.done} of {len(wanted)} levels are committed; the same command goes on."
-                )
+                done = f"{board.tally.done:,} of {many(len(wanted), 'level')} committed"
+                board.say(f"Stopped: {done}; the same command goes on.")
                 raise
             manifest = read_manifest(split, ["label", "env_steps"], compact=True)
             prune_paused(split, manifest.level_ids)
             spent = _spent(manifest, np.setdiff1d(wanted, done), board.tally.spent) if board.tally.spent.shown else ""
         else:
-            print(f"Nothing to do: all {len(wanted)} levels are there.")
+            print(f"Nothing to do: {many(len(wanted), 'level')} there already.")
             spent = ""
         _closing(split, manifest, wanted, scheduler.quarantined, spent)
     return Exit.QUARANTINED if scheduler.quarantined else Exit.DONE
@@ -152,7 +152,7 @@ def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, given_up: list
     labels, folder = manifest.counts(np.isin(manifest.level_ids, wanted)), shlex.quote(as_typed(split))
     total = sum(labels.values())
     counts = ", ".join(f"{count} {label}" for label, count in labels.items())
-    print(f"{as_typed(split)}: {f'{total} levels, {counts}' if total else 'nothing is committed'}.")
+    print(f"{as_typed(split)}: {many(total, 'level') + ', ' + counts if total else 'nothing is committed'}.")
     if spent:
         print(spent)
     for unit in given_up:

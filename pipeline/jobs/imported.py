@@ -34,6 +34,7 @@ from pipeline.store.origins import Origin, RecordPlace, can_be_noted
 from pipeline.store.remote import require_folder
 from pipeline.store.runs import runs
 from pipeline.store.split import writing
+from pipeline.words import many
 
 UNIT_BYTES = 2**28  # of the records of a unit, as the reference has them; they are in memory a few times
 TOLD = 3  # records that are left out, each with its reason
@@ -72,7 +73,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
         note_job(split, job, command, [(0, found.rows - 1)])
         done = len(parts) - len(left)
         there = f", {done} of {len(parts)} units are there already" if done else ""
-        say(console, f"{found.rows} trajectories of size {job.size} into {split}{there}")
+        say(console, f"{many(found.rows, 'trajectory')} of size {job.size} into {split}{there}")
         out_of: Counter[str] = Counter()
         shown = track(left, "units of trajectories", console=console, transient=True, disable=not console.is_terminal)
         firsts = [*(part.unit.level_ids[0] for part in left[1:]), None]  # of what is to come after each
@@ -163,7 +164,7 @@ def _closing(folder: Folder, split: Path, manifest: Manifest) -> None:
     total, reached = sum(labels.values()), sum(count for label, count in labels.items() if label in WITNESSED)
     counts = ", ".join(f"{count} {label}" for label, count in labels.items())
     left = f" {folder.rows - total} were left out." if total < folder.rows else ""
-    print(f"{split}: {total} levels of {folder.path}, {counts}.{left}")
+    print(f"{split}: {many(total, 'level')} of {folder.path}, {counts}.{left}")
     if total:
         print(f"{reached / total:.1%} reach the goal here.")
         print(f"Next:  levelproof inspect {shlex.quote(str(split))}")

@@ -29,7 +29,7 @@ from pipeline.store.layout import split_path
 from pipeline.store.manifest import read_manifest
 from pipeline.store.schema import Encoding
 from pipeline.store.shard import stored_bytes, write_shard
-from pipeline.words import duration
+from pipeline.words import duration, many
 
 SECONDS = 60.0  # of making levels, about
 MOST = 4096  # levels
@@ -60,17 +60,17 @@ def told(job: JobConfig, sample: Sample, of: Forecast) -> list[str]:
     """In lines for people."""
     scale, unit = next((one for one in UNITS if of.wall.expected > 1.5 * one[0]), UNITS[-1])
     lines = {
-        "wall time": f"{of.wall.told(scale)} {unit} with {of.workers} workers",
+        "wall time": f"{of.wall.told(scale)} {unit} with {many(of.workers, 'worker')}",
         f"{sample.device}-hours": of.hours.told(),
         "solved levels": of.solved.told(tell="{:,.0f}".format),
         f"{sample.device}-seconds a solved level": of.seconds_per_solved.told() if of.seconds_per_solved else "unknown",
         **{
-            f"GB, density={name}": f"{of.bytes[name].told(1e9)} in {of.files[name]:,} files, sealed"
+            f"GB, density={name}": f"{of.bytes[name].told(1e9)} in {many(of.files[name], 'file')}, sealed"
             for name in of.bytes
         },
     }
     return [
-        f"{of.levels:,} levels of size {job.size}, {job.budget} env steps each:",
+        f"{many(of.levels, 'level')} of size {job.size}, {job.budget} env steps each:",
         *(f"  {name + ':':30} {text}" for name, text in lines.items()),
         f"From {len(sample.busy)} of them, made on {sample.workers} {sample.device}s here in {duration(sample.wall)}; "
         f"in {LIKELY:.0%} of cases it is within the interval. All workers are taken to be like those here, "

@@ -24,6 +24,7 @@ from pipeline.store.manifest import Fragment, require_manifest, write_index
 from pipeline.store.remote import as_typed
 from pipeline.store.seal import Piece, seal
 from pipeline.store.split import taken
+from pipeline.words import many
 
 
 def seal_split(
@@ -64,9 +65,8 @@ def seal_split(
                 note_density(split, density, key_every)
     merged = sum(map(len, groups))
     levels, fragments = sum(piece.rows for piece in pieces), len(pieces) - merged + len(groups)
-    done = f"{merged:,} fragments were merged into {len(groups):,}" if groups else "there was nothing to seal"
-    now = f"{fragments:,} fragment{'s' if fragments > 1 else ''}"
-    print(f"{as_typed(split)}: {done}; it has {levels:,} levels in {now} now.")
+    done = f"merged {many(merged, 'fragment')} into {len(groups):,}" if groups else "there was nothing to seal"
+    print(f"{as_typed(split)}: {done}; it has {many(levels, 'level')} in {many(fragments, 'fragment')} now.")
     print(f"Next:  levelproof inspect {shlex.quote(as_typed(split))}")
 
 

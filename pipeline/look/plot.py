@@ -14,6 +14,7 @@ from pipeline.read.levels import writing_to
 from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import require_manifest
 from pipeline.store.remote import as_typed
+from pipeline.words import many
 
 KINDS = (".svg", ".png")
 NUMBERS = ("steps_to_goal", "steps_to_first_success", "env_steps", "success_rate", "portability")
@@ -38,7 +39,7 @@ def plot(split: Path, asked: Asked, out: Path) -> None:
     if not values and not curves:
         raise UserError(f"There is nothing to draw of {split}: choose other rows with --where.")
     with writing_to(out):
-        draw_panels(values, curves, BINS, f"{as_typed(split)}: {table.num_rows:,} levels", out)
+        draw_panels(values, curves, BINS, f"{as_typed(split)}: {many(table.num_rows, 'level')}", out)
     print(f"{out}: {', '.join([*values, *curves])}")
 
 

@@ -12,6 +12,7 @@ from pipeline.store.manifest import read_manifest
 from pipeline.store.quarantine import given_up
 from pipeline.store.remote import as_typed
 from pipeline.store.runs import inside
+from pipeline.words import many
 
 
 def status(split: Path, as_json: bool) -> None:
@@ -26,7 +27,7 @@ def status(split: Path, as_json: bool) -> None:
         print(json.dumps(facts, indent=2))
         return
     counts = "".join(f", {count} {label}" for label, count in facts["labels"].items())
-    print(f"{as_typed(split)}: {facts['done']} of {facts['wanted']} levels committed{counts}.")
+    print(f"{as_typed(split)}: {facts['done']:,} of {many(facts['wanted'], 'level')} committed{counts}.")
     for note in facts["quarantined"]:
         print(f"Given up: {as_typed(split / QUARANTINE / note)}")
     if facts["running"]:

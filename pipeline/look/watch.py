@@ -17,7 +17,7 @@ from pipeline.store.events import events_of, runs_in
 from pipeline.store.layout import EVENTS
 from pipeline.store.locks import is_written
 from pipeline.store.remote import as_typed
-from pipeline.words import duration
+from pipeline.words import duration, many
 
 EVERY = 2.0  # s between looks
 STALE = 30.0  # s after which a state is no more than the last that was told
@@ -83,7 +83,7 @@ def shown(facts: dict[str, Any]) -> Table:
         "split": facts["split"],
         "levels": f"{facts['done']:,} of {facts['levels']:,} committed{share}",
         "pace": f"{facts['rate']:,} env steps/s, {left}{stale}" if facts["running"] else "no run is at work",
-        "failed attempts": f"{facts['failures']}, {facts['quarantined']} units given up",
+        "failed attempts": f"{facts['failures']}, {many(facts['quarantined'], 'unit')} given up",
         **{
             f"workers on {host}": f"{of['count']}, the most silent for {duration(of['silent'] + facts['age'])}"
             for host, of in facts["workers"].items()

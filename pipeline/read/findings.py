@@ -8,6 +8,7 @@ from typing import Any
 from pipeline.store.origins import Origin
 from pipeline.store.remote import as_typed
 from pipeline.store.runs import runs, told_levels
+from pipeline.words import many
 
 
 @dataclass
@@ -48,8 +49,9 @@ class Findings:
         """A line for everything that is wrong, and what was looked at."""
         where = as_typed(split)
         looked = (
-            f"{where}: {self.levels} levels made again, {self.shards} shards read, {self.witnesses} witnesses "
-            f"replayed, {self.same_bits} of them bit for bit, {len(self.wrong)} problems."
+            f"{where}: {many(self.levels, 'level')} made again, {many(self.shards, 'shard')} read, "
+            f"{many(self.witnesses, 'witness')} replayed, {self.same_bits:,} of them bit for bit, "
+            f"{many(len(self.wrong), 'problem')}."
         )
         return "\n".join([*self.sentences, looked])
 

@@ -23,6 +23,7 @@ from pipeline.store.contents import level_fields
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.origins import ASKED, origin_of
+from pipeline.words import many
 
 COLUMNS = ("label", "label_reason", *ASKED)  # of a level that is drawn or exported
 
@@ -38,7 +39,7 @@ def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
     if not manifest.table.num_rows:
         ids = require_manifest(split, []).level_ids
         raise UserError(
-            f"There is no level {level_id} in {split}: it has {len(ids)} levels, from {ids[0]} to {ids[-1]}."
+            f"There is no level {level_id} in {split}: it has {many(len(ids), 'level')}, from {ids[0]} to {ids[-1]}."
         )
     return manifest, manifest.table.to_pylist()[0]
 

@@ -22,6 +22,7 @@ from pipeline.read.pace import Pace
 from pipeline.read.select import columns_in, select
 from pipeline.store.columns import COLUMNS
 from pipeline.store.manifest import Manifest, require_manifest, settings_metadata
+from pipeline.words import many
 
 GROUP = 16 * CHUNK  # rows: what is in memory at once, and what a query reads or skips
 FILE = 25 * GROUP  # rows of a file, about as many as a sealed manifest's files have
@@ -51,7 +52,9 @@ def export_parquet(split: Path, where: str | None, out: Path) -> None:
             written += _write(folder / f"levels-{number:05d}.parquet", groups, metadata)
     left_out = len(ids) - written
     print(
-        f"{out}: {written} levels" + (f", without {left_out} that come out otherwise here" if left_out else "") + ". "
+        f"{out}: {many(written, 'level')}"
+        + (f", without {left_out} that come out otherwise here" if left_out else "")
+        + ". "
         f'In Python: levelproof.levels_from(pyarrow.parquet.read_table("{out}"))'
     )
 

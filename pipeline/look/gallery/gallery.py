@@ -33,6 +33,7 @@ from pipeline.read.select import columns_in, select
 from pipeline.store.manifest import Manifest, require_manifest
 from pipeline.store.remote import as_typed
 from pipeline.store.shown import shown
+from pipeline.words import many
 
 SITE = Path(__file__).parent / "site"
 ABOUT = Path("data") / "about.js"  # what makes a folder a gallery
@@ -63,7 +64,8 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
             _write(folder, f"columns/{page}", page_of(values, page))
         _write(folder, "about", _about(manifest, found, where, about))
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    some = f"{count:,} levels" if count == found else f"{count:,} of {found:,} levels, spread evenly over their ids,"
+    spread = f"{count:,} of {many(found, 'level')}, spread evenly over their ids,"
+    some = many(count, "level") if count == found else spread
     print(f"{out / 'index.html'}: {some} of {as_typed(split)}, {size / 1e6:,.1f} MB. Open it in a browser, or:")
     print(f"{Path(sys.executable).name} -m webbrowser {shlex.quote(str(out / 'index.html'))}")
 

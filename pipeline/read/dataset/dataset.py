@@ -39,6 +39,7 @@ from pipeline.store.columns import schema_of
 from pipeline.store.fields import tree_of
 from pipeline.store.manifest import require_manifest
 from pipeline.store.shard import open_shard
+from pipeline.words import many
 
 READ = ("content_hash", "label", "steps_to_goal", *COLUMNS)  # columns of the manifest that are always read
 OPEN_SHARDS = 256  # whose indices are kept in memory
@@ -241,7 +242,7 @@ class Dataset:
         return _opened_again, (self._opened_with, self.fingerprint)
 
     def __repr__(self) -> str:
-        return f"levelproof.open({', '.join(map(repr, self._opened_with))}) of {len(self)} trajectories"
+        return f"levelproof.open({', '.join(map(repr, self._opened_with))}) of {many(len(self), 'trajectory')}"
 
     def _part(self, part: str | None) -> Int[np.ndarray, " number"]:
         share = self._opened_with[-1]

@@ -15,6 +15,7 @@ from pipeline.store.fields import tree_of
 from pipeline.store.remote import as_typed
 from pipeline.store.shard import stored_bytes
 from pipeline.store.shown import shown
+from pipeline.words import many
 
 BLOCK = 4 * ROWS  # trajectories in memory at a time
 ARRAY = 64 * ROWS  # trajectories of an array: the reference shuffles arrays, and what they have
@@ -42,7 +43,7 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
             write_array(folder / name_of_array(first // ARRAY), min(ARRAY, count - first), dtype)
         write_group(folder)
     print(
-        f"{out}: {count} trajectories of {as_typed(split)}, "
+        f"{out}: {many(count, 'trajectory')} of {as_typed(split)}, "
         f"{stored_bytes(out) / (count * RECORD_STEPS):.0f} bytes per transition.\n"
         f'Next:  kinetix.data.TrajectoryDatasetManager("{out}", batch_size=64)'
     )

@@ -27,6 +27,7 @@ from pipeline.store.fields import tree_of
 from pipeline.store.manifest import require_manifest
 from pipeline.store.shown import shown
 from pipeline.version import __version__
+from pipeline.words import many
 
 if TYPE_CHECKING:
     import h5py
@@ -66,13 +67,13 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
                 "dataset_size": float(storage.get_size()),
                 "author": {f"levelproof {__version__}"},
                 "algorithm_name": "PPO experts of one level each, random play and search; replayed",
-                "description": f"Witnesses of {rows.num_rows} levels of size {size}, made with a budget of {budget} "
-                f"env steps a level. infos has success, level_id, and which entries of an action do something. "
-                + (f"Six entries of an action: {NUMBERS}" if kind == ActionKind.COMBINED else ""),
+                "description": f"Witnesses of {many(rows.num_rows, 'level')} of size {size}, made with a budget of "
+                f"{budget} env steps a level. infos has success, level_id, and which entries of an action do "
+                "something. " + (f"Six entries of an action: {NUMBERS}" if kind == ActionKind.COMBINED else ""),
             }
         )
     print(
-        f"{out}: {episodes} episodes of {rows.num_rows} levels, {steps} steps.\n"
+        f"{out}: {many(episodes, 'episode')} of {many(rows.num_rows, 'level')}, {many(steps, 'step')}.\n"
         f'Next:  MINARI_DATASETS_PATH={out} and, in Python, minari.load_dataset("{dataset_id}")'
     )
 

@@ -28,7 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = here(["generate", *SETTINGS, "budget=8k", "keep_experts=true", "unit=2"], folder)
     assert done.returncode == 0, done.stderr
     done = here(["seal", "data/8k/s", "--rows", "5"], folder)
-    assert "6 fragments were merged into 2; it has 12 levels in 2 fragments now" in done.stdout
+    assert "merged 6 fragments into 2; it has 12 levels in 2 fragments now" in done.stdout
     return folder
 
 

@@ -235,7 +235,7 @@ def test_a_sealed_split_is_as_before(server: Server, here: Path, tmp_path: Path)
     drive(OUT)
     done = command(["seal", str(THERE)], tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "3 fragments were merged into 1" in done.stdout
+    assert "merged 3 fragments into 1" in done.stdout
     assert_sealed(here)
 
 

@@ -1,0 +1,16 @@
+"""How numbers are told."""
+
+import pytest
+
+from pipeline.words import many
+
+
+@pytest.mark.parametrize(
+    ("count", "noun", "told"),
+    [
+        (0, "level", "0 levels"), (1, "level", "1 level"), (12_345, "level", "12,345 levels"),
+        (1, "trajectory", "1 trajectory"), (2, "trajectory", "2 trajectories"), (2, "witness", "2 witnesses"),
+    ],
+)  # fmt: skip
+def test_one_and_many(count: int, noun: str, told: str) -> None:
+    assert many(count, noun) == told
