@@ -76,7 +76,23 @@ def advance(
     left = (slot.mode == Mode.EMPTY) & (mode == Mode.EVALUATE)
     evaluated = (mode == Mode.EVALUATE) & (left | slot.trial.solved)
     after = Slots(slot, _where(trains, acting, slots.acting), acting, slots.taken)
-    return after, Report(slot.queue_index, mode, share, evaluated, left, slots.taken)
+    early = left & slot.trial.solved & ~slot.trial.final
+    return after, Report(slot.queue_index, mode, share, evaluated, left, early, slots.taken)
+
+
+@partial(jax.jit, donate_argnames="slots")
+def train_on(slots: Slots, stays: Bool[Array, " slot"], stopping: StopRules) -> Slots:
+    """Slots (used up) in which some levels that left early stay, for a witness that more replays survive."""
+    slot = slots.slot
+    course, deadline = stop.steady_on(slot.training.course, slot.deadline, stopping)
+    keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(stays, a, b), new, old)
+    return slots._replace(
+        slot=slot._replace(
+            mode=keep(jnp.full_like(slot.mode, Mode.TRAIN), slot.mode),
+            deadline=keep(deadline, slot.deadline),
+            training=slot.training._replace(course=keep(course, slot.training.course)),
+        )
+    )
 
 
 def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:

@@ -128,12 +128,13 @@ class StopConfig:
     share: float = 0.25  # of an update's finished episodes that must reach the goal before an evaluation is worth it
     wait: int = 2048  # env steps of training between an evaluation that failed and the next; doubles each time
     polish: int = 0  # env steps of training after a level is solved, for a shorter way to the goal
+    steady: int = 65_536  # env steps of training after a level is solved, for a witness that more replays survive
     first_rung: int = 2048  # env steps of training at the first rung; each is twice the one before
     gain: float = 0.05  # by which the best return must have grown since the rung before
 
     def __post_init__(self) -> None:
         require(self, ("successes", "first_rung"), 1)
-        require(self, ("wait", "polish", "gain"), 0)
+        require(self, ("wait", "polish", "steady", "gain"), 0)
         require(self, ("share",), 0, 1)
 
 
@@ -164,6 +165,7 @@ def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> Non
     waits = {
         "wait": config.updates_in(stopping.wait) << MOST_DOUBLINGS,
         "polish": config.updates_in(stopping.polish),
+        "steady": config.updates_in(stopping.steady),
         "first_rung": config.updates_in(stopping.first_rung),
     }
     for name, longest in waits.items():

@@ -1,6 +1,6 @@
 """From what training and evaluation showed of a level to its witness and its verdict."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from experts.slots import Begun
 from experts.success import Success
 from experts.witness import Record, steps_to_goal, succeeds
 
-MOST_CANDIDATES = 16  # of a level
+MOST_CANDIDATES = 16  # of an evaluation
 
 
 class Evaluation(NamedTuple):
@@ -49,7 +49,7 @@ class Trained(NamedTuple):
     curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
     evaluations: list[Evaluation]  # those that solved it, and the last
     expert: Kept | None = None  # if it is kept
-    candidates: Sequence[Witness] = ()  # for its witness, the shortest first; not yet replayed
+    candidates: Sequence[Witness] = ()  # for its witness, the shortest first; some have been replayed
     evaluation_steps: int = 0  # env steps
 
 
@@ -83,7 +83,12 @@ def candidates_of(evaluations: Sequence[Evaluation], source: Source, config: Exp
     found = [witness for e in evaluations for witness in witnesses_in(e, config)]
     if not found and config.exploration:
         return repeating(evaluations[-1].success, source)
-    return sorted(found, key=lambda witness: witness.steps)[:MOST_CANDIDATES]
+    return shortest_first(found)
+
+
+def shortest_first(witnesses: Iterable[Witness]) -> list[Witness]:
+    """Of equals the first stays the first."""
+    return sorted(witnesses, key=lambda witness: witness.steps)
 
 
 def repeating(success: Success, source: Source) -> list[Witness]:
@@ -93,13 +98,13 @@ def repeating(success: Success, source: Source) -> list[Witness]:
 
 
 def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
-    """Witnesses of an evaluation; where none is replayed from moved starts, one."""
+    """Witnesses of an evaluation, the shortest ones; where none is replayed from moved starts, one."""
     attempts = evaluation.action.shape[-1]
     done, goal = evaluation.done[:, :attempts], evaluation.goal[:, :attempts]
     source = lambda attempt: Source.SAMPLED if attempt else Source.MOST_PROBABLE
     if config.witness == Choice.RECORD:
         steps, usable = steps_to_goal(done), np.flatnonzero(succeeds(done, goal))
-        usable = usable if config.replays else usable[:1]
+        usable = usable[np.argsort(steps[usable], kind="stable")][:MOST_CANDIDATES] if config.replays else usable[:1]
         return [Witness(evaluation.action[..., i], source(i), int(steps[i])) for i in usable]
     episodes = [(end - start, attempt, start) for attempt in range(attempts)
                 for start, end in successful_episodes(done[:, attempt], goal[:, attempt])]  # fmt: skip

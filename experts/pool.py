@@ -15,12 +15,13 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from experts.advance import advance
+from experts.advance import advance, train_on
 from experts.config import RECORD_STEPS, ExpertConfig, check_budget
 from experts.found import Found, nothing_found, row_of
-from experts.judge import Evaluation, Kept, Trained, Witness, candidates_of
+from experts.judge import Evaluation, Kept, Trained, Witness, candidates_of, shortest_first, witnesses_in
 from experts.ledger import Lap, Ledger, Steps, lap
 from experts.paused import Paused
+from experts.portability import PORTABLE, choose
 from experts.procedure import Procedure
 from experts.queue import GROUP, empty_queue, enter
 from experts.search.search import Searching
@@ -220,6 +221,7 @@ class Pool:
             levels = [self._at[int(seen.queue_index[slot])] for slot in busy]
             for slot, (submission, i) in zip(busy, levels, strict=True):
                 self._note(slot, seen, submission, i)
+        self._leave(seen, {slot: level for slot, level in zip(busy, levels, strict=True) if seen.left[slot]})
         trains = (seen.mode[busy] == Mode.TRAIN).tolist()
         training, evaluation = self._steps.part(took.seconds, sum(trains), len(seen.mode))
         for train, (submission, i) in zip(trains, levels, strict=True):
@@ -262,14 +264,50 @@ class Pool:
             submission.evaluated_rollouts[i] += 1
         if seen.evaluated[slot]:
             submission.evaluations[i].append(evaluation_of(self._slots, slot))
-        if seen.left[slot]:
+
+    def _leave(self, seen: Report, levels: Mapping[int, tuple[Submission, int]]) -> None:
+        """Let levels go whose time is over, by slot; not yet those whose witness few replays survive."""
+        assert self._slots is not None
+        for submission, i in levels.values():
+            submission.candidates[i] = self._candidates(submission, i)
+        stay = self._fragile({slot: level for slot, level in levels.items() if seen.early[slot]})
+        for slot, (submission, i) in levels.items():
+            if slot in stay:
+                continue
             if submission.keep:
                 submission.experts[i] = Kept(expert_of(self._slots, slot, self.config), submission.curves[i])
-            candidates = candidates_of(submission.evaluations[i], submission.found.source[i], self.config)
-            submission.candidates[i] = candidates
-            submission.solved += bool(candidates)
+            submission.solved += bool(submission.candidates[i])
             del self._at[int(seen.queue_index[slot])]
             submission.under_way.remove(i)
+        if stay:
+            self._slots = train_on(self._slots, np.isin(np.arange(len(seen.left)), stay), self._stopping)
+
+    def _candidates(self, submission: Submission, i: int) -> list[Witness]:
+        """For a level's witness: the best so far, if it has been chosen, and what the last evaluation adds."""
+        evaluations, best = submission.evaluations[i], submission.candidates[i]
+        if best:
+            return shortest_first([*best, *witnesses_in(evaluations[-1], self.config)])
+        return candidates_of(evaluations, submission.found.source[i], self.config)
+
+    def _fragile(self, solved: Mapping[int, tuple[Submission, int]]) -> list[int]:
+        """Slots of levels that are solved by witnesses of which none survives enough replays; each keeps its best."""
+        if not (solved and self.procedure.stop.steady and self.config.replays):
+            return []
+        with lap() as took:
+            each = [take(submission.levels, np.array([i])) for submission, i in solved.values()]
+            levels = jax.tree.map(lambda *xs: np.concatenate(xs, -1), *each)
+            level_ids = np.array([submission.level_ids[i] for submission, i in solved.values()])
+            candidates = [submission.candidates[i] for submission, i in solved.values()]
+            best = choose(levels, level_ids, candidates, self.config.replays, self.rules)
+        slots = []
+        for (slot, (submission, i)), witness in zip(solved.items(), best, strict=True):
+            assert witness is not None
+            submission.candidates[i] = [witness]
+            submission.ledger.put("replay", i, took.seconds / len(solved))
+            submission.ledger.put("compiling", i, took.compiling / len(solved))
+            if (witness.portability or 0) < PORTABLE:
+                slots.append(slot)
+        return slots
 
 
 def slot_count(config: ExpertConfig) -> int:

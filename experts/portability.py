@@ -23,7 +23,9 @@ from levelgen.task.rules import TaskParams
 from physics.types import State
 
 LATE = 16  # env steps by which a replay may reach the goal later than the candidate
-IN_CACHE = 128  # lanes, of candidates side by side
+PORTABLE = 0.95  # share of replays; where fewer survive, a steadier witness is looked for
+IN_CACHE = 32  # lanes, of candidates side by side
+BLOCKS = (16, 64, 256)  # candidates that an accelerator replays side by side: the fewest of these that do
 
 
 def choose(
@@ -35,7 +37,8 @@ def choose(
 ) -> list[Witness | None]:
     """Of each level's candidates the first of those that survive most replays, with its portability.
 
-    None survives more than one that survives all, so those after it are not replayed.
+    None survives more than one that survives all, so those after it are not replayed; nor is one whose portability is
+    known.
 
     Args:
         levels: on the host.
@@ -49,11 +52,13 @@ def choose(
     left = [i for i, witness in enumerate(best) if witness is not None and replays]
     rank = 0
     while left:
-        at, now = np.array(left), [candidates[i][rank] for i in left]
-        found = survival(take(levels, at), level_ids[at], now, replays, rules)
-        for i, witness, share in zip(left, now, found.tolist(), strict=True):
-            if share > shares[i]:
-                best[i], shares[i] = witness._replace(portability=share), share
+        now = {i: candidates[i][rank] for i in left}
+        new = [i for i, witness in now.items() if witness.portability is None]
+        found = survival(take(levels, np.array(new, int)), level_ids[new], [now[i] for i in new], replays, rules)
+        now |= {i: now[i]._replace(portability=share) for i, share in zip(new, found.tolist(), strict=True)}
+        for i, witness in now.items():
+            if witness.portability is not None and witness.portability > shares[i]:
+                best[i], shares[i] = witness, witness.portability
         rank += 1
         left = [i for i in left if rank < len(candidates[i]) and shares[i] < 1]
     return best
@@ -71,8 +76,9 @@ def survival(
         replays: of each witness: their starts are the same for all witnesses of a level.
         rules: of the task.
     """
-    shares = []
-    for some in blocks(len(witnesses), at_once(replays, IN_CACHE)):
+    shares, most = [], at_once(replays, IN_CACHE)
+    size = next((size for size in BLOCKS if len(witnesses) <= size < most), most)
+    for some in blocks(len(witnesses), size):
         action = np.stack([witnesses[i].action for i in some], -1).astype(np.int8)
         steps = np.array([witnesses[i].steps for i in some], np.int32)
         shares.append(jax.device_get(_survival(take(levels, some), level_ids[some], action, steps, replays, rules)))

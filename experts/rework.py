@@ -8,8 +8,8 @@ from jaxtyping import Int
 
 from experts.config import RECORD_STEPS
 from experts.judge import Witness, repeating
-from experts.labels import Source
-from experts.portability import choose
+from experts.labels import BY_EXPERT, Source
+from experts.portability import PORTABLE, choose
 from experts.procedure import Procedure
 from experts.search.polish import LANES, polish
 from experts.search.shorten import Shortened
@@ -19,8 +19,8 @@ from experts.witness import at_once, blocks, take
 from levelgen.level import Level
 from levelgen.task.rules import TaskParams
 
+OWN = 0.5  # share of replays of an expert's own witness; only where fewer survive, a search's may stand in
 IN_CACHE = 256  # lanes: their physics fits the cache of a core
-PORTABLE = 0.95  # share of replays; witnesses of which fewer survive are made steady
 Program = Callable[[Level, Int[np.ndarray, " level"], Success], Shortened]
 
 
@@ -64,7 +64,8 @@ def rework(
     if search.polish:
         improve(range(len(witnesses)), LANES, lambda *of: polish(*of, search.polish, rules))
     if search.steady and replays:
-        fragile = [i for i, of in enumerate(witnesses) if of and (of.portability or 0) < PORTABLE]
+        enough = lambda of: OWN if of.source in BY_EXPERT else PORTABLE
+        fragile = [i for i, of in enumerate(witnesses) if of and (of.portability or 0) < enough(of)]
         improve(fragile, KEPT * STARTS, lambda *of: steady(*of, search.steady, rules))
     return witnesses, env_steps
 

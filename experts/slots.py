@@ -111,6 +111,7 @@ class Report(NamedTuple):
     share: Float[Array, " slot"]  # of a trained slot's finished episodes that reached the goal
     evaluated: Bool[Array, " slot"]  # an evaluation ended that solved the level, or after which it left
     left: Bool[Array, " slot"]
+    early: Bool[Array, " slot"]  # it left, being solved, and might have trained on
     taken: Int[Array, ""]  # levels that have left the queue, ever
 
 

@@ -9,6 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 from experts.config import MOST_DOUBLINGS, RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from experts.progress import NEVER, Progress
 
+LAST = np.int32(2**31 - 1)  # update, that nobody reaches
+
 
 class StopRules(NamedTuple):
     """A StopConfig as data of a compiled program: one program serves all."""
@@ -19,6 +21,7 @@ class StopRules(NamedTuple):
     share: np.float32  # of finished episodes that must reach the goal before an evaluation
     wait: np.int32  # updates between an evaluation that failed and the next; doubles each time
     polish: np.int32  # updates after the level is solved
+    steady: np.int32  # updates after it is solved by witnesses that few replays survive
     first_rung: np.int32  # updates
     gain: np.float32  # of the best return between rungs
 
@@ -32,6 +35,7 @@ def rules_of(stopping: StopConfig, config: ExpertConfig) -> StopRules:
         share=np.float32(stopping.share),
         wait=np.int32(config.updates_in(stopping.wait)),
         polish=np.int32(config.updates_in(stopping.polish) if stopping.polish else 0),
+        steady=np.int32(config.updates_in(stopping.steady) if stopping.steady else 0),
         first_rung=np.int32(config.updates_in(stopping.first_rung)),
         gain=np.float32(stopping.gain),
     )
@@ -42,7 +46,7 @@ class Course(NamedTuple):
 
     updates: Int[Array, ""]  # done
     next_evaluation: Int[Array, ""]  # updates before which none is worth it
-    failed: Int[Array, ""]  # evaluations that did not solve the level
+    failed: Int[Array, ""]  # evaluations after which it trained on
     solved: Bool[Array, ""]  # by an evaluation
     rung_return: Float[Array, ""]  # the best return at the last rung
     over: Bool[Array, ""]  # for good: more budget would change nothing
@@ -74,7 +78,7 @@ def after_update(
         The course, whether an evaluation is due, and whether the level leaves after one, due or not.
     """
     updates = course.updates + 1
-    worth_it = (share >= rules.share) & (updates >= course.next_evaluation) & ~course.solved
+    worth_it = (share >= rules.share) & (updates >= course.next_evaluation)
     evaluate = rules.evaluates & worth_it
     at_rung = rules.halves & is_rung(updates, rules.first_rung)
     moves = usable | (progress.first_success != NEVER) | (progress.best_return >= course.rung_return + rules.gain)
@@ -93,17 +97,28 @@ def after_evaluation(
     rules: StopRules,
 ) -> tuple[Course, Bool[Array, ""], Int[Array, ""]]:
     """The course, whether the level leaves, and its deadline."""
-    leaves = final | (solved & (rules.polish == 0))
-    deadline = jnp.where(solved & ~final, jnp.minimum(deadline, course.updates + rules.polish), deadline)
-    wait = rules.wait << jnp.minimum(course.failed, MOST_DOUBLINGS)
+    polished = solved & (rules.polish > 0)
+    leaves = final | (solved & ~polished)
+    deadline = jnp.where(polished & ~final, jnp.minimum(deadline, course.updates + rules.polish), deadline)
     tried = course._replace(
-        next_evaluation=course.updates + wait,
+        next_evaluation=jnp.where(solved, LAST, course.updates + _wait(course, rules)),
         failed=course.failed + ~solved,
-        solved=solved,
+        solved=course.solved | solved,
     )
     # one that only the deadline asked for leaves no trace: an expert that goes on later goes on as if it had not been
     course = Course(*(jnp.where(due, new, old) for old, new in zip(course, tried, strict=True)))
     return course, leaves, deadline
+
+
+def steady_on(course: Course, deadline: Int[Array, "..."], rules: StopRules) -> tuple[Course, Int[Array, "..."]]:
+    """The course and the deadline of a level that would leave, being solved, but trains on for a steadier witness."""
+    course = course._replace(next_evaluation=course.updates + _wait(course, rules), failed=course.failed + 1)
+    return course, jnp.minimum(deadline, course.updates + rules.steady)
+
+
+def _wait(course: Course, rules: StopRules) -> Int[Array, "..."]:
+    """Updates before another evaluation is worth it."""
+    return rules.wait << jnp.minimum(course.failed, MOST_DOUBLINGS)
 
 
 def solves(

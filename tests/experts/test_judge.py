@@ -21,15 +21,15 @@ from experts.success import Success
 CONFIG = ExpertConfig(environments=8, rehearsals=2, attempts=3, sticky_attempts=2, moved_attempts=2)
 
 
-def evaluation(*episodes: list[tuple[int, bool]], success: int = 0) -> Evaluation:
+def evaluation(*episodes: list[tuple[int, bool]], success: int = 0, config: ExpertConfig = CONFIG) -> Evaluation:
     """Environments with these episodes: (last step, whether it reached the goal). Actions count the steps."""
-    done, goal = np.zeros((2, RECORD_STEPS, CONFIG.environments), bool)
+    done, goal = np.zeros((2, RECORD_STEPS, config.environments), bool)
     for environment, ends in enumerate(episodes):
         for end, reached in ends:
             done[end, environment], goal[end, environment] = True, reached
-    action = np.arange(RECORD_STEPS)[:, None, None] + 1000 * np.arange(CONFIG.attempts) + np.zeros((1, 6, 1), int)
+    action = np.arange(RECORD_STEPS)[:, None, None] + 1000 * np.arange(config.attempts) + np.zeros((1, 6, 1), int)
     played = Success(np.full((RECORD_STEPS, 6), 7, np.int8), np.int32(success))
-    return Evaluation(action, done, goal, progress.start(CONFIG.environments), played)
+    return Evaluation(action, done, goal, progress.start(config.environments), played)
 
 
 def best_of(evaluations: list[Evaluation], source: Source, config: ExpertConfig) -> Witness | None:
@@ -80,7 +80,11 @@ def test_of_many_candidates_the_shortest_are_kept_and_of_copies_one() -> None:
     ends = [(end, True) for end in np.cumsum(np.arange(20, 8, -1)).tolist()]
     one = evaluation(ends)
     found = candidates_of([one, one, one], Source.SCOUT, config)
-    assert [witness.steps for witness in found] == [n for n in range(9, 20) for _ in "123"][:MOST_CANDIDATES]
+    assert [witness.steps for witness in found] == [n for n in [*range(9, 20), 21] for _ in "123"]
+    whole = [[(end, True)] for end in range(40, 10, -1)]
+    many = replace(CONFIG, environments=len(whole), attempts=len(whole), sticky_attempts=0, moved_attempts=0)
+    shortest = candidates_of([evaluation(*whole, config=many)], Source.SCOUT, many)
+    assert [witness.steps for witness in shortest] == list(range(12, 12 + MOST_CANDIDATES))
     assert len(candidates_of([one], Source.SCOUT, replace(config, replays=0))) == 1
     copies = evaluation(*[[(9, True), (19, True), (29, True)]] * 3)
     copies.action[:] = 1

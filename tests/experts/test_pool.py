@@ -1,13 +1,16 @@
 """Submissions that share a pool: each gets what it would have got alone, whenever it came."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 from experts.found import nothing_found
-from experts.judge import Kept, Trained
+from experts.judge import Kept, Trained, Witness
 from experts.paused import Paused
 from experts.pool import Pool, Submission, capacity_of
+from experts.portability import PORTABLE, choose
 from experts.queue import empty_queue, enter
 from experts.slots import Pending, begin
 from experts.success import no_success
@@ -115,6 +118,85 @@ def test_an_expert_that_is_paused_at_any_moment_goes_on_to_the_same(levels: Leve
     assert later.trained_rollouts == sum(len(alone[i].curve) for i in at) - steps
     finished(pool, submission)
     same(submission.trained(CONFIG), alone[:4])
+
+
+@pytest.fixture
+def never_portable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No witness survives enough replays."""
+    monkeypatch.setattr("experts.pool.PORTABLE", 2)
+
+
+def steadied(updates: int) -> Pool:
+    """In which levels train on for so many updates after they are solved, 10 at most in all."""
+    stopping = replace(SOLVED, steady=updates * CONFIG.steps_per_update)
+    return Pool(10 * CONFIG.steps_per_update, untouched(stopping), DEFAULT_RULES)
+
+
+def trained_by(pool: Pool, levels: Level) -> list[Trained]:
+    (submission,) = finished(pool, pool.submit(levels, IDS))
+    return submission.trained(CONFIG)
+
+
+def chosen(levels: Level, i: int, trained: Trained) -> Witness:
+    """A level's witness."""
+    level, candidates = take(levels, np.array([i])), [trained.candidates]
+    (witness,) = choose(level, IDS[[i]], candidates, CONFIG.replays, DEFAULT_RULES)
+    assert witness is not None
+    assert witness.portability is not None
+    return witness
+
+
+def test_levels_train_on_where_few_replays_survive_and_no_others_do(levels: Level) -> None:
+    at_once, waited = (trained_by(steadied(updates), levels) for updates in (0, 3))
+    left = [i for i, of in enumerate(at_once) if len(of.curve) < 10]
+    assert left
+    for i in left:
+        before, best = len(at_once[i].curve), chosen(levels, i, at_once[i])
+        stays = (best.portability or 0) < PORTABLE
+        assert len(waited[i].curve) > before if stays else len(waited[i].curve) == before
+        assert stays or [witness.steps for witness in waited[i].candidates] == [best.steps]
+
+
+@pytest.mark.usefixtures("never_portable")
+def test_a_level_trains_on_for_no_longer_than_that(levels: Level) -> None:
+    """What it was before is in what it becomes, and of the witnesses of all its evaluations the best is kept."""
+    at_once, waited = (trained_by(steadied(updates), levels) for updates in (0, 3))
+    early = [i for i, of in enumerate(at_once) if of.candidates and len(of.curve) < 10]
+    assert early
+    for i in early:
+        before, after = at_once[i], waited[i]
+        assert len(after.curve) == min(len(before.curve) + 3, 10)
+        np.testing.assert_array_equal(after.curve[: len(before.curve)], before.curve)
+        same(after.evaluations[0], before.evaluations[0])
+        best, now = chosen(levels, i, before), chosen(levels, i, after)
+        assert (now.portability or 0, -now.steps) >= (best.portability or 0, -best.steps)
+
+
+@pytest.mark.usefixtures("never_portable")
+def test_levels_that_train_on_are_the_same_in_any_company_and_after_any_pause(levels: Level) -> None:
+    alone = trained_by(steadied(3), levels)
+    assert any(len(of.evaluations) > 1 for of in alone)
+    pool = steadied(3)
+    parts = [pool.submit(*part(levels, at)) for at in (range(7), range(7, 36))]
+    finished(pool, *parts)
+    same([of for submission in parts for of in submission.trained(CONFIG)], alone)
+
+    stopped = steadied(3)
+    submission = stopped.submit(levels, IDS)
+    paused: dict[int, Paused] = {}
+    while not stopped.step():
+        for _, i, now in stopped.paused():
+            if now.evaluations and i not in paused:  # it has been solved once
+                paused[i] = now
+    same(submission.trained(CONFIG), alone)
+    assert paused
+    at, other = np.array(sorted(paused)), steadied(3)
+    later = other.submit(take(levels, at), IDS[at], paused={row: paused[i] for row, i in enumerate(at.tolist())})
+    finished(other, later)
+    told = lambda trained, at: [
+        of._replace(candidates=[chosen(levels, i, of)]) for i, of in zip(at, trained, strict=True)
+    ]
+    same(told(later.trained(CONFIG), at), told([alone[i] for i in at], at))
 
 
 def test_totals_grow_to_the_whole(levels: Level) -> None:

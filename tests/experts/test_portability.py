@@ -115,6 +115,11 @@ def test_the_most_portable_is_chosen_and_of_equals_the_first(monkeypatch: pytest
     assert told == [(2, 0.5), None, (4, 1.0), (5, 0.0), (4, 1.0)]
     assert (2, 5) not in replayed
     assert (4, 2) not in replayed, "the one before survived all"
+    replayed.clear()
+    known_one = candidates[0][0]._replace(portability=0.75)
+    some = [[known_one, *candidates[0][1:]]]
+    (again,) = choose(levels[:, :1], ids[:1], some, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
+    assert (again, replayed) == (known_one, [(0, 2), (0, 3)]), "what is known is not found out again"
     first = choose(levels, ids, candidates, 0, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
     assert [(of.steps, of.portability) if of else None for of in first] == [
         (1, None), None, (4, None), (5, None), (1, None),

@@ -67,6 +67,19 @@ def test_a_fragile_witness_becomes_steady_and_no_other_is_touched() -> None:
     assert verdicts[FRAGILE].cells is None, "nobody searched before"
 
 
+def test_an_experts_own_witness_stays_unless_most_replays_fail() -> None:
+    """Those that are varied are the same actions whoever found them."""
+    found, own = witnesses()[FRAGILE], Source.SAMPLED
+    assert found.portability is not None
+    for source, share, stays in ((own, 0.5, True), (own, 0.45, False), (Source.SCOUT, 0.5, False)):
+        before = found._replace(source=source, portability=share)
+        some = take(levels(), np.array([FRAGILE]))
+        (after,), _ = rework(some, IDS[[FRAGILE]], [before], PROCEDURE, DEFAULT_RULES)
+        assert after is not None
+        assert (after is before) == stays
+        assert after.source is (own if stays else Source.SEARCH)
+
+
 def test_without_rounds_or_replays_nothing_is_reworked() -> None:
     for procedure in (
         replace(PROCEDURE, search=replace(PROCEDURE.search, steady=0)),

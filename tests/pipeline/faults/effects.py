@@ -6,6 +6,7 @@ import os
 import random
 import shutil
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -26,7 +27,8 @@ class Effects:
 
     def __init__(self, below: Path, tell: Tell, log: Path | None = None) -> None:
         """`tell` may raise the error that the disk gives; what it does itself is not counted."""
-        self.count, self._below, self._log, self._telling = 0, str(below), log, False
+        self.count, self._below, self._log = 0, str(below), log
+        self._telling, self._lock = threading.local(), threading.Lock()
         self._fsync = os.fsync
         self.tell = tell
         os.fsync = self._flushed
@@ -50,24 +52,25 @@ class Effects:
         self._fsync(descriptor)
 
     def _happen(self, kind: str, path: str, arguments: tuple) -> None:
-        if self._telling:
+        if getattr(self._telling, "now", False):
             return
-        self._telling = True
+        self._telling.now = True
         try:
-            number, self.count = self.count, self.count + 1
+            with self._lock:
+                number, self.count = self.count, self.count + 1
             self.tell(number, kind, path)
             if self._log and path.startswith("/"):
-                self._note(kind, path, arguments)
+                self._note(number, kind, path, arguments)
         finally:
-            self._telling = False
+            self._telling.now = False
 
-    def _note(self, kind: str, path: str, arguments: tuple) -> None:
+    def _note(self, number: int, kind: str, path: str, arguments: tuple) -> None:
         """In a log that is there after this process."""
         assert self._log
         there = os.fsdecode(arguments[1]) if kind == "rename" else path
         saved = ""
         if kind in ("unlink", "rename") and os.path.isfile(there):
-            saved = f"{self._log}.{os.getpid()}.{self.count}"
+            saved = f"{self._log}.{os.getpid()}.{number}"
             shutil.copyfile(there, saved)
         with open(self._log, "a") as file:
             file.write("\t".join([kind, path, there, saved, str(os.path.exists(path))]) + "\n")
