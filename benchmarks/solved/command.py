@@ -89,8 +89,8 @@ def report_of(results: list[Results], whole: bool) -> Report:
             *([f"![How the unsolved share falls with budget]({PLOT})"] if curves else []),
             tables.variants_of(results),
             "*An expert reaches the goal by itself* where its witness is its own, or attempts of its last evaluation "
-            "do; a search's may stand in for its own, where fewer than half of the replays survive that. Success rates are of first episodes. Where "
-            "there is none (-), it was not measured so.",
+            "do; a search's may stand in for its own, where fewer than half of the replays survive that. Success rates "
+            "are of first episodes. Where there is none (-), it was not measured so.",
         ],
         plots={PLOT: lambda path: plot.draw(curves, path)} if curves else {},
         made=made(results),
