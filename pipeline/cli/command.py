@@ -5,7 +5,7 @@ import textwrap
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-EXITS = "exit codes: 0 done, 1 failed, 2 change the command, 3 some units quarantined, 130 stopped"
+EXITS = "exit codes: 0 done, 1 failed, 2 change the command,\n            3 some units quarantined, 130 stopped"
 SPLIT = "folder or URL of a split, such as data/128k/s or s3://bucket/data/128k/s"
 
 

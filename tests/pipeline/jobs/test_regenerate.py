@@ -15,6 +15,7 @@ from pipeline.read.verify import examine
 from pipeline.store.checkpoints import load_experts, require_same_experts
 from pipeline.store.layout import new_attempt
 from pipeline.store.manifest import begin_fragment, read_manifest
+from pipeline.words import many
 from tests.pipeline.command import here
 from tests.pipeline.made import lasting, made_job
 
@@ -45,7 +46,7 @@ def test_going_on_equals_having_trained_through(folder: Path) -> None:
     words = ["manifest=data/8k/s", "budget=24k", where, "continue=true", "unit=1", "executor=inline"]
     done = here(["regenerate", *words], folder)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(f"data/24k/s: {len(unsolved)} levels")
+    assert done.stdout.startswith(f"data/24k/s: {many(len(unsolved), 'level')}, ")
     again = ["regenerate", "manifest=data/8k/s", "budget=24k", where, "out=through", "executor=inline"]
     assert here(again, folder).returncode == 0
     continued, through = rows_of(folder / "data/24k/s"), rows_of(folder / "through/24k/s")
@@ -53,7 +54,7 @@ def test_going_on_equals_having_trained_through(folder: Path) -> None:
     assert continued == through
     assert any(int(row["env_steps"]) > 8_000 for row in through)
     assert not examine(folder / "data/24k/s").wrong
-    assert "levels committed" in here(["status", "data/24k/s"], folder).stdout
+    assert f"of {many(len(unsolved), 'level')} committed" in here(["status", "data/24k/s"], folder).stdout
     assert here(again, folder).stdout.startswith("Nothing to do")
 
 

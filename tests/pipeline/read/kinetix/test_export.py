@@ -14,6 +14,7 @@ from pipeline.read.kinetix.records import dtype_of
 from pipeline.read.kinetix.zarr2 import write_group
 from pipeline.read.rows import read_rows
 from pipeline.store.manifest import require_manifest
+from pipeline.words import many
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
 from tests.pipeline.read.kinetix.folder import trajectories_in
@@ -72,7 +73,7 @@ def test_every_bit_of_a_record_is_there(split: Path, tmp_path: Path) -> None:
 def test_which_levels_go_out_is_said_with_where(split: Path, tmp_path: Path) -> None:
     for where, count in (("true", 3), ("label = 'trivial'", 1), ("level_id > 0 AND label = 'solved'", 1)):
         done = here(["export", str(split), "--format", "kinetix", "-o", f"k{where}", "--where", where], tmp_path)
-        assert f"{count} trajectories" in done.stdout, done.stderr
+        assert many(count, "trajectory") in done.stdout, done.stderr
     none = ["export", str(split), "--format", "kinetix", "-o", "none", "--where"]
     assert_refused(here([*none, "label = 'unsolved'"], tmp_path), 2, "has a witness", "--where")
     assert_refused(here([*none, "labell = 1"], tmp_path), 2, "Cannot use the condition")
