@@ -96,6 +96,23 @@ def test_it_depends_on_the_level_alone(
     np.testing.assert_array_equal(some, shares[at])
 
 
+@pytest.mark.parametrize(("count", "blocks"), [(2, [16]), (17, [64]), (130, [128, 128])])
+def test_an_accelerator_replays_a_few_candidates_without_filling_itself(
+    monkeypatch: pytest.MonkeyPatch, count: int, blocks: list[int]
+) -> None:
+    seen = []
+
+    def replayed(levels, level_ids, action, steps, replays, rules):
+        seen.append(len(level_ids))
+        return level_ids.astype(np.float32)
+
+    monkeypatch.setattr(portability, "_survival", replayed)
+    monkeypatch.setattr(portability, "at_once", lambda lanes, in_cache: 128)
+    witness = Witness(np.zeros((256, 6), int), Source.SAMPLED, 1)
+    found = survival(np.zeros((1, count)), np.arange(count), [witness] * count, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
+    assert (found.tolist(), seen) == ([*range(count)], blocks)
+
+
 def test_the_most_portable_is_chosen_and_of_equals_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """`steps` names a candidate here, and its number is what survives of it."""
     replayed = []
