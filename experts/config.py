@@ -128,9 +128,7 @@ class StopConfig:
     share: float = 0.25  # of an update's finished episodes that must reach the goal before an evaluation is worth it
     wait: int = 2048  # env steps of training between an evaluation that failed and the next; doubles each time
     polish: int = 0  # env steps of training after a level is solved, for a shorter way to the goal
-    steady: int = (
-        65_536  # env steps of training after a level is solved, for a witness that more replays survive; 0: none
-    )
+    steady: int = 65_536  # env steps of training after a level is solved, for a steadier witness; 0: none
     first_rung: int = 2048  # env steps of training at the first rung; each is twice the one before
     gain: float = 0.05  # by which the best return must have grown since the rung before
 
