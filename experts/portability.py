@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from experts.config import RECORD_STEPS
 from experts.judge import Witness
 from experts.search.play import Arena, Walk, act, arena, fresh_walk
-from experts.witness import at_once, blocks, take
+from experts.witness import at_once, block_size, blocks, take
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import Level
 from levelgen.task.rules import TaskParams
@@ -25,7 +25,6 @@ from physics.types import State
 LATE = 16  # env steps by which a replay may reach the goal later than the candidate
 PORTABLE = 0.95  # share of replays; where fewer survive, a steadier witness is looked for
 IN_CACHE = 32  # lanes, of candidates side by side
-BLOCKS = (16, 64, 256)  # candidates that an accelerator replays side by side: the fewest of these that do
 
 
 def choose(
@@ -76,8 +75,7 @@ def survival(
         replays: of each witness: their starts are the same for all witnesses of a level.
         rules: of the task.
     """
-    shares, most = [], at_once(replays, IN_CACHE)
-    size = next((size for size in BLOCKS if len(witnesses) <= size < most), most)
+    shares, size = [], block_size(len(witnesses), at_once(replays, IN_CACHE))
     for some in blocks(len(witnesses), size):
         action = np.stack([witnesses[i].action for i in some], -1).astype(np.int8)
         steps = np.array([witnesses[i].steps for i in some], np.int32)

@@ -13,7 +13,7 @@ from jax.tree_util import keystr, tree_flatten_with_path
 from jaxtyping import Array, Bool, Int, UInt32
 
 from experts.config import RECORD_STEPS
-from experts.witness import blocks, onwards, record_of, take
+from experts.witness import block_size, blocks, onwards, record_of, take
 from levelgen.level import Level
 from levelgen.task import rules as task
 from levelgen.task.actions import controls
@@ -21,7 +21,7 @@ from levelgen.task.rules import StepResult, TaskParams, TaskState
 from physics.buffers import zeros_of
 from physics.types import Manifold, State
 
-BLOCKS = (16, 64, 256)  # levels that are played side by side: the fewest of these that do
+MOST = 256  # levels that are played side by side
 # of `checksum`
 GOLDEN, MIX_A, MIX_B = (np.uint32(x) for x in (0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35))
 
@@ -63,9 +63,11 @@ def resume(
         fields: paths of `Record` that are wanted; what they do not need is not computed.
     """
     count = moves.action.shape[-1]
-    size = next((size for size in BLOCKS if size >= count), BLOCKS[-1])
     given = level, moves, states, timesteps(moves.done)
-    parts = [jax.device_get(_resume_block(*take(given, lanes), rules, fields)) for lanes in blocks(count, size)]
+    parts = [
+        jax.device_get(_resume_block(*take(given, lanes), rules, fields))
+        for lanes in blocks(count, block_size(count, MOST))
+    ]
     return jax.tree.map(lambda *xs: np.concatenate(xs, -1)[..., :count], *parts)
 
 

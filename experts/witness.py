@@ -25,6 +25,7 @@ from physics.types import Manifold, State
 from physics.vector import select, unvec, vec
 
 LANES = 64  # of a block of replays
+BLOCKS = (16, 64, 256)  # levels of a block: a program for each, and not one for each count
 LANES_ON_ACCELERATOR = 32_768  # that keep it busy
 
 T = TypeVar("T")
@@ -79,6 +80,11 @@ def blocks(count: int, size: int = LANES) -> Iterator[np.ndarray]:
     """Numbers of each block of so many; the last one is filled up with its last number: one program serves all."""
     for first in range(0, count, size):
         yield np.minimum(np.arange(first, first + size), count - 1)
+
+
+def block_size(count: int, most: int) -> int:
+    """Of BLOCKS and `most` the smallest block that has room for so many, or `most`: as much as goes at once."""
+    return min((size for size in (*BLOCKS, most) if count <= size <= most), default=most)
 
 
 def at_once(lanes: int, in_cache: int) -> int:
