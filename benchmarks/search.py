@@ -36,7 +36,7 @@ from pipeline.runtime import cache_folder, own_cores, prepare_jax
 FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
 LEVELS = {"s": 256, "m": 128, "l": 64}
 LEAST = 16_384  # env steps at which the curve begins
-CONFIG = SearchConfig(env_steps=MOST_COUNTED // 2, bodies=0, per_cell=0, rounds=64)  # the default one, without an end
+CONFIG = SearchConfig(MOST_COUNTED // 2, bodies=0, patience=0, per_cell=0, rounds=64)  # the default one, without an end
 COLOURS = {"s": "#0072b2", "m": "#d55e00", "l": "#009e73"}  # Okabe and Ito
 PLOT = "search.svg"
 

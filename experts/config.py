@@ -131,10 +131,11 @@ class StopConfig:
     steady: int = 65_536  # env steps of training after a level is solved, for a steadier witness; 0: none
     first_rung: int = 2048  # env steps of training at the first rung; each is twice the one before
     gain: float = 0.05  # by which the best return must have grown since the rung before
+    fruitless: int = 163_840  # env steps of training after which an expert leaves that never reached the goal; 0: none
 
     def __post_init__(self) -> None:
         require(self, ("successes", "first_rung"), 1)
-        require(self, ("wait", "polish", "steady", "gain"), 0)
+        require(self, ("wait", "polish", "steady", "gain", "fruitless"), 0)
         require(self, ("share",), 0, 1)
 
 

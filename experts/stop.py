@@ -24,6 +24,7 @@ class StopRules(NamedTuple):
     steady: np.int32  # updates after it is solved by witnesses that few replays survive
     first_rung: np.int32  # updates
     gain: np.float32  # of the best return between rungs
+    fruitless: np.int32  # updates
 
 
 def rules_of(stopping: StopConfig, config: ExpertConfig) -> StopRules:
@@ -38,6 +39,7 @@ def rules_of(stopping: StopConfig, config: ExpertConfig) -> StopRules:
         steady=np.int32(config.updates_in(stopping.steady) if stopping.steady else 0),
         first_rung=np.int32(config.updates_in(stopping.first_rung)),
         gain=np.float32(stopping.gain),
+        fruitless=np.int32(config.updates_in(stopping.fruitless) if stopping.fruitless else LAST),
     )
 
 
@@ -81,8 +83,10 @@ def after_update(
     worth_it = (share >= rules.share) & (updates >= course.next_evaluation)
     evaluate = rules.evaluates & worth_it
     at_rung = rules.halves & is_rung(updates, rules.first_rung)
-    moves = usable | (progress.first_success != NEVER) | (progress.best_return >= course.rung_return + rules.gain)
-    over = (progress.diverged != NEVER) | (at_rung & ~moves)
+    reached = progress.first_success != NEVER
+    moves = usable | reached | (progress.best_return >= course.rung_return + rules.gain)
+    fruitless = rules.halves & ~reached & (updates >= rules.fruitless)
+    over = (progress.diverged != NEVER) | (at_rung & ~moves) | fruitless
     rung_return = jnp.where(at_rung, progress.best_return, course.rung_return)
     course = course._replace(updates=updates, rung_return=rung_return, over=over)
     return course, evaluate, over | (updates >= deadline)

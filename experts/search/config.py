@@ -14,9 +14,11 @@ MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are co
 class SearchConfig:
     """Settings of a search (hashable: pass as a static argument)."""
 
-    env_steps: int = 524_288  # of one level, all lanes together; rounded up to whole rounds; 0: none
-    bodies: int = 8  # of a world that is searched so long; of more, fewer env steps, as the square of their number
-    first_rung: int = 16_384  # env steps at the first rung; each is four times the one before
+    env_steps: int = 1_048_576  # of one level, all lanes together; rounded up to whole rounds; 0: none
+    bodies: int = 11  # of a world that is searched so long; of more, fewer env steps, as the square of their number
+    patience: float = 0.5  # share of env_steps after which a level leaves that comes no nearer to the goal; 0: none
+    near: float = 0.2  # m, the gap of green and blue up to which patience is that long; of twice the gap, half as long
+    first_rung: int = 16_384  # env steps at the first rung, and the least patience; each is four times the one before
     per_cell: int = 256  # env steps for each cell reached, above which a level leaves at a rung; 0: none leaves
     # play
     lanes: int = 64  # of one level
@@ -37,7 +39,7 @@ class SearchConfig:
     trials: int = 4  # rounds of attempts to make it shorter, one a lane; the first also verifies it
     # a witness
     polish: int = 0  # env steps of search around it for a shorter one, rounded up to whole rounds; 0: none
-    steady: int = 16  # rounds of search around one that few replays survive, for one that more do; 0: none
+    steady: int = 8  # rounds of search around one that few replays survive, for one that more do; 0: none
     # machine
     rounds: int = 2  # between looks of the host
 
@@ -48,8 +50,8 @@ class SearchConfig:
         require(self, ("trials",), 1, MOST_ROUNDS)
         require(self, ("lanes", "segment", "stretch", "rounds", "first_rung"), 1)
         require(self, ("entries",), 1, MOST_ENTRIES)
-        require(self, ("nearer", "anew"), 0, 1)
-        require(self, ("width",), 0, above=True)
+        require(self, ("patience", "nearer", "anew"), 0, 1)
+        require(self, ("width", "near"), 0, above=True)
         require(self, ("growth",), 1, above=True)
         require(self, ("driven_weight", "other_weight", "velocity_seconds"), 0)
         if not self.redrawn or not all(0 < chance <= 1 for chance in self.redrawn):

@@ -14,13 +14,15 @@ from experts.config import RECORD_STEPS
 from experts.search.archive import Archive, Reached, choose, insert, new_archive, visit
 from experts.search.cells import features
 from experts.search.config import SearchConfig
-from experts.search.near import gap, goals_of
+from experts.search.near import FAR, gap, goals_of
 from experts.search.play import CODES, Arena, Walk, arena, decode, most_steps, play
 from experts.search.rows import from_rows, to_rows
 from experts.success import Success
 from levelgen.identity.keys import Stream, key_for
 from levelgen.level import ACTIONS, Level
 from levelgen.task.rules import TaskParams
+
+NEARER = 0.98  # of the least gap: what shrinks it less does not count
 
 
 @jax.tree_util.register_dataclass
@@ -33,6 +35,8 @@ class Search:
     archive: Archive
     env_steps: Int[Array, " level"]  # of all lanes
     grew: Int[Array, " level"]  # env steps when the last cell entered the archive
+    gap: Float[Array, " level"]  # m, the least one of green and blue so far
+    closed: Int[Array, " level"]  # env steps when it last shrank
     code: UInt16[Array, "level step"]  # actions of the success, each as one number
     length: Int[Array, " level"]  # of the success, env steps; 0: there is none
 
@@ -67,7 +71,8 @@ def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, 
     )
     key = jax.vmap(lambda level_id: key_for(level_id, Stream.SEARCH))(level_ids)
     none, code = jnp.zeros(count, jnp.int32), jnp.zeros((count, room), jnp.uint16)
-    return Search(levels, key, new_archive(start, config), none, none, code, none)
+    apart = jnp.nan_to_num(start.distance[:, 0], nan=FAR)  # of a world that is broken from the start
+    return Search(levels, key, new_archive(start, config), none, none, apart, none, code, none)
 
 
 @partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="search")
@@ -88,17 +93,19 @@ def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: Task
     drawn = jnp.where(ring.live, decode(chance.code.reshape(-1)), 0)
     walk = walk._replace(action=jnp.where(chance.anew.reshape(-1), drawn, walk.action))
 
-    def one(carry: tuple[Archive, Walk, Array], bits: Array) -> tuple[tuple, None]:
-        archive, walk, code = carry
+    def one(carry: tuple[Archive, Walk, Array, Array], bits: Array) -> tuple[tuple, None]:
+        archive, walk, code, least = carry
         before = walk.timestep
         walk, played = play(ring, walk, bits, rules)
         code = written(code, played, before // config.segment)
         come, valid = reached_by(walk, code, ring, config)
         archive = insert(archive, come, valid & active[:, None], config)
-        return (archive, walk, code), None
+        least = jnp.minimum(least, jnp.where(valid, come.distance, jnp.inf).min(-1))
+        return (archive, walk, code, least), None
 
-    carry = visit(search.archive, chosen, active), walk, code
-    archive, walk, code = jax.lax.scan(one, carry, bits)[0]
+    carry = visit(search.archive, chosen, active), walk, code, search.gap
+    archive, walk, code, least = jax.lax.scan(one, carry, bits)[0]
+    closer = active & (least < NEARER * search.gap)
 
     env_steps = search.env_steps + jnp.where(active, config.steps_per_round, 0)
     level, length = jnp.arange(len(active)), length_of(walk, rules).reshape(len(active), -1)
@@ -110,20 +117,28 @@ def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: Task
         archive=archive,
         env_steps=env_steps,
         grew=jnp.where(archive.cells > search.archive.cells, env_steps, search.grew),
+        gap=jnp.where(closer, least, search.gap),
+        closed=jnp.where(closer, env_steps, search.closed),
         code=jnp.where(won[:, None], code.reshape(len(active), config.lanes, -1)[level, lane], search.code),
         length=jnp.where(won, length[level, lane], search.length),
     )
 
 
 def under_way(search: Search, config: SearchConfig) -> Bool[Array, " level"]:
-    """Levels without a success that have env steps left, and are not at a rung with too few cells.
+    """Levels without a success that have env steps left, are not at a rung with too few cells, and have lately come
+    nearer to the goal.
 
-    Where next to nothing is reached, nothing will be: the world ends at once, or what acts moves little in it.
+    Where next to nothing is reached, nothing will be: the world ends at once, or what acts moves little in it. And the
+    farther green and blue have stayed from each other, for the longer, the less a search finds (docs/tried.md).
     """
     going = (search.length == 0) & (search.env_steps < config.env_steps)
     at_rung = jnp.isin(search.env_steps // config.steps_per_round, jnp.array(config.rungs, jnp.int32))
     least = -(-search.env_steps // max(config.per_cell, 1))  # rounded up; nothing here outgrows 32 bits
-    return going & ~(at_rung & (search.archive.cells < least) & (config.per_cell > 0))
+    few = at_rung & (search.archive.cells < least) & (config.per_cell > 0)
+    share = config.patience * config.near / jnp.maximum(search.gap, config.near)
+    patience = jnp.maximum(share * config.env_steps, config.first_rung)
+    waited = search.env_steps - search.closed >= patience
+    return going & ~few & ~(waited & (config.patience > 0))
 
 
 def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> Chance:

@@ -72,6 +72,29 @@ def test_at_a_rung_learning_has_to_move() -> None:
     assert (evaluate, final, float(between.rung_return)) == (False, False, 0.5)
 
 
+@pytest.mark.parametrize(
+    ("updates", "first", "stopping", "leaves"),
+    [
+        (19, progress.NEVER, HALVING, False),
+        (20, progress.NEVER, HALVING, True),
+        (20, 77, HALVING, False),
+        (20, progress.NEVER, replace(HALVING, fruitless=0), False),
+        (20, progress.NEVER, replace(HALVING, rule=Rule.SOLVED), False),
+    ],
+)
+def test_an_expert_that_never_reaches_the_goal_leaves(
+    updates: int, first: int, stopping: StopConfig, leaves: bool
+) -> None:
+    """After 20 updates, whatever success it was given, and whether or not that is a rung."""
+    stopping = replace(stopping, fruitless=stopping.fruitless and 20_480)
+    course, totals = stop.begin()._replace(updates=jnp.int32(updates - 1)), progress.start(16)
+    totals, given = totals._replace(first_success=jnp.int32(first)), jnp.bool_(True)
+    course, _, final = stop.after_update(
+        course, totals, given, jnp.float32(0.0), jnp.int32(100), rules_of(stopping, CONFIG)
+    )
+    assert (bool(final), bool(course.over)) == (leaves, leaves)
+
+
 def test_rungs() -> None:
     assert [u for u in range(1, 200) if bool(stop.is_rung(jnp.int32(u), 3))] == [3, 6, 12, 24, 48, 96, 192]
 

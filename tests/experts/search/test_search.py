@@ -14,7 +14,8 @@ from experts.labels import Label, Source
 from experts.procedure import Procedure
 from experts.scout import STEPS_PER_ROUND
 from experts.search.config import SearchConfig
-from experts.search.explore import Search, begin, draw, explore, under_way
+from experts.search.explore import NEARER, Search, begin, draw, explore, under_way
+from experts.search.near import FAR
 from experts.search.play import arena, fresh_walk, play
 from experts.search.search import AHEAD, Searched, Searching, side_by_side
 from experts.search.shorten import shorten
@@ -172,8 +173,46 @@ def test_a_level_with_few_cells_leaves_at_a_rung() -> None:
     """One cell, and it is over at the first rung; as many as a rung asks for, and it goes on to the next."""
     assert (found().env_steps[KINDS == BROKEN] == CONFIG.first_rung).all()
     broken = take(levels(), np.flatnonzero(KINDS == BROKEN)[:1])
-    config = replace(CONFIG, env_steps=40_960, first_rung=4096, per_cell=4096)
+    config = replace(CONFIG, env_steps=40_960, patience=0, first_rung=4096, per_cell=4096)
     assert search(broken, IDS[:1], config, DEFAULT_RULES).env_steps == 16_384
+
+
+@pytest.mark.parametrize(
+    ("gap", "patience"), [(0.0, 65_536), (0.25, 65_536), (0.5, 32_768), (1.0, 16_384), (4.0, 16_384), (1e6, 16_384)]
+)
+def test_a_level_that_comes_no_nearer_leaves(gap: float, patience: int) -> None:
+    """Sooner where the gap is wide, but not before the first rung."""
+    config = replace(CONFIG, patience=0.25, near=0.25, per_cell=0)
+    now = begun()
+    at = lambda waited: replace(
+        now,
+        gap=jnp.full_like(now.gap, gap),
+        closed=jnp.full_like(now.closed, 8192),
+        env_steps=jnp.full_like(now.env_steps, 8192 + waited),
+    )
+    assert under_way(at(patience - ROUND), config).all()
+    assert not under_way(at(patience), config).any()
+    assert under_way(at(patience), replace(config, patience=0)).all()
+
+
+def test_the_gap_shrinks_on_the_way_to_the_goal() -> None:
+    """The least one so far, and when it last shrank; a broken world has none."""
+    now, of = begun(), lambda now: jax.device_get((now.gap, now.closed, now.env_steps))
+    first = last = of(now)
+    broken = KINDS[: len(first[0])] == BROKEN
+    np.testing.assert_array_equal(first[0] == FAR, broken)
+    for _ in range(4):
+        now = explore(now, CONFIG, DEFAULT_RULES)
+        gap, closed, env_steps = of(now)
+        shrank = gap < last[0]
+        assert (closed[shrank] > last[2][shrank]).all()
+        np.testing.assert_array_equal(closed[~shrank], last[1][~shrank])
+        archive = jax.device_get(now.archive)
+        nearest = np.where(archive.used, archive.entry.distance, np.inf).min(-1)
+        assert (NEARER * gap <= nearest)[~broken].all()  # what shrinks it less does not count
+        last = gap, closed, env_steps
+    assert (last[0] < first[0])[~broken].all()
+    assert (last[1] == 0)[broken].all()
 
 
 def test_a_rung_that_asks_for_next_to_nothing_lets_all_go_on() -> None:
@@ -181,8 +220,8 @@ def test_a_rung_that_asks_for_next_to_nothing_lets_all_go_on() -> None:
     now = begun()
     steps, cells = jnp.full_like(now.env_steps, CONFIG.first_rung), jnp.full_like(now.archive.cells, 3000)
     reached = replace(now, env_steps=steps, archive=now.archive._replace(cells=cells))
-    assert under_way(reached, replace(CONFIG, per_cell=1_000_000)).all()
-    assert not under_way(reached, replace(CONFIG, per_cell=1)).any()
+    assert under_way(reached, replace(CONFIG, patience=0, per_cell=1_000_000)).all()
+    assert not under_way(reached, replace(CONFIG, patience=0, per_cell=1)).any()
 
 
 def test_larger_worlds_are_searched_for_fewer_env_steps() -> None:
@@ -190,7 +229,7 @@ def test_larger_worlds_are_searched_for_fewer_env_steps() -> None:
     given = SearchConfig(env_steps=100_000, bodies=8)
     assert [given.scaled(bodies).env_steps for bodies in (7, 8, 16)] == [100_000, 100_000, 25_000]
     assert replace(given, bodies=0).scaled(16).env_steps == 100_000
-    four = replace(CONFIG, bodies=4, env_steps=207_360, per_cell=0)
+    four = replace(CONFIG, bodies=4, env_steps=207_360, patience=0, per_cell=0)
     at = np.flatnonzero(KINDS == BROKEN)[:1]
     assert search(take(levels(), at), IDS[:1], four, DEFAULT_RULES).env_steps == 40_960  # of 9 bodies
 
@@ -266,7 +305,7 @@ def test_shortening() -> None:
     [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"anew": -0.5},
      {"redrawn": (0.5, 2.0)}, {"redrawn": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"velocity_seconds": -1.0},
      {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000}, {"steady": 2000}, {"width": 1e-46},
-     {"growth": 1.00000001}, {"lanes": 2**28}],
+     {"growth": 1.00000001}, {"lanes": 2**28}, {"patience": 1.5}, {"patience": -0.1}, {"near": 0.0}],
 )  # fmt: skip
 def test_settings_that_cannot_be(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
