@@ -25,7 +25,7 @@ from configs.numbers import parse_count
 from experts.before import decide
 from experts.config import MOST_COUNTED
 from experts.search.config import SearchConfig
-from experts.search.explore import Search, begin, explore, successes
+from experts.search.explore import Search, begin, explore, success_of
 from experts.search.search import side_by_side
 from experts.witness import blocks, replay, take
 from levelgen.level import SIZES, Level
@@ -135,7 +135,8 @@ def joined(rows: Sequence[Search]) -> Search:
 
 def steps_to_success(levels: Level, rows: Sequence[Search], env_steps: int) -> Int[np.ndarray, " level"]:
     """Env steps of search to a success that replays; -1: none within so many."""
-    found = successes(joined([replace(row, archive=None) for row in rows]))
+    both = joined([replace(row, archive=None) for row in rows])
+    found = success_of(both.code, both.length)
     length, steps = np.asarray(found.length), np.array([int(row.env_steps[0]) for row in rows])
     goal = replay(levels, np.moveaxis(np.asarray(found.action), 0, -1)).goal
     reached = goal[length - 1, np.arange(len(length))] & (length > 0)

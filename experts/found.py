@@ -11,7 +11,8 @@ from experts.labels import Source
 from experts.ledger import Ledger
 from experts.procedure import Procedure
 from experts.scout import scout
-from experts.search.search import Searched, Searching
+from experts.search.search import Searching
+from experts.search.stage import Searched
 from experts.success import Success, no_success
 from experts.witness import take
 from levelgen.level import Level
@@ -109,7 +110,7 @@ class Looking:
         found, left = self.found, self._left
         put = lambda whole, part: whole.__setitem__(left, part)
         jax.tree.map(put, found.success, searched.success)
-        put(found.search_steps, searched.env_steps)
+        put(found.search_steps, searched.env_steps + searched.varied)
         put(found.cells, searched.cells)
         put(found.still_grew, searched.grew > STILL * np.asarray(searched.env_steps))
         for i in left[np.asarray(searched.success.length) > 0]:

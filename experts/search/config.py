@@ -16,7 +16,8 @@ class SearchConfig:
 
     env_steps: int = 1_048_576  # of one level, all lanes together; rounded up to whole rounds; 0: none
     bodies: int = 11  # of a world that is searched so long; of more, fewer env steps, as the square of their number
-    patience: float = 0.5  # share of env_steps after which a level leaves that comes no nearer to the goal; 0: none
+    variations: int = 262_144  # env steps in which what came nearest to the goal is varied, after that; 0: none
+    patience: int = 262_144  # env steps of either after which a level leaves that comes no nearer to the goal; 0: none
     near: float = 0.2  # m, the gap of green and blue up to which patience is that long; of twice the gap, half as long
     first_rung: int = 16_384  # env steps at the first rung, and the least patience; each is four times the one before
     per_cell: int = 256  # env steps for each cell reached, above which a level leaves at a rung; 0: none leaves
@@ -44,13 +45,15 @@ class SearchConfig:
     rounds: int = 2  # between looks of the host
 
     def __post_init__(self) -> None:
-        require(self, ("bodies", "per_cell"), 0, MOST_COUNTED)
-        require(self, ("env_steps", "polish"), 0, MOST_COUNTED // 2)  # and what the last round has too many
+        require(self, ("bodies", "per_cell", "patience"), 0, MOST_COUNTED)
+        require(
+            self, ("env_steps", "variations", "polish"), 0, MOST_COUNTED // 2
+        )  # and what the last round has too many
         require(self, ("steady",), 0, MOST_ROUNDS)
         require(self, ("trials",), 1, MOST_ROUNDS)
         require(self, ("lanes", "segment", "stretch", "rounds", "first_rung"), 1)
         require(self, ("entries",), 1, MOST_ENTRIES)
-        require(self, ("patience", "nearer", "anew"), 0, 1)
+        require(self, ("nearer", "anew"), 0, 1)
         require(self, ("width", "near"), 0, above=True)
         require(self, ("growth",), 1, above=True)
         require(self, ("driven_weight", "other_weight", "velocity_seconds"), 0)
@@ -63,8 +66,9 @@ class SearchConfig:
 
     def scaled(self, bodies: int) -> "SearchConfig":
         """For worlds of so many bodies: about the time that a small one takes, where env steps cost as their square."""
-        most = int(self.env_steps * min(1.0, (self.bodies / bodies) ** 2)) if self.bodies else self.env_steps
-        return replace(self, env_steps=most)
+        share = min(1.0, (self.bodies / bodies) ** 2) if self.bodies else 1.0
+        less = {name: int(getattr(self, name) * share) for name in ("env_steps", "variations", "patience")}
+        return replace(self, **less)
 
     @property
     def steps_per_round(self) -> int:

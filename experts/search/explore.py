@@ -108,9 +108,7 @@ def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: Task
     closer = active & (least < NEARER * search.gap)
 
     env_steps = search.env_steps + jnp.where(active, config.steps_per_round, 0)
-    level, length = jnp.arange(len(active)), length_of(walk, rules).reshape(len(active), -1)
-    lane = jnp.argmin(length, axis=-1)
-    won = active & (length[level, lane] <= RECORD_STEPS)
+    code, length = with_success(search.code, search.length, walk, code, active, rules)
     return Search(
         levels=search.levels,
         key=search.key,
@@ -119,8 +117,8 @@ def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: Task
         grew=jnp.where(archive.cells > search.archive.cells, env_steps, search.grew),
         gap=jnp.where(closer, least, search.gap),
         closed=jnp.where(closer, env_steps, search.closed),
-        code=jnp.where(won[:, None], code.reshape(len(active), config.lanes, -1)[level, lane], search.code),
-        length=jnp.where(won, length[level, lane], search.length),
+        code=code,
+        length=length,
     )
 
 
@@ -135,10 +133,13 @@ def under_way(search: Search, config: SearchConfig) -> Bool[Array, " level"]:
     at_rung = jnp.isin(search.env_steps // config.steps_per_round, jnp.array(config.rungs, jnp.int32))
     least = -(-search.env_steps // max(config.per_cell, 1))  # rounded up; nothing here outgrows 32 bits
     few = at_rung & (search.archive.cells < least) & (config.per_cell > 0)
-    share = config.patience * config.near / jnp.maximum(search.gap, config.near)
-    patience = jnp.maximum(share * config.env_steps, config.first_rung)
-    waited = search.env_steps - search.closed >= patience
-    return going & ~few & ~(waited & (config.patience > 0))
+    return going & ~few & patient(search.gap, search.env_steps - search.closed, config)
+
+
+def patient(gap: Float[Array, " level"], waited: Int[Array, " level"], config: SearchConfig) -> Bool[Array, " level"]:
+    """Whether levels go on that have come no nearer to the goal for so many env steps."""
+    patience = config.patience * config.near / jnp.maximum(gap, config.near)
+    return (waited < jnp.maximum(patience, config.first_rung)) | (config.patience == 0)
 
 
 def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> Chance:
@@ -185,14 +186,25 @@ def reached_by(
     return jax.tree.map(by_level, come), by_level(~walk.ended)
 
 
-def length_of(walk: Walk, rules: TaskParams) -> Int[Array, " lane"]:
-    """Env steps from the level's start to the goal; RECORD_STEPS + 1 where it was not reached in time."""
-    goal = (walk.reached > 0) & (walk.reached <= most_steps(rules))
-    return jnp.where(goal, walk.reached, RECORD_STEPS + 1)
+def with_success(
+    code: UInt16[Array, "level step"],
+    length: Int[Array, " level"],
+    walk: Walk,
+    played: UInt16[Array, "lane step"],
+    active: Bool[Array, " level"],
+    rules: TaskParams,
+) -> tuple[UInt16[Array, "level step"], Int[Array, " level"]]:
+    """Actions of each level's success, and their number: the shortest one of its lanes, where one is in time."""
+    in_time = (walk.reached > 0) & (walk.reached <= most_steps(rules))
+    steps = jnp.where(in_time, walk.reached, RECORD_STEPS + 1).reshape(len(active), -1)
+    level, lane = jnp.arange(len(active)), jnp.argmin(steps, axis=-1)
+    won = active & (steps[level, lane] <= RECORD_STEPS)
+    best = played.reshape(*steps.shape, -1)[level, lane]
+    return jnp.where(won[:, None], best, code), jnp.where(won, steps[level, lane], length)
 
 
-def successes(search: Search) -> Success:
+def success_of(code: UInt16[Array, "level step"], length: Int[Array, " level"]) -> Success:
     """What was found, level first."""
-    code = jnp.pad(search.code, [(0, 0), (0, max(0, RECORD_STEPS - search.code.shape[1]))])[:, :RECORD_STEPS]
-    action = decode(jnp.where(jnp.arange(RECORD_STEPS) < search.length[:, None], code, 0))
-    return Success(jnp.moveaxis(action, 0, -1).astype(jnp.int8), search.length)
+    code = jnp.pad(code, [(0, 0), (0, max(0, RECORD_STEPS - code.shape[1]))])[:, :RECORD_STEPS]
+    action = decode(jnp.where(jnp.arange(RECORD_STEPS) < length[:, None], code, 0))
+    return Success(jnp.moveaxis(action, 0, -1).astype(jnp.int8), length)

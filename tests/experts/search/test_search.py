@@ -17,8 +17,9 @@ from experts.search.config import SearchConfig
 from experts.search.explore import NEARER, Search, begin, draw, explore, under_way
 from experts.search.near import FAR
 from experts.search.play import arena, fresh_walk, play
-from experts.search.search import AHEAD, Searched, Searching, side_by_side
+from experts.search.search import AHEAD, Searching, side_by_side
 from experts.search.shorten import shorten
+from experts.search.stage import Searched
 from experts.steps import EnvSteps
 from experts.success import Success
 from experts.witness import replay, take
@@ -28,7 +29,7 @@ from levelgen.task.rules import DEFAULT_RULES, TaskParams
 from tests.experts.search.worlds import broken, switchback, tower, valley
 from tests.experts.search.worlds import side_by_side as together
 
-CONFIG = SearchConfig(env_steps=262_144, bodies=9, lanes=32, entries=128)
+CONFIG = SearchConfig(env_steps=262_144, variations=65_536, bodies=9, lanes=32, entries=128)
 ROUND = CONFIG.lanes * CONFIG.stretch * CONFIG.segment  # env steps
 SWITCHBACK, VALLEY, BROKEN = range(3)
 KINDS = np.array([SWITCHBACK, VALLEY, BROKEN, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY])
@@ -182,7 +183,7 @@ def test_a_level_with_few_cells_leaves_at_a_rung() -> None:
 )
 def test_a_level_that_comes_no_nearer_leaves(gap: float, patience: int) -> None:
     """Sooner where the gap is wide, but not before the first rung."""
-    config = replace(CONFIG, patience=0.25, near=0.25, per_cell=0)
+    config = replace(CONFIG, patience=65_536, near=0.25, per_cell=0)
     now = begun()
     at = lambda waited: replace(
         now,
@@ -226,9 +227,10 @@ def test_a_rung_that_asks_for_next_to_nothing_lets_all_go_on() -> None:
 
 def test_larger_worlds_are_searched_for_fewer_env_steps() -> None:
     """The level has one cell, and where no level leaves at a rung it is searched to the end."""
-    given = SearchConfig(env_steps=100_000, bodies=8)
-    assert [given.scaled(bodies).env_steps for bodies in (7, 8, 16)] == [100_000, 100_000, 25_000]
-    assert replace(given, bodies=0).scaled(16).env_steps == 100_000
+    given = SearchConfig(env_steps=100_000, variations=20_000, patience=4000, bodies=8)
+    of = lambda config: (config.env_steps, config.variations, config.patience)
+    assert of(given.scaled(7)) == of(given.scaled(8)) == of(given) == of(replace(given, bodies=0).scaled(16))
+    assert of(given.scaled(16)) == (25_000, 5000, 1000)
     four = replace(CONFIG, bodies=4, env_steps=207_360, patience=0, per_cell=0)
     at = np.flatnonzero(KINDS == BROKEN)[:1]
     assert search(take(levels(), at), IDS[:1], four, DEFAULT_RULES).env_steps == 40_960  # of 9 bodies
@@ -305,7 +307,7 @@ def test_shortening() -> None:
     [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"anew": -0.5},
      {"redrawn": (0.5, 2.0)}, {"redrawn": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"velocity_seconds": -1.0},
      {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000}, {"steady": 2000}, {"width": 1e-46},
-     {"growth": 1.00000001}, {"lanes": 2**28}, {"patience": 1.5}, {"patience": -0.1}, {"near": 0.0}],
+     {"growth": 1.00000001}, {"lanes": 2**28}, {"patience": -1}, {"near": 0.0}, {"variations": 2**31}],
 )  # fmt: skip
 def test_settings_that_cannot_be(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
@@ -317,11 +319,12 @@ def test_a_label_rests_on_what_was_found() -> None:
     some = np.array([0, 1, 2])
     procedure = Procedure(ScoutConfig(rounds=1), CONFIG, ExpertConfig(), StopConfig(rule=Rule.NONE))
     result = label(take(levels(), some), IDS[some], 2048, procedure)
+    searched = found().env_steps + found().varied
     for i, verdict in zip(some, result.verdicts, strict=True):
         length = int(found().success.length[i])
         assert verdict.label is (Label.SOLVED if length else Label.UNSOLVED)
         assert verdict.witness is (Source.SEARCH if length else None)
         assert verdict.steps_to_goal == (length or None)
-        assert (verdict.scout_steps, verdict.search_steps) == (STEPS_PER_ROUND, found().env_steps[i])
+        assert (verdict.scout_steps, verdict.search_steps) == (STEPS_PER_ROUND, searched[i])
         assert verdict.cells == found().cells[i]
-    assert result.spent == EnvSteps(scouted=3 * STEPS_PER_ROUND, searched=int(found().env_steps[some].sum()))
+    assert result.spent == EnvSteps(scouted=3 * STEPS_PER_ROUND, searched=int(searched[some].sum()))

@@ -41,6 +41,21 @@ def valley() -> Level:
     return level
 
 
+def cannon() -> Level:
+    """A ball that has to fly over a low red wall onto a goal behind it; its thrusters push it up and forth, or forth
+    only, and the bar that it starts from is the only ground that is not red."""
+    level = world(
+        bars=[((0.6, 1.2), (0.4, 0.1), 0.0), ((2.6, 0.7), (0.1, 0.3), 0.0), ((2.5, FLOOR_TOP), (2.5, 0.1), 0.0)],
+        bar_role=Role.RED,
+        ball=(0.6, 1.5),
+        goal=(4.2, 0.9),
+        angles=(np.pi / 3, 0.0),
+        thrust=1.5,
+    )
+    level.role[FIXED_POLYGONS] = Role.PLAIN
+    return level
+
+
 def tower() -> Level:
     """Two heavy boxes on each other, green on top, and blue between them and a wall. A ball has to fly over wall and
     tower and to topple it from behind, at some speed. From this side green falls off the other one, out of reach."""

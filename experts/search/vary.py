@@ -1,0 +1,243 @@
+"""What came nearest to the goal, varied until it reaches it: evolution of whole trajectories.
+
+Of each level the few trajectories that brought green and blue nearest to each other are kept. A lane plays one of them
+from the level's start, with some of it drawn anew or moved in time. At its end it takes its place among them if it came
+nearer than they did, and the lane plays another. A search from states draws all anew that comes after the state; here
+what follows a change stays, and an aim is corrected.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
+
+from experts.search.archive import Archive
+from experts.search.config import SearchConfig
+from experts.search.explore import NEARER, patient, with_success
+from experts.search.near import FAR, gap
+from experts.search.play import CODES, Arena, Walk, act, arena, decode, encode, fresh_walk, most_steps
+from experts.search.rows import from_rows, to_rows
+from experts.search.shorten import MOST_HALVINGS, below
+from levelgen.identity.keys import Stream, key_for
+from levelgen.level import ACTIONS, Level
+from levelgen.task.rules import TaskParams
+
+KEPT = 8  # trajectories of a level
+BEYOND = 32  # env steps that are played after the one at which the trajectory that is varied was nearest
+CHANGES = 2  # at most, in a variation
+MOST_MOVED = 8  # env steps by which what follows comes sooner or later
+
+
+class Trajectories(NamedTuple):
+    """Of each level, the nearest to the goal first."""
+
+    code: UInt16[Array, "level kept step"]  # actions from the level's start, each as one number
+    gap: Float[Array, "level kept"]  # m, the least one of green and blue
+    steps: Int[Array, "level kept"]  # env steps until then
+
+
+class Episodes(NamedTuple):
+    """What lanes play."""
+
+    so_far: Trajectories  # a lane in the place of what is kept: all its actions, its least gap until now
+    state: Float[Array, "level lane word"]  # all that evolves (`experts.search.rows`)
+    timestep: Int[Array, "level lane"]
+    most: Int[Array, "level lane"]  # env steps after which it is over
+    over: Bool[Array, "level lane"]
+
+
+class Change(NamedTuple):
+    """Random numbers of one variation."""
+
+    parent: UInt32[Array, "2 *lane"]  # of which the nearer is varied
+    number: UInt32[Array, "*lane"]  # of changes
+    change: UInt32[Array, "change 5 *lane"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Varying:
+    """Levels whose trajectories are varied. The level axis is first, but for the levels themselves."""
+
+    levels: Level  # lane axis last
+    key: Key[Array, " level"]  # of the variations' random stream
+    nearest: Trajectories
+    episodes: Episodes
+    env_steps: Int[Array, " level"]  # of all lanes
+    gap: Float[Array, " level"]  # m, the least one of green and blue so far
+    closed: Int[Array, " level"]  # env steps when it last shrank
+    code: UInt16[Array, "level step"]  # actions of the success, each as one number
+    length: Int[Array, " level"]  # of the success, env steps; 0: there is none
+
+
+@jax.jit
+def nearest_of(archive: Archive) -> Trajectories:
+    """What leads to the entries that are nearest to the goal; after its end the last action goes on."""
+    entry = archive.entry
+    distance = jnp.where(archive.used & ~jnp.isnan(entry.distance), entry.distance, FAR)
+    step = jnp.minimum(jnp.arange(entry.code.shape[-1]), jnp.maximum(entry.steps - 1, 0)[..., None])
+    return first_of(Trajectories(jnp.take_along_axis(entry.code, step, axis=-1), distance, entry.steps))
+
+
+@partial(jax.jit, static_argnames=("config", "rules"))
+def begin(
+    levels: Level,
+    level_ids: Int[Array, " level"],
+    nearest: Trajectories,
+    config: SearchConfig,
+    rules: TaskParams,
+) -> Varying:
+    """Levels of which these trajectories are known, before the first is varied.
+
+    Args:
+        levels: lane axis last.
+        level_ids: their ids, the seeds of all randomness.
+        nearest: of each level.
+        config: how they are searched.
+        rules: of the task.
+    """
+    key = jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, Stream.SEARCH), 4))(level_ids)
+    count, steps = len(level_ids), nearest.code.shape[-1]
+    state = to_rows(arena(levels, config.lanes, (1.0,)).lanes.state).reshape(count, config.lanes, -1)
+    none, of_lane = jnp.zeros(count, jnp.int32), jnp.zeros((count, config.lanes), jnp.int32)
+    so_far = Trajectories(jnp.zeros((*of_lane.shape, steps), jnp.uint16), jnp.full(of_lane.shape, FAR), of_lane)
+    episodes = Episodes(so_far, state, of_lane, of_lane, jnp.ones(of_lane.shape, bool))
+    code = jnp.zeros((count, steps), jnp.uint16)
+    return Varying(levels, key, nearest, episodes, none, nearest.gap[:, 0], none, code, none)
+
+
+@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="varying")
+def vary(varying: Varying, config: SearchConfig, rules: TaskParams) -> Varying:
+    """As many segments as `config.rounds` rounds of a search have. Levels that are done stay as they are."""
+    ring = arena(varying.levels, config.lanes, (1.0,))
+    step = lambda varying, _: (vary_segment(varying, ring, config, rules), None)
+    return jax.lax.scan(step, varying, length=config.rounds * config.stretch)[0]
+
+
+def vary_segment(varying: Varying, ring: Arena, config: SearchConfig, rules: TaskParams) -> Varying:
+    """Lanes whose episodes are over begin another; then all play a segment. `ring` has the levels' lanes."""
+    active = under_way(varying, config)
+    stays = lambda new, old: jnp.where(active.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+    episodes = varying.episodes
+    come = episodes.so_far._replace(gap=jnp.where(episodes.over, episodes.so_far.gap, FAR))
+    nearest = jax.tree.map(stays, first_of(jax.tree.map(together, varying.nearest, come)), varying.nearest)
+
+    change = jax.vmap(partial(drawn, lanes=config.lanes))(varying.key, varying.env_steps)
+    episodes = renewed(episodes, nearest, change, ring, rules)
+    walk, so_far = played(episodes, ring, config, rules)
+    by_level = lambda x: x.reshape(*episodes.over.shape, *x.shape[1:])
+    state, timestep = by_level(to_rows(walk.state)), by_level(walk.timestep)
+    over = by_level(walk.ended) | (timestep >= episodes.most)
+    code = so_far.code.reshape(-1, so_far.code.shape[-1])
+    code, length = with_success(varying.code, varying.length, walk, code, active, rules)
+
+    env_steps = varying.env_steps + jnp.where(active, config.lanes * config.segment, 0)
+    closer = active & (nearest.gap[:, 0] < NEARER * varying.gap)
+    return Varying(
+        levels=varying.levels,
+        key=varying.key,
+        nearest=nearest,
+        episodes=Episodes(so_far, state, timestep, episodes.most, over),
+        env_steps=env_steps,
+        gap=jnp.where(closer, nearest.gap[:, 0], varying.gap),
+        closed=jnp.where(closer, env_steps, varying.closed),
+        code=code,
+        length=length,
+    )
+
+
+def under_way(varying: Varying, config: SearchConfig) -> Bool[Array, " level"]:
+    """Levels without a success that have env steps left and have lately come nearer to the goal."""
+    going = (varying.length == 0) & (varying.env_steps < config.variations)
+    return going & patient(varying.gap, varying.env_steps - varying.closed, config)
+
+
+def together(one: Array, other: Array) -> Array:
+    """Things of each level, one after another."""
+    return jnp.concatenate([one, other], axis=1)
+
+
+def first_of(some: Trajectories) -> Trajectories:
+    """The KEPT nearest ones; of several with the same gap only the first, as far as there are others."""
+    pick = lambda some, order: jax.tree.map(lambda x: jax.vmap(lambda x, order: x[order])(x, order), some)
+    some = pick(some, jnp.argsort(some.gap, axis=-1))
+    again = jnp.pad(some.gap[:, 1:] == some.gap[:, :-1], [(0, 0), (1, 0)])
+    some = some._replace(gap=jnp.where(again, FAR, some.gap))
+    return pick(some, jnp.argsort(some.gap, axis=-1)[:, :KEPT])
+
+
+def drawn(key: Key[Array, ""], env_steps: Int[Array, ""], lanes: int) -> Change:
+    """All the chance in one level's segment."""
+    bits = jax.random.bits(jax.random.fold_in(key, env_steps), (3 + 5 * CHANGES, lanes))
+    return Change(bits[:2], bits[2], bits[3:].reshape(CHANGES, 5, lanes))
+
+
+def renewed(episodes: Episodes, nearest: Trajectories, change: Change, ring: Arena, rules: TaskParams) -> Episodes:
+    """The episodes, in the place of those that are over variations of what is nearest."""
+    kept = jnp.int32(nearest.gap.shape[1])
+    parent = jax.vmap(lambda bits: jnp.minimum(below(bits[0], kept), below(bits[1], kept)))(change.parent)
+    code, steps = (jax.vmap(lambda x, at: x[at])(x, parent) for x in (nearest.code, nearest.steps))
+    live = ring.live.T.reshape(*parent.shape, ACTIONS)
+    by_lane = jax.vmap(varied, (0, 0, -1, 0))
+    so_far = Trajectories(
+        jax.vmap(by_lane)(code, steps, change, live), jnp.full(steps.shape, FAR), jnp.zeros_like(steps)
+    )
+    start = to_rows(ring.lanes.state).reshape(episodes.state.shape)
+    most = jnp.minimum(steps + BEYOND, most_steps(rules))
+    fresh = Episodes(so_far, start, jnp.zeros_like(steps), most, jnp.zeros_like(episodes.over))
+    renew = lambda new, old: jnp.where(episodes.over.reshape(*steps.shape, *[1] * (old.ndim - 2)), new, old)
+    return jax.tree.map(renew, fresh, episodes)
+
+
+def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskParams) -> tuple[Walk, Trajectories]:
+    """Where a segment takes lanes, and how near they came until then."""
+    flat = lambda x: x.reshape(-1, *x.shape[2:])
+    code, least, steps = (flat(x) for x in episodes.so_far)
+    lane, last = jnp.arange(len(code)), code.shape[1] - 1
+
+    def one(now: tuple[Walk, Array, Array], _: None) -> tuple[tuple[Walk, Array, Array], None]:
+        before, least, steps = now
+        action = decode(code[lane, jnp.minimum(before.timestep, last)])
+        walk = act(ring, before, action, rules)
+        apart = gap(ring.goals, walk.state)
+        nearer = ~before.ended & (apart < least)
+        return (walk, jnp.where(nearer, apart, least), jnp.where(nearer, walk.timestep, steps)), None
+
+    walk = fresh_walk(ring.lanes)._replace(
+        state=from_rows(flat(episodes.state), ring.lanes.state), timestep=flat(episodes.timestep)
+    )
+    walk, least, steps = jax.lax.scan(one, (walk, least, steps), length=config.segment)[0]
+    shape = episodes.over.shape
+    return walk, Trajectories(episodes.so_far.code, least.reshape(shape), steps.reshape(shape))
+
+
+def varied(
+    code: UInt16[Array, " step"], steps: Int[Array, ""], change: Change, live: Bool[Array, "6"]
+) -> UInt16[Array, " step"]:
+    """The actions with one change or more before this step: a stretch is drawn anew, or what follows is moved."""
+    first = changed(code, steps, change.change[0], live)
+    for number, bits in enumerate(change.change[1:]):
+        more = (change.number >> number) & 1 == 1
+        first = jnp.where(more, changed(first, steps, bits, live), first)
+    return first
+
+
+def changed(
+    code: UInt16[Array, " step"], steps: Int[Array, ""], bits: UInt32[Array, "5"], live: Bool[Array, "6"]
+) -> UInt16[Array, " step"]:
+    """In half of the cases some live entries are drawn anew for a stretch; else what follows comes sooner or later."""
+    step, length = jnp.arange(len(code)), jnp.maximum(steps, 1)
+    first = below(bits[0], length)
+    stretch = jnp.maximum(length >> below(bits[1], jnp.int32(MOST_HALVINGS + 1)), 1)
+    which = (bits[2][None] >> jnp.arange(ACTIONS, dtype=jnp.uint32)) & 1 == 1
+    fresh = decode((bits[3] % CODES).astype(jnp.uint16))
+    inside = (step >= first) & (step < first + stretch)
+    redrawn = encode(jnp.where(inside & (which & live)[:, None], fresh[:, None], decode(code)))
+    moved = jnp.minimum(stretch, 1 + below(bits[4] >> 2, jnp.int32(MOST_MOVED)))
+    sooner = code[jnp.where(step >= first, jnp.minimum(step + moved, len(code) - 1), step)]
+    later = code[jnp.where(step >= first, jnp.maximum(step - moved, first), step)]
+    kind = bits[4] & 3
+    return jnp.select([kind < 2, kind == 2], [redrawn, sooner], later)

@@ -1,0 +1,215 @@
+"""Varying what came nearest to the goal: near misses become successes, and a level depends on nothing but itself."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experts.search.config import SearchConfig
+from experts.search.explore import NEARER, success_of
+from experts.search.near import FAR, gap
+from experts.search.play import act, arena, decode, encode, fresh_walk
+from experts.search.search import Searching, side_by_side
+from experts.search.vary import (
+    BEYOND,
+    CHANGES,
+    KEPT,
+    Change,
+    Trajectories,
+    Varying,
+    begin,
+    changed,
+    drawn,
+    first_of,
+    under_way,
+    varied,
+    vary,
+)
+from experts.witness import replay, take
+from levelgen.identity.keys import GENERATOR
+from levelgen.level import ACTIONS, MOTOR_BINDINGS, Level
+from levelgen.task.rules import DEFAULT_RULES
+from tests.experts.search.worlds import broken, cannon
+from tests.experts.search.worlds import side_by_side as together
+
+CONFIG = SearchConfig(env_steps=2048, variations=131_072, patience=0, bodies=0, lanes=32, entries=128)
+WIDTH = side_by_side(CONFIG)
+BROKEN = np.arange(WIDTH) % 4 == 3
+IDS = np.arange(40, 40 + WIDTH, dtype=np.int32)
+SEGMENT = CONFIG.lanes * CONFIG.segment  # env steps
+
+
+@cache
+def levels() -> Level:
+    return take(together(cannon(), broken()), BROKEN.astype(int))
+
+
+def misses() -> Trajectories:
+    """Of each level, nothing but a shot into the wall."""
+    action = np.zeros((ACTIONS, 256), int)
+    action[MOTOR_BINDINGS, :8] = 1
+    code = np.broadcast_to(encode(jnp.array(action)), (WIDTH, KEPT, 256)).copy()
+    steps = np.full((WIDTH, KEPT), 48, np.int32)
+    return Trajectories(code, np.full(steps.shape, FAR, np.float32), steps)  # pyright: ignore
+
+
+def begun() -> Varying:
+    return begin(levels(), IDS, misses(), CONFIG, DEFAULT_RULES)
+
+
+@cache
+def ended() -> Varying:
+    now = begun()
+    while np.asarray(under_way(now, CONFIG)).any():
+        now = vary(now, CONFIG, DEFAULT_RULES)
+    return jax.device_get(replace(now, key=jax.random.key_data(now.key)))
+
+
+def test_an_aim_is_corrected() -> None:
+    """What is found replays: the goal at its last step, nothing before. A broken world reaches nothing."""
+    end, length = ended(), ended().length
+    assert (length[~BROKEN] > 0).all()
+    assert (length[BROKEN] == 0).all()
+    assert (end.gap[BROKEN] == FAR).all()
+    success = success_of(jnp.array(end.code), jnp.array(length))
+    at = np.flatnonzero(length)
+    record = replay(take(levels(), at), np.moveaxis(np.asarray(success.action)[at], 0, -1))
+    np.testing.assert_array_equal(np.argmax(record.done, axis=0) + 1, length[at])
+    assert record.goal[length[at] - 1, np.arange(len(at))].all()
+
+
+def test_both_in_turn() -> None:
+    """A search too short to find anything, then variations of what it leaves; each counts its env steps."""
+    searching = Searching(CONFIG, DEFAULT_RULES)
+    sought = searching.submit(levels(), IDS)
+    while searching.step():
+        pass
+    found = searching.result(sought)
+    assert (np.asarray(found.success.length)[~BROKEN] > 0).all()
+    steps = CONFIG.rounds * CONFIG.steps_per_round
+    assert (np.asarray(found.env_steps)[BROKEN] == steps).all()
+    assert (found.varied[BROKEN] >= CONFIG.variations).all()
+    assert (found.varied % SEGMENT == 0).all()
+    assert sought.env_steps == found.env_steps.sum() + found.varied.sum()
+
+
+def test_what_is_kept_is_what_it_says() -> None:
+    """Each trajectory has its gap at its step and no less before; none is kept twice, the nearest comes first."""
+    now = begun()
+    for _ in range(2):
+        now = vary(now, CONFIG, DEFAULT_RULES)
+    nearest = jax.device_get(now.nearest)
+    assert (np.diff(nearest.gap) >= 0).all()
+    assert (np.diff(nearest.gap)[nearest.gap[:, 1:] < FAR] > 0).all()
+    ring = arena(levels(), KEPT, (1.0,))
+    by_lane = jnp.array(nearest.code.reshape(WIDTH * KEPT, -1))
+
+    @jax.jit
+    def gaps() -> jax.Array:
+        def one(walk, code):
+            walk = act(ring, walk, decode(code), DEFAULT_RULES)
+            return walk, gap(ring.goals, walk.state)
+
+        return jax.lax.scan(one, fresh_walk(ring.lanes), by_lane.T)[1]
+
+    seen, steps = np.asarray(gaps()).reshape(256, WIDTH, KEPT), nearest.steps
+    for level, kept in np.argwhere(nearest.gap < FAR):
+        until = seen[: steps[level, kept], level, kept]
+        np.testing.assert_allclose(until[-1], nearest.gap[level, kept], rtol=1e-5)  # another program rounds otherwise
+        assert until[-1] <= until.min() * (1 + 1e-5)
+    assert (now.gap <= np.maximum(nearest.gap[:, 0] / NEARER, nearest.gap[:, 0])).all()
+
+
+def test_a_level_alone_gives_what_it_gives_among_others() -> None:
+    """In another row, beside others."""
+    order = np.roll(np.arange(WIDTH), 1)
+    now = begin(take(levels(), order), IDS[order], misses(), CONFIG, DEFAULT_RULES)
+    for _ in range(3):
+        now = vary(now, CONFIG, DEFAULT_RULES)
+    straight = begun()
+    for _ in range(3):
+        straight = vary(straight, CONFIG, DEFAULT_RULES)
+    of = lambda now: jax.device_get((now.nearest, now.env_steps, now.gap, now.closed, now.code, now.length))
+    jax.tree.map(lambda one, other: np.testing.assert_array_equal(one, other[order]), of(now), of(straight))
+
+
+def test_an_interruption_changes_nothing() -> None:
+    """To the host and back, as a row that others enter."""
+    once = vary(begun(), CONFIG, DEFAULT_RULES)
+    plain = jax.tree.map(np.array, replace(once, key=jax.random.key_data(once.key)))
+    back = jax.tree.map(jnp.array, plain)
+    resumed = vary(replace(back, key=jax.random.wrap_key_data(back.key, impl=GENERATOR)), CONFIG, DEFAULT_RULES)
+    twice = vary(vary(begun(), CONFIG, DEFAULT_RULES), CONFIG, DEFAULT_RULES)
+    bits = lambda now: jax.device_get(replace(now, key=jax.random.key_data(now.key)))
+    jax.tree.map(np.testing.assert_array_equal, bits(resumed), bits(twice))
+
+
+def test_env_steps_end_it() -> None:
+    """Every lane's are counted, in whole segments, until there is a success or none are left."""
+    end, call = ended(), SEGMENT * CONFIG.rounds * CONFIG.stretch
+    assert (end.env_steps[BROKEN] >= CONFIG.variations).all()
+    assert (end.env_steps[BROKEN] < CONFIG.variations + call).all()
+    assert (end.env_steps[~BROKEN] < CONFIG.variations).all()
+    assert (end.closed <= end.env_steps).all()
+    impatient = replace(CONFIG, patience=16_384)
+    now = replace(begun(), closed=jnp.full(WIDTH, 1024), env_steps=jnp.full(WIDTH, 1024 + 16_384))
+    assert not under_way(now, impatient).any()
+    assert under_way(now, CONFIG).all()
+
+
+def test_no_chance_twice() -> None:
+    """Segments and levels draw their own."""
+    keys = begun().key
+    some = [drawn(keys[level], jnp.int32(steps), 8) for level in (0, 1) for steps in (0, SEGMENT)]
+    for numbers in zip(*some, strict=True):
+        assert len({np.asarray(x).tobytes() for x in numbers}) == len(some)
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 3])
+def test_a_change_stays_before_the_nearest_step(kind: int) -> None:
+    """What is before it and dead entries stay; a redrawn stretch is one action, what is moved comes as it was."""
+    rng = np.random.default_rng(kind)
+    live = np.array([True, False, True, False, True, False])
+    action = np.where(live[:, None], rng.integers(2, size=(ACTIONS, 256)), 0)
+    code, steps = encode(jnp.array(action)), 60
+    change = jax.jit(changed)
+    for _ in range(20):
+        bits = rng.integers(2**32, size=5, dtype=np.uint32)
+        bits[4] = (bits[4] & ~np.uint32(3)) | np.uint32(kind)
+        after = np.asarray(change(code, jnp.int32(steps), jnp.array(bits), jnp.array(live)))
+        first = int(bits[0] % steps)
+        np.testing.assert_array_equal(after[:first], code[:first])
+        assert (np.asarray(decode(jnp.array(after)))[~live] == 0).all()
+        if kind < 2:
+            new = np.unique(after[after != code])
+            assert len(new) <= 2 ** int(live.sum())
+        elif kind == 2:
+            assert any((after[first : 256 - by] == code[first + by :]).all() for by in range(1, 9))
+        else:
+            assert any((after[first + by :] == code[first : 256 - by]).all() for by in range(1, 9))
+
+
+def test_a_variation_has_a_change_or_more() -> None:
+    """As many as its number says."""
+    code, live = jnp.zeros(256, jnp.uint16), jnp.ones(ACTIONS, bool)
+    bits = np.full((CHANGES, 5), 0, np.uint32)
+    bits[:, 2], bits[:, 3] = 63, 5  # all entries, to another action
+    bits[1:, 0] = 40  # the others begin later
+    one, both = (varied(code, jnp.int32(60), Change(bits[:2, 0], jnp.uint32(n), bits), live) for n in (0, 1))  # pyright: ignore
+    assert (np.asarray(one)[:60] == 5).all()
+    assert (np.asarray(one)[60:] == 0).all()
+    assert (np.asarray(both)[60:100] == 5).all()
+
+
+def test_only_the_nearest_stay() -> None:
+    """Of several with the same gap the first, and the others only where there is room."""
+    gaps = np.array([[0.5, 0.25, 0.5, 0.25, 1.0] + [0.5] * (KEPT - 1)], np.float32)
+    count = gaps.shape[1]
+    some = Trajectories(np.zeros((1, count, 8), np.uint16), gaps, np.arange(count)[None])  # pyright: ignore
+    kept = first_of(some)
+    np.testing.assert_array_equal(kept.steps[0, :3], [1, 0, 4])
+    assert kept.gap.shape == (1, KEPT)
+    assert BEYOND > 0
