@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
 from experts.config import RECORD_STEPS
@@ -21,6 +22,18 @@ from physics.step import step
 from physics.types import State
 
 CODES = math.prod(CHOICES)  # different actions
+
+
+def _without() -> UInt16[np.ndarray, "entries code"]:
+    """Each action with some of its entries 0: those whose bit is set in the first index."""
+    entry, code = np.array(np.unravel_index(np.arange(CODES), CHOICES)), np.empty((1 << ACTIONS, CODES), np.uint16)
+    for entries in range(1 << ACTIONS):
+        zero = (entries >> np.arange(ACTIONS)) & 1 == 1
+        code[entries] = np.ravel_multi_index(tuple(np.where(zero[:, None], 0, entry)), CHOICES)
+    return code
+
+
+WITHOUT = _without()
 
 
 class Arena(NamedTuple):

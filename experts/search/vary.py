@@ -18,7 +18,7 @@ from experts.search.archive import Archive
 from experts.search.config import SearchConfig
 from experts.search.explore import NEARER, patient, with_success
 from experts.search.near import FAR, gap
-from experts.search.play import CODES, Arena, Walk, act, arena, decode, encode, fresh_walk, most_steps
+from experts.search.play import CODES, WITHOUT, Arena, Walk, act, arena, decode, fresh_walk, most_steps
 from experts.search.rows import from_rows, to_rows
 from experts.search.shorten import MOST_HALVINGS, below
 from levelgen.identity.keys import Stream, key_for
@@ -26,7 +26,7 @@ from levelgen.level import ACTIONS, Level
 from levelgen.task.rules import TaskParams
 
 KEPT = 8  # trajectories of a level
-BEYOND = 32  # env steps that are played after the one at which the trajectory that is varied was nearest
+BEYOND = 16  # env steps, at least, that are played after the one at which the trajectory that is varied was nearest
 CHANGES = 2  # at most, in a variation
 MOST_MOVED = 8  # env steps by which what follows comes sooner or later
 
@@ -111,14 +111,14 @@ def begin(
 
 @partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="varying")
 def vary(varying: Varying, config: SearchConfig, rules: TaskParams) -> Varying:
-    """As many segments as `config.rounds` rounds of a search have. Levels that are done stay as they are."""
+    """`config.rounds` rounds. What is known of levels that are done stays as it is."""
     ring = arena(varying.levels, config.lanes, (1.0,))
-    step = lambda varying, _: (vary_segment(varying, ring, config, rules), None)
-    return jax.lax.scan(step, varying, length=config.rounds * config.stretch)[0]
+    step = lambda varying, _: (vary_round(varying, ring, config, rules), None)
+    return jax.lax.scan(step, varying, length=config.rounds)[0]
 
 
-def vary_segment(varying: Varying, ring: Arena, config: SearchConfig, rules: TaskParams) -> Varying:
-    """Lanes whose episodes are over begin another; then all play a segment. `ring` has the levels' lanes."""
+def vary_round(varying: Varying, ring: Arena, config: SearchConfig, rules: TaskParams) -> Varying:
+    """Lanes whose episodes are over begin another; then all play on. `ring` has the levels' lanes."""
     active = under_way(varying, config)
     stays = lambda new, old: jnp.where(active.reshape(-1, *[1] * (old.ndim - 1)), new, old)
     episodes = varying.episodes
@@ -134,7 +134,7 @@ def vary_segment(varying: Varying, ring: Arena, config: SearchConfig, rules: Tas
     code = so_far.code.reshape(-1, so_far.code.shape[-1])
     code, length = with_success(varying.code, varying.length, walk, code, active, rules)
 
-    env_steps = varying.env_steps + jnp.where(active, config.lanes * config.segment, 0)
+    env_steps = varying.env_steps + jnp.where(active, config.steps_per_round, 0)
     closer = active & (nearest.gap[:, 0] < NEARER * varying.gap)
     return Varying(
         levels=varying.levels,
@@ -162,15 +162,18 @@ def together(one: Array, other: Array) -> Array:
 
 def first_of(some: Trajectories) -> Trajectories:
     """The KEPT nearest ones; of several with the same gap only the first, as far as there are others."""
-    pick = lambda some, order: jax.tree.map(lambda x: jax.vmap(lambda x, order: x[order])(x, order), some)
-    some = pick(some, jnp.argsort(some.gap, axis=-1))
-    again = jnp.pad(some.gap[:, 1:] == some.gap[:, :-1], [(0, 0), (1, 0)])
-    some = some._replace(gap=jnp.where(again, FAR, some.gap))
-    return pick(some, jnp.argsort(some.gap, axis=-1)[:, :KEPT])
+    order = jnp.argsort(some.gap, axis=-1)
+    gaps = jnp.take_along_axis(some.gap, order, axis=-1)
+    again = jnp.pad(gaps[:, 1:] == gaps[:, :-1], [(0, 0), (1, 0)])
+    gaps = jnp.where(again, FAR, gaps)
+    first = jnp.argsort(gaps, axis=-1)[:, :KEPT]
+    of = lambda x, order: jax.vmap(lambda x, order: x[order])(x, order)
+    kept = jax.tree.map(lambda x: of(x, of(order, first)), some)
+    return kept._replace(gap=of(gaps, first))
 
 
 def drawn(key: Key[Array, ""], env_steps: Int[Array, ""], lanes: int) -> Change:
-    """All the chance in one level's segment."""
+    """All the chance in one level's round."""
     bits = jax.random.bits(jax.random.fold_in(key, env_steps), (3 + 5 * CHANGES, lanes))
     return Change(bits[:2], bits[2], bits[3:].reshape(CHANGES, 5, lanes))
 
@@ -193,7 +196,7 @@ def renewed(episodes: Episodes, nearest: Trajectories, change: Change, ring: Are
 
 
 def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskParams) -> tuple[Walk, Trajectories]:
-    """Where a segment takes lanes, and how near they came until then."""
+    """Where a round takes lanes, and how near they came until then."""
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     code, least, steps = (flat(x) for x in episodes.so_far)
     lane, last = jnp.arange(len(code)), code.shape[1] - 1
@@ -209,7 +212,7 @@ def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskPar
     walk = fresh_walk(ring.lanes)._replace(
         state=from_rows(flat(episodes.state), ring.lanes.state), timestep=flat(episodes.timestep)
     )
-    walk, least, steps = jax.lax.scan(one, (walk, least, steps), length=config.segment)[0]
+    walk, least, steps = jax.lax.scan(one, (walk, least, steps), length=config.stretch * config.segment)[0]
     shape = episodes.over.shape
     return walk, Trajectories(episodes.so_far.code, least.reshape(shape), steps.reshape(shape))
 
@@ -232,12 +235,13 @@ def changed(
     step, length = jnp.arange(len(code)), jnp.maximum(steps, 1)
     first = below(bits[0], length)
     stretch = jnp.maximum(length >> below(bits[1], jnp.int32(MOST_HALVINGS + 1)), 1)
-    which = (bits[2][None] >> jnp.arange(ACTIONS, dtype=jnp.uint32)) & 1 == 1
-    fresh = decode((bits[3] % CODES).astype(jnp.uint16))
-    inside = (step >= first) & (step < first + stretch)
-    redrawn = encode(jnp.where(inside & (which & live)[:, None], fresh[:, None], decode(code)))
+    after, kind = step >= first, bits[4] & 3
+
     moved = jnp.minimum(stretch, 1 + below(bits[4] >> 2, jnp.int32(MOST_MOVED)))
-    sooner = code[jnp.where(step >= first, jnp.minimum(step + moved, len(code) - 1), step)]
-    later = code[jnp.where(step >= first, jnp.maximum(step - moved, first), step)]
-    kind = bits[4] & 3
-    return jnp.select([kind < 2, kind == 2], [redrawn, sooner], later)
+    sooner, later = jnp.minimum(step + moved, len(code) - 1), jnp.maximum(step - moved, first)
+    code = code[jnp.where(after & (kind == 2), sooner, jnp.where(after & (kind == 3), later, step))]
+
+    entries = (live * (1 << jnp.arange(ACTIONS))).sum() & bits[2].astype(jnp.int32)
+    rest, fresh = jnp.array(WITHOUT)[entries], (bits[3] % CODES).astype(jnp.int32)
+    drawn = fresh.astype(jnp.uint16) - rest[fresh]
+    return jnp.where(after & (step < first + stretch) & (kind < 2), rest[code] + drawn, code)

@@ -39,7 +39,7 @@ CONFIG = SearchConfig(env_steps=2048, variations=131_072, patience=0, bodies=0, 
 WIDTH = side_by_side(CONFIG)
 BROKEN = np.arange(WIDTH) % 4 == 3
 IDS = np.arange(40, 40 + WIDTH, dtype=np.int32)
-SEGMENT = CONFIG.lanes * CONFIG.segment  # env steps
+ROUND = CONFIG.steps_per_round  # env steps
 
 
 @cache
@@ -92,7 +92,7 @@ def test_both_in_turn() -> None:
     steps = CONFIG.rounds * CONFIG.steps_per_round
     assert (np.asarray(found.env_steps)[BROKEN] == steps).all()
     assert (found.varied[BROKEN] >= CONFIG.variations).all()
-    assert (found.varied % SEGMENT == 0).all()
+    assert (found.varied % ROUND == 0).all()
     assert sought.env_steps == found.env_steps.sum() + found.varied.sum()
 
 
@@ -148,8 +148,8 @@ def test_an_interruption_changes_nothing() -> None:
 
 
 def test_env_steps_end_it() -> None:
-    """Every lane's are counted, in whole segments, until there is a success or none are left."""
-    end, call = ended(), SEGMENT * CONFIG.rounds * CONFIG.stretch
+    """Every lane's are counted, in whole rounds, until there is a success or none are left."""
+    end, call = ended(), ROUND * CONFIG.rounds
     assert (end.env_steps[BROKEN] >= CONFIG.variations).all()
     assert (end.env_steps[BROKEN] < CONFIG.variations + call).all()
     assert (end.env_steps[~BROKEN] < CONFIG.variations).all()
@@ -161,9 +161,9 @@ def test_env_steps_end_it() -> None:
 
 
 def test_no_chance_twice() -> None:
-    """Segments and levels draw their own."""
+    """Rounds and levels draw their own."""
     keys = begun().key
-    some = [drawn(keys[level], jnp.int32(steps), 8) for level in (0, 1) for steps in (0, SEGMENT)]
+    some = [drawn(keys[level], jnp.int32(steps), 8) for level in (0, 1) for steps in (0, ROUND)]
     for numbers in zip(*some, strict=True):
         assert len({np.asarray(x).tobytes() for x in numbers}) == len(some)
 
