@@ -19,6 +19,7 @@ from PIL import Image
 
 from benchmarks import oracle
 from benchmarks.alone import label
+from benchmarks.falls import fall
 from benchmarks.report import Report, Table
 from benchmarks.solved.variants import VARIANTS
 from configs.compose import compose_job
@@ -40,6 +41,14 @@ PPO_TOLD = {"PPO: first success": "steps_to_first_success", "PPO: steps to goal"
 SIDE_BY_SIDE = 8  # levels on which the reference's PPO is trained together
 PLOT = "handmade.png"
 COLUMNS, PIXELS = 8, 130  # of the sheet; width of a picture
+FALLS = (
+    "level",
+    "size",
+    "weight of green, N",
+    "lift of its thrusters at most, N",
+    "env steps until red",
+    "covers x, m",
+)
 HEAD = ("level", "size", "label", "seconds", *KINDS, "witness", "steps to goal", *PPO_TOLD)
 
 
@@ -68,7 +77,11 @@ def run(given: argparse.Namespace) -> Report:
     return Report(
         "The reference's handmade levels",
         results,
-        [Table(HEAD, rows), Table(sizes, totals(results), "By size")],
+        [
+            Table(HEAD, rows),
+            Table(sizes, totals(results), "By size"),
+            Table(FALLS, falls(job, listing.levels, given.size), "Levels in which green can only fall onto red"),
+        ],
         notes=[
             "Each level is labelled alone, on one core, by the default procedure, with up to "
             f"`search.env_steps={given.search}`; seconds are without compiling. The "
@@ -79,10 +92,12 @@ def run(given: argparse.Namespace) -> Report:
             "[solved.md](solved.md), which has it beside the reference's own environment, where this would take some "
             "eight hours of a core. It solves a level if its last evaluation has a witness; *first success* are env "
             "steps of training until then.",
-            "No level is known to be out of reach, but [tried.md](../tried.md) tells why some look so: in "
-            "`h8_maze_2`, `h11_obstacle_avoidance`, `h12_platformer_1`, `h13_platformer_2` and `h16_thruster_goal` "
-            "thrusters give about half the weight of what they have to lift, and in `hard_beam_balance`, "
-            "`hard_cartpole_thrust` and `hard_cartpole_wheels` blue is more than a metre above what can reach it.",
+            "In the levels of the last table no actions reach the goal: green is a circle that its thrusters cannot "
+            "turn, they lift less than it weighs, and all it can cover before it lies on the red floor meets nothing "
+            "that is not red (`benchmarks/falls.py`). In `h12_platformer_1` and `h13_platformer_2` the thrusters lift "
+            "half of the weight, too, and what green can reach before red is one side of a shelf, below its edge. In "
+            "`hard_beam_balance`, `hard_cartpole_thrust` and `hard_cartpole_wheels` blue is more than a metre above "
+            "what can reach it ([tried.md](../tried.md)).",
             f"![The solved levels when their witnesses reach the goal]({PLOT})",
         ],
         plots={PLOT: lambda path: write_sheet(solved, path)} if solved else {},
@@ -112,6 +127,17 @@ def labelled(job: JobConfig, origins: dict[int, Origin]) -> tuple[list[dict[str,
             pictures.append(picture_of(result, verdict.steps_to_goal - 1, Path(origin.file).stem))
         oracle.tell(f"{of_level['level']}: {of_level['label']}, {of_level['seconds']:.1f} s")
     return results, pictures
+
+
+def falls(job: JobConfig, levels: Mapping[str, Mapping[int, Origin]], sizes: Sequence[str]) -> list[list[str]]:
+    """A row for each level whose green can only fall."""
+    rows = []
+    for origin in (origin for size in sizes for origin in levels[size].values()):
+        if what := fall(level_at(origin), job.task):
+            numbers = f"{what.weight:.2f}", f"{what.lift:.2f}", str(what.env_steps)
+            left, right = what.reach
+            rows.append([Path(origin.file).stem, origin.size, *numbers, f"{left:.2f} to {right:.2f}"])
+    return rows
 
 
 def ppo(origins: Mapping[int, Origin], folder: Path) -> list[dict[str, Any]]:
