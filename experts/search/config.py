@@ -15,7 +15,7 @@ class SearchConfig:
     """Settings of a search (hashable: pass as a static argument)."""
 
     env_steps: int = 1_048_576  # of one level, all lanes together; rounded up to whole rounds; 0: none
-    bodies: int = 11  # of a world that is searched so long; of more, fewer env steps, as the square of their number
+    bodies: int = 10  # of a world that is searched so long; of more, fewer env steps, as the square of their number
     variations: int = 524_288  # env steps in which what came nearest to the goal is varied, after that; 0: none
     patience: int = 262_144  # env steps of either after which a level leaves that comes no nearer to the goal; 0: none
     near: float = 0.2  # m, the gap of green and blue up to which patience is that long; of twice the gap, half as long
