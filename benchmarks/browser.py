@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pipeline.errors import Failure
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser  # pyright: ignore[reportMissingImports]
 
 VARIABLE = "LEVELPROOF_CHROMIUM"  # a Chromium, if it is not on the path
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -27,7 +27,7 @@ def browser() -> "Iterator[Browser]":
     if not program:
         raise Failure(f"there is no Chromium: install Debian's package chromium, or name a program in {VARIABLE}.")
     try:
-        from playwright.sync_api import sync_playwright
+        from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise Failure("there is no Playwright: pip install playwright.") from None
     with sync_playwright() as driver:

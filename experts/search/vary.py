@@ -31,7 +31,7 @@ CHANGES = 2  # at most, in a variation
 MOST_MOVED = 8  # env steps by which what follows comes sooner or later
 
 
-class Trajectories(NamedTuple):
+class Approaches(NamedTuple):
     """Of each level, the nearest to the goal first."""
 
     code: UInt16[Array, "level kept step"]  # actions from the level's start, each as one number
@@ -42,7 +42,7 @@ class Trajectories(NamedTuple):
 class Episodes(NamedTuple):
     """What lanes play."""
 
-    so_far: Trajectories  # a lane in the place of what is kept: all its actions, its least gap until now
+    so_far: Approaches  # a lane in the place of what is kept: all its actions, its least gap until now
     state: Float[Array, "level lane word"]  # all that evolves (`experts.search.rows`)
     timestep: Int[Array, "level lane"]
     most: Int[Array, "level lane"]  # env steps after which it is over
@@ -64,7 +64,7 @@ class Varying:
 
     levels: Level  # lane axis last
     key: Key[Array, " level"]  # of the variations' random stream
-    nearest: Trajectories
+    nearest: Approaches
     episodes: Episodes
     env_steps: Int[Array, " level"]  # of all lanes
     gap: Float[Array, " level"]  # m, the least one of green and blue so far
@@ -74,19 +74,19 @@ class Varying:
 
 
 @jax.jit
-def nearest_of(archive: Archive) -> Trajectories:
+def nearest_of(archive: Archive) -> Approaches:
     """What leads to the entries that are nearest to the goal; after its end the last action goes on."""
     entry = archive.entry
     distance = jnp.where(archive.used & ~jnp.isnan(entry.distance), entry.distance, FAR)
     step = jnp.minimum(jnp.arange(entry.code.shape[-1]), jnp.maximum(entry.steps - 1, 0)[..., None])
-    return first_of(Trajectories(jnp.take_along_axis(entry.code, step, axis=-1), distance, entry.steps))
+    return first_of(Approaches(jnp.take_along_axis(entry.code, step, axis=-1), distance, entry.steps))
 
 
 @partial(jax.jit, static_argnames=("config", "rules"))
 def begin(
     levels: Level,
     level_ids: Int[Array, " level"],
-    nearest: Trajectories,
+    nearest: Approaches,
     config: SearchConfig,
     rules: TaskParams,
 ) -> Varying:
@@ -103,7 +103,7 @@ def begin(
     count, steps = len(level_ids), nearest.code.shape[-1]
     state = to_rows(arena(levels, config.lanes, (1.0,)).lanes.state).reshape(count, config.lanes, -1)
     none, of_lane = jnp.zeros(count, jnp.int32), jnp.zeros((count, config.lanes), jnp.int32)
-    so_far = Trajectories(jnp.zeros((*of_lane.shape, steps), jnp.uint16), jnp.full(of_lane.shape, FAR), of_lane)
+    so_far = Approaches(jnp.zeros((*of_lane.shape, steps), jnp.uint16), jnp.full(of_lane.shape, FAR), of_lane)
     episodes = Episodes(so_far, state, of_lane, of_lane, jnp.ones(of_lane.shape, bool))
     code = jnp.zeros((count, steps), jnp.uint16)
     return Varying(levels, key, nearest, episodes, none, nearest.gap[:, 0], none, code, none)
@@ -160,7 +160,7 @@ def together(one: Array, other: Array) -> Array:
     return jnp.concatenate([one, other], axis=1)
 
 
-def first_of(some: Trajectories) -> Trajectories:
+def first_of(some: Approaches) -> Approaches:
     """The KEPT nearest ones; of several with the same gap only the first, as far as there are others."""
     order = jnp.argsort(some.gap, axis=-1)
     gaps = jnp.take_along_axis(some.gap, order, axis=-1)
@@ -178,16 +178,14 @@ def drawn(key: Key[Array, ""], env_steps: Int[Array, ""], lanes: int) -> Change:
     return Change(bits[:2], bits[2], bits[3:].reshape(CHANGES, 5, lanes))
 
 
-def renewed(episodes: Episodes, nearest: Trajectories, change: Change, ring: Arena, rules: TaskParams) -> Episodes:
+def renewed(episodes: Episodes, nearest: Approaches, change: Change, ring: Arena, rules: TaskParams) -> Episodes:
     """The episodes, in the place of those that are over variations of what is nearest."""
     kept = jnp.int32(nearest.gap.shape[1])
     parent = jax.vmap(lambda bits: jnp.minimum(below(bits[0], kept), below(bits[1], kept)))(change.parent)
     code, steps = (jax.vmap(lambda x, at: x[at])(x, parent) for x in (nearest.code, nearest.steps))
     live = ring.live.T.reshape(*parent.shape, ACTIONS)
     by_lane = jax.vmap(varied, (0, 0, -1, 0))
-    so_far = Trajectories(
-        jax.vmap(by_lane)(code, steps, change, live), jnp.full(steps.shape, FAR), jnp.zeros_like(steps)
-    )
+    so_far = Approaches(jax.vmap(by_lane)(code, steps, change, live), jnp.full(steps.shape, FAR), jnp.zeros_like(steps))
     start = to_rows(ring.lanes.state).reshape(episodes.state.shape)
     most = jnp.minimum(steps + BEYOND, most_steps(rules))
     fresh = Episodes(so_far, start, jnp.zeros_like(steps), most, jnp.zeros_like(episodes.over))
@@ -195,7 +193,7 @@ def renewed(episodes: Episodes, nearest: Trajectories, change: Change, ring: Are
     return jax.tree.map(renew, fresh, episodes)
 
 
-def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskParams) -> tuple[Walk, Trajectories]:
+def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskParams) -> tuple[Walk, Approaches]:
     """Where a round takes lanes, and how near they came until then."""
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     code, least, steps = (flat(x) for x in episodes.so_far)
@@ -214,7 +212,7 @@ def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskPar
     )
     walk, least, steps = jax.lax.scan(one, (walk, least, steps), length=config.stretch * config.segment)[0]
     shape = episodes.over.shape
-    return walk, Trajectories(episodes.so_far.code, least.reshape(shape), steps.reshape(shape))
+    return walk, Approaches(episodes.so_far.code, least.reshape(shape), steps.reshape(shape))
 
 
 def varied(

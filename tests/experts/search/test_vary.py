@@ -17,8 +17,8 @@ from experts.search.vary import (
     BEYOND,
     CHANGES,
     KEPT,
+    Approaches,
     Change,
-    Trajectories,
     Varying,
     begin,
     changed,
@@ -47,13 +47,13 @@ def levels() -> Level:
     return take(together(cannon(), broken()), BROKEN.astype(int))
 
 
-def misses() -> Trajectories:
+def misses() -> Approaches:
     """Of each level, nothing but a shot into the wall."""
     action = np.zeros((ACTIONS, 256), int)
     action[MOTOR_BINDINGS, :8] = 1
     code = np.broadcast_to(encode(jnp.array(action)), (WIDTH, KEPT, 256)).copy()
     steps = np.full((WIDTH, KEPT), 48, np.int32)
-    return Trajectories(code, np.full(steps.shape, FAR, np.float32), steps)  # pyright: ignore
+    return Approaches(code, np.full(steps.shape, FAR, np.float32), steps)  # pyright: ignore
 
 
 def begun() -> Varying:
@@ -208,7 +208,7 @@ def test_only_the_nearest_stay() -> None:
     """Of several with the same gap the first, and the others only where there is room."""
     gaps = np.array([[0.5, 0.25, 0.5, 0.25, 1.0] + [0.5] * (KEPT - 1)], np.float32)
     count = gaps.shape[1]
-    some = Trajectories(np.zeros((1, count, 8), np.uint16), gaps, np.arange(count)[None])  # pyright: ignore
+    some = Approaches(np.zeros((1, count, 8), np.uint16), gaps, np.arange(count)[None])  # pyright: ignore
     kept = first_of(some)
     np.testing.assert_array_equal(kept.steps[0, :3], [1, 0, 4])
     assert kept.gap.shape == (1, KEPT)
