@@ -23,6 +23,7 @@ from benchmarks.falls import fall
 from benchmarks.report import Report, Table
 from benchmarks.solved.variants import VARIANTS
 from configs.compose import compose_job
+from configs.numbers import parse_count
 from configs.schema import JobConfig
 from experts.labels import WITNESSED, Verdict
 from experts.train import UnitResult
@@ -55,14 +56,21 @@ HEAD = ("level", "size", "label", "seconds", *KINDS, "witness", "steps to goal",
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=SIZES, default=list(SIZES), help="default: all")
     parser.add_argument("--budget", default="256k", help="env steps an expert may use (default: 256k)")
-    parser.add_argument("--search", default="16M", help="search.env_steps (default: 16M, as the levels are few)")
+    parser.add_argument(
+        "--search",
+        default="16M",
+        help="search.env_steps; patience half of it, variations a quarter (default: 16M, as the levels are few)",
+    )
 
 
 def run(given: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
     python = oracle.oracle_python()
     folder = oracle.handmade_levels(python)
-    job = compose_job([f"level_files={folder}", f"budget={given.budget}", f"search.env_steps={given.search}"])
+    most = parse_count(given.search, "--search")
+    longer = {"env_steps": most, "patience": most // 2, "variations": most // 4}
+    words = [f"search.{name}={steps}" for name, steps in longer.items()]
+    job = compose_job([f"level_files={folder}", f"budget={given.budget}", *words])
     listing = levels_below(folder, job)
     if listing.refused:
         raise UserError(listing.refused[0])
@@ -84,8 +92,9 @@ def run(given: argparse.Namespace) -> Report:
         ],
         notes=[
             "Each level is labelled alone, on one core, by the default procedure, with up to "
-            f"`search.env_steps={given.search}`; seconds are without compiling. The "
-            "slots beside its expert are empty, so a job that labels many levels takes fewer seconds for each. The "
+            f"`search.env_steps={given.search}`, half as much patience and a quarter as many variations; seconds are "
+            "without compiling. The slots beside its expert are empty, so a job that labels many levels takes fewer "
+            "seconds for each. The "
             "columns named after them are env steps.",
             f"*PPO*: the reference's hyperparameters for {PPO.expert.updates_in(PPO_BUDGET):,} updates of "
             f"{PPO.expert.steps_per_update:,} env steps, on our engine: the variant `reference` of "
