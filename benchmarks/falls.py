@@ -54,7 +54,8 @@ def fall(level: Level, rules: TaskParams) -> Fall | None:
     if most[1] >= 0:
         return None
 
-    start, floor = state.position[body, :, 0], boxes(level)[0]
+    start, covered = state.position[body, :, 0], boxes(level)
+    floor = covered[0]
     step = np.arange(1, LONGEST + 1)
     way = physics.dt**2 * step * (step + 1) / 2  # of semi-implicit Euler, for each m/s^2
     on_floor = start[1] + most[1] * way - radius < floor[1, 1] - MARGIN
@@ -63,7 +64,7 @@ def fall(level: Level, rules: TaskParams) -> Fall | None:
     last = int(np.argmax(on_floor))
     left, right = start[0] + min(least[0], 0) * way[last] - radius, start[0] + max(most[0], 0) * way[last] + radius
     swept = np.array([[left - MARGIN, right + MARGIN], [-np.inf, start[1] + radius + MARGIN]])
-    for other, box in enumerate(boxes(level)):
+    for other, box in enumerate(covered):
         meets = (box[:, 0] <= swept[:, 1]).all() and (swept[:, 0] <= box[:, 1]).all()
         if m.active[other, 0] and other != body and role[other] != Role.RED and meets:
             return None

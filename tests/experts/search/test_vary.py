@@ -14,7 +14,6 @@ from experts.search.near import FAR, gap
 from experts.search.play import act, arena, decode, encode, fresh_walk
 from experts.search.search import Searching, side_by_side
 from experts.search.vary import (
-    BEYOND,
     CHANGES,
     KEPT,
     Approaches,
@@ -212,4 +211,3 @@ def test_only_the_nearest_stay() -> None:
     kept = first_of(some)
     np.testing.assert_array_equal(kept.steps[0, :3], [1, 0, 4])
     assert kept.gap.shape == (1, KEPT)
-    assert BEYOND > 0
