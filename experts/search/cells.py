@@ -14,29 +14,24 @@ FARTHEST = 1e6  # cells from the start
 
 
 def features(level: Level, state: State, config: SearchConfig) -> Float[Array, "lane feature"]:
-    """Metres that tell states apart."""
+    """Metres that tell states apart: where bodies are, and how they are turned.
+
+    Not how fast they are: in a world of many bodies that fills the archive with states that differ in nothing else.
+    """
     model, moving = level.model, slice(FIXED_POLYGONS, None)
     turns = (model.inverse_inertia > 0) & (model.inverse_mass > 0)
     arm = jnp.sqrt(jnp.where(turns, model.inverse_mass / jnp.where(turns, model.inverse_inertia, 1.0), 0.0))
     turned, place = state.rotation - level.state.rotation, state.position - level.state.position
     angle = turned - TURN * jnp.round(turned / TURN)
-    seconds, weight = config.velocity_seconds, weights(level, config)
-    rows = [
-        place[:, 0] * weight,
-        place[:, 1] * weight,
-        angle * arm * weight,
-        state.velocity[:, 0] * weight * seconds,
-        state.velocity[:, 1] * weight * seconds,
-        state.angular_velocity * arm * weight * seconds,
-    ]
-    return jnp.concatenate([row[moving] for row in (rows if seconds else rows[:3])]).T
+    weight = weights(level, config)
+    rows = place[:, 0] * weight, place[:, 1] * weight, angle * arm * weight
+    return jnp.concatenate([row[moving] for row in rows]).T
 
 
 def weights(level: Level, config: SearchConfig) -> Float[Array, "body lane"]:
     goal = (level.role == Role.GREEN) | (level.role == Role.BLUE)
     moves = level.model.active & (level.model.inverse_mass + level.model.inverse_inertia > 0)
-    weight = jnp.select([goal, driven(level)], [1.0, config.driven_weight], config.other_weight)
-    return jnp.where(moves, weight, 0.0)
+    return jnp.where(moves, jnp.where(driven(level) & ~goal, config.driven_weight, 1.0), 0.0)
 
 
 def cell_key(feature: Float[Array, "thing feature"], width: Float[Array, ""]) -> UInt32[Array, " thing"]:

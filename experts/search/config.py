@@ -15,12 +15,11 @@ class SearchConfig:
     """Settings of a search (hashable: pass as a static argument)."""
 
     env_steps: int = 1_048_576  # of one level, all lanes together; rounded up to whole rounds; 0: none
-    bodies: int = 10  # of a world that is searched so long; of more, fewer env steps, as the square of their number
-    variations: int = 524_288  # env steps in which what came nearest to the goal is varied, after that; 0: none
-    patience: int = 262_144  # env steps of either after which a level leaves that comes no nearer to the goal; 0: none
-    near: float = 0.2  # m, the gap of green and blue up to which patience is that long; of twice the gap, half as long
-    first_rung: int = 16_384  # env steps at the first rung, and the least patience; each is four times the one before
-    per_cell: int = 256  # env steps for each cell reached, above which a level leaves at a rung; 0: none leaves
+    bodies: int = 7  # of a world that is searched so long; of more, fewer env steps, as the square of their number
+    variations: int = 262_144  # env steps in which what came nearest to the goal is varied, after that; 0: none
+    patience: int = 393_216  # env steps after which a level leaves that comes no nearer to the goal; 0: none does
+    first_rung: int = 16_384  # env steps at the first rung; each is four times the one before
+    per_cell: int = 512  # env steps for each cell reached, above which a level leaves at a rung; 0: none leaves
     # play
     lanes: int = 64  # of one level
     redrawn: tuple[float, ...] = (0.02, 0.05, 0.1, 0.3)  # chance of drawing an entry of the action anew, per env step
@@ -32,10 +31,8 @@ class SearchConfig:
     nearer: float = 0.5  # share of returns that go to the nearer to the goal of two states
     # cells: bodies tell states apart by metres, weighted
     width: float = 0.05  # m, of a cell, until the archive is full
-    growth: float = 1.5  # by which cells become wider each time it is
-    driven_weight: float = 0.5  # of bodies that actuators move; of green and blue ones it is 1
-    other_weight: float = 0.25  # of all others that move
-    velocity_seconds: float = 0.3  # s; metres for each metre a second
+    growth: float = 1.15  # by which cells become wider each time it is
+    driven_weight: float = 0.5  # of bodies that actuators move, neither green nor blue; of all others it is 1
     # a success
     trials: int = 4  # rounds of attempts to make it shorter, one a lane; the first also verifies it
     # a witness
@@ -54,9 +51,9 @@ class SearchConfig:
         require(self, ("lanes", "segment", "stretch", "rounds", "first_rung"), 1)
         require(self, ("entries",), 1, MOST_ENTRIES)
         require(self, ("nearer", "anew"), 0, 1)
-        require(self, ("width", "near"), 0, above=True)
+        require(self, ("width",), 0, above=True)
         require(self, ("growth",), 1, above=True)
-        require(self, ("driven_weight", "other_weight", "velocity_seconds"), 0)
+        require(self, ("driven_weight",), 0)
         if not self.redrawn or not all(0 < chance <= 1 for chance in self.redrawn):
             raise ValueError(f"redrawn is {self.redrawn}: give chances above 0 and at most 1")
         if self.lanes % len(self.redrawn):

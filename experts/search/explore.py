@@ -127,19 +127,14 @@ def under_way(search: Search, config: SearchConfig) -> Bool[Array, " level"]:
     nearer to the goal.
 
     Where next to nothing is reached, nothing will be: the world ends at once, or what acts moves little in it. And the
-    farther green and blue have stayed from each other, for the longer, the less a search finds (docs/tried.md).
+    longer green and blue have come no nearer to each other, the less a search finds (docs/tried.md).
     """
     going = (search.length == 0) & (search.env_steps < config.env_steps)
     at_rung = jnp.isin(search.env_steps // config.steps_per_round, jnp.array(config.rungs, jnp.int32))
     least = -(-search.env_steps // max(config.per_cell, 1))  # rounded up; nothing here outgrows 32 bits
     few = at_rung & (search.archive.cells < least) & (config.per_cell > 0)
-    return going & ~few & patient(search.gap, search.env_steps - search.closed, config)
-
-
-def patient(gap: Float[Array, " level"], waited: Int[Array, " level"], config: SearchConfig) -> Bool[Array, " level"]:
-    """Whether levels go on that have come no nearer to the goal for so many env steps."""
-    patience = config.patience * config.near / jnp.maximum(gap, config.near)
-    return (waited < jnp.maximum(patience, config.first_rung)) | (config.patience == 0)
+    patient = (search.env_steps - search.closed < config.patience) | (config.patience == 0)
+    return going & ~few & patient
 
 
 def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> Chance:
