@@ -17,7 +17,7 @@ class SearchConfig:
     env_steps: int = 1_048_576  # of one level, all lanes together; rounded up to whole rounds; 0: none
     bodies: int = 7  # of a world that is searched so long; of more, fewer env steps, as the square of their number
     variations: int = 262_144  # env steps in which what came nearest to the goal is varied, after that; 0: none
-    patience: int = 393_216  # env steps after which a level leaves that comes no nearer to the goal; 0: none does
+    patience: int = 393_216  # env steps, of variations a quarter, until a level leaves that comes no nearer; 0: no end
     first_rung: int = 16_384  # env steps at the first rung; each is four times the one before
     per_cell: int = 512  # env steps for each cell reached, above which a level leaves at a rung; 0: none leaves
     # play

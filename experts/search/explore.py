@@ -133,8 +133,12 @@ def under_way(search: Search, config: SearchConfig) -> Bool[Array, " level"]:
     at_rung = jnp.isin(search.env_steps // config.steps_per_round, jnp.array(config.rungs, jnp.int32))
     least = -(-search.env_steps // max(config.per_cell, 1))  # rounded up; nothing here outgrows 32 bits
     few = at_rung & (search.archive.cells < least) & (config.per_cell > 0)
-    patient = (search.env_steps - search.closed < config.patience) | (config.patience == 0)
-    return going & ~few & patient
+    return going & ~few & patient(search.env_steps - search.closed, config.patience)
+
+
+def patient(waited: Int[Array, " level"], patience: int) -> Bool[Array, " level"]:
+    """Whether levels go on that have come no nearer to the goal for so many env steps; always where patience is 0."""
+    return (waited < patience) | (patience == 0)
 
 
 def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> Chance:

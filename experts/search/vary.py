@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
 
 from experts.search.archive import Archive
 from experts.search.config import SearchConfig
-from experts.search.explore import NEARER, with_success
+from experts.search.explore import NEARER, patient, with_success
 from experts.search.near import FAR, gap
 from experts.search.play import CODES, WITHOUT, Arena, Walk, act, arena, decode, fresh_walk, most_steps
 from experts.search.rows import from_rows, to_rows
@@ -153,8 +153,7 @@ def vary_round(varying: Varying, ring: Arena, config: SearchConfig, rules: TaskP
 def under_way(varying: Varying, config: SearchConfig) -> Bool[Array, " level"]:
     """Levels without a success that have env steps left and have lately come nearer to the goal."""
     going = (varying.length == 0) & (varying.env_steps < config.variations)
-    patient = (varying.env_steps - varying.closed < config.patience // LESS_PATIENT) | (config.patience == 0)
-    return going & patient
+    return going & patient(varying.env_steps - varying.closed, -(-config.patience // LESS_PATIENT))
 
 
 def together(one: Array, other: Array) -> Array:

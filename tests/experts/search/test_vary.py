@@ -157,6 +157,8 @@ def test_env_steps_end_it() -> None:
     now = replace(begun(), closed=jnp.full(WIDTH, 1024), env_steps=jnp.full(WIDTH, 1024 + 16_384))
     assert not under_way(now, impatient).any()
     assert under_way(now, CONFIG).all()
+    assert not under_way(now, replace(CONFIG, patience=4 * 16_384)).any()  # a quarter of what Go-Explore has
+    assert under_way(now, replace(CONFIG, patience=4 * 16_384 + 4)).all()
 
 
 def test_no_chance_twice() -> None:
