@@ -31,10 +31,11 @@ from experts.witness import replay, take
 from levelgen.identity.keys import GENERATOR
 from levelgen.level import ACTIONS, MOTOR_BINDINGS, Level
 from levelgen.task.rules import DEFAULT_RULES
-from tests.experts.search.worlds import broken, cannon
+from tests.experts.search.worlds import SIZE, broken, cannon
 from tests.experts.search.worlds import side_by_side as together
 
-CONFIG = SearchConfig(env_steps=2048, variations=131_072, patience=0, bodies=0, lanes=32, entries=128)
+GIVEN = SearchConfig(env_steps=18_432, variations=1_179_648, patience=0, bodies=3, lanes=32, entries=128)
+CONFIG = GIVEN.scaled(SIZE.bodies)  # a ninth of the env steps
 WIDTH = side_by_side(CONFIG)
 BROKEN = np.arange(WIDTH) % 4 == 3
 IDS = np.arange(40, 40 + WIDTH, dtype=np.int32)
@@ -81,8 +82,10 @@ def test_an_aim_is_corrected() -> None:
 
 
 def test_both_in_turn() -> None:
-    """A search too short to find anything, then variations of what it leaves; each counts its env steps."""
-    searching = Searching(CONFIG, DEFAULT_RULES)
+    """A search too short to find anything, then variations of what it leaves; each counts its env steps, and has fewer
+    in larger worlds."""
+    assert (CONFIG.env_steps, CONFIG.variations) == (2048, 131_072)
+    searching = Searching(GIVEN, DEFAULT_RULES)
     sought = searching.submit(levels(), IDS)
     while searching.step():
         pass
@@ -175,7 +178,7 @@ def test_a_change_stays_before_the_nearest_step(kind: int) -> None:
     rng = np.random.default_rng(kind)
     live = np.array([True, False, True, False, True, False])
     action = np.where(live[:, None], rng.integers(2, size=(ACTIONS, 256)), 0)
-    code, steps = encode(jnp.array(action)), 60
+    code, steps = np.asarray(encode(jnp.array(action))), 60
     change = jax.jit(changed)
     for _ in range(20):
         bits = rng.integers(2**32, size=5, dtype=np.uint32)
