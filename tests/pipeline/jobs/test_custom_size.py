@@ -26,7 +26,7 @@ pytestmark = pytest.mark.campaign
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a real, tiny split of this size: levels 5 to 8, of which 8 stays unsolved after a long search too."""
+    """A folder with a real, tiny split of this size: levels 5 to 8, of which a long search leaves 8 unsolved too."""
     folder = tmp_path_factory.mktemp("custom")
     words = [f"size={SIZE}", "distribution=free", "first_level=5", "levels=4", "budget=5k", "executor=inline"]
     done = here(["generate", *words], folder)
