@@ -153,7 +153,8 @@ def vary_round(varying: Varying, ring: Arena, config: SearchConfig, rules: TaskP
 def under_way(varying: Varying, config: SearchConfig) -> Bool[Array, " level"]:
     """Levels without a success that have env steps left and have lately come nearer to the goal."""
     going = (varying.length == 0) & (varying.env_steps < config.variations)
-    return going & patient(varying.env_steps - varying.closed, -(-config.patience // LESS_PATIENT))
+    less = -(-config.patience // LESS_PATIENT)  # rounded up: 0 would have no end
+    return going & patient(varying.env_steps - varying.closed, less)
 
 
 def together(one: Array, other: Array) -> Array:

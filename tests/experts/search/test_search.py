@@ -173,12 +173,9 @@ def test_env_steps_add_up() -> None:
 def test_a_level_with_few_cells_leaves_at_a_rung() -> None:
     """One cell, and it is over at the first rung; as many as a rung asks for, and it goes on to the next."""
     assert (found().env_steps[KINDS == BROKEN] == CONFIG.first_rung).all()
-    config, now = replace(CONFIG, patience=0, first_rung=4096, per_cell=4096), begun()
-    at = lambda env_steps: under_way(replace(now, env_steps=jnp.full_like(now.env_steps, env_steps)), config)
-    assert (now.archive.cells == 1).all()
-    assert at(4096).all()
-    assert not at(16_384).any()
-    assert at(16_384 + ROUND).all()  # between rungs nobody asks
+    broken = take(levels(), np.flatnonzero(KINDS == BROKEN)[:1])
+    config = replace(CONFIG, env_steps=40_960, patience=0, first_rung=4096, per_cell=4096)
+    assert search(broken, IDS[:1], config, DEFAULT_RULES).env_steps == 16_384
 
 
 def test_a_level_that_comes_no_nearer_leaves() -> None:
@@ -222,11 +219,14 @@ def test_a_rung_that_asks_for_next_to_nothing_lets_all_go_on() -> None:
 
 
 def test_larger_worlds_are_searched_for_fewer_env_steps() -> None:
-    """That a search does so, test_vary's of both in turn says."""
+    """The level has one cell, and where no level leaves at a rung it is searched to the end."""
     given = SearchConfig(env_steps=100_000, variations=20_000, patience=4000, bodies=8)
     of = lambda config: (config.env_steps, config.variations, config.patience)
     assert of(given.scaled(7)) == of(given.scaled(8)) == of(given) == of(replace(given, bodies=0).scaled(16))
     assert of(given.scaled(16)) == (25_000, 5000, 1000)
+    four = replace(CONFIG, bodies=4, env_steps=207_360, patience=0, per_cell=0)
+    at = np.flatnonzero(KINDS == BROKEN)[:1]
+    assert search(take(levels(), at), IDS[:1], four, DEFAULT_RULES).env_steps == 40_960  # of 9 bodies
 
 
 def test_a_level_that_has_a_success_stays_as_it_is() -> None:

@@ -22,7 +22,7 @@ def run(first: int, count: int) -> None:
 
 
 def test_some_schedules_change_nothing() -> None:
-    run(10_000, 10)
+    run(10_000, 20)
 
 
 @pytest.mark.campaign
