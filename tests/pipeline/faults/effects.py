@@ -19,6 +19,7 @@ KINDS = {
     "fcntl.flock": "lock",
     "open": "write",
 }
+WHOLE = "whole"  # ends a line of the log: a process that is killed may have written the beginning of one
 Tell = Callable[[int, str, str], None]  # of the number of an effect, its kind, and a path
 
 
@@ -73,7 +74,7 @@ class Effects:
             saved = f"{self._log}.{os.getpid()}.{number}"
             shutil.copyfile(there, saved)
         with open(self._log, "a") as file:
-            file.write("\t".join([kind, path, there, saved, str(os.path.exists(path))]) + "\n")
+            file.write("\n" + "\t".join([kind, path, there, saved, str(os.path.exists(path)), WHOLE]))
 
 
 class Change(NamedTuple):
@@ -89,7 +90,9 @@ def lose_power(log: Path, seed: int) -> None:
     """Undo some of what was not flushed, the last first: written bytes, and what names folders have."""
     loose: list[Change] = []
     for line in log.read_text().splitlines():
-        kind, path, there, saved, existed = line.split("\t")
+        if not line.endswith("\t" + WHOLE):
+            continue  # what it tells of was not done
+        kind, path, there, saved, existed, _ = line.split("\t")
         at = Path(there)
         if kind == "fsync":
             loose = [of for of in loose if (of.path if of.kind == "write" else of.path.parent) != at]

@@ -5,10 +5,12 @@ They run in a process that has not started JAX, because it forks.
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from tests.pipeline.command import ROOT
+from tests.pipeline.faults.effects import lose_power
 
 EACH = 65
 
@@ -23,6 +25,21 @@ def run(first: int, count: int) -> None:
 
 def test_some_schedules_change_nothing() -> None:
     run(10_000, 20)
+
+
+def test_a_line_that_a_kill_left_half_written_tells_of_nothing(tmp_path: Path) -> None:
+    log, kept, gone = tmp_path / "log", tmp_path / "kept", tmp_path / "gone"
+    line = lambda path: f"\nwrite\t{path}\t{path}\t\tFalse\twhole"
+    seen = set()
+    for end in range(len(line(kept)) + 1):
+        kept.write_text("kept")
+        gone.write_text("gone")
+        log.write_text(line(kept)[:end] + line(gone))
+        for seed in range(8):
+            lose_power(log, seed)
+        assert not gone.exists()
+        seen |= {(end, kept.exists())}
+    assert seen == {(end, end < len(line(kept))) for end in range(len(line(kept)) + 1)}
 
 
 @pytest.mark.campaign
