@@ -104,7 +104,9 @@ def begin(
     count, steps = len(level_ids), nearest.code.shape[-1]
     state = to_rows(arena(levels, config.lanes, (1.0,)).lanes.state).reshape(count, config.lanes, -1)
     none, of_lane = jnp.zeros(count, jnp.int32), jnp.zeros((count, config.lanes), jnp.int32)
-    so_far = Approaches(jnp.zeros((*of_lane.shape, steps), jnp.uint16), jnp.full(of_lane.shape, FAR), of_lane)
+    so_far = Approaches(
+        jnp.zeros((*of_lane.shape, steps), jnp.uint16), jnp.full(of_lane.shape, FAR, jnp.float32), of_lane
+    )
     episodes = Episodes(so_far, state, of_lane, of_lane, jnp.ones(of_lane.shape, bool))
     code = jnp.zeros((count, steps), jnp.uint16)
     return Varying(levels, key, nearest, episodes, none, nearest.gap[:, 0], none, code, none)
@@ -187,7 +189,9 @@ def renewed(episodes: Episodes, nearest: Approaches, change: Change, ring: Arena
     code, steps = (jax.vmap(lambda x, at: x[at])(x, parent) for x in (nearest.code, nearest.steps))
     live = ring.live.T.reshape(*parent.shape, ACTIONS)
     by_lane = jax.vmap(varied, (0, 0, -1, 0))
-    so_far = Approaches(jax.vmap(by_lane)(code, steps, change, live), jnp.full(steps.shape, FAR), jnp.zeros_like(steps))
+    so_far = Approaches(
+        jax.vmap(by_lane)(code, steps, change, live), jnp.full(steps.shape, FAR, jnp.float32), jnp.zeros_like(steps)
+    )
     start = to_rows(ring.lanes.state).reshape(episodes.state.shape)
     most = jnp.minimum(steps + BEYOND, most_steps(rules))
     fresh = Episodes(so_far, start, jnp.zeros_like(steps), most, jnp.zeros_like(episodes.over))
