@@ -2,12 +2,27 @@
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Int
 
 from experts.config import MOST_COUNTED
 from physics.bounds import require
 
 MOST_ROUNDS = 1024  # of what a success gets afterwards
+MOST_RUNGS = 16  # each is four times the one before, and env steps are counted in 32 bits
 MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are counted in 32 bits
+
+
+class Ends(NamedTuple):
+    """Of a SearchConfig what says when a search ends: data of its program, so that other numbers need no other one."""
+
+    env_steps: Int[Array, ""]
+    variations: Int[Array, ""]
+    patience: Int[Array, ""]
+    per_cell: Int[Array, ""]
+    rungs: Int[Array, " rung"]  # env steps after which a level that has reached few cells leaves
 
 
 @dataclass(frozen=True)
@@ -73,7 +88,16 @@ class SearchConfig:
         return self.lanes * self.stretch * self.segment
 
     @property
-    def rungs(self) -> tuple[int, ...]:
-        """Rounds after which a level that has reached few cells leaves."""
-        first, rounds = -(-self.first_rung // self.steps_per_round), -(-self.env_steps // self.steps_per_round)
-        return tuple(itertools.takewhile(lambda rung: rung < rounds, (first * 4**i for i in itertools.count())))
+    def ends(self) -> Ends:
+        """When it ends; a rung that there is not is -1."""
+        first = -(-self.first_rung // self.steps_per_round) * self.steps_per_round
+        rungs = itertools.takewhile(lambda rung: rung < self.env_steps, (first * 4**i for i in itertools.count()))
+        rungs = np.array([*(there := tuple(rungs)), *[-1] * (MOST_RUNGS - len(there))], np.int32)
+        return Ends(*map(np.int32, (self.env_steps, self.variations, self.patience, self.per_cell)), rungs)  # pyright: ignore
+
+    @property
+    def endless(self) -> "SearchConfig":
+        """The same for all that differ only in when they end, and in what comes after a search."""
+        return replace(
+            self, env_steps=0, bodies=0, variations=0, patience=0, first_rung=1, per_cell=0, polish=0, steady=0
+        )

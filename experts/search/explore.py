@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
 from experts.config import RECORD_STEPS
 from experts.search.archive import Archive, Reached, choose, insert, new_archive, visit
 from experts.search.cells import features
-from experts.search.config import SearchConfig
+from experts.search.config import Ends, SearchConfig
 from experts.search.near import FAR, gap, goals_of
 from experts.search.play import CODES, Arena, Walk, arena, decode, most_steps, play
 from experts.search.rows import from_rows, to_rows
@@ -75,17 +75,22 @@ def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, 
     return Search(levels, key, new_archive(start, config), none, none, apart, none, code, none)
 
 
-@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="search")
 def explore(search: Search, config: SearchConfig, rules: TaskParams) -> Search:
-    """`config.rounds` rounds. Levels that have a success, or have had their env steps, stay as they are."""
+    """`config.rounds` rounds, after which `search` is used up. Levels that have a success, or have had their env steps,
+    stay as they are."""
+    return _explore(search, config.ends, config.endless, rules)
+
+
+@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="search")
+def _explore(search: Search, ends: Ends, config: SearchConfig, rules: TaskParams) -> Search:
     ring = arena(search.levels, config.lanes, config.redrawn)
-    step = lambda search, _: (explore_round(search, ring, config, rules), None)
+    step = lambda search, _: (explore_round(search, ring, ends, config, rules), None)
     return jax.lax.scan(step, search, length=config.rounds)[0]
 
 
-def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: TaskParams) -> Search:
+def explore_round(search: Search, ring: Arena, ends: Ends, config: SearchConfig, rules: TaskParams) -> Search:
     """One round; `ring` has the levels' lanes."""
-    active = under_way(search, config)
+    active = under_way(search, ends)
     chance = jax.vmap(partial(draw, config=config))(search.key, search.env_steps)
     bits = jnp.moveaxis(chance.bits, 0, 3).reshape(config.stretch, config.segment, ACTIONS, -1)
     chosen = choose(search.archive, chance.choice, config)
@@ -122,21 +127,21 @@ def explore_round(search: Search, ring: Arena, config: SearchConfig, rules: Task
     )
 
 
-def under_way(search: Search, config: SearchConfig) -> Bool[Array, " level"]:
+def under_way(search: Search, ends: Ends) -> Bool[Array, " level"]:
     """Levels without a success that have env steps left, are not at a rung with too few cells, and have lately come
     nearer to the goal.
 
     Where next to nothing is reached, nothing will be: the world ends at once, or what acts moves little in it. And the
     longer green and blue have come no nearer to each other, the less a search finds (docs/tried.md).
     """
-    going = (search.length == 0) & (search.env_steps < config.env_steps)
-    at_rung = jnp.isin(search.env_steps // config.steps_per_round, jnp.array(config.rungs, jnp.int32))
-    least = -(-search.env_steps // max(config.per_cell, 1))  # rounded up; nothing here outgrows 32 bits
-    few = at_rung & (search.archive.cells < least) & (config.per_cell > 0)
-    return going & ~few & patient(search.env_steps - search.closed, config.patience)
+    going = (search.length == 0) & (search.env_steps < ends.env_steps)
+    at_rung = (search.env_steps[:, None] == ends.rungs).any(-1)
+    least = -(-search.env_steps // jnp.maximum(ends.per_cell, 1))  # rounded up; nothing here outgrows 32 bits
+    few = at_rung & (search.archive.cells < least) & (ends.per_cell > 0)
+    return going & ~few & patient(search.env_steps - search.closed, ends.patience)
 
 
-def patient(waited: Int[Array, " level"], patience: int) -> Bool[Array, " level"]:
+def patient(waited: Int[Array, " level"], patience: Int[Array, ""]) -> Bool[Array, " level"]:
     """Whether levels go on that have come no nearer to the goal for so many env steps; always where patience is 0."""
     return (waited < patience) | (patience == 0)
 

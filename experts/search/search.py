@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from experts.search import explore, vary
-from experts.search.config import SearchConfig
+from experts.search.config import Ends, SearchConfig
 from experts.search.explore import Search, success_of
 from experts.search.shorten import shorten
 from experts.search.stage import Entrant, Searched, Sought, Stage
@@ -47,10 +47,10 @@ class Searching:
         """
         level_ids, rules = np.asarray(level_ids, np.int32), self._rules
         config = self._scaled = self._config.scaled(levels.model.size.bodies)
-        begin = partial(explore.begin, config=config, rules=rules)
+        begin = partial(explore.begin, config=config.endless, rules=rules)
         of_one = jax.eval_shape(begin, take(levels, ONE), jnp.array(ONE))
         empty = lambda x: np.zeros((len(level_ids), *x.shape[1:]), x.dtype)
-        nothing = jax.tree.map(empty, jax.eval_shape(partial(explored, config=config), of_one)[1])
+        nothing = jax.tree.map(empty, jax.eval_shape(explored, of_one, config.ends)[1])
         sought = Sought(levels, level_ids, nothing)
         self._exploring.waiting.extend(Entrant(sought, i) for i in range(len(level_ids)))
         return sought
@@ -94,7 +94,7 @@ class Searching:
             some = indices[block]
             given = jax.tree.map(lambda x, some=some: x[some], found.success)
             levels, level_ids = take(sought.levels, some), sought.level_ids[some]
-            shorter = jax.device_get(shorten(levels, level_ids, given, self._scaled, self._rules))
+            shorter = jax.device_get(shorten(levels, level_ids, given, self._scaled.endless, self._rules))
             found.success.action[some], found.success.length[some] = shorter.success
             found.env_steps[some] += shorter.env_steps  # once for a level that fills up its block
         return found
@@ -102,10 +102,10 @@ class Searching:
     def _explore(self) -> None:
         """Go-Explore; what it leaves without a success has its nearest trajectories varied."""
         stage, config, rules = self._exploring, self._scaled, self._rules
-        begin = lambda levels, level_ids, _: explore.begin(levels, level_ids, config, rules)
+        begin = lambda levels, level_ids, _: explore.begin(levels, level_ids, config.endless, rules)
         advance = lambda rows: explore.explore(rows, config, rules)
         nearest = None
-        for row, of, seen in stage.step(begin, advance, partial(explored, config=config)):
+        for row, of, seen in stage.step(begin, advance, partial(explored, ends=config.ends)):
             put(of, seen)
             if stage.at[row]:
                 continue
@@ -119,9 +119,9 @@ class Searching:
     def _vary(self) -> None:
         """Variations of what came nearest."""
         stage, config, rules = self._varying, self._scaled, self._rules
-        begin = partial(vary.begin, config=config, rules=rules)
+        begin = partial(vary.begin, config=config.endless, rules=rules)
         advance = lambda rows: vary.vary(rows, config, rules)
-        for row, of, (success, env_steps) in stage.step(begin, advance, partial(varied, config=config)):
+        for row, of, (success, env_steps) in stage.step(begin, advance, partial(varied, ends=config.ends)):
             before = jax.tree.map(lambda x, of=of: x[of.index], of.sought.known)
             put(of, before._replace(success=success, varied=env_steps))
             of.sought.left -= not stage.at[row]
@@ -138,17 +138,15 @@ def side_by_side(config: SearchConfig) -> int:
     return at_once(config.lanes, IN_CACHE)
 
 
-@partial(jax.jit, static_argnames="config")
-def explored(search: Search, config: SearchConfig) -> tuple[Bool[Array, " level"], Searched]:
+@jax.jit
+def explored(search: Search, ends: Ends) -> tuple[Bool[Array, " level"], Searched]:
     """Levels that are done, and what came of all of them so far."""
     found, none = success_of(search.code, search.length), jnp.zeros_like(search.env_steps)
     seen = Searched(found, search.env_steps, none, search.archive.cells, search.grew)
-    return ~explore.under_way(search, config), seen
+    return ~explore.under_way(search, ends), seen
 
 
-@partial(jax.jit, static_argnames="config")
-def varied(
-    varying: Varying, config: SearchConfig
-) -> tuple[Bool[Array, " level"], tuple[Success, Int[Array, " level"]]]:
+@jax.jit
+def varied(varying: Varying, ends: Ends) -> tuple[Bool[Array, " level"], tuple[Success, Int[Array, " level"]]]:
     """Levels that are done, what was found in all of them, and in how many env steps."""
-    return ~vary.under_way(varying, config), (success_of(varying.code, varying.length), varying.env_steps)
+    return ~vary.under_way(varying, ends), (success_of(varying.code, varying.length), varying.env_steps)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
 
 from experts.search.archive import Archive
-from experts.search.config import SearchConfig
+from experts.search.config import Ends, SearchConfig
 from experts.search.explore import NEARER, patient, with_success
 from experts.search.near import FAR, gap
 from experts.search.play import CODES, WITHOUT, Arena, Walk, act, arena, decode, fresh_walk, most_steps
@@ -112,17 +112,21 @@ def begin(
     return Varying(levels, key, nearest, episodes, none, nearest.gap[:, 0], none, code, none)
 
 
-@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="varying")
 def vary(varying: Varying, config: SearchConfig, rules: TaskParams) -> Varying:
-    """`config.rounds` rounds. What is known of levels that are done stays as it is."""
+    """`config.rounds` rounds, after which `varying` is used up. Levels that are done stay as they are."""
+    return _vary(varying, config.ends, config.endless, rules)
+
+
+@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="varying")
+def _vary(varying: Varying, ends: Ends, config: SearchConfig, rules: TaskParams) -> Varying:
     ring = arena(varying.levels, config.lanes, (1.0,))
-    step = lambda varying, _: (vary_round(varying, ring, config, rules), None)
+    step = lambda varying, _: (vary_round(varying, ring, ends, config, rules), None)
     return jax.lax.scan(step, varying, length=config.rounds)[0]
 
 
-def vary_round(varying: Varying, ring: Arena, config: SearchConfig, rules: TaskParams) -> Varying:
+def vary_round(varying: Varying, ring: Arena, ends: Ends, config: SearchConfig, rules: TaskParams) -> Varying:
     """Lanes whose episodes are over begin another; then all play on. `ring` has the levels' lanes."""
-    active = under_way(varying, config)
+    active = under_way(varying, ends)
     stays = lambda new, old: jnp.where(active.reshape(-1, *[1] * (old.ndim - 1)), new, old)
     episodes = varying.episodes
     come = episodes.so_far._replace(gap=jnp.where(episodes.over, episodes.so_far.gap, FAR))
@@ -152,10 +156,10 @@ def vary_round(varying: Varying, ring: Arena, config: SearchConfig, rules: TaskP
     )
 
 
-def under_way(varying: Varying, config: SearchConfig) -> Bool[Array, " level"]:
+def under_way(varying: Varying, ends: Ends) -> Bool[Array, " level"]:
     """Levels without a success that have env steps left and have lately come nearer to the goal."""
-    going = (varying.length == 0) & (varying.env_steps < config.variations)
-    less = -(-config.patience // LESS_PATIENT)  # rounded up: 0 would have no end
+    going = (varying.length == 0) & (varying.env_steps < ends.variations)
+    less = -(-ends.patience // LESS_PATIENT)  # rounded up: 0 would have no end
     return going & patient(varying.env_steps - varying.closed, less)
 
 

@@ -184,9 +184,9 @@ def test_a_level_that_comes_no_nearer_leaves() -> None:
     at = lambda waited: replace(
         now, closed=jnp.full_like(now.closed, 8192), env_steps=jnp.full_like(now.env_steps, 8192 + waited)
     )
-    assert under_way(at(65_536 - ROUND), config).all()
-    assert not under_way(at(65_536), config).any()
-    assert under_way(at(65_536), replace(config, patience=0)).all()
+    assert under_way(at(65_536 - ROUND), config.ends).all()
+    assert not under_way(at(65_536), config.ends).any()
+    assert under_way(at(65_536), replace(config, patience=0).ends).all()
 
 
 def test_the_gap_shrinks_on_the_way_to_the_goal() -> None:
@@ -214,8 +214,8 @@ def test_a_rung_that_asks_for_next_to_nothing_lets_all_go_on() -> None:
     now = begun()
     steps, cells = jnp.full_like(now.env_steps, CONFIG.first_rung), jnp.full_like(now.archive.cells, 3000)
     reached = replace(now, env_steps=steps, archive=now.archive._replace(cells=cells))
-    assert under_way(reached, replace(CONFIG, patience=0, per_cell=1_000_000)).all()
-    assert not under_way(reached, replace(CONFIG, patience=0, per_cell=1)).any()
+    assert under_way(reached, replace(CONFIG, patience=0, per_cell=1_000_000).ends).all()
+    assert not under_way(reached, replace(CONFIG, patience=0, per_cell=1).ends).any()
 
 
 def test_larger_worlds_are_searched_for_fewer_env_steps() -> None:

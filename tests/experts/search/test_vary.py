@@ -62,7 +62,7 @@ def begun() -> Varying:
 @cache
 def ended() -> Varying:
     now = begun()
-    while np.asarray(under_way(now, CONFIG)).any():
+    while np.asarray(under_way(now, CONFIG.ends)).any():
         now = vary(now, CONFIG, DEFAULT_RULES)
     return jax.device_get(replace(now, key=jax.random.key_data(now.key)))
 
@@ -155,10 +155,10 @@ def test_env_steps_end_it() -> None:
     assert (end.closed <= end.env_steps).all()
     impatient = replace(CONFIG, patience=16_384)
     now = replace(begun(), closed=jnp.full(WIDTH, 1024), env_steps=jnp.full(WIDTH, 1024 + 16_384))
-    assert not under_way(now, impatient).any()
-    assert under_way(now, CONFIG).all()
-    assert not under_way(now, replace(CONFIG, patience=4 * 16_384)).any()  # a quarter of what Go-Explore has
-    assert under_way(now, replace(CONFIG, patience=4 * 16_384 + 4)).all()
+    assert not under_way(now, impatient.ends).any()
+    assert under_way(now, CONFIG.ends).all()
+    assert not under_way(now, replace(CONFIG, patience=4 * 16_384).ends).any()  # a quarter of what Go-Explore has
+    assert under_way(now, replace(CONFIG, patience=4 * 16_384 + 4).ends).all()
 
 
 def test_no_chance_twice() -> None:
