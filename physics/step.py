@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 from physics.block import Block, Given, Scratch
 from physics.buffers import buffers_like, buffers_of
 from physics.codegen.buffers import LANES, Buffer
-from physics.codegen.compile import compile_kernel
+from physics.codegen.compile import register, write
+from physics.codegen.kept import kept_while_sources_stay
 from physics.engine import STAGES, Stage, step_block
 from physics.pairs import table_of
 from physics.types import DEFAULT_PARAMS, Manifold, Model, Params, Size, State
@@ -90,25 +91,26 @@ def as_machine_code(given: Given, params: Params, seen: bool, stages: tuple[Stag
 @cache
 def _compiled(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...]) -> tuple[str, Any, int]:
     """The name of the compiled step for `jax.ffi.ffi_call`, buffers of its results, and bytes of its scratch memory."""
-    buffers, jaxpr = trace(size, params, seen, given, stages)
+    buffers = block_buffers(size, params, seen, given)
     reads, table, results, scratch = map(jax.tree.leaves, buffers)
-    name = compile_kernel(jaxpr, [*reads, *table], results, scratch)
+    text = lambda: write(trace(buffers, params, stages), [*reads, *table], results, scratch).encode()
+    asked = repr((buffers, params, [(stage.__module__, stage.__qualname__) for stage in stages]))
+    name = register(kept_while_sources_stay(asked, text).decode())
     return name, buffers[2], sum(buffer.bytes for buffer in scratch)
 
 
-def trace(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...] = STAGES) -> tuple[Any, Any]:
-    """The step of a block as a jaxpr, given the buffers of what it reads.
-
-    Returns:
-        Buffers of what it is given, of the lookup tables, of its results and of its scratch memory; and the jaxpr,
-        of a function of one reference for each of their leaves.
-    """
+def block_buffers(size: Size, params: Params, seen: bool, given: Given) -> tuple[Given, Any, Any, Any]:
+    """Of what a block's step is given, of the lookup tables, of its results and of its scratch memory."""
     table = jax.tree.map(lambda x: Buffer(x.shape, str(x.dtype), lanes=False), table_of(size, params.faithful_padding))
     results = given.before, buffers_of(Manifold, size) if seen else None
-    buffers = given, table, results, buffers_of(Scratch, size)
+    return given, table, results, buffers_of(Scratch, size)
+
+
+def trace(buffers: tuple[Given, Any, Any, Any], params: Params, stages: tuple[Stage, ...] = STAGES) -> Any:
+    """The step of a block as a jaxpr, of a function of one reference for each leaf of `block_buffers`."""
 
     def kernel(*arrays):
         given, table, (after, contacts), scratch = jax.tree.map(jax.new_ref, arrays)
         step_block(Block(table, given, after, contacts, scratch), params, stages)
 
-    return buffers, jax.make_jaxpr(kernel)(*jax.tree.map(Buffer.array, buffers))
+    return jax.make_jaxpr(kernel)(*jax.tree.map(Buffer.array, buffers))

@@ -19,19 +19,16 @@ from physics.codegen.values import INDEX
 _libraries: dict[str, binding.ResourceTracker] = {}  # machine code must outlive every executable that calls it
 
 
-def compile_kernel(
+def write(
     jaxpr: core.ClosedJaxpr, arguments: Sequence[Buffer], results: Sequence[Buffer], scratch: Sequence[Buffer]
 ) -> str:
-    """Compile a kernel and register it with XLA.
+    """A kernel as the text of an LLVM module.
 
     Args:
         jaxpr: of a function of references: to the arguments, to the results, to scratch memory.
         arguments: the arrays that XLA hands over; the first has lanes.
         results: the arrays that the kernel fills; XLA gets one more, the scratch memory, `sum(Buffer.bytes)` of uint8.
         scratch: what the kernel works in.
-
-    Returns:
-        The name by which `jax.ffi.ffi_call` finds it.
 
     Raises:
         NotImplementedError: the kernel uses what `lower` does not know.
@@ -40,7 +37,11 @@ def compile_kernel(
     module.triple = binding.get_default_triple()
     block = _block(module, jaxpr, [*arguments, *results, *scratch], len(arguments) + len(results))
     add_handler(module, block, arguments, results, scratch)
-    text = str(module)
+    return str(module)
+
+
+def register(text: str) -> str:
+    """Compile what `write` gave, and make it known to XLA; the name by which `jax.ffi.ffi_call` finds it."""
     name = "levelproof_" + hashlib.sha256(text.encode()).hexdigest()[:16]
     if name not in _libraries:
         builder = binding.JITLibraryBuilder().add_object_img(_object_code(text))

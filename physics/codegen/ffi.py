@@ -64,7 +64,7 @@ def add_handler(
 ) -> None:
     """Add `handler(frame)` to the module of the kernel `block`, which it calls as `block(lanes, pointers ...)`.
 
-    For each block of lanes of the buffers, of which `compile.compile_kernel` tells.
+    For each block of lanes of the buffers, of which `compile.write` tells.
     """
     function = ir.Function(module, ir.FunctionType(POINTER, [POINTER]), "handler")
     (frame,) = function.args

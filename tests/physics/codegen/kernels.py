@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from physics.codegen.buffers import LANES, Buffer
-from physics.codegen.compile import compile_kernel
+from physics.codegen.compile import register, write
 
 Arrays = Sequence[np.ndarray]
 
@@ -41,7 +41,7 @@ class Kernel:
             self.body(*map(jax.new_ref, arrays))
 
         jaxpr = jax.make_jaxpr(kernel)(*map(Buffer.array, [*self.arguments, *self.results, *self.scratch]))
-        return compile_kernel(jaxpr, self.arguments, self.results, self.scratch)
+        return register(write(jaxpr, self.arguments, self.results, self.scratch))
 
     def as_machine_code(self, *arguments: np.ndarray) -> list[np.ndarray]:
         """What it makes of arguments of some blocks of lanes."""

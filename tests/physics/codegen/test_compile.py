@@ -23,5 +23,5 @@ def test_the_same_kernel_is_compiled_and_registered_once(monkeypatch: pytest.Mon
     monkeypatch.setattr(compile_module, "_object_code", noted)
     buffer, row = Buffer((1,), "float32"), jnp.zeros((1, LANES))
     jaxpr = jax.make_jaxpr(kernel)(row, row)
-    names = {compile_module.compile_kernel(jaxpr, [buffer], [buffer], []) for _ in range(2)}
+    names = {compile_module.register(compile_module.write(jaxpr, [buffer], [buffer], [])) for _ in range(2)}
     assert len(names) == len(compiled) == 1

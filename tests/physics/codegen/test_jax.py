@@ -11,7 +11,7 @@ from jax.extend import core
 from physics.block import Given
 from physics.buffers import buffers_like
 from physics.codegen.buffers import LANES
-from physics.step import trace
+from physics.step import block_buffers, trace
 from physics.types import Params, Size
 from tests.physics.worlds import scattered
 
@@ -61,7 +61,7 @@ def equations(jaxpr: core.Jaxpr) -> Iterator[core.JaxprEqn]:
 @functools.cache
 def of_the_step() -> list[core.JaxprEqn]:
     given = buffers_like(Given(*scattered(SIZE, LANES)))
-    return list(equations(trace(SIZE, Params(), True, given)[1].jaxpr))
+    return list(equations(trace(block_buffers(SIZE, Params(), True, given), Params()).jaxpr))
 
 
 def test_the_step_uses_the_primitives_that_are_known() -> None:
