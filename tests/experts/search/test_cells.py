@@ -1,6 +1,7 @@
 """What tells two worlds apart: the places and turns of bodies that move, weighted."""
 
 from dataclasses import replace
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -8,38 +9,46 @@ import numpy as np
 
 from experts.search.cells import TURN, features
 from experts.search.config import SearchConfig
-from levelgen.level import SIZES, Role
+from levelgen.level import SIZES, Level, Role
 from levelgen.proofs import driven
 from levelgen.sampling.sampler import sample_levels
 
 CONFIG = SearchConfig(driven_weight=0.5)
-LEVELS = sample_levels(np.arange(64), SIZES["m"])
-MOVES = np.asarray(LEVELS.model.active & (LEVELS.model.inverse_mass + LEVELS.model.inverse_inertia > 0))
-GOAL = np.isin(np.asarray(LEVELS.role), (Role.GREEN, Role.BLUE))
-DRIVEN = np.asarray(driven(LEVELS))
+
+
+@cache
+def levels() -> Level:
+    return sample_levels(np.arange(64), SIZES["m"])
+
+
+def moves() -> np.ndarray:
+    """Which bodies do."""
+    model = levels().model
+    return np.asarray(model.active & (model.inverse_mass + model.inverse_inertia > 0))
 
 
 def apart(**changed: jax.Array) -> np.ndarray:
     """How far cells have it from the start to the start with this changed, the farthest of its features by level."""
-    of = lambda state: np.asarray(features(LEVELS, state, CONFIG))
-    return np.abs(of(replace(LEVELS.state, **changed)) - of(LEVELS.state)).max(-1)
+    of = lambda state: np.asarray(features(levels(), state, CONFIG))
+    return np.abs(of(replace(levels().state, **changed)) - of(levels().state)).max(-1)
 
 
 def test_every_body_counts_by_what_it_is() -> None:
     """All that moves counts in full, but what actuators drive to bring green to blue."""
-    kinds = set()
-    for body in range(len(MOVES)):
-        position = jnp.asarray(LEVELS.state.position).at[body, 1].add(0.25)
-        weight = np.where(MOVES[body], np.where(DRIVEN[body] & ~GOAL[body], 0.5, 1.0), 0.0)
+    moving, goal = moves(), np.isin(np.asarray(levels().role), (Role.GREEN, Role.BLUE))
+    acted_on, kinds = np.asarray(driven(levels())), set()
+    for body in range(len(moving)):
+        position = jnp.asarray(levels().state.position).at[body, 1].add(0.25)
+        weight = np.where(moving[body], np.where(acted_on[body] & ~goal[body], 0.5, 1.0), 0.0)
         np.testing.assert_allclose(apart(position=position), 0.25 * weight, atol=1e-5)
-        kinds |= set(zip(MOVES[body].tolist(), DRIVEN[body].tolist(), GOAL[body].tolist(), strict=True))
+        kinds |= set(zip(moving[body].tolist(), acted_on[body].tolist(), goal[body].tolist(), strict=True))
     assert {(True, True, False), (True, False, False), (True, True, True), (True, False, True)} <= kinds
 
 
 def test_speed_and_whole_turns_do_not_count() -> None:
     """Nor whether a body has come round once more."""
-    state = LEVELS.state
+    state = levels().state
     assert not apart(velocity=state.velocity + 3.0, angular_velocity=state.angular_velocity - 2.0).any()
     assert apart(rotation=state.rotation + TURN).max() < 1e-4
     quarter = apart(rotation=state.rotation + TURN / 4)
-    assert (quarter[(MOVES & (np.asarray(LEVELS.model.inverse_inertia) > 0)).any(0)] > 0).all()
+    assert (quarter[(moves() & (np.asarray(levels().model.inverse_inertia) > 0)).any(0)] > 0).all()
