@@ -11,7 +11,7 @@ from experts.judge import Kept, Trained, Witness
 from experts.paused import Paused
 from experts.pool import Pool, Submission, capacity_of
 from experts.portability import PORTABLE, choose
-from experts.queue import empty_queue, enter
+from experts.queue import GROUP, empty_queue, enter
 from experts.slots import Pending, begin
 from experts.success import no_success
 from experts.witness import take
@@ -244,7 +244,9 @@ def test_indices_of_a_queue_are_used_again_in_any_order(levels: Level) -> None:
 def test_a_level_that_stays_long_keeps_no_slot_empty(levels: Level) -> None:
     """More others come and go meanwhile than the queue has room for."""
     pool = Pool(400 * CONFIG.steps_per_update, untouched(WHOLE), DEFAULT_RULES)
-    experts = jax.device_get(begin(levels, IDS, no_success(len(IDS)), CONFIG))
+    groups = np.resize(np.arange(len(IDS)), (-(-len(IDS) // GROUP), GROUP))  # for so many at once there is a program
+    begun = [jax.device_get(begin(take(levels, at), IDS[at], no_success(GROUP), CONFIG)) for at in groups]
+    experts = jax.tree.map(lambda *xs: np.concatenate(xs), *begun)
     soon, no = np.int32(1), np.bool_(False)  # they leave after an update
     paused = {
         i: Paused(Kept(jax.tree.map(lambda x, i=i: x[i], experts), []), Pending(no, no, soon), 0, [], nothing_found(1))
