@@ -4,7 +4,7 @@ Green is a circle without a joint, at rest, and nothing else moves. Its thruster
 does not turn, and lift less than it weighs: until it touches something its position stays in a box that is known for
 every physics step, whatever the actions. Where that box meets nothing but red before it is below the top of a red
 floor, red is the first thing that green touches, and ends the episode. Too few random levels are like this for a label
-to rest on it (docs/tried.md).
+to rest on it (docs/tried/labels.md).
 """
 
 from dataclasses import dataclass

@@ -106,7 +106,7 @@ def run(given: argparse.Namespace) -> Report:
             "that is not red (`benchmarks/falls.py`). In `h12_platformer_1` and `h13_platformer_2` the thrusters lift "
             "half of the weight, too, and what green can reach before red is one side of a shelf, below its edge. In "
             "`hard_beam_balance`, `hard_cartpole_thrust` and `hard_cartpole_wheels` blue is more than a metre above "
-            "what can reach it ([tried.md](../tried.md)).",
+            "what can reach it ([tried](../tried/labels.md)).",
             f"![The solved levels when their witnesses reach the goal]({PLOT})",
         ],
         plots={PLOT: lambda path: write_sheet(solved, path)} if solved else {},

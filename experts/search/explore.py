@@ -132,7 +132,7 @@ def under_way(search: Search, ends: Ends) -> Bool[Array, " level"]:
     nearer to the goal.
 
     Where next to nothing is reached, nothing will be: the world ends at once, or what acts moves little in it. And the
-    longer green and blue have come no nearer to each other, the less a search finds (docs/tried.md).
+    longer green and blue have come no nearer to each other, the less a search finds (docs/tried/variations.md).
     """
     going = (search.length == 0) & (search.env_steps < ends.env_steps)
     at_rung = (search.env_steps[:, None] == ends.rungs).any(-1)

@@ -28,7 +28,7 @@ from levelgen.task.rules import TaskParams
 KEPT = 8  # trajectories of a level
 BEYOND = 16  # env steps, at least, that are played after the one at which the trajectory that is varied was nearest
 CHANGES = 2  # at most, in a variation
-LESS_PATIENT = 4  # times, than Go-Explore: what they find comes sooner (docs/tried.md)
+LESS_PATIENT = 4  # times, than Go-Explore: what they find comes sooner (docs/tried/cells.md)
 MOST_MOVED = 8  # env steps by which what follows comes sooner or later
 
 
