@@ -14,7 +14,7 @@ from experts.labels import Label, Source
 from experts.procedure import Procedure
 from experts.scout import STEPS_PER_ROUND
 from experts.search.config import SearchConfig
-from experts.search.explore import NEARER, Search, begin, draw, explore, under_way
+from experts.search.explore import NEARER, Search, _explore, begin, draw, explore, under_way
 from experts.search.near import FAR
 from experts.search.play import arena, fresh_walk, play
 from experts.search.search import AHEAD, Searching, side_by_side
@@ -176,6 +176,18 @@ def test_a_level_with_few_cells_leaves_at_a_rung() -> None:
     broken = take(levels(), np.flatnonzero(KINDS == BROKEN)[:1])
     config = replace(CONFIG, env_steps=40_960, patience=0, first_rung=4096, per_cell=4096)
     assert search(broken, IDS[:1], config, DEFAULT_RULES).env_steps == 16_384
+
+
+def test_when_a_search_ends_is_no_part_of_its_programs() -> None:
+    """Other env steps, rungs or patience compile nothing."""
+    programs = lambda: _explore._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+    explore(begun(), CONFIG, DEFAULT_RULES)
+    before = programs()
+    given = {"env_steps": 5000, "variations": 7000, "patience": 300, "per_cell": 9, "first_rung": 2048, "bodies": 30}
+    for name, number in given.items():
+        assert number != getattr(CONFIG, name)
+        explore(begun(), replace(CONFIG, **{name: number}), DEFAULT_RULES)
+    assert programs() == before
 
 
 def test_a_level_that_comes_no_nearer_leaves() -> None:

@@ -19,6 +19,7 @@ from experts.search.vary import (
     Approaches,
     Change,
     Varying,
+    _vary,
     begin,
     changed,
     drawn,
@@ -144,6 +145,14 @@ def test_an_interruption_changes_nothing() -> None:
     twice = vary(vary(begun(), CONFIG, DEFAULT_RULES), CONFIG, DEFAULT_RULES)
     bits = lambda now: jax.device_get(replace(now, key=jax.random.key_data(now.key)))
     jax.tree.map(np.testing.assert_array_equal, bits(resumed), bits(twice))
+
+
+def test_the_first_call_takes_no_program_of_its_own() -> None:
+    programs = lambda: _vary._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+    once = vary(begun(), CONFIG, DEFAULT_RULES)
+    before = programs()
+    vary(once, CONFIG, DEFAULT_RULES)
+    assert programs() == before
 
 
 def test_env_steps_end_it() -> None:
