@@ -54,7 +54,7 @@ def starts(levels: Level) -> Level:
     """Of the first levels, moved starts."""
     at = np.arange(FOUND)
     lanes = repeat(take(levels, at), REPLAYS)
-    return jax.device_get(replace(lanes, state=moved(lanes, jnp.asarray(IDS[at]), REPLAYS)))
+    return jax.device_get(replace(lanes, state=jax.jit(moved, static_argnums=2)(lanes, IDS[at], REPLAYS)))
 
 
 def test_it_is_the_share_of_replays_that_reach_the_goal(
