@@ -1,6 +1,5 @@
 """How a level is searched."""
 
-import itertools
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -89,10 +88,9 @@ class SearchConfig:
 
     @property
     def ends(self) -> Ends:
-        """When it ends; a rung that there is not is -1."""
+        """When it ends. There is no rung that matters after `env_steps`, which end it anyway."""
         first = -(-self.first_rung // self.steps_per_round) * self.steps_per_round
-        rungs = itertools.takewhile(lambda rung: rung < self.env_steps, (first * 4**i for i in itertools.count()))
-        rungs = np.array([*(there := tuple(rungs)), *[-1] * (MOST_RUNGS - len(there))], np.int32)
+        rungs = np.array([min(first * 4**i, MOST_COUNTED) for i in range(MOST_RUNGS)], np.int32)
         return Ends(*map(np.int32, (self.env_steps, self.variations, self.patience, self.per_cell)), rungs)  # pyright: ignore
 
     @property
