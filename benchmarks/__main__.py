@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from benchmarks.report import RESULTS, Report, Run, as_json, as_page, as_text
-from configs.errors import ConfigError
-from pipeline.errors import Exit, LevelproofError
+from levelproof.configs.errors import ConfigError
+from levelproof.pipeline.errors import Exit, LevelproofError
 
 BENCHMARKS = {  # name: (module, what it measures)
     "physics": ("benchmarks.physics", "env steps/s of both engines under random actions, without observations"),

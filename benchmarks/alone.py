@@ -5,13 +5,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from experts.judge import Kept
-from experts.labels import Label
-from experts.pool import NOTHING_BEGUN, Pool
-from experts.procedure import Procedure
-from experts.train import TrainingRun, UnitResult
-from levelgen.level import Level
-from levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.experts.judge import Kept
+from levelproof.experts.labels import Label
+from levelproof.experts.pool import NOTHING_BEGUN, Pool
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.train import TrainingRun, UnitResult
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 
 Tell = Callable[[int, float, int], None]  # totals so far: env steps, levels (parts count), solved levels
 Name = TypeVar("Name")

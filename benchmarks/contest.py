@@ -11,7 +11,7 @@ from typing import IO
 
 from benchmarks.oracle import tell
 from benchmarks.reference.serve import MARK
-from pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from experts.advance import advance
-from experts.config import ExpertConfig, Rule, StopConfig
-from experts.queue import GROUP, empty_queue, enter
-from experts.slots import LevelQueue, Report, Slots
-from experts.stop import rules_of
-from experts.success import no_success
-from experts.witness import take
-from levelgen.level import Level
-from levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.experts.advance import advance
+from levelproof.experts.config import ExpertConfig, Rule, StopConfig
+from levelproof.experts.queue import GROUP, empty_queue, enter
+from levelproof.experts.slots import LevelQueue, Report, Slots
+from levelproof.experts.stop import rules_of
+from levelproof.experts.success import no_success
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 
 UPDATES = 10**6  # more than a benchmark waits for
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from levelgen.level import Level, Role
-from levelgen.task.rules import TaskParams
+from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.task.rules import TaskParams
 
 MARGIN = 0.02  # m; more than what contacts overlap before they count, and than all rounding
 LONGEST = 512  # physics steps

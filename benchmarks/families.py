@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.report import Report, Table
-from configs.compose import compose_job, distributions
-from experts.before import facts_of
-from levelgen.level import SIZES
-from levelgen.pictures.raster import write_png
-from levelgen.proofs import Proof
-from levelgen.sampling.sampler import Distribution, sample_levels
-from levelgen.task.rules import DEFAULT_RULES
-from pipeline.look.sample import LEVELS, sheet_of
-from pipeline.runtime import prepare_jax
+from levelproof.configs.compose import compose_job, distributions
+from levelproof.experts.before import facts_of
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.pictures.raster import write_png
+from levelproof.levelgen.proofs import Proof
+from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.look.sample import LEVELS, sheet_of
+from levelproof.pipeline.runtime import prepare_jax
 
 SHEET_SIZE = "l"
 KINDS = ("trivial", "fails", "unsolvable")

@@ -19,13 +19,13 @@ from benchmarks import oracle
 from benchmarks.reference.level_statistics import statistics
 from benchmarks.report import Report, Table
 from benchmarks.statistics import holm
-from experts.before import facts_of
-from levelgen.files.kinetix import level_from_kinetix, state_to_kinetix
-from levelgen.level import SIZES, Level
-from levelgen.proofs import Proof
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
-from pipeline.runtime import prepare_jax
+from levelproof.experts.before import facts_of
+from levelproof.levelgen.files.kinetix import level_from_kinetix, state_to_kinetix
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.proofs import Proof
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.runtime import prepare_jax
 
 SIGNIFICANT = 1e-3
 COUNTED = 40  # statistics with at most so many different values are compared by their counts

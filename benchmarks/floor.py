@@ -16,19 +16,19 @@ import numpy as np
 from jax.extend import core
 
 from benchmarks.report import Report, Table
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task import rules as task
-from levelgen.task.actions import CHOICES, controls
-from physics.block import Block, Given, Scratch
-from physics.buffers import buffers_of
-from physics.codegen.buffers import LANES
-from physics.codegen.primitives import ELEMENTWISE
-from physics.engine import STAGES, step_block
-from physics.pairs import table_of
-from physics.step import as_machine_code
-from physics.types import DEFAULT_PARAMS
-from pipeline.runtime import own_cores, prepare_jax
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES, controls
+from levelproof.physics.block import Block, Given, Scratch
+from levelproof.physics.buffers import buffers_of
+from levelproof.physics.codegen.buffers import LANES
+from levelproof.physics.codegen.primitives import ELEMENTWISE
+from levelproof.physics.engine import STAGES, step_block
+from levelproof.physics.pairs import table_of
+from levelproof.physics.step import as_machine_code
+from levelproof.physics.types import DEFAULT_PARAMS
+from levelproof.pipeline.runtime import own_cores, prepare_jax
 
 LEVELS, COUNTED = 1024, 64  # lanes timed, lanes counted
 STEPS = 32  # env steps under random actions before the measurement

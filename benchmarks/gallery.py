@@ -17,20 +17,20 @@ import numpy as np
 
 from benchmarks.browser import browser
 from benchmarks.report import Report, Table
-from configs.compose import compose_job
-from configs.numbers import parse_count
-from experts.config import RECORD_STEPS
-from experts.labels import Label, Source, Verdict
-from experts.steps import EnvSteps
-from experts.train import UnitResult
-from experts.witness import replay, steps_to_goal, succeeds, take
-from levelgen.level import ACTIONS, size_of
-from levelgen.sampling.sampler import sample_levels
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
-from pipeline.look.gallery.gallery import gallery
-from pipeline.runtime import prepare_jax
-from pipeline.store.layout import split_path
+from levelproof.configs.compose import compose_job
+from levelproof.configs.numbers import parse_count
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import Label, Source, Verdict
+from levelproof.experts.steps import EnvSteps
+from levelproof.experts.train import UnitResult
+from levelproof.experts.witness import replay, steps_to_goal, succeeds, take
+from levelproof.levelgen.level import ACTIONS, size_of
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.look.gallery.gallery import gallery
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.layout import split_path
 
 UNIT = 1000  # levels that are made at once
 HELD = 16  # env steps that an action is held

@@ -22,18 +22,18 @@ from benchmarks.alone import label
 from benchmarks.falls import fall
 from benchmarks.report import Report, Table
 from benchmarks.solved.variants import VARIANTS
-from configs.compose import compose_job
-from configs.numbers import parse_count
-from configs.schema import JobConfig
-from experts.labels import WITNESSED, Verdict
-from experts.train import UnitResult
-from experts.witness import blocks
-from levelgen.pictures.raster import draw, sheet
-from levelgen.pictures.words import Caption
-from pipeline.errors import UserError
-from pipeline.read.level_files import level_at, levels_at, levels_below
-from pipeline.runtime import cache_folder, own_cores, prepare_jax
-from pipeline.store.origins import Origin
+from levelproof.configs.compose import compose_job
+from levelproof.configs.numbers import parse_count
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.labels import WITNESSED, Verdict
+from levelproof.experts.train import UnitResult
+from levelproof.experts.witness import blocks
+from levelproof.levelgen.pictures.raster import draw, sheet
+from levelproof.levelgen.pictures.words import Caption
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.level_files import level_at, levels_at, levels_below
+from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
+from levelproof.pipeline.store.origins import Origin
 
 SIZES = ("s", "m", "l")
 KINDS = {"search": "search_steps", "training": "env_steps", "evaluation": "evaluation_steps"}

@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 
-from levelgen.files.kinetix import level_from_kinetix
-from levelgen.level import Level
+from levelproof.levelgen.files.kinetix import level_from_kinetix
+from levelproof.levelgen.level import Level
 
 
 def load_levels(path: str, first: int, count: int) -> Level:

@@ -24,14 +24,14 @@ import pyarrow.parquet as pq
 
 from benchmarks import oracle
 from benchmarks.report import Report, Table
-from configs.compose import compose_job
-from configs.numbers import parse_count
-from experts.steps import Seconds
-from pipeline.store.columns import COLUMNS
-from pipeline.store.layout import new_attempt, split_path, unit_name
-from pipeline.store.manifest import begin_fragment, write_fragment
-from pipeline.store.merge import FILE_BYTES
-from pipeline.store.seal import ROWS
+from levelproof.configs.compose import compose_job
+from levelproof.configs.numbers import parse_count
+from levelproof.experts.steps import Seconds
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.layout import new_attempt, split_path, unit_name
+from levelproof.pipeline.store.manifest import begin_fragment, write_fragment
+from levelproof.pipeline.store.merge import FILE_BYTES
+from levelproof.pipeline.store.seal import ROWS
 
 REFERENCE = Path(__file__).parent.parent / "manifests" / "128k-s.parquet"
 SECONDS, BYTES = 10, 2 * 2**30  # that each command should stay within

@@ -13,15 +13,15 @@ import numpy as np
 
 from benchmarks.endless import endless_queue, go_on
 from benchmarks.report import Report, Table
-from experts.config import ExpertConfig, Network
-from experts.networks.entity import KINDS
-from experts.networks.layers import LOGITS
-from experts.slots import empty_slots
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.observe.flat import DYNAMIC_ROWS
-from physics.types import FIXED_POLYGONS, Size
-from pipeline.runtime import own_cores, prepare_jax
+from levelproof.experts.config import ExpertConfig, Network
+from levelproof.experts.networks.entity import KINDS
+from levelproof.experts.networks.layers import LOGITS
+from levelproof.experts.slots import empty_slots
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.observe.flat import DYNAMIC_ROWS
+from levelproof.physics.types import FIXED_POLYGONS, Size
+from levelproof.pipeline.runtime import own_cores, prepare_jax
 
 SLOTS, UPDATES, REPEATS = 4, 5, 9  # REPEATS in turns, so that medians compare
 LAYERS, MODEL = 2, 64  # of the transformer; heads change nothing here

@@ -15,8 +15,8 @@ from typing import Any
 from benchmarks import oracle
 from benchmarks.plan import measured
 from benchmarks.report import Report, Table
-from pipeline.errors import Failure
-from pipeline.store.layout import split_path
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.layout import split_path
 
 PLOT = "night.svg"
 COLOURS = {"driver": "#0072b2", "workers": "#d55e00", "ray": "#777777"}  # Okabe and Ito

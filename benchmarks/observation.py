@@ -11,11 +11,11 @@ import numpy as np
 from benchmarks.reference.actions import sticky_actions
 from benchmarks.reference.serve import timed
 from benchmarks.report import Report, Table
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task import rules as task
-from levelgen.task.observe.flat import level_features, symbolic_flat
-from pipeline.runtime import own_cores, prepare_jax
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.observe.flat import level_features, symbolic_flat
+from levelproof.pipeline.runtime import own_cores, prepare_jax
 
 LANES = 128  # stepped together
 STEPS = 64

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.errors import Failure, UserError
-from pipeline.runtime import cache_folder
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.runtime import cache_folder
 
 PYTHON_VARIABLE = "LEVELPROOF_ORACLE_PYTHON"  # a Python that has the reference already
 REQUIREMENTS = ("kinetix-env==3.0.2", "jax2d==1.0.1", "jax[cpu]==0.9.0")

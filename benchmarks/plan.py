@@ -12,12 +12,12 @@ from typing import Any
 
 from benchmarks import oracle
 from benchmarks.report import Report, Table
-from experts.labels import Label
-from pipeline.errors import Failure
-from pipeline.look.cost import READ, cost_of
-from pipeline.store.manifest import read_manifest
-from pipeline.store.shard import stored_bytes
-from pipeline.words import number
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.look.cost import READ, cost_of
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.shard import stored_bytes
+from levelproof.pipeline.words import number
 
 TARGET = 0.15  # by which wall time may be off
 SIZE, LEVELS, BUDGET = "s", "4k", "64k"

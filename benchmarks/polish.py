@@ -11,17 +11,17 @@ from jaxtyping import Float, Int
 from benchmarks.alone import label
 from benchmarks.oracle import tell
 from benchmarks.report import Report, Table
-from configs.compose import compose_job
-from experts.judge import Witness
-from experts.labels import BY_EXPERT, Label
-from experts.procedure import Procedure
-from experts.rework import rework
-from experts.train import UnitResult
-from experts.witness import take
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
-from pipeline.runtime import prepare_jax
+from levelproof.configs.compose import compose_job
+from levelproof.experts.judge import Witness
+from levelproof.experts.labels import BY_EXPERT, Label
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.rework import rework
+from levelproof.experts.train import UnitResult
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.runtime import prepare_jax
 
 FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
 LEVELS = {"s": 64, "m": 64, "l": 32}

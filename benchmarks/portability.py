@@ -18,19 +18,19 @@ from jaxtyping import Bool, Float, Int
 from benchmarks import oracle
 from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
-from experts.config import RECORD_STEPS, ExpertConfig
-from experts.judge import Witness, candidates_of
-from experts.labels import Label
-from experts.pool import Pool
-from experts.portability import survival
-from experts.procedure import Procedure
-from experts.train import TrainingRun
-from experts.witness import take
-from levelgen.files.level_file import LevelFile, write_level_file
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
-from pipeline.runtime import prepare_jax
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig
+from levelproof.experts.judge import Witness, candidates_of
+from levelproof.experts.labels import Label
+from levelproof.experts.pool import Pool
+from levelproof.experts.portability import survival
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.train import TrainingRun
+from levelproof.experts.witness import take
+from levelproof.levelgen.files.level_file import LevelFile, write_level_file
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.runtime import prepare_jax
 
 BUDGET = 64_000  # env steps of an expert
 FIRST = 1_000_000  # level id: nothing was tuned on levels from there on

@@ -12,9 +12,9 @@ import numpy as np
 from benchmarks import oracle
 from benchmarks.contest import Entry, Score, compete
 from benchmarks.report import Report, Table
-from levelgen.level import SIZES
-from pipeline.errors import UserError
-from pipeline.runtime import own_cores
+from levelproof.levelgen.level import SIZES
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.runtime import own_cores
 
 OURS, PINNED, FREE = "ours", "reference, process per core", "reference, one process"
 

@@ -15,10 +15,10 @@ from typing import Any
 from benchmarks import oracle
 from benchmarks.reference.batches import WARM
 from benchmarks.report import Report, Table
-from levelgen.level import SIZES
-from pipeline.errors import Failure
-from pipeline.runtime import cache_folder
-from pipeline.store.shard import stored_bytes
+from levelproof.levelgen.level import SIZES
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.runtime import cache_folder
+from levelproof.pipeline.store.shard import stored_bytes
 
 BATCH = 64
 BUDGET = "64k"

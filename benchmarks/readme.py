@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import Report, Table
-from pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure
 
 ROOT = Path(__file__).parent.parent
 INSTALL, GENERATE = "pip install -e .", "levelproof generate"

@@ -21,13 +21,23 @@ from jaxtyping import Float
 from rich.console import Console
 
 from benchmarks.report import Report, Table
-from configs.compose import compose_job
-from configs.numbers import parse_count
-from experts.steps import EnvSteps
-from pipeline.errors import UserError
-from pipeline.jobs.cluster import REPORTS
-from pipeline.jobs.plan import costs_of, measured
-from pipeline.jobs.schedule import ROUND, Cut, Order, Round, Scheduler, Summary, UnitOutcome, WorkUnit, plan_units
+from levelproof.configs.compose import compose_job
+from levelproof.configs.numbers import parse_count
+from levelproof.experts.steps import EnvSteps
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.jobs.cluster import REPORTS
+from levelproof.pipeline.jobs.plan import costs_of, measured
+from levelproof.pipeline.jobs.schedule import (
+    ROUND,
+    Cut,
+    Order,
+    Round,
+    Scheduler,
+    Summary,
+    UnitOutcome,
+    WorkUnit,
+    plan_units,
+)
 
 UNIT, SLOTS = 32, 4  # levels of a unit, experts side by side: of size s on a core
 HEARING = 1e-3  # s of the driver for a report beside the scheduler's: Ray's call and its answer; assumed

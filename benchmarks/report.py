@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.runtime import own_cores
-from pipeline.store.provenance import device, versions
+from levelproof.pipeline.runtime import own_cores
+from levelproof.pipeline.store.provenance import device, versions
 
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
 DIGITS = 5  # of a number in JSON

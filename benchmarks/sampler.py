@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 from benchmarks import oracle
 from benchmarks.report import Report, Table
-from levelgen.level import SIZES
+from levelproof.levelgen.level import SIZES
 
 LEVELS = 4096
 

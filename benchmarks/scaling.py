@@ -18,12 +18,12 @@ from jaxtyping import Int
 
 from benchmarks.reference.actions import sticky_actions
 from benchmarks.report import Report, Table
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task import rules as task
-from physics.pairs import pairs_of
-from physics.types import FIXED_POLYGONS, Size
-from pipeline.runtime import own_cores, prepare_jax
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task import rules as task
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import FIXED_POLYGONS, Size
+from levelproof.pipeline.runtime import own_cores, prepare_jax
 
 LEVELS, LANES = 4096, 128  # sampled, and stepped together
 SETTLING = 32  # env steps under random actions before the measurement

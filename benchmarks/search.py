@@ -21,17 +21,17 @@ from scipy.stats import chi2
 from benchmarks.oracle import tell
 from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
-from configs.numbers import parse_count
-from experts.before import decide
-from experts.config import MOST_COUNTED
-from experts.search.config import SearchConfig
-from experts.search.explore import Search, begin, explore, success_of
-from experts.search.search import side_by_side
-from experts.witness import blocks, replay, take
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
-from pipeline.runtime import cache_folder, own_cores, prepare_jax
+from levelproof.configs.numbers import parse_count
+from levelproof.experts.before import decide
+from levelproof.experts.config import MOST_COUNTED
+from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.search.explore import Search, begin, explore, success_of
+from levelproof.experts.search.search import side_by_side
+from levelproof.experts.witness import blocks, replay, take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
 
 FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
 LEVELS = {"s": 256, "m": 128, "l": 64}

@@ -22,15 +22,15 @@ import pyarrow.compute as pc
 
 from benchmarks import oracle
 from benchmarks.report import Report, Table
-from configs.schema import Density
-from experts.config import RECORD_STEPS
-from levelgen.level import SIZES
-from pipeline.errors import UserError
-from pipeline.read.rows import COLUMNS, read_rows
-from pipeline.runtime import own_cores, prepare_jax
-from pipeline.store.manifest import require_manifest
-from pipeline.store.schema import Encoding
-from pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
+from levelproof.configs.schema import Density
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.levelgen.level import SIZES
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.rows import COLUMNS, read_rows
+from levelproof.pipeline.runtime import own_cores, prepare_jax
+from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.schema import Encoding
+from levelproof.pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
 
 PUBLISHED = {"s": 80, "m": 111, "l": 306}  # bytes per transition, Kinetix's 1M splits
 BATCH = 64  # random trajectories that are read at once

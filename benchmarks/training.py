@@ -15,19 +15,19 @@ import numpy as np
 
 from benchmarks.endless import endless_queue, go_on
 from benchmarks.report import Report, Table
-from experts import ppo
-from experts.config import ExpertConfig
-from experts.policy import network_of
-from experts.pool import slot_count
-from experts.ppo import LevelConstants, Samples
-from experts.rollout import Manner, rollout, start
-from experts.slots import empty_slots
-from experts.witness import repeat
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.actions import CHOICES, action_mask
-from levelgen.task.rules import DEFAULT_RULES
-from pipeline.runtime import own_cores, prepare_jax
+from levelproof.experts import ppo
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.policy import network_of
+from levelproof.experts.pool import slot_count
+from levelproof.experts.ppo import LevelConstants, Samples
+from levelproof.experts.rollout import Manner, rollout, start
+from levelproof.experts.slots import empty_slots
+from levelproof.experts.witness import repeat
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.runtime import own_cores, prepare_jax
 
 REPEATS = 30
 

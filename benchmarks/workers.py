@@ -23,12 +23,12 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.report import Report, Table
-from configs.compose import compose_job
-from pipeline.errors import Failure
-from pipeline.jobs.progress import Board, Tally
-from pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, UnitOutcome, WorkUnit, plan_units
-from pipeline.runtime import own_cores, prepare_jax
-from pipeline.store.split import writing
+from levelproof.configs.compose import compose_job
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.jobs.progress import Board, Tally
+from levelproof.pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, UnitOutcome, WorkUnit, plan_units
+from levelproof.pipeline.runtime import own_cores, prepare_jax
+from levelproof.pipeline.store.split import writing
 
 UNIT = 32  # levels
 WORKERS, UNITS = 1_000, (2_000, 20_000, 200_000)  # simulated
@@ -123,7 +123,7 @@ def told_by(target: Callable[..., None], each: Sequence[tuple[Any, ...]]) -> lis
 
 def work(words: Sequence[str], told: Any) -> None:
     """The job, as `levelproof generate` does it."""
-    from pipeline.jobs import cluster
+    from levelproof.pipeline.jobs import cluster
 
     job = compose_job(words)
     count = len(job.level_ids)
@@ -151,7 +151,7 @@ def beside(words: Sequence[str], processes: int) -> float:
 def work_alone(words: Sequence[str], core: int, ready: Any, told: Any) -> None:
     """The job's first units, by a worker's loop that nobody drives."""
     prepare_jax(core)
-    from pipeline.jobs.worker import Worker  # imports what reads the settings just made
+    from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
     job = compose_job(words)
     first, *units = islice(plan_units(job.level_ids, [], job.levels_per_unit), 1 + BESIDE)

@@ -16,12 +16,13 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from configs.convert import flat, plain, typed
-from configs.errors import ConfigError, suggestion
-from configs.schema import JobConfig, from_files, hash_of
-from levelgen.sampling.distribution import Distribution
+from levelproof.configs.convert import flat, plain, typed
+from levelproof.configs.errors import ConfigError, suggestion
+from levelproof.configs.schema import JobConfig, from_files, hash_of
+from levelproof.levelgen.sampling.distribution import Distribution
 
 JOB = "generate"
+PACKAGE = "levelproof.configs"  # where the yaml files are
 ConfigStore.instance().store(name="code", node=plain(JobConfig()))  # where configs/generate.yaml has defaults from
 # Results that are not settings, or have their own word
 BY_HAND = frozenset({"size", "distribution", "budget", "sampler_version"})
@@ -60,14 +61,14 @@ def _known() -> Mapping[str, Any]:
 @cache
 def chosen() -> dict[str, str]:
     """The preset that each folder of configs/ stands for where no other is chosen."""
-    with initialize_config_module("configs", version_base="1.3"):
+    with initialize_config_module(PACKAGE, version_base="1.3"):
         choices = compose(JOB, return_hydra_config=True).hydra.runtime.choices
     return {name: str(choices[name]) for name in presets()}
 
 
 def presets() -> dict[str, list[str]]:
     """The files to choose from in each folder of configs/."""
-    folders = [entry for entry in files("configs").iterdir() if entry.is_dir() and not entry.name.startswith("_")]
+    folders = [entry for entry in files(PACKAGE).iterdir() if entry.is_dir() and not entry.name.startswith("_")]
     return {
         f.name: sorted(e.name.removesuffix(".yaml") for e in f.iterdir() if e.name.endswith(".yaml")) for f in folders
     }
@@ -110,7 +111,7 @@ def _default() -> JobConfig:
 @cache
 def _written(folder: str, name: str) -> dict[str, Any]:
     """What stands in a preset's file: without Hydra, which takes a hundred times as long to compose all settings."""
-    written = OmegaConf.to_container(OmegaConf.load(str(files("configs") / folder / f"{name}.yaml")))
+    written = OmegaConf.to_container(OmegaConf.load(str(files(PACKAGE) / folder / f"{name}.yaml")))
     assert isinstance(written, dict)
     return {str(key): value for key, value in written.items()}
 
@@ -139,7 +140,7 @@ def identified(distribution: Distribution) -> tuple[str | None, str]:
 
 def _composed(overrides: list[str]) -> dict[str, Any]:
     try:
-        with initialize_config_module("configs", version_base="1.3"):
+        with initialize_config_module(PACKAGE, version_base="1.3"):
             composed = OmegaConf.to_container(compose(JOB, overrides), resolve=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(f"cannot use these settings: {str(error).splitlines()[0].rstrip('.')}.") from None

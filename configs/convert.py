@@ -16,8 +16,8 @@ from cattrs import BaseValidationError, Converter, ForbiddenExtraKeysError
 from cattrs.errors import AttributeValidationNote
 from cattrs.gen import make_dict_structure_fn
 
-from configs.errors import ConfigError, suggestion
-from configs.numbers import SCALES, parse_count
+from levelproof.configs.errors import ConfigError, suggestion
+from levelproof.configs.numbers import SCALES, parse_count
 
 T = TypeVar("T")
 CONVERTER = Converter()

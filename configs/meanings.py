@@ -14,9 +14,9 @@ from dataclasses import dataclass, is_dataclass
 from enum import Enum
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
-from configs.compose import chosen, presets, settings, typed_as
-from configs.convert import flat
-from configs.schema import JobConfig
+from levelproof.configs.compose import chosen, presets, settings, typed_as
+from levelproof.configs.convert import flat
+from levelproof.configs.schema import JobConfig
 
 JOB = "job"  # the group of settings without a dot
 

@@ -3,7 +3,7 @@
 import re
 from decimal import Decimal
 
-from configs.errors import ConfigError
+from levelproof.configs.errors import ConfigError
 
 SCALES = {"": 1, "k": 1_000, "M": 1_000_000, "B": 1_000_000_000}
 PATTERN = re.compile(r"([0-9]+(?:\.[0-9]+)?)([kMB]?)")

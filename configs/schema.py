@@ -7,17 +7,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from configs.convert import plain
-from configs.errors import ConfigError
-from configs.numbers import parse_count, parse_duration
-from experts.config import ExpertConfig, ScoutConfig, StopConfig, check_budget
-from experts.procedure import Procedure
-from experts.search.config import SearchConfig
-from levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION
-from levelgen.level import SIZES, size_of
-from levelgen.sampling.distribution import CONTROL_WEIGHTS, Distribution
-from levelgen.sampling.sampler import check_size, control_weights
-from levelgen.task.rules import TaskParams
+from levelproof.configs.convert import plain
+from levelproof.configs.errors import ConfigError
+from levelproof.configs.numbers import parse_count, parse_duration
+from levelproof.experts.config import ExpertConfig, ScoutConfig, StopConfig, check_budget
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.search.config import SearchConfig
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION
+from levelproof.levelgen.level import SIZES, size_of
+from levelproof.levelgen.sampling.distribution import CONTROL_WEIGHTS, Distribution
+from levelproof.levelgen.sampling.sampler import check_size, control_weights
+from levelproof.levelgen.task.rules import TaskParams
 
 HASH_DIGITS = 16
 Density = Literal["full", "resume", "witness"]  # how much of a record is stored

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from levelgen.edit import add_body, add_joint, add_thruster, bind, fix, resize, set_role
-from levelgen.level import Level, Role
-from levelgen.pictures.scene import scene_of
-from levelgen.pictures.shapes import Part, Point, line, text
-from levelgen.pictures.style import INK
-from levelgen.pictures.svg import svg_of
-from levelgen.pictures.words import Caption
-from pipeline.look.play.session import empty_file
-from pipeline.runtime import prepare_jax
+from levelproof.levelgen.edit import add_body, add_joint, add_thruster, bind, fix, resize, set_role
+from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.pictures.scene import scene_of
+from levelproof.levelgen.pictures.shapes import Part, Point, line, text
+from levelproof.levelgen.pictures.style import INK
+from levelproof.levelgen.pictures.svg import svg_of
+from levelproof.levelgen.pictures.words import Caption
+from levelproof.pipeline.look.play.session import empty_file
+from levelproof.pipeline.runtime import prepare_jax
 
 DRAWING = Path(__file__).with_name("concepts-level.svg")
 ACTION = np.array([1, 0, 0, 0, 1, 0])

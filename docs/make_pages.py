@@ -9,10 +9,10 @@ import sys
 from pathlib import Path
 
 from benchmarks.browser import browser
-from experts.procedure import Procedure
-from pipeline.look.play.open import level_to_play
-from pipeline.look.play.server import HOST, serving
-from pipeline.runtime import prepare_jax
+from levelproof.experts.procedure import Procedure
+from levelproof.pipeline.look.play.open import level_to_play
+from levelproof.pipeline.look.play.server import HOST, serving
+from levelproof.pipeline.runtime import prepare_jax
 
 VIEW = {"width": 1180, "height": 700}
 FOLDER = Path(__file__).parent

@@ -7,10 +7,10 @@ python docs/make_sheets.py data/64k/s
 import sys
 from pathlib import Path
 
-from experts.labels import Label
-from levelgen.pictures.raster import rasterised, sheet, write_png
-from pipeline.look.show import film_of
-from pipeline.store.manifest import read_manifest
+from levelproof.experts.labels import Label
+from levelproof.levelgen.pictures.raster import rasterised, sheet, write_png
+from levelproof.pipeline.look.show import film_of
+from levelproof.pipeline.store.manifest import read_manifest
 
 LEVELS, COLUMNS = 10, 5
 PIXELS = 220  # width of one level's picture

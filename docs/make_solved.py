@@ -7,8 +7,8 @@ python docs/make_solved.py data/64k/l 66 32 76 88 83 89
 import sys
 from pathlib import Path
 
-from levelgen.pictures.raster import rasterised, sheet
-from pipeline.look.show import film_of
+from levelproof.levelgen.pictures.raster import rasterised, sheet
+from levelproof.pipeline.look.show import film_of
 
 COLUMNS = 3
 PIXELS = 260  # width of one level's picture

@@ -16,19 +16,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from experts import ppo, progress, stop
-from experts.config import ExpertConfig
-from experts.policy import ActorCritic, network_of
-from experts.ppo import LevelConstants, Samples
-from experts.rollout import Acting, Manner, Trajectory, rollout, start
-from experts.slots import LevelQueue, Mode, Report, Slot, Slots, Training, Trial, lanes_of
-from experts.stop import StopRules
-from experts.success import find, remember
-from experts.witness import repeat
-from levelgen.identity.keys import Stream, key_for
-from levelgen.level import Level
-from levelgen.task.actions import action_mask
-from levelgen.task.rules import TaskParams
+from levelproof.experts import ppo, progress, stop
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.policy import ActorCritic, network_of
+from levelproof.experts.ppo import LevelConstants, Samples
+from levelproof.experts.rollout import Acting, Manner, Trajectory, rollout, start
+from levelproof.experts.slots import LevelQueue, Mode, Report, Slot, Slots, Training, Trial, lanes_of
+from levelproof.experts.stop import StopRules
+from levelproof.experts.success import find, remember
+from levelproof.experts.witness import repeat
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.rules import TaskParams
 
 STICKINESS = 0.25  # of sticky attempts (Machado et al. 2018, arXiv:1709.06009)
 MOVED = 0.1  # m/s and rad/s, the most by which velocities of moved attempts differ from the level's

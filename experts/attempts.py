@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from flax.typing import VariableDict as Params
 from jaxtyping import Array, Bool, Float, Key
 
-from experts.config import ExpertConfig
-from experts.policy import network_of
-from experts.rollout import Manner, rollout, start
-from experts.witness import repeat
-from levelgen.level import Level
-from levelgen.task.actions import CHOICES
-from levelgen.task.rules import TaskParams
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.policy import network_of
+from levelproof.experts.rollout import Manner, rollout, start
+from levelproof.experts.witness import repeat
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.rules import TaskParams
 
 
 class Attempts(NamedTuple):

@@ -6,12 +6,12 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
-from experts.config import RECORD_STEPS
-from experts.labels import Label, Source, Verdict, trivial_reason, unsolvable_reason, untrained
-from experts.witness import blocks, replay, steps_to_goal, succeeds, take
-from levelgen.level import ACTIONS, Level
-from levelgen.proofs import Facts, Proof, examine
-from levelgen.task.rules import TaskParams
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import Label, Source, Verdict, trivial_reason, unsolvable_reason, untrained
+from levelproof.experts.witness import blocks, replay, steps_to_goal, succeeds, take
+from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.proofs import Facts, Proof, examine
+from levelproof.levelgen.task.rules import TaskParams
 
 
 class Before(NamedTuple):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from physics.bounds import require
+from levelproof.physics.bounds import require
 
 RECORD_STEPS = 256  # env steps of a record, with automatic reset inside
 MOST_DOUBLINGS = 6  # of the wait between evaluations

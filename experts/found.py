@@ -7,16 +7,16 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from experts.labels import Source
-from experts.ledger import Ledger
-from experts.procedure import Procedure
-from experts.scout import scout
-from experts.search.search import Searching
-from experts.search.stage import Searched
-from experts.success import Success, no_success
-from experts.witness import take
-from levelgen.level import Level
-from levelgen.task.rules import TaskParams
+from levelproof.experts.labels import Source
+from levelproof.experts.ledger import Ledger
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.scout import scout
+from levelproof.experts.search.search import Searching
+from levelproof.experts.search.stage import Searched
+from levelproof.experts.success import Success, no_success
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
 
 STILL = 0.75  # of a search: a cell that is new after so much of it says that more of it would find more
 

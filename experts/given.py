@@ -4,12 +4,12 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from experts.before import decide
-from experts.judge import repeated
-from experts.labels import Label, Source, Verdict, untrained
-from experts.witness import Record, replay, steps_to_goal, succeeds, take
-from levelgen.level import Level
-from levelgen.task.rules import TaskParams
+from levelproof.experts.before import decide
+from levelproof.experts.judge import repeated
+from levelproof.experts.labels import Label, Source, Verdict, untrained
+from levelproof.experts.witness import Record, replay, steps_to_goal, succeeds, take
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
 
 AGAIN = "the actions of the first imported episode, again and again, reach the goal"
 WHOLE = "the imported actions reach the goal in all {} of their finished episodes"

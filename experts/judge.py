@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
-from experts.config import RECORD_STEPS, Choice, ExpertConfig
-from experts.labels import UNTRAINED, Label, Source, Verdict, solved_reason, unsolved_reason, untrained
-from experts.progress import NEVER, Progress
-from experts.slots import Begun
-from experts.success import Success
-from experts.witness import Record, steps_to_goal, succeeds
+from levelproof.experts.config import RECORD_STEPS, Choice, ExpertConfig
+from levelproof.experts.labels import UNTRAINED, Label, Source, Verdict, solved_reason, unsolved_reason, untrained
+from levelproof.experts.progress import NEVER, Progress
+from levelproof.experts.slots import Begun
+from levelproof.experts.success import Success
+from levelproof.experts.witness import Record, steps_to_goal, succeeds
 
 MOST_CANDIDATES = 16  # of an evaluation
 

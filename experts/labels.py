@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import inf, nan
 
-from levelgen.proofs import Proof
+from levelproof.levelgen.proofs import Proof
 
 
 class Label(StrEnum):

@@ -13,7 +13,7 @@ import numpy as np
 from jax import monitoring
 from jaxtyping import Int
 
-from experts.steps import Seconds
+from levelproof.experts.steps import Seconds
 
 COMPILING = "/jax/core/compile/"  # what JAX's events of tracing, lowering and compiling begin with
 

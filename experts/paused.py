@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-from experts.found import Found
-from experts.judge import Evaluation, Kept
-from experts.slots import Pending
+from levelproof.experts.found import Found
+from levelproof.experts.judge import Evaluation, Kept
+from levelproof.experts.slots import Pending
 
 
 class Paused(NamedTuple):

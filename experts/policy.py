@@ -8,12 +8,12 @@ import numpy as np
 from flax.typing import VariableDict as Params
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from experts.config import ExpertConfig, Network
-from experts.networks.entity import EntityNetwork
-from experts.networks.flat import FlatNetwork
-from levelgen.task.actions import CHOICES
-from levelgen.task.observe.flat import dynamic_features
-from physics.types import Size
+from levelproof.experts.config import ExpertConfig, Network
+from levelproof.experts.networks.entity import EntityNetwork
+from levelproof.experts.networks.flat import FlatNetwork
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.observe.flat import dynamic_features
+from levelproof.physics.types import Size
 
 ActorCritic = FlatNetwork | EntityNetwork
 Constant = Any  # what is constant within one level, as the network's `constant` lays it out

@@ -15,21 +15,21 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from experts.advance import advance, train_on
-from experts.config import RECORD_STEPS, ExpertConfig, check_budget
-from experts.found import Found, nothing_found, row_of
-from experts.judge import Evaluation, Kept, Trained, Witness, candidates_of, shortest_first, witnesses_in
-from experts.ledger import Lap, Ledger, Steps, lap
-from experts.paused import Paused
-from experts.portability import PORTABLE, choose
-from experts.procedure import Procedure
-from experts.queue import GROUP, empty_queue, enter
-from experts.search.search import Searching
-from experts.slots import Begun, LevelQueue, Mode, Pending, Report, Slots, empty_slots
-from experts.stop import rules_of
-from experts.witness import at_once, take
-from levelgen.level import Level
-from levelgen.task.rules import TaskParams
+from levelproof.experts.advance import advance, train_on
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig, check_budget
+from levelproof.experts.found import Found, nothing_found, row_of
+from levelproof.experts.judge import Evaluation, Kept, Trained, Witness, candidates_of, shortest_first, witnesses_in
+from levelproof.experts.ledger import Lap, Ledger, Steps, lap
+from levelproof.experts.paused import Paused
+from levelproof.experts.portability import PORTABLE, choose
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.queue import GROUP, empty_queue, enter
+from levelproof.experts.search.search import Searching
+from levelproof.experts.slots import Begun, LevelQueue, Mode, Pending, Report, Slots, empty_slots
+from levelproof.experts.stop import rules_of
+from levelproof.experts.witness import at_once, take
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
 
 IN_CACHE = 128  # lanes: their physics and one minibatch fit the cache of a core
 QUEUED_PER_SLOT = 4  # levels: with those in the slots, and while the next group does not fit yet, enough wait

@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from experts.config import RECORD_STEPS
-from experts.judge import Witness
-from experts.search.play import Arena, Walk, act, arena, fresh_walk
-from experts.witness import at_once, block_size, blocks, take
-from levelgen.identity.keys import Stream, key_for
-from levelgen.level import Level
-from levelgen.task.rules import TaskParams
-from physics.types import State
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.judge import Witness
+from levelproof.experts.search.play import Arena, Walk, act, arena, fresh_walk
+from levelproof.experts.witness import at_once, block_size, blocks, take
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.physics.types import State
 
 LATE = 16  # env steps by which a replay may reach the goal later than the candidate
 PORTABLE = 0.95  # share of replays; where fewer survive, a steadier witness is looked for

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from experts.config import ExpertConfig
-from experts.policy import ActorCritic, Constant, Params, entropy, forward, initial, log_probability
-from levelgen.task.actions import CHOICES
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.policy import ActorCritic, Constant, Params, entropy, forward, initial, log_probability
+from levelproof.levelgen.task.actions import CHOICES
 
 ADVANTAGE_EPSILON = 1e-8
 

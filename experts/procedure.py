@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, field
 
-from experts.config import ExpertConfig, ScoutConfig, StopConfig
-from experts.search.config import SearchConfig
+from levelproof.experts.config import ExpertConfig, ScoutConfig, StopConfig
+from levelproof.experts.search.config import SearchConfig
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from experts.config import ExpertConfig
-from experts.slots import Begun, LevelQueue, Pending, begin
-from experts.success import Success, no_success
-from experts.witness import take
-from levelgen.level import Level
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.slots import Begun, LevelQueue, Pending, begin
+from levelproof.experts.success import Success, no_success
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import Level
 
 GROUP = 16  # levels that enter at once
 

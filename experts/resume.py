@@ -12,14 +12,14 @@ import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 from jaxtyping import Array, Bool, Int, UInt32
 
-from experts.config import RECORD_STEPS
-from experts.witness import block_size, blocks, onwards, record_of, take
-from levelgen.level import Level
-from levelgen.task import rules as task
-from levelgen.task.actions import controls
-from levelgen.task.rules import StepResult, TaskParams, TaskState
-from physics.buffers import zeros_of
-from physics.types import Manifold, State
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness import block_size, blocks, onwards, record_of, take
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import controls
+from levelproof.levelgen.task.rules import StepResult, TaskParams, TaskState
+from levelproof.physics.buffers import zeros_of
+from levelproof.physics.types import Manifold, State
 
 MOST = 256  # levels that are played side by side
 # of `checksum`

@@ -6,18 +6,18 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from experts.config import RECORD_STEPS
-from experts.judge import Witness, repeating
-from experts.labels import BY_EXPERT, Source
-from experts.portability import PORTABLE, choose
-from experts.procedure import Procedure
-from experts.search.polish import LANES, polish
-from experts.search.shorten import Shortened
-from experts.steady import KEPT, STARTS, steady
-from experts.success import Success
-from experts.witness import at_once, blocks, take
-from levelgen.level import Level
-from levelgen.task.rules import TaskParams
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.judge import Witness, repeating
+from levelproof.experts.labels import BY_EXPERT, Source
+from levelproof.experts.portability import PORTABLE, choose
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.search.polish import LANES, polish
+from levelproof.experts.search.shorten import Shortened
+from levelproof.experts.steady import KEPT, STARTS, steady
+from levelproof.experts.success import Success
+from levelproof.experts.witness import at_once, blocks, take
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
 
 OWN = 0.5  # share of replays of an expert's own witness; only where fewer survive, a search's may stand in
 IN_CACHE = 256  # lanes: their physics fits the cache of a core

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from experts.policy import ActorCritic, forward, log_probability, most_probable, sample
-from experts.witness import repeat
-from levelgen.level import Level
-from levelgen.task import rules as task
-from levelgen.task.actions import CHOICES, action_mask
-from levelgen.task.observe.flat import state_features
-from levelgen.task.rules import TaskParams, TaskState
+from levelproof.experts.policy import ActorCritic, forward, log_probability, most_probable, sample
+from levelproof.experts.witness import repeat
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.observe.flat import state_features
+from levelproof.levelgen.task.rules import TaskParams, TaskState
 
 
 class Acting(NamedTuple):

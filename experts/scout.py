@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Key
 
-from experts.config import RECORD_STEPS, ScoutConfig
-from experts.success import Success, ending_at, no_success
-from experts.witness import at_once, blocks, repeat, take
-from levelgen.identity.keys import Stream, key_for
-from levelgen.level import Level
-from levelgen.task import rules as task
-from levelgen.task.actions import CHOICES, action_mask
-from levelgen.task.rules import TaskParams
+from levelproof.experts.config import RECORD_STEPS, ScoutConfig
+from levelproof.experts.success import Success, ending_at, no_success
+from levelproof.experts.witness import at_once, blocks, repeat, take
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.rules import TaskParams
 
 EPISODES = 64  # lanes of a level
 STEPS_PER_ROUND = EPISODES * RECORD_STEPS

@@ -12,18 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from experts import ppo, progress, stop
-from experts.config import RECORD_STEPS, ExpertConfig
-from experts.policy import Constant, network_of
-from experts.ppo import TrainState
-from experts.progress import Progress
-from experts.rollout import Acting, start
-from experts.stop import Course
-from experts.success import Success
-from experts.witness import repeat
-from levelgen.identity.keys import Stream, key_for
-from levelgen.level import Level
-from levelgen.task.actions import CHOICES
+from levelproof.experts import ppo, progress, stop
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig
+from levelproof.experts.policy import Constant, network_of
+from levelproof.experts.ppo import TrainState
+from levelproof.experts.progress import Progress
+from levelproof.experts.rollout import Acting, start
+from levelproof.experts.stop import Course
+from levelproof.experts.success import Success
+from levelproof.experts.witness import repeat
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.actions import CHOICES
 
 
 class Mode(IntEnum):

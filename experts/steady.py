@@ -11,17 +11,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from experts.config import RECORD_STEPS
-from experts.portability import moved, survivors
-from experts.search.play import arena, fresh_walk
-from experts.search.polish import varied
-from experts.search.shorten import Shortened, replayed
-from experts.success import Success
-from experts.witness import repeat
-from levelgen.identity.keys import Stream, key_for
-from levelgen.level import Level
-from levelgen.task.actions import action_mask
-from levelgen.task.rules import TaskParams
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.portability import moved, survivors
+from levelproof.experts.search.play import arena, fresh_walk
+from levelproof.experts.search.polish import varied
+from levelproof.experts.search.shorten import Shortened, replayed
+from levelproof.experts.success import Success
+from levelproof.experts.witness import repeat
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.rules import TaskParams
 
 LANES = 64  # of variations, the witness itself the first
 KEPT = 8  # of these, to be replayed

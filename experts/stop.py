@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from experts.config import MOST_DOUBLINGS, RECORD_STEPS, ExpertConfig, Rule, StopConfig
-from experts.progress import NEVER, Progress
+from levelproof.experts.config import MOST_DOUBLINGS, RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from levelproof.experts.progress import NEVER, Progress
 
 LAST = np.int32(2**31 - 1)  # update, that nobody reaches
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from experts.config import RECORD_STEPS
-from levelgen.task.actions import CHOICES
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.levelgen.task.actions import CHOICES
 
 
 class Success(NamedTuple):

@@ -7,21 +7,21 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from experts.before import decide
-from experts.config import RECORD_STEPS, ExpertConfig, Rule
-from experts.found import Found, Looking, joined
-from experts.judge import Kept, Trained, Witness, judge, repeating
-from experts.labels import WITNESSED, Source, Verdict
-from experts.ledger import Ledger, lap
-from experts.paused import Paused
-from experts.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Submission, Totals
-from experts.portability import choose
-from experts.rework import rework
-from experts.steps import EnvSteps
-from experts.success import Success
-from experts.witness import Record, replay, take
-from levelgen.identity.keys import level_id_array
-from levelgen.level import ACTIONS, Level
+from levelproof.experts.before import decide
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig, Rule
+from levelproof.experts.found import Found, Looking, joined
+from levelproof.experts.judge import Kept, Trained, Witness, judge, repeating
+from levelproof.experts.labels import WITNESSED, Source, Verdict
+from levelproof.experts.ledger import Ledger, lap
+from levelproof.experts.paused import Paused
+from levelproof.experts.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Submission, Totals
+from levelproof.experts.portability import choose
+from levelproof.experts.rework import rework
+from levelproof.experts.steps import EnvSteps
+from levelproof.experts.success import Success
+from levelproof.experts.witness import Record, replay, take
+from levelproof.levelgen.identity.keys import level_id_array
+from levelproof.levelgen.level import ACTIONS, Level
 
 
 @dataclass(frozen=True)

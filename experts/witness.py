@@ -16,13 +16,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.level import Level
-from levelgen.task import rules as task
-from levelgen.task.actions import controls
-from levelgen.task.rules import DEFAULT_RULES, StepResult, TaskParams, TaskState
-from physics.buffers import zeros_of
-from physics.types import Manifold, State
-from physics.vector import select, unvec, vec
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import controls
+from levelproof.levelgen.task.rules import DEFAULT_RULES, StepResult, TaskParams, TaskState
+from levelproof.physics.buffers import zeros_of
+from levelproof.physics.types import Manifold, State
+from levelproof.physics.vector import select, unvec, vec
 
 LANES = 64  # of a block of replays
 BLOCKS = (16, 64, 256)  # levels of a block: a program for each, and not one for each count

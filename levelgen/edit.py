@@ -11,12 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from levelgen.frames import in_world, turned
-from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role, name_of
-from levelgen.sampling.scenery import NORMAL
-from levelgen.sampling.shuffle import separate
-from physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
-from physics.types import FIXED_POLYGONS
+from levelproof.levelgen.frames import in_world, turned
+from levelproof.levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role, name_of
+from levelproof.levelgen.sampling.scenery import NORMAL
+from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
+from levelproof.physics.types import FIXED_POLYGONS
 
 HALF_SIDE = 0.25  # m, of a new body
 SHAPES = {  # corners of a new polygon, in HALF_SIDE, clockwise around their mean

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from physics.types import State
+from levelproof.physics.types import State
 
 
 def turned(points: ArrayLike, angle: Any) -> np.ndarray:

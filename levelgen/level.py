@@ -10,7 +10,7 @@ from enum import IntEnum
 import jax
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.types import Model, Size, State
+from levelproof.physics.types import Model, Size, State
 
 SIZES: dict[str, Size] = {
     "s": Size(polygons=5, circles=2, joints=1, thrusters=1),

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from levelgen.level import ACTIONS, Level, Role
-from levelgen.task.rules import TaskParams, TaskState, advance, has_nan, has_roles, reset
-from physics.manifold import may_touch
-from physics.pairs import pairs_of
-from physics.types import Model, Params
-from physics.vector import rows
+from levelproof.levelgen.level import ACTIONS, Level, Role
+from levelproof.levelgen.task.rules import TaskParams, TaskState, advance, has_nan, has_roles, reset
+from levelproof.physics.manifold import may_touch
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import Model, Params
+from levelproof.physics.vector import rows
 
 LARGEST = 1e9  # of any quantity: what is multiplied by zero has to be a number, and so do products of two of them
 

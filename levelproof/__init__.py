@@ -1,59 +1,67 @@
-"""Random 2D physics levels, experts that provably solve them, and the data of it: all that users import.
+"""Random 2D physics levels, experts that provably solve them, and the resulting data: everything that users import.
 
-Re-exports and nothing else: each name says here where it lives and is imported when it is first used, so that
-`import levelproof` and `levelproof --help` do not wait for JAX.
+This module only re-exports. It imports a name's home when the name is first used, so `import levelproof` and
+`levelproof --help` do not wait for JAX. The rooms `levelproof.physics`, `.levelgen`, `.experts`, `.configs` and
+`.pipeline` are links to the folders at the top of the repository; a wheel contains them as folders.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+if not os.path.isdir(os.path.join(__path__[0], "physics")):
+    raise ImportError(
+        f"{os.path.join(__path__[0], 'physics')} is not a folder, because git wrote this checkout without symbolic "
+        "links: run `git config core.symlinks true` and `git checkout -- levelproof`."
+    )
+
 if TYPE_CHECKING:
-    from experts.witness import Record as Record
-    from experts.witness import replay as replay
-    from levelgen.files.level_file import LevelFile as LevelFile
-    from levelgen.files.level_file import read_level_file as read_level_file
-    from levelgen.files.level_file import write_level_file as write_level_file
-    from levelgen.level import SIZES as SIZES
-    from levelgen.level import Level as Level
-    from levelgen.pictures.raster import draw as draw
-    from levelgen.sampling.distribution import Distribution as Distribution
-    from levelgen.sampling.sampler import sample_levels as sample_levels
-    from levelgen.task.environment import make as make
-    from levelgen.task.environment import starts as starts
-    from levelgen.task.rules import TaskParams as TaskParams
-    from physics.types import Size as Size
-    from pipeline.read.columns import levels_from as levels_from
-    from pipeline.read.dataset.batch import Batch as Batch
-    from pipeline.read.dataset.dataset import Dataset as Dataset
-    from pipeline.read.dataset.dataset import open as open
-    from pipeline.store.manifest import read_manifest as read_manifest
-    from pipeline.store.shard import EngineDiffers as EngineDiffers
-    from pipeline.store.shard import Shard as Shard
-    from pipeline.version import __version__ as __version__
+    from levelproof.experts.witness import Record as Record
+    from levelproof.experts.witness import replay as replay
+    from levelproof.levelgen.files.level_file import LevelFile as LevelFile
+    from levelproof.levelgen.files.level_file import read_level_file as read_level_file
+    from levelproof.levelgen.files.level_file import write_level_file as write_level_file
+    from levelproof.levelgen.level import SIZES as SIZES
+    from levelproof.levelgen.level import Level as Level
+    from levelproof.levelgen.pictures.raster import draw as draw
+    from levelproof.levelgen.sampling.distribution import Distribution as Distribution
+    from levelproof.levelgen.sampling.sampler import sample_levels as sample_levels
+    from levelproof.levelgen.task.environment import make as make
+    from levelproof.levelgen.task.environment import starts as starts
+    from levelproof.levelgen.task.rules import TaskParams as TaskParams
+    from levelproof.physics.types import Size as Size
+    from levelproof.pipeline.read.columns import levels_from as levels_from
+    from levelproof.pipeline.read.dataset.batch import Batch as Batch
+    from levelproof.pipeline.read.dataset.dataset import Dataset as Dataset
+    from levelproof.pipeline.read.dataset.dataset import open as open
+    from levelproof.pipeline.store.manifest import read_manifest as read_manifest
+    from levelproof.pipeline.store.shard import EngineDiffers as EngineDiffers
+    from levelproof.pipeline.store.shard import Shard as Shard
+    from levelproof.pipeline.version import __version__ as __version__
 
 HOME = {
-    "Batch": "pipeline.read.dataset.batch",
-    "Dataset": "pipeline.read.dataset.dataset",
-    "SIZES": "levelgen.level",
-    "EngineDiffers": "pipeline.store.shard",
-    "Distribution": "levelgen.sampling.distribution",
-    "Level": "levelgen.level",
-    "LevelFile": "levelgen.files.level_file",
-    "Record": "experts.witness",
-    "Shard": "pipeline.store.shard",
-    "Size": "physics.types",
-    "TaskParams": "levelgen.task.rules",
-    "__version__": "pipeline.version",
-    "draw": "levelgen.pictures.raster",
-    "levels_from": "pipeline.read.columns",
-    "make": "levelgen.task.environment",
-    "open": "pipeline.read.dataset.dataset",
-    "read_level_file": "levelgen.files.level_file",
-    "read_manifest": "pipeline.store.manifest",
-    "replay": "experts.witness",
-    "sample_levels": "levelgen.sampling.sampler",
-    "starts": "levelgen.task.environment",
-    "write_level_file": "levelgen.files.level_file",
+    "Batch": "levelproof.pipeline.read.dataset.batch",
+    "Dataset": "levelproof.pipeline.read.dataset.dataset",
+    "SIZES": "levelproof.levelgen.level",
+    "EngineDiffers": "levelproof.pipeline.store.shard",
+    "Distribution": "levelproof.levelgen.sampling.distribution",
+    "Level": "levelproof.levelgen.level",
+    "LevelFile": "levelproof.levelgen.files.level_file",
+    "Record": "levelproof.experts.witness",
+    "Shard": "levelproof.pipeline.store.shard",
+    "Size": "levelproof.physics.types",
+    "TaskParams": "levelproof.levelgen.task.rules",
+    "__version__": "levelproof.pipeline.version",
+    "draw": "levelproof.levelgen.pictures.raster",
+    "levels_from": "levelproof.pipeline.read.columns",
+    "make": "levelproof.levelgen.task.environment",
+    "open": "levelproof.pipeline.read.dataset.dataset",
+    "read_level_file": "levelproof.levelgen.files.level_file",
+    "read_manifest": "levelproof.pipeline.store.manifest",
+    "replay": "levelproof.experts.witness",
+    "sample_levels": "levelproof.levelgen.sampling.sampler",
+    "starts": "levelproof.levelgen.task.environment",
+    "write_level_file": "levelproof.levelgen.files.level_file",
 }
 __all__ = list(HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 

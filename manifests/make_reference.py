@@ -12,12 +12,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pyarrow.parquet as pq
 
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from pipeline.look.gallery.gallery import gallery
-from pipeline.runtime import prepare_jax
-from pipeline.store.fields import arrays_of
-from pipeline.store.manifest import read_manifest
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.look.gallery.gallery import gallery
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.manifest import read_manifest
 
 EXAMPLE = Path(__file__).parent.parent / "docs" / "example"
 

@@ -6,11 +6,11 @@ Facts: `jax2d.joint.apply_motor`, `jax2d.engine`.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from physics.block import Block
-from physics.lanes import NOBODY, Scalar, anywhere, each, pick, spread, when
-from physics.trigonometry import cos_sin, tanh
-from physics.types import FIXED_POLYGONS, Params
-from physics.vector import Vec
+from levelproof.physics.block import Block
+from levelproof.physics.lanes import NOBODY, Scalar, anywhere, each, pick, spread, when
+from levelproof.physics.trigonometry import cos_sin, tanh
+from levelproof.physics.types import FIXED_POLYGONS, Params
+from levelproof.physics.vector import Vec
 
 
 def drive_motors(block: Block, params: Params) -> None:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from jaxtyping import Bool, Float, Int
 
-from physics.lanes import Ref
-from physics.pairs import Table
-from physics.types import Manifold, Model, State
+from levelproof.physics.lanes import Ref
+from levelproof.physics.pairs import Table
+from levelproof.physics.types import Manifold, Model, State
 
 
 class Given(NamedTuple):

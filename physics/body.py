@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from physics.block import Block
-from physics.lanes import Scalar, each
-from physics.trigonometry import cos_sin
-from physics.types import FIXED_POLYGONS, Params
-from physics.vector import Vec
+from levelproof.physics.block import Block
+from levelproof.physics.lanes import Scalar, each
+from levelproof.physics.trigonometry import cos_sin
+from levelproof.physics.types import FIXED_POLYGONS, Params
+from levelproof.physics.vector import Vec
 
 
 def position(motion: Float[Array, "5 lane"]) -> Vec:

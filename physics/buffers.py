@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import AbstractArray, Bool, Float, Int
 
-from physics.codegen.buffers import Buffer
-from physics.pairs import GROUPS, KINDS, pairs_of
-from physics.types import MAX_VERTICES, Size
+from levelproof.physics.codegen.buffers import Buffer
+from levelproof.physics.pairs import GROUPS, KINDS, pairs_of
+from levelproof.physics.types import MAX_VERTICES, Size
 
 T = TypeVar("T")
 DTYPES: dict[Any, str] = {Float: "float32", Int: "int32", Bool: "bool"}

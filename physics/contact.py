@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from physics.block import Block, Bodies, Constraints
-from physics.body import position, velocity, yield_all, yield_one
-from physics.lanes import Scalar, anywhere, each, when
-from physics.pairs import GROUPS
-from physics.types import FIXED_POLYGONS, Params
-from physics.vector import Vec, nonzero, spin
+from levelproof.physics.block import Block, Bodies, Constraints
+from levelproof.physics.body import position, velocity, yield_all, yield_one
+from levelproof.physics.lanes import Scalar, anywhere, each, when
+from levelproof.physics.pairs import GROUPS
+from levelproof.physics.types import FIXED_POLYGONS, Params
+from levelproof.physics.vector import Vec, nonzero, spin
 
 NONE = -1.0  # instead of a batch
 

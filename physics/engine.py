@@ -5,11 +5,11 @@ The order is part of the reference's result (`jax2d.engine.PhysicsEngine.step`).
 
 from collections.abc import Callable
 
-from physics import actuator, body, contact, joint, manifold
-from physics.block import Block
-from physics.lanes import each
-from physics.pairs import KIND_OF_GROUP
-from physics.types import SOLVER_ITERATIONS, Params
+from levelproof.physics import actuator, body, contact, joint, manifold
+from levelproof.physics.block import Block
+from levelproof.physics.lanes import each
+from levelproof.physics.pairs import KIND_OF_GROUP
+from levelproof.physics.types import SOLVER_ITERATIONS, Params
 
 Stage = Callable[[Block, Params], None]
 

@@ -5,11 +5,11 @@ Facts: `jax2d.joint`. Joints are solved one after another; each also moves its b
 
 import jax.numpy as jnp
 
-from physics.block import Block
-from physics.body import position, velocity
-from physics.lanes import NOBODY, Scalar, anywhere, each, pick, spread, when
-from physics.types import FIXED_POLYGONS, Params
-from physics.vector import Vec, nonzero, spin
+from levelproof.physics.block import Block
+from levelproof.physics.body import position, velocity
+from levelproof.physics.lanes import NOBODY, Scalar, anywhere, each, pick, spread, when
+from levelproof.physics.types import FIXED_POLYGONS, Params
+from levelproof.physics.vector import Vec, nonzero, spin
 
 
 def prepare(block: Block, params: Params) -> None:

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.block import Block
-from physics.body import position
-from physics.contact import Contact
-from physics.lanes import Ref, Scalar, anywhere, each, when
-from physics.pairs import CIRCLE_POLYGON, CIRCLES, POLYGONS, pairs_of
-from physics.types import MAX_VERTICES, Model
-from physics.vector import Vec, nonzero, where
+from levelproof.physics.block import Block
+from levelproof.physics.body import position
+from levelproof.physics.contact import Contact
+from levelproof.physics.lanes import Ref, Scalar, anywhere, each, when
+from levelproof.physics.pairs import CIRCLE_POLYGON, CIRCLES, POLYGONS, pairs_of
+from levelproof.physics.types import MAX_VERTICES, Model
+from levelproof.physics.vector import Vec, nonzero, where
 
 FLIP_BIAS = 0.01  # m; b must separate this much more than a to become the reference polygon (Jax2D `epsilon`)
 # rad; Jax2D turns edges into normals by rmat(pi / 2) in single precision, whose cosine is -4.371139e-8: its faces lean

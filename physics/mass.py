@@ -11,8 +11,8 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from physics.types import MAX_VERTICES
-from physics.vector import nonzero, vec
+from levelproof.physics.types import MAX_VERTICES
+from levelproof.physics.vector import nonzero, vec
 
 Vertices = Float[Array, "polygon vertex 2 lane"]  # the fourth of a triangle is unused
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from physics.lanes import Rows
-from physics.types import FIXED_POLYGONS, SOLVER_BATCH, Size
+from levelproof.physics.lanes import Rows
+from levelproof.physics.types import FIXED_POLYGONS, SOLVER_BATCH, Size
 
 KINDS = 3  # of pairs: polygons, circle-polygon, circles
 GROUPS = 4  # of contacts: first and second points of polygon pairs, circle-polygon, circles

@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from physics.block import Block, Given, Scratch
-from physics.buffers import buffers_like, buffers_of
-from physics.codegen.buffers import LANES, Buffer
-from physics.codegen.compile import register, write
-from physics.codegen.kept import kept_while_sources_stay
-from physics.engine import STAGES, Stage, step_block
-from physics.pairs import table_of
-from physics.types import DEFAULT_PARAMS, Manifold, Model, Params, Size, State
+from levelproof.physics.block import Block, Given, Scratch
+from levelproof.physics.buffers import buffers_like, buffers_of
+from levelproof.physics.codegen.buffers import LANES, Buffer
+from levelproof.physics.codegen.compile import register, write
+from levelproof.physics.codegen.kept import kept_while_sources_stay
+from levelproof.physics.engine import STAGES, Stage, step_block
+from levelproof.physics.pairs import table_of
+from levelproof.physics.types import DEFAULT_PARAMS, Manifold, Model, Params, Size, State
 
 
 def step(

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.bounds import require
+from levelproof.physics.bounds import require
 
 FIXED_POLYGONS = 4  # floor, left wall, right wall, ceiling; pairs among them are never tested
 MAX_VERTICES = 4  # of a polygon; a triangle leaves its fourth vertex unused

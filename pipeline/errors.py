@@ -3,7 +3,7 @@
 import re
 from enum import IntEnum
 
-from configs.errors import readable
+from levelproof.configs.errors import readable
 
 
 class Exit(IntEnum):

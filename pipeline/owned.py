@@ -5,7 +5,7 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
-from pipeline.errors import UserError
+from levelproof.pipeline.errors import UserError
 
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
 

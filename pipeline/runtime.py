@@ -15,9 +15,9 @@ from pathlib import Path
 
 from loky import cpu_count
 
-from pipeline.compiled import remove_damaged
-from pipeline.errors import Exit
-from pipeline.owned import own_folder
+from levelproof.pipeline.compiled import remove_damaged
+from levelproof.pipeline.errors import Exit
+from levelproof.pipeline.owned import own_folder
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
 # One process per core, each with one thread, is twice as fast as one process with XLA's own threads; and a sum

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from pipeline.errors import UserError
+from levelproof.pipeline.errors import UserError
 
 BUCKETS, WEB, HUB = ("s3:", "gs:", "az:"), ("https:", "http:"), ("hf:",)
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")

@@ -15,8 +15,8 @@ import pytest
 from xdist.scheduler import LoadScopeScheduling
 
 from benchmarks import oracle
-from pipeline.errors import Failure
-from pipeline.runtime import CACHE_VARIABLE, prepare_jax
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.runtime import CACHE_VARIABLE, prepare_jax
 
 ROOT = Path(__file__).parent.parent
 DEMANDED = "LEVELPROOF_TEST_ORACLE"

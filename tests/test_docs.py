@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 import levelproof
-from pipeline.look.gallery.gallery import SITE
-from pipeline.read.export import export
-from pipeline.read.parquet import export_parquet
-from pipeline.store.manifest import read_manifest
+from levelproof.pipeline.look.gallery.gallery import SITE
+from levelproof.pipeline.read.export import export
+from levelproof.pipeline.read.parquet import export_parquet
+from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import played_split
 
 ROOT = Path(__file__).parent.parent

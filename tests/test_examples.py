@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from configs.compose import compose_job
+from levelproof.configs.compose import compose_job
 
 FOLDER = Path(__file__).parent.parent / "docs" / "examples"
 SCRIPTS = sorted(FOLDER.glob("*.sh"))

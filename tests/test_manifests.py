@@ -9,12 +9,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from benchmarks.alone import label
-from configs.compose import compose_job
-from levelgen.level import SIZES
-from levelgen.pictures.palette import palette_css
-from levelgen.sampling.sampler import sample_levels
-from pipeline.look.gallery.gallery import SITE
-from pipeline.store.fields import arrays_of
+from levelproof.configs.compose import compose_job
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.pictures.palette import palette_css
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.look.gallery.gallery import SITE
+from levelproof.pipeline.store.fields import arrays_of
 
 FOLDER = Path(__file__).parent.parent / "manifests"
 EXAMPLE = FOLDER.parent / "docs" / "example"

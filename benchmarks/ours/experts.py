@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.reference.serve import serve, timed
-from pipeline.runtime import prepare_jax
+from levelproof.pipeline.runtime import prepare_jax
 
 
 def main() -> None:
@@ -26,10 +26,10 @@ def main() -> None:
     from benchmarks.endless import endless_queue, go_on
     from benchmarks.levels import load_levels
     from benchmarks.solved.variants import REFERENCE
-    from experts.pool import slot_count
-    from experts.slots import LevelQueue, Training, empty_slots
-    from experts.witness import take
-    from levelgen.task.rules import TaskParams
+    from levelproof.experts.pool import slot_count
+    from levelproof.experts.slots import LevelQueue, Training, empty_slots
+    from levelproof.experts.witness import take
+    from levelproof.levelgen.task.rules import TaskParams
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
     no_evaluation = {"attempts": 1, "sticky_attempts": 0, "moved_attempts": 0}

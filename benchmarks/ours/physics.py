@@ -5,7 +5,7 @@ import argparse
 import numpy as np
 
 from benchmarks.reference.serve import serve, timed
-from pipeline.runtime import prepare_jax
+from levelproof.pipeline.runtime import prepare_jax
 
 
 def main() -> None:
@@ -22,7 +22,7 @@ def main() -> None:
     import jax
 
     from benchmarks.levels import load_levels
-    from levelgen.task import rules as task
+    from levelproof.levelgen.task import rules as task
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
 

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from benchmarks.reference.serve import timed
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
 
 FIRST = 256  # levels of the first call: one block
 

@@ -4,9 +4,9 @@ import sys
 
 from rich.console import Console
 
-from configs.compose import compose_job
-from pipeline.jobs import inline
-from pipeline.jobs.generate import generate
+from levelproof.configs.compose import compose_job
+from levelproof.pipeline.jobs import inline
+from levelproof.pipeline.jobs.generate import generate
 
 
 def begin(*_: object) -> None:

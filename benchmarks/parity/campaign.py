@@ -18,10 +18,10 @@ from benchmarks.parity.progress import Board
 from benchmarks.parity.scenes import SCENES
 from benchmarks.parity.worlds import BLOCK, joined, lanes_of
 from benchmarks.reference.actions import sticky_actions
-from experts.witness import blocks
-from levelgen.level import SIZES, Level, Role, name_of, size_of
-from levelgen.sampling.sampler import sample_levels
-from pipeline.errors import UserError
+from levelproof.experts.witness import blocks
+from levelproof.levelgen.level import SIZES, Level, Role, name_of, size_of
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.errors import UserError
 
 SAMPLED, HANDMADE = "sampled", "handmade"
 ADVERSARIAL_SHARE, HANDMADE_SHARE = 0.4, 0.2  # of the states; the others come from sampled levels

@@ -18,9 +18,9 @@ from jaxtyping import Bool, Int
 from benchmarks.parity.distance import CONTACT_IMPULSES, JOINT_IMPULSES, MOTION, OFF, evolving_gaps
 from benchmarks.parity.engines import Stepped
 from benchmarks.parity.worlds import BLOCK, contact_bodies, lanes_of, nudged_tree
-from levelgen.level import Level
-from physics.pairs import pairs_of
-from physics.types import State
+from levelproof.levelgen.level import Level
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import State
 
 COPIES = BLOCK  # neighbours, the state itself first
 MOVES = (1, 4, 16)  # units in the last place

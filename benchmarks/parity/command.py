@@ -9,10 +9,10 @@ from benchmarks import oracle, race
 from benchmarks.parity.progress import Board
 from benchmarks.reference.actions import STICKINESS
 from benchmarks.report import Report
-from levelgen.level import size_of
-from physics.types import FIXED_POLYGONS
-from pipeline.errors import UserError
-from pipeline.runtime import prepare_jax
+from levelproof.levelgen.level import size_of
+from levelproof.physics.types import FIXED_POLYGONS
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.runtime import prepare_jax
 
 CUSTOM = "8-8-8-4"  # a size without a name
 

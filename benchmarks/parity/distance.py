@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from benchmarks.parity.engines import Stepped
 from benchmarks.parity.worlds import contact_bodies
-from levelgen.level import Level
-from physics.types import State
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import State
 
 OFF = 1e-3  # a state with a larger difference is looked into
 MOTION = ("position", "rotation", "velocity", "angular_velocity")

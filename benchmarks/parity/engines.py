@@ -18,14 +18,14 @@ from jaxtyping import Array, Bool, Float, Int
 from benchmarks import oracle
 from benchmarks.contest import Process
 from benchmarks.parity.worlds import record_from_kinetix
-from levelgen.files.kinetix import MANIFOLDS, level_from_kinetix, state_from_kinetix, state_to_kinetix
-from levelgen.level import Level
-from levelgen.task import rules as task
-from levelgen.task.actions import controls
-from levelgen.task.rules import TaskParams, TaskState
-from physics.step import step as physics_step
-from physics.types import Manifold, Params, State
-from pipeline.runtime import cache_folder
+from levelproof.levelgen.files.kinetix import MANIFOLDS, level_from_kinetix, state_from_kinetix, state_to_kinetix
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import controls
+from levelproof.levelgen.task.rules import TaskParams, TaskState
+from levelproof.physics.step import step as physics_step
+from levelproof.physics.types import Manifold, Params, State
+from levelproof.pipeline.runtime import cache_folder
 
 RULES = TaskParams(dense_reward_scale=0.0)  # rewards are -1, 0 and 1
 GEOMETRY = {"normal": "normal", "penetration": "penetration", "point": "collision_point"}

@@ -18,8 +18,8 @@ from benchmarks.parity.engines import Played, Reference, env_step_ours, play_our
 from benchmarks.parity.onestep import Pool
 from benchmarks.parity.scenes import movable
 from benchmarks.parity.worlds import BLOCK, lanes_of, nudged_tree, starting_in
-from levelgen.level import Level
-from physics.types import State
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import State
 
 STEPS = 256  # env steps; by then every first episode has ended
 TARGETS = {"s": 0.97, "m": 0.95, "l": 0.9}  # share of the pairs with the same outcome

@@ -12,9 +12,9 @@ from benchmarks.parity.causes import Step, find_cause
 from benchmarks.parity.distance import OFF, UNITS, Distances, distances
 from benchmarks.parity.engines import RULES, Stepped, step_ours
 from benchmarks.parity.worlds import BLOCK, joined, lanes_of, starting_in
-from experts.witness import blocks
-from levelgen.level import Level
-from physics.types import State
+from levelproof.experts.witness import blocks
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import State
 
 LIMITS = (1e-6, 1e-5, 1e-4, 1e-3)
 DEFECT_OFF = (1e-4, 1e-2)

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
-from levelgen.level import WORLD_SIDE, Level
-from levelgen.sampling.shuffle import separate
-from physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
-from physics.types import FIXED_POLYGONS, State
+from levelproof.levelgen.level import WORLD_SIDE, Level
+from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
+from levelproof.physics.types import FIXED_POLYGONS, State
 
 FLOOR_TOP = 0.4  # m
 Change = Callable[[Level, np.random.Generator], Level]

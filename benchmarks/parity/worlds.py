@@ -8,10 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
-from levelgen.files.kinetix import state_from_kinetix
-from levelgen.level import Level
-from physics.pairs import pairs_of
-from physics.types import Size, State
+from levelproof.levelgen.files.kinetix import state_from_kinetix
+from levelproof.levelgen.level import Level
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import Size, State
 
 BLOCK = 256  # lanes of every program, ours and the reference's: few compilations, however many worlds
 T = TypeVar("T")

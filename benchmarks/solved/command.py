@@ -12,11 +12,11 @@ from benchmarks.solved import measure, original, plot, tables
 from benchmarks.solved.results import FILE, Header, Results, made, read
 from benchmarks.solved.variants import VARIANTS
 from benchmarks.statistics import wilson
-from configs.convert import plain
-from configs.numbers import parse_count
-from experts.config import check_budget
-from levelgen.level import size_of
-from pipeline.errors import UserError
+from levelproof.configs.convert import plain
+from levelproof.configs.numbers import parse_count
+from levelproof.experts.config import check_budget
+from levelproof.levelgen.level import size_of
+from levelproof.pipeline.errors import UserError
 
 DRAWN = ("s-1M-alone", "s-4M-alone", "m-1M-alone", "m-4M-alone", "l-4M-alone")  # curves, unless others are named
 PLOT = "solved.svg"

@@ -19,12 +19,12 @@ from rich.console import Console
 
 from benchmarks.solved.results import FILE, OF_LEVEL, Header, Results, merge, read
 from benchmarks.solved.variants import Variant
-from experts.labels import Label, Verdict
-from pipeline.errors import Failure, LevelproofError, UserError
-from pipeline.jobs.progress import Board, Tally
-from pipeline.jobs.schedule import Summary, WorkUnit, plan_units
-from pipeline.runtime import cache_folder, interruptible, own_cores, prepare_jax
-from pipeline.store.provenance import device, versions
+from levelproof.experts.labels import Label, Verdict
+from levelproof.pipeline.errors import Failure, LevelproofError, UserError
+from levelproof.pipeline.jobs.progress import Board, Tally
+from levelproof.pipeline.jobs.schedule import Summary, WorkUnit, plan_units
+from levelproof.pipeline.runtime import cache_folder, interruptible, own_cores, prepare_jax
+from levelproof.pipeline.store.provenance import device, versions
 
 UNIT = 32  # levels, as in a job
 POLL = 0.5  # s between looks at the processes
@@ -179,12 +179,12 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
     import numpy as np
 
     from benchmarks.alone import side_by_side
-    from experts.pool import Pool
-    from experts.train import TrainingRun
-    from levelgen.level import Level, size_of
-    from levelgen.sampling.distribution import Distribution
-    from levelgen.sampling.sampler import sample_levels
-    from levelgen.task.rules import DEFAULT_RULES
+    from levelproof.experts.pool import Pool
+    from levelproof.experts.train import TrainingRun
+    from levelproof.levelgen.level import Level, size_of
+    from levelproof.levelgen.sampling.distribution import Distribution
+    from levelproof.levelgen.sampling.sampler import sample_levels
+    from levelproof.levelgen.task.rules import DEFAULT_RULES
 
     pools = lambda budget: Pool(budget, variant.procedure, DEFAULT_RULES)
     told_at = time.monotonic()

@@ -21,14 +21,14 @@ from benchmarks.contest import Process
 from benchmarks.solved.measure import Progress, Trained, row_of
 from benchmarks.solved.results import Header
 from benchmarks.solved.variants import Variant
-from experts.config import RECORD_STEPS, ExpertConfig
-from experts.labels import Label, Source, Verdict
-from experts.steps import EnvSteps
-from levelgen.level import Level
-from pipeline.errors import LevelproofError
-from pipeline.jobs.schedule import Summary, WorkUnit
-from pipeline.runtime import cache_folder, prepare_jax
-from pipeline.store.provenance import device, versions
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig
+from levelproof.experts.labels import Label, Source, Verdict
+from levelproof.experts.steps import EnvSteps
+from levelproof.levelgen.level import Level
+from levelproof.pipeline.errors import LevelproofError
+from levelproof.pipeline.jobs.schedule import Summary, WorkUnit
+from levelproof.pipeline.runtime import cache_folder, prepare_jax
+from levelproof.pipeline.store.provenance import device, versions
 
 WIDTH = 8  # levels that the reference trains side by side; empty places of a last batch are not charged
 
@@ -88,11 +88,11 @@ def train(
     """
     import jax.numpy as jnp
 
-    from experts.before import decide
-    from experts.witness import take
-    from levelgen.level import size_of
-    from levelgen.sampling.sampler import sample_levels
-    from levelgen.task.rules import DEFAULT_RULES
+    from levelproof.experts.before import decide
+    from levelproof.experts.witness import take
+    from levelproof.levelgen.level import size_of
+    from levelproof.levelgen.sampling.sampler import sample_levels
+    from levelproof.levelgen.task.rules import DEFAULT_RULES
 
     ids, updates = np.asarray(unit.level_ids, np.int32), config.updates_in(header.budget)
     levels = sample_levels(jnp.asarray(ids), size_of(header.size))
@@ -130,8 +130,8 @@ def train_batch(
     Raises:
         Failure: it ended.
     """
-    from levelgen.files.kinetix import state_to_kinetix
-    from levelgen.task.rules import NO_DISTANCE
+    from levelproof.levelgen.files.kinetix import state_to_kinetix
+    from levelproof.levelgen.task.rules import NO_DISTANCE
 
     worlds, out, count = reference.folder / "levels.npz", reference.folder / "out.npz", len(level_ids)
     start = levels.state, np.zeros(count, np.int32), np.full(count, NO_DISTANCE, np.float32)
@@ -158,9 +158,9 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
     import jax
     import jax.numpy as jnp
 
-    from experts import judge, progress
-    from experts.success import no_success
-    from experts.witness import succeeds
+    from levelproof.experts import judge, progress
+    from levelproof.experts.success import no_success
+    from levelproof.experts.witness import succeeds
 
     done, goal = seen["trained_done"], seen["trained_goal"]
     totals = progress.Progress(
@@ -181,7 +181,7 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
 
 def first_success(goal: Bool[np.ndarray, "step environment"]) -> int:
     """Env steps of training until then, those of all environments."""
-    from experts.progress import NEVER
+    from levelproof.experts.progress import NEVER
 
     reached = goal.any(1)
     return int((np.argmax(reached) + 1) * goal.shape[1]) if reached.any() else NEVER

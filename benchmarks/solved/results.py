@@ -12,9 +12,9 @@ import pyarrow.parquet as pq
 
 from benchmarks.oracle import alone
 from benchmarks.statistics import wilson
-from experts.config import Rule
-from experts.labels import TRAINED, Label
-from pipeline.errors import UserError
+from levelproof.experts.config import Rule
+from levelproof.experts.labels import TRAINED, Label
+from levelproof.pipeline.errors import UserError
 
 FILE = Path(__file__).parents[1] / "results" / "solved.parquet"
 SIZES = ("s", "m", "l")  # in this order; others follow

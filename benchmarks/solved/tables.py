@@ -8,7 +8,7 @@ from benchmarks.report import Table
 from benchmarks.solved.results import Results, by_size, count, mean, share
 from benchmarks.solved.variants import VARIANTS
 from benchmarks.statistics import mcnemar
-from experts.labels import BY_EXPERT
+from levelproof.experts.labels import BY_EXPERT
 
 QUARTER = "alone"  # the variant whose quarter of the budget is compared with the reference's whole
 HEAD = (

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from benchmarks.reference.hyperparameters import PPO
-from configs.compose import compose_job
-from experts.config import Choice, ExpertConfig, Network, Rule, StopConfig
-from experts.procedure import Procedure
+from levelproof.configs.compose import compose_job
+from levelproof.experts.config import Choice, ExpertConfig, Network, Rule, StopConfig
+from levelproof.experts.procedure import Procedure
 
 PUBLISHED = compose_job(["procedure=published"]).procedure
 ALONE = replace(PUBLISHED, stop=StopConfig(rule=Rule.SOLVED))

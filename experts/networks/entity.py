@@ -14,9 +14,9 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
-from levelgen.level import Level
-from levelgen.task.observe.flat import (
+from levelproof.experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.observe.flat import (
     BODY_ROWS,
     CIRCLE_ROWS,
     DYNAMIC_ROWS,
@@ -28,8 +28,8 @@ from levelgen.task.observe.flat import (
     level_features,
     tables_of,
 )
-from physics.types import FIXED_POLYGONS, Size
-from physics.vector import rows
+from levelproof.physics.types import FIXED_POLYGONS, Size
+from levelproof.physics.vector import rows
 
 
 class Kind(NamedTuple):

@@ -10,11 +10,11 @@ import flax.linen as nn
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
-from levelgen.level import Level
-from levelgen.task.observe.flat import dynamic_features, feature_count, level_features
-from physics.types import Size
-from physics.vector import rows
+from levelproof.experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.observe.flat import dynamic_features, feature_count, level_features
+from levelproof.physics.types import Size
+from levelproof.physics.vector import rows
 
 
 class FirstKernel(NamedTuple):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.actions import CHOICES
 
 LOGITS = sum(CHOICES)
 HIDDEN_GAIN, POLICY_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0  # of orthogonal initial kernels

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
-from experts.search.cells import cell_key
-from experts.search.config import SearchConfig
+from levelproof.experts.search.cells import cell_key
+from levelproof.experts.search.config import SearchConfig
 
 ONE = 65_536  # the weight of an entry that was never chosen
 

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
-from experts.search.config import SearchConfig
-from levelgen.level import Level, Role
-from levelgen.proofs import driven
-from physics.types import FIXED_POLYGONS, State
+from levelproof.experts.search.config import SearchConfig
+from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.proofs import driven
+from levelproof.physics.types import FIXED_POLYGONS, State
 
 TURN = 2 * np.pi
 FARTHEST = 1e6  # cells from the start

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Int
 
-from experts.config import MOST_COUNTED
-from physics.bounds import require
+from levelproof.experts.config import MOST_COUNTED
+from levelproof.physics.bounds import require
 
 MOST_ROUNDS = 1024  # of what a success gets afterwards
 MOST_RUNGS = 16  # each is four times the one before, and env steps are counted in 32 bits

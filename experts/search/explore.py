@@ -10,17 +10,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
 
-from experts.config import RECORD_STEPS
-from experts.search.archive import Archive, Reached, choose, insert, new_archive, visit
-from experts.search.cells import features
-from experts.search.config import Ends, SearchConfig
-from experts.search.near import FAR, gap, goals_of
-from experts.search.play import CODES, Arena, Walk, arena, decode, most_steps, play
-from experts.search.rows import from_rows, to_rows
-from experts.success import Success
-from levelgen.identity.keys import Stream, key_for
-from levelgen.level import ACTIONS, Level
-from levelgen.task.rules import TaskParams
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.search.archive import Archive, Reached, choose, insert, new_archive, visit
+from levelproof.experts.search.cells import features
+from levelproof.experts.search.config import Ends, SearchConfig
+from levelproof.experts.search.near import FAR, gap, goals_of
+from levelproof.experts.search.play import CODES, Arena, Walk, arena, decode, most_steps, play
+from levelproof.experts.search.rows import from_rows, to_rows
+from levelproof.experts.success import Success
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.task.rules import TaskParams
 
 NEARER = 0.98  # of the least gap: what shrinks it less does not count
 

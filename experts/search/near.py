@@ -8,10 +8,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.level import Level, Role
-from physics.manifold import faces
-from physics.types import MAX_VERTICES, Model, State
-from physics.vector import Vec, nonzero, select, vec
+from levelproof.levelgen.level import Level, Role
+from levelproof.physics.manifold import faces
+from levelproof.physics.types import MAX_VERTICES, Model, State
+from levelproof.physics.vector import Vec, nonzero, select, vec
 
 MOST_PAIRS = 2  # of a green and a blue body that are measured; sampled levels have one
 FAR = 1e6  # m; where there is none

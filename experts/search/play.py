@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
-from experts.config import RECORD_STEPS
-from experts.search.near import Goals, goals_of
-from experts.witness import repeat
-from levelgen.level import ACTIONS, Level, Role
-from levelgen.task.actions import CHOICES, action_mask, controls
-from levelgen.task.rules import TaskParams, has_nan, has_roles
-from physics.pairs import pairs_of
-from physics.step import step
-from physics.types import State
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.search.near import Goals, goals_of
+from levelproof.experts.witness import repeat
+from levelproof.levelgen.level import ACTIONS, Level, Role
+from levelproof.levelgen.task.actions import CHOICES, action_mask, controls
+from levelproof.levelgen.task.rules import TaskParams, has_nan, has_roles
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.step import step
+from levelproof.physics.types import State
 
 CODES = math.prod(CHOICES)  # different actions
 

@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from experts.config import RECORD_STEPS
-from experts.search.play import CODES, Arena, Walk, arena, decode
-from experts.search.shorten import Shortened, below, drawn, edited, ended, replayed
-from experts.success import Success
-from levelgen.identity.keys import Stream, key_for
-from levelgen.level import ACTIONS, Level
-from levelgen.task.actions import action_mask
-from levelgen.task.rules import TaskParams, goal_distance
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.search.play import CODES, Arena, Walk, arena, decode
+from levelproof.experts.search.shorten import Shortened, below, drawn, edited, ended, replayed
+from levelproof.experts.success import Success
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.rules import TaskParams, goal_distance
 
 LANES = 16  # of a level: few, so that there are many rounds
 

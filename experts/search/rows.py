@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from physics.types import State
+from levelproof.physics.types import State
 
 
 def to_rows(state: State) -> Float[Array, "lane word"]:

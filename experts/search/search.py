@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from experts.search import explore, vary
-from experts.search.config import Ends, SearchConfig
-from experts.search.explore import Search, success_of
-from experts.search.shorten import shorten
-from experts.search.stage import Entrant, Searched, Sought, Stage
-from experts.search.vary import Varying, nearest_of
-from experts.success import Success
-from experts.witness import at_once, blocks, take
-from levelgen.level import Level
-from levelgen.task.rules import TaskParams
+from levelproof.experts.search import explore, vary
+from levelproof.experts.search.config import Ends, SearchConfig
+from levelproof.experts.search.explore import Search, success_of
+from levelproof.experts.search.shorten import shorten
+from levelproof.experts.search.stage import Entrant, Searched, Sought, Stage
+from levelproof.experts.search.vary import Varying, nearest_of
+from levelproof.experts.success import Success
+from levelproof.experts.witness import at_once, blocks, take
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
 
 IN_CACHE = 256  # lanes: their physics and archives fit the cache of a core
 AHEAD = 8  # levels that wait for a row, of each row: about a second's, so that none is empty until more have come

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
-from experts.config import RECORD_STEPS
-from experts.search.config import SearchConfig
-from experts.search.play import Arena, Walk, act, arena, fresh_walk
-from experts.success import Success
-from levelgen.identity.keys import Stream, key_for
-from levelgen.level import ACTIONS, Level
-from levelgen.task.rules import TaskParams
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.search.play import Arena, Walk, act, arena, fresh_walk
+from levelproof.experts.success import Success
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.task.rules import TaskParams
 
 MOST_HALVINGS = 6  # stretches are from a whole success to a 64th of it
 T = TypeVar("T")

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from experts.ledger import Lap, Ledger, lap
-from experts.success import Success
-from experts.witness import take
-from levelgen.level import Level
+from levelproof.experts.ledger import Lap, Ledger, lap
+from levelproof.experts.success import Success
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import Level
 
 Rows = Any  # what a program advances: a dataclass, its `levels` with their axis last, all else level-first
 

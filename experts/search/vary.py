@@ -14,16 +14,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
 
-from experts.search.archive import Archive
-from experts.search.config import Ends, SearchConfig
-from experts.search.explore import NEARER, patient, with_success
-from experts.search.near import FAR, gap
-from experts.search.play import CODES, WITHOUT, Arena, Walk, act, arena, decode, fresh_walk, most_steps
-from experts.search.rows import from_rows, to_rows
-from experts.search.shorten import MOST_HALVINGS, below
-from levelgen.identity.keys import Stream, key_for
-from levelgen.level import ACTIONS, Level
-from levelgen.task.rules import TaskParams
+from levelproof.experts.search.archive import Archive
+from levelproof.experts.search.config import Ends, SearchConfig
+from levelproof.experts.search.explore import NEARER, patient, with_success
+from levelproof.experts.search.near import FAR, gap
+from levelproof.experts.search.play import CODES, WITHOUT, Arena, Walk, act, arena, decode, fresh_walk, most_steps
+from levelproof.experts.search.rows import from_rows, to_rows
+from levelproof.experts.search.shorten import MOST_HALVINGS, below
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.task.rules import TaskParams
 
 KEPT = 8  # trajectories of a level
 BEYOND = 16  # env steps, at least, that are played after the one at which the trajectory that is varied was nearest

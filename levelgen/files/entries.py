@@ -8,8 +8,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Role
-from physics.types import FIXED_POLYGONS, MAX_VERTICES, SOLVER_BATCH, SOLVER_ITERATIONS, Size
+from levelproof.levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Role
+from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, SOLVER_BATCH, SOLVER_ITERATIONS, Size
 
 LARGEST = 1000.0  # of a quantity of a thing; the engine itself stops bodies at 15 m and 100 m/s
 LARGEST_INVERSE = 1e9  # 1/kg and 1/(kg m^2)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from levelgen.level import Level
-from physics.pairs import pairs_of
-from physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, Size, State
+from levelproof.levelgen.level import Level
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, Size, State
 
 Fields = dict[str, np.ndarray]
 

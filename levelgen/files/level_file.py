@@ -19,15 +19,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from levelgen.files import entries as layout
-from levelgen.files.entries import Entry, LevelFileError, entries_of, item, told
-from levelgen.files.kinetix import MANIFOLDS, Fields, level_from_kinetix, state_to_kinetix
-from levelgen.frames import in_world
-from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
-from levelgen.sampling.scenery import empty_level
-from levelgen.sampling.shuffle import separate
-from levelgen.task.rules import NO_DISTANCE, TaskParams
-from physics.types import FIXED_POLYGONS, Params, Size
+from levelproof.levelgen.files import entries as layout
+from levelproof.levelgen.files.entries import Entry, LevelFileError, entries_of, item, told
+from levelproof.levelgen.files.kinetix import MANIFOLDS, Fields, level_from_kinetix, state_to_kinetix
+from levelproof.levelgen.frames import in_world
+from levelproof.levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.levelgen.task.rules import NO_DISTANCE, TaskParams
+from levelproof.physics.types import FIXED_POLYGONS, Params, Size
 
 MOST_BYTES = 4_000_000  # of a file; the reference's own have at most 52,438
 PATHS = {  # where levelgen.files.kinetix has what a file keeps with a thing

@@ -12,10 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from levelgen.identity.form import NO_ENTRY, Push, Side, World, canonical_form
-from levelgen.identity.keys import MAX_LEVEL_ID
-from levelgen.level import Level
-from physics.types import FIXED_POLYGONS, MAX_VERTICES
+from levelproof.levelgen.identity.form import NO_ENTRY, Push, Side, World, canonical_form
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES
 
 VERSION = 1  # of the form; hashes of different versions never compare equal
 DIGITS = 32  # of a hash, hexadecimal: 128 bits

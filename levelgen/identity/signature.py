@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from levelgen.identity.content import acting_joints, acting_thrusters, kinds, level_first
-from levelgen.level import Level
-from physics.types import MAX_VERTICES
+from levelproof.levelgen.identity.content import acting_joints, acting_thrusters, kinds, level_first
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import MAX_VERTICES
 
 VERSION = 1  # of the rules; signatures of different versions never compare equal
 DIGITS = 16  # of each hash, hexadecimal

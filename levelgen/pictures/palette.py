@@ -1,6 +1,6 @@
 """The colours of pictures as CSS custom properties: pages that draw levels themselves take them from here."""
 
-from levelgen.pictures import style
+from levelproof.levelgen.pictures import style
 
 
 def palette_css() -> str:

@@ -15,13 +15,13 @@ import resvg_py
 from jaxtyping import Int
 from PIL import Image
 
-from levelgen.level import Level
-from levelgen.pictures.scene import scene_of
-from levelgen.pictures.shapes import Scene, font
-from levelgen.pictures.style import PAPER, PIXELS
-from levelgen.pictures.svg import svg_of
-from levelgen.pictures.words import Caption
-from physics.types import State
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.pictures.scene import scene_of
+from levelproof.levelgen.pictures.shapes import Scene, font
+from levelproof.levelgen.pictures.style import PAPER, PIXELS
+from levelproof.levelgen.pictures.svg import svg_of
+from levelproof.levelgen.pictures.words import Caption
+from levelproof.physics.types import State
 
 
 def draw(

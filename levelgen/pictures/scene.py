@@ -15,12 +15,12 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from levelgen.frames import in_world, turned
-from levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
-from levelgen.pictures import style
-from levelgen.pictures.shapes import Host, Part, Point, Scene, disc, line, polygon, rectangle
-from levelgen.pictures.words import Caption, caption_parts, key_parts, printable
-from physics.types import State
+from levelproof.levelgen.frames import in_world, turned
+from levelproof.levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
+from levelproof.levelgen.pictures import style
+from levelproof.levelgen.pictures.shapes import Host, Part, Point, Scene, disc, line, polygon, rectangle
+from levelproof.levelgen.pictures.words import Caption, caption_parts, key_parts, printable
+from levelproof.physics.types import State
 
 NOZZLE = ((0.06, 0.045), (0.06, -0.045), (-0.12, -0.1), (-0.12, 0.1))
 

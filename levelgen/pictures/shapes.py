@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from PIL import ImageFont
 
-from levelgen.pictures.style import EDGE, HATCHING, Colour
+from levelproof.levelgen.pictures.style import EDGE, HATCHING, Colour
 
 Point = tuple[float, float]
 Host = np.ndarray | jax.Array  # levels and states that were read or computed

@@ -1,6 +1,6 @@
 """How pictures for people look: colours, and lengths in metres."""
 
-from levelgen.level import Role
+from levelproof.levelgen.level import Role
 
 Colour = tuple[int, int, int]
 

@@ -10,9 +10,9 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from levelgen.level import WORLD_SIDE
-from levelgen.pictures.shapes import Part, Scene, number, rectangle
-from levelgen.pictures.style import BORDER, FONTS, HATCH, HEADER, PAPER, PIXELS
+from levelproof.levelgen.level import WORLD_SIDE
+from levelproof.levelgen.pictures.shapes import Part, Scene, number, rectangle
+from levelproof.levelgen.pictures.style import BORDER, FONTS, HATCH, HEADER, PAPER, PIXELS
 
 WIDTH = WORLD_SIDE + 2 * BORDER  # m, of a picture
 TOP = WORLD_SIDE + BORDER + HEADER  # m, of a picture's upper edge above the world's lower one

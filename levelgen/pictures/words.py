@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
-from levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
-from levelgen.pictures import style
-from levelgen.pictures.shapes import Part, disc, rectangle, text, text_width
+from levelproof.levelgen.level import MOTOR_BINDINGS, WORLD_SIDE, Level, Role
+from levelproof.levelgen.pictures import style
+from levelproof.levelgen.pictures.shapes import Part, disc, rectangle, text, text_width
 
 ELLIPSIS = "…"
 

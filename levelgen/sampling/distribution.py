@@ -7,8 +7,8 @@ The defaults are the reference's random-level distribution, Kinetix 3.0.2: names
 import math
 from dataclasses import dataclass, fields
 
-from levelgen.level import HALF_WORLD
-from physics.bounds import require
+from levelproof.levelgen.level import HALF_WORLD
+from levelproof.physics.bounds import require
 
 # m, largest reach of a free body from its centre: green and blue may have to fit into one half of the world
 MAX_REACH = HALF_WORLD / 2

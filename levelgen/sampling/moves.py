@@ -11,10 +11,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.level import HALF_WORLD, MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role
-from levelgen.sampling.distribution import Distribution
-from levelgen.sampling.draws import at, between, choose, first_free, first_of_two, put
-from levelgen.sampling.proposal import (
+from levelproof.levelgen.level import HALF_WORLD, MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.sampling.draws import at, between, choose, first_free, first_of_two, put
+from levelproof.levelgen.sampling.proposal import (
     BodyDraws,
     BodyShape,
     Flag,
@@ -26,10 +26,10 @@ from levelgen.sampling.proposal import (
     shape_mass,
     turned,
 )
-from levelgen.sampling.scenery import FLOOR_TOP
-from physics.mass import inverse
-from physics.types import FIXED_POLYGONS
-from physics.vector import Vec, unvec, vec, where
+from levelproof.levelgen.sampling.scenery import FLOOR_TOP
+from levelproof.physics.mass import inverse
+from levelproof.physics.types import FIXED_POLYGONS
+from levelproof.physics.vector import Vec, unvec, vec, where
 
 TURN = 2 * math.pi  # rad
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from physics.manifold import FLIP_BIAS, Faces, faces
-from physics.types import Model, State
-from physics.vector import Vec, nonzero, vec
+from levelproof.physics.manifold import FLIP_BIAS, Faces, faces
+from levelproof.physics.types import Model, State
+from levelproof.physics.vector import Vec, nonzero, vec
 
 
 class WorldPolygons(NamedTuple):

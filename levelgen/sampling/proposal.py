@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.level import Level, Role
-from levelgen.sampling.distribution import Distribution
-from levelgen.sampling.draws import at, between, first_free, pick, put
-from physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
-from physics.types import MAX_VERTICES
-from physics.vector import Vec, unvec, vec, where
+from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.sampling.draws import at, between, first_free, pick, put
+from levelproof.physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
+from levelproof.physics.types import MAX_VERTICES
+from levelproof.physics.vector import Vec, unvec, vec, where
 
 CORNERS = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)], np.float32)  # of a rectangle, clockwise
 Lane = Float[Array, " lane"]

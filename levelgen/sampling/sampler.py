@@ -17,17 +17,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 from numpy.typing import ArrayLike
 
-from levelgen.identity.keys import Stream, key_for, level_id_array
-from levelgen.level import Level, Role, name_of
-from levelgen.sampling.distribution import Distribution
-from levelgen.sampling.draws import at, deal, pick
-from levelgen.sampling.moves import ThrusterDraws, add_thruster, propose_connected, propose_free
-from levelgen.sampling.overlap import WorldCircles, count_contacts
-from levelgen.sampling.proposal import BodyDraws, Flag, Lane, Proposal, corners_in_world, insert
-from levelgen.sampling.scenery import empty_level
-from levelgen.sampling.shuffle import OrderDraws, shuffle, shuffled_rows
-from physics.bounds import require_32_bits
-from physics.types import FIXED_POLYGONS, Size
+from levelproof.levelgen.identity.keys import Stream, key_for, level_id_array
+from levelproof.levelgen.level import Level, Role, name_of
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.sampling.draws import at, deal, pick
+from levelproof.levelgen.sampling.moves import ThrusterDraws, add_thruster, propose_connected, propose_free
+from levelproof.levelgen.sampling.overlap import WorldCircles, count_contacts
+from levelproof.levelgen.sampling.proposal import BodyDraws, Flag, Lane, Proposal, corners_in_world, insert
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.levelgen.sampling.shuffle import OrderDraws, shuffle, shuffled_rows
+from levelproof.physics.bounds import require_32_bits
+from levelproof.physics.types import FIXED_POLYGONS, Size
 
 CHUNK = 256  # levels sampled by one call of the compiled program, however many are asked for
 GOAL_BODIES = 2  # green and blue come first

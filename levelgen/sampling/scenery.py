@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from levelgen.level import HALF_WORLD, WORLD_SIDE, Level
-from physics.buffers import zeros_of
-from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
+from levelproof.levelgen.level import HALF_WORLD, WORLD_SIDE, Level
+from levelproof.physics.buffers import zeros_of
+from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
 
 GRAVITY = (0.0, -9.81)  # m/s^2
 FLOOR_TOP = 0.4  # m above the lower edge of the world

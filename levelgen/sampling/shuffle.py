@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.level import Level
-from physics.types import FIXED_POLYGONS, Model, Size
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import FIXED_POLYGONS, Model, Size
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.level import ACTIONS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
+from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
 
 MOTOR_CHOICES = 3
 THRUSTER_CHOICES = 2

@@ -16,17 +16,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from levelgen.level import ACTIONS, Level
-from levelgen.task import rules as task
-from levelgen.task.actions import CHOICES, DISCRETE_ACTIONS, Controls, continuous_controls, controls, discrete_controls
-from levelgen.task.observe.entities import entities, padded_shape, symbolic_padded
-from levelgen.task.observe.flat import LIMIT, feature_count, symbolic_flat
-from levelgen.task.observe.pixels import SIDE, pixels
-from levelgen.task.rules import TaskParams, TaskState
-from levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete, Space
-from levelgen.task.vmapped import single
-from physics.bounds import require_32_bits
-from physics.types import Size
+from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import (
+    CHOICES,
+    DISCRETE_ACTIONS,
+    Controls,
+    continuous_controls,
+    controls,
+    discrete_controls,
+)
+from levelproof.levelgen.task.observe.entities import entities, padded_shape, symbolic_padded
+from levelproof.levelgen.task.observe.flat import LIMIT, feature_count, symbolic_flat
+from levelproof.levelgen.task.observe.pixels import SIDE, pixels
+from levelproof.levelgen.task.rules import TaskParams, TaskState
+from levelproof.levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete, Space
+from levelproof.levelgen.task.vmapped import single
+from levelproof.physics.bounds import require_32_bits
+from levelproof.physics.types import Size
 
 
 class ActionType(StrEnum):

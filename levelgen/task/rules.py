@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.level import Level, Role
-from levelgen.task.actions import Controls, controls
-from physics.bounds import require
-from physics.pairs import pairs_of
-from physics.step import step as physics_step
-from physics.types import Params, State
-from physics.vector import rows, select, vec
+from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.task.actions import Controls, controls
+from levelproof.physics.bounds import require
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.step import step as physics_step
+from levelproof.physics.types import Params, State
+from levelproof.physics.vector import rows, select, vec
 
 MOST_STEPS = 10**6
 NO_DISTANCE = -1.0  # last_distance before the first step of an episode

@@ -10,11 +10,11 @@ import llvmlite
 from jax.extend import core
 from llvmlite import binding, ir
 
-from physics.codegen.buffers import LANES, Buffer
-from physics.codegen.ffi import POINTER, add_handler
-from physics.codegen.kept import kept
-from physics.codegen.lower import Memory, lower
-from physics.codegen.values import INDEX
+from levelproof.physics.codegen.buffers import LANES, Buffer
+from levelproof.physics.codegen.ffi import POINTER, add_handler
+from levelproof.physics.codegen.kept import kept
+from levelproof.physics.codegen.lower import Memory, lower
+from levelproof.physics.codegen.values import INDEX
 
 _libraries: dict[str, binding.ResourceTracker] = {}  # machine code must outlive every executable that calls it
 

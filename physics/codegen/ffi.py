@@ -12,8 +12,8 @@ from typing import Any
 
 from llvmlite import ir
 
-from physics.codegen.buffers import LANES, Buffer
-from physics.codegen.values import INDEX, STORED, Operand
+from levelproof.physics.codegen.buffers import LANES, Buffer
+from levelproof.physics.codegen.values import INDEX, STORED, Operand
 
 VERSION_MAJOR, VERSION_MINOR = 0, 3
 METADATA_QUERY = 1  # XLA_FFI_Extension_Metadata: XLA asks which version the handler was made for

@@ -11,9 +11,9 @@ from jax.extend import core
 from jax.lax import RoundingMethod
 from llvmlite import ir
 
-from physics.codegen import primitives
-from physics.codegen.buffers import BYTES, LANES
-from physics.codegen.values import INDEX, STORED, Operand, Value, array, constant, has_lanes, llvm_type
+from levelproof.physics.codegen import primitives
+from levelproof.physics.codegen.buffers import BYTES, LANES
+from levelproof.physics.codegen.values import INDEX, STORED, Operand, Value, array, constant, has_lanes, llvm_type
 
 
 @dataclass(frozen=True)

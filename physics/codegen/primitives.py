@@ -7,8 +7,8 @@ from functools import reduce
 import numpy as np
 from llvmlite import ir
 
-from physics.codegen.buffers import LANES
-from physics.codegen.values import Operand, Value, array, constant, has_lanes, llvm_type, vector
+from levelproof.physics.codegen.buffers import LANES
+from levelproof.physics.codegen.values import Operand, Value, array, constant, has_lanes, llvm_type, vector
 
 Emit = Callable[..., Operand]
 FLOAT, INT, BOOL = "float32", "int32", "bool"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from physics.codegen.buffers import LANES
+from levelproof.physics.codegen.buffers import LANES
 
 Operand = Any  # an LLVM value; llvmlite does not say of its own that they have types
 INDEX = ir.IntType(64)

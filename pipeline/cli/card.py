@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from pipeline.cli.command import SPLIT
+from levelproof.pipeline.cli.command import SPLIT
 
 DOES = "write the README of a dataset of splits, for the Hugging Face hub"
 EXAMPLE = """\
@@ -21,8 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from pipeline.look.card import Wishes, card
-    from pipeline.store.remote import require_folder
+    from levelproof.pipeline.look.card import Wishes, card
+    from levelproof.pipeline.store.remote import require_folder
 
     for split in arguments.splits:
         require_folder(split, "write its card")

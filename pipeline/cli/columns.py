@@ -5,11 +5,11 @@ import json
 import shutil
 from typing import TYPE_CHECKING
 
-from pipeline.cli.command import add_json, listed
-from pipeline.errors import UserError
+from levelproof.pipeline.cli.command import add_json, listed
+from levelproof.pipeline.errors import UserError
 
 if TYPE_CHECKING:
-    from pipeline.store.columns import ManifestColumn
+    from levelproof.pipeline.store.columns import ManifestColumn
 
 DOES = "list a manifest's columns with their meanings, types and units"
 EXAMPLE = "levelproof columns steps"
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from pipeline.store.columns import DESCRIBED
+    from levelproof.pipeline.store.columns import DESCRIBED
 
     has_word = lambda of: arguments.word.lower() in f"{of.name} {of.type_name} {of.unit} {of.meaning}".lower()
     found = [of for of in DESCRIBED if has_word(of)]
@@ -66,7 +66,7 @@ def _kind(of: "ManifestColumn") -> str:
 
 def as_markdown() -> str:
     """The page docs/columns.md."""
-    from pipeline.store.columns import DESCRIBED, MANIFEST_VERSION, OLDEST_VERSION
+    from levelproof.pipeline.store.columns import DESCRIBED, MANIFEST_VERSION, OLDEST_VERSION
 
     newer = " and ".join(f"`{of.name}`" for of in DESCRIBED if of.since > OLDEST_VERSION)
     rows = [f"| `{of.name}` | {_kind(of)} | {of.text} |" for of in DESCRIBED]

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from pipeline.cli.command import SPLIT, add_json
+from levelproof.pipeline.cli.command import SPLIT, add_json
 
 DOES = "tell how two splits of the same levels differ: solved where, at what cost"
 EXAMPLE = "levelproof diff data/128k/s data/256k/s"
@@ -20,6 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from pipeline.look.diff import diff
+    from levelproof.pipeline.look.diff import diff
 
     diff(arguments.split, arguments.other, arguments.where, arguments.rows, arguments.json)

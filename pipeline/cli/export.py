@@ -4,8 +4,8 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.cli.command import add_split
-from pipeline.errors import UserError
+from levelproof.pipeline.cli.command import add_split
+from levelproof.pipeline.errors import UserError
 
 DOES = "write levels and their witnesses for other programs"
 EXAMPLE = """\
@@ -22,20 +22,20 @@ WHERE = (
 
 
 def _kinetix(split: Path, where: str | None, out: Path) -> None:
-    from pipeline.read.kinetix.export import export_kinetix
+    from levelproof.pipeline.read.kinetix.export import export_kinetix
 
     export_kinetix(split, where, out)
 
 
 def _parquet(split: Path, where: str | None, out: Path) -> None:
-    from pipeline.read.parquet import export_parquet
+    from levelproof.pipeline.read.parquet import export_parquet
 
     export_parquet(split, where, out)
 
 
 def _minari(split: Path, where: str | None, out: Path, actions: str = "multi_discrete") -> None:
-    from pipeline.read.minari.episodes import ActionKind
-    from pipeline.read.minari.export import export_minari
+    from levelproof.pipeline.read.minari.episodes import ActionKind
+    from levelproof.pipeline.read.minari.export import export_minari
 
     export_minari(split, where, out, ActionKind(actions))
 
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
                 f"As {JSON} one level is exported: give its id, as in levelproof export {split} 7, without --where; "
                 f"--format chooses one of {', '.join(FORMATS)} for many."
             )
-        from pipeline.read.export import export
+        from levelproof.pipeline.read.export import export
 
         export(split, level_id, out or Path("level.json"))
         return

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from pipeline.cli.command import add_split
+from levelproof.pipeline.cli.command import add_split
 
 DOES = "write a split as a site that browsers open from the disk"
 EXAMPLE = "levelproof gallery data/128k/s -o gallery/"
@@ -20,6 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from pipeline.look.gallery.gallery import gallery
+    from levelproof.pipeline.look.gallery.gallery import gallery
 
     gallery(arguments.split, arguments.out, arguments.where, arguments.levels)

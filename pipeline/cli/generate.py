@@ -3,8 +3,8 @@
 import argparse
 import shutil
 
-from pipeline.cli.command import listed
-from pipeline.errors import Exit
+from levelproof.pipeline.cli.command import listed
+from levelproof.pipeline.errors import Exit
 
 DOES = "make levels and their experts"
 EXAMPLE = """\
@@ -37,9 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Exit:
     from rich.console import Console
 
-    from configs.compose import compose_job
-    from pipeline.jobs.generate import generate
-    from pipeline.jobs.level_files import generate_from_files
+    from levelproof.configs.compose import compose_job
+    from levelproof.pipeline.jobs.generate import generate
+    from levelproof.pipeline.jobs.level_files import generate_from_files
 
     job = compose_job(arguments.settings)
     make = generate_from_files if job.level_files else generate
@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> Exit:
 
 def _help(parser: argparse.ArgumentParser) -> str:
     """argparse's help, with the settings that people change before the examples: on one screen."""
-    from configs.meanings import every_setting
+    from levelproof.configs.meanings import every_setting
 
     settings = {setting.name: setting for setting in every_setting()}
     entries = ((settings[name].word, settings[name].text) for name in OFTEN)

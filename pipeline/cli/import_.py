@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from pipeline.errors import Exit
+from levelproof.pipeline.errors import Exit
 
 DOES = "make a split of trajectories in Kinetix' own layout"
 EXAMPLE = "levelproof import kinetix/1M/s -o data/1M/s"
@@ -19,6 +19,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Exit:
     from rich.console import Console
 
-    from pipeline.jobs.imported import import_folder
+    from levelproof.pipeline.jobs.imported import import_folder
 
     return import_folder(arguments.folder, arguments.out, Console(stderr=True))

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from pipeline.cli.command import add_json, add_split
+from levelproof.pipeline.cli.command import add_json, add_split
 
 DOES = "show what is in a split"
 EXAMPLE = """\
@@ -33,16 +33,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     import sys
 
-    from pipeline.look.rows import Asked, write_csv
+    from levelproof.pipeline.look.rows import Asked, write_csv
 
     columns = [name.strip() for name in arguments.columns.split(",")] if arguments.columns else None
     asked = Asked(arguments.where, columns, arguments.sort, arguments.limit)
     if arguments.csv:
         return write_csv(arguments.split, asked, sys.stdout)
     if arguments.plot:
-        from pipeline.look.plot import plot
+        from levelproof.pipeline.look.plot import plot
 
         return plot(arguments.split, asked, arguments.plot)
-    from pipeline.look.inspect import inspect
+    from levelproof.pipeline.look.inspect import inspect
 
     return inspect(arguments.split, asked, arguments.json, arguments.against)

@@ -11,18 +11,18 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from configs.errors import ConfigError, readable
-from pipeline.cli.command import EXITS
-from pipeline.errors import Exit, LevelproofError, UserError
-from pipeline.urls import require_here, require_known
-from pipeline.version import __version__
+from levelproof.configs.errors import ConfigError, readable
+from levelproof.pipeline.cli.command import EXITS
+from levelproof.pipeline.errors import Exit, LevelproofError, UserError
+from levelproof.pipeline.urls import require_here, require_known
+from levelproof.pipeline.version import __version__
 
 NAMES = (
     "generate regenerate settings sample inspect columns plan diff show gallery play export import_ card status verify "
     "seal"
 )
 WRITTEN = ("out", "plot")  # what is written on this machine
-COMMANDS = [import_module(f"pipeline.cli.{name}") for name in NAMES.split()]
+COMMANDS = [import_module(f"levelproof.pipeline.cli.{name}") for name in NAMES.split()]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,7 +2,7 @@
 
 import argparse
 
-from pipeline.cli.command import add_json
+from levelproof.pipeline.cli.command import add_json
 
 DOES = "tell what a job would take: hours, bytes, files, solved levels"
 EXAMPLE = """levelproof plan size=s levels=6M budget=256k
@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from rich.console import Console
 
-    from configs.compose import compose_job
-    from pipeline.jobs.plan import plan
+    from levelproof.configs.compose import compose_job
+    from levelproof.pipeline.jobs.plan import plan
 
     plan(compose_job(arguments.settings), arguments.json, Console(stderr=True))

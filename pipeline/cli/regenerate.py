@@ -2,7 +2,7 @@
 
 import argparse
 
-from pipeline.errors import Exit
+from levelproof.pipeline.errors import Exit
 
 DOES = "train a manifest's levels at another budget"
 EXAMPLE = "levelproof regenerate manifest=data/256k/s budget=1M where=\"label = 'unsolved'\""
@@ -20,6 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Exit:
     from rich.console import Console
 
-    from pipeline.jobs.regenerate import regenerate
+    from levelproof.pipeline.jobs.regenerate import regenerate
 
     return regenerate(arguments.words, Console(stderr=True))

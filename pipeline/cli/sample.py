@@ -2,7 +2,7 @@
 
 import argparse
 
-from pipeline.cli.command import add_out
+from levelproof.pipeline.cli.command import add_out
 
 DOES = "draw random levels, before anything is trained"
 EXAMPLE = "levelproof sample size=m distribution=clutter -o sheet.png"
@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from configs.compose import compose_job
-    from pipeline.look.sample import LEVELS, sample
+    from levelproof.configs.compose import compose_job
+    from levelproof.pipeline.look.sample import LEVELS, sample
 
     sample(compose_job([f"levels={LEVELS}", *arguments.settings]), arguments.out)

@@ -2,7 +2,7 @@
 
 import argparse
 
-from pipeline.cli.command import add_split
+from levelproof.pipeline.cli.command import add_split
 
 DOES = "merge a split's many small files into few large ones"
 EXAMPLE = """levelproof seal data/128k/s
@@ -23,9 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from rich.console import Console
 
-    from configs.schema import KEY_EVERY
-    from pipeline.errors import UserError
-    from pipeline.jobs.seal import seal_split
+    from levelproof.configs.schema import KEY_EVERY
+    from levelproof.pipeline.errors import UserError
+    from levelproof.pipeline.jobs.seal import seal_split
 
     every = arguments.key_every
     if every is not None and arguments.density != "witness":

@@ -8,11 +8,11 @@ from dataclasses import asdict
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from pipeline.cli.command import add_json, listed
-from pipeline.errors import UserError
+from levelproof.pipeline.cli.command import add_json, listed
+from levelproof.pipeline.errors import UserError
 
 if TYPE_CHECKING:
-    from configs.meanings import Setting
+    from levelproof.configs.meanings import Setting
 
 DOES = "list settings with their meanings, units and defaults"
 EXAMPLE = "levelproof settings thruster"
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from configs.meanings import every_setting
+    from levelproof.configs.meanings import every_setting
 
     has_word = lambda text: arguments.word.lower() in text.lower()
     found = [setting for setting in every_setting() if has_word(f"{setting.word} {setting.text} {setting.group}")]

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from pipeline.cli.command import SPLIT, add_out
+from levelproof.pipeline.cli.command import SPLIT, add_out
 
 DOES = "draw a level's witness, or what doing nothing does"
 EXAMPLE = "levelproof show data/128k/s 7 -o level.gif"
@@ -16,6 +16,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from pipeline.look.show import show
+    from levelproof.pipeline.look.show import show
 
     show(arguments.source, arguments.level_id, arguments.out)

@@ -2,7 +2,7 @@
 
 import argparse
 
-from pipeline.cli.command import add_json, add_split
+from levelproof.pipeline.cli.command import add_json, add_split
 
 DOES = "tell how far a split is"
 EXAMPLE = """levelproof status data/128k/s
@@ -20,8 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from rich.console import Console
 
-    from pipeline.look.status import status
-    from pipeline.look.watch import watch
+    from levelproof.pipeline.look.status import status
+    from levelproof.pipeline.look.watch import watch
 
     if arguments.watch:
         watch(arguments.split, arguments.json, Console(markup=False))

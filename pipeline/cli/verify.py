@@ -2,8 +2,8 @@
 
 import argparse
 
-from pipeline.cli.command import add_json, add_split
-from pipeline.errors import Exit
+from levelproof.pipeline.cli.command import add_json, add_split
+from levelproof.pipeline.errors import Exit
 
 DOES = "hold every byte of a split against its checksum, make every level again, replay every witness"
 EXAMPLE = """\
@@ -27,13 +27,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Exit:
     from rich.console import Console
 
-    from pipeline.store.remote import require_folder
+    from levelproof.pipeline.store.remote import require_folder
 
     if arguments.repair is not None:
         require_folder(arguments.split, "repair it")
-        from pipeline.jobs.repair import repair
+        from levelproof.pipeline.jobs.repair import repair
 
         return repair(arguments.split, arguments.repair, Console(stderr=True))
-    from pipeline.read.verify import verify
+    from levelproof.pipeline.read.verify import verify
 
     return verify(arguments.split, arguments.json, Console(stderr=True))

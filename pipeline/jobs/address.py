@@ -4,7 +4,7 @@ import os
 import re
 import socket
 
-from pipeline.errors import UserError
+from levelproof.pipeline.errors import UserError
 
 REACH = 5.0  # s in which a cluster has to answer
 

@@ -28,15 +28,15 @@ from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 from ray.util.metrics import Gauge
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from configs.schema import JobConfig
-from pipeline.errors import Failure
-from pipeline.jobs.address import existing, no_cluster, require_reachable
-from pipeline.jobs.likeness import Program, program_of, unlike
-from pipeline.jobs.progress import STOPPING, Board, Tally
-from pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, Settle, UnitOutcome, levels_text
-from pipeline.runtime import GRACE, own_core, own_cores, prepare_jax, stoppable
-from pipeline.store.remote import absolute, as_typed
-from pipeline.words import duration
+from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.jobs.address import existing, no_cluster, require_reachable
+from levelproof.pipeline.jobs.likeness import Program, program_of, unlike
+from levelproof.pipeline.jobs.progress import STOPPING, Board, Tally
+from levelproof.pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, Settle, UnitOutcome, levels_text
+from levelproof.pipeline.runtime import GRACE, own_core, own_cores, prepare_jax, stoppable
+from levelproof.pipeline.store.remote import absolute, as_typed
+from levelproof.pipeline.words import duration
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s after which people see progress, whether a worker has reported or not
@@ -55,7 +55,7 @@ class WorkerActor:
         if refusal := unlike(program, job):
             return refusal
         prepare_jax(own_core(neighbours))
-        from pipeline.jobs.worker import Worker  # imports what reads the settings just made
+        from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
         self._worker, self._at_work = Worker(job, split), False
         self._before = signal.signal(signal.SIGTERM, self._asked_to_go)

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline.jobs.progress import Board, Tally
-from pipeline.jobs.schedule import Scheduler, UnitOutcome
-from pipeline.store.events import Event, new_run, tell
+from levelproof.pipeline.jobs.progress import Board, Tally
+from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome
+from levelproof.pipeline.store.events import Event, new_run, tell
 
 EVERY = 5.0  # s between two states that are told
 MOST = 500  # events that are kept, the latest; and before them how the run began

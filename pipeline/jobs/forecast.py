@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.store.merge import FILE_BYTES
-from pipeline.store.seal import ROWS
-from pipeline.words import number
+from levelproof.pipeline.store.merge import FILE_BYTES
+from levelproof.pipeline.store.seal import ROWS
+from levelproof.pipeline.words import number
 
 DRAWS = 2000
 LIKELY = 0.9  # of an interval

@@ -9,28 +9,28 @@ import numpy as np
 import pyarrow.compute as pc
 from rich.console import Console
 
-from configs.schema import JobConfig
-from experts.labels import Label
-from experts.steps import EnvSteps
-from pipeline.errors import Exit, Failure
-from pipeline.jobs.events import Events, telling
-from pipeline.jobs.log import logged, require_library
-from pipeline.jobs.progress import Board, Tally, say
-from pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, plan_units
-from pipeline.jobs.seal import Sealer, sealing
-from pipeline.runtime import cache_folder
-from pipeline.store import quarantine
-from pipeline.store.checkpoints import require_same_experts
-from pipeline.store.files import remove
-from pipeline.store.job_note import note_job
-from pipeline.store.layout import quarantine_path
-from pipeline.store.manifest import Manifest, read_manifest
-from pipeline.store.origins import Origin, require_same_levels
-from pipeline.store.paused import prune_paused
-from pipeline.store.remote import as_typed
-from pipeline.store.runs import ascending, merged, runs
-from pipeline.store.split import writing
-from pipeline.words import many
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.labels import Label
+from levelproof.experts.steps import EnvSteps
+from levelproof.pipeline.errors import Exit, Failure
+from levelproof.pipeline.jobs.events import Events, telling
+from levelproof.pipeline.jobs.log import logged, require_library
+from levelproof.pipeline.jobs.progress import Board, Tally, say
+from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, plan_units
+from levelproof.pipeline.jobs.seal import Sealer, sealing
+from levelproof.pipeline.runtime import cache_folder
+from levelproof.pipeline.store import quarantine
+from levelproof.pipeline.store.checkpoints import require_same_experts
+from levelproof.pipeline.store.files import remove
+from levelproof.pipeline.store.job_note import note_job
+from levelproof.pipeline.store.layout import quarantine_path
+from levelproof.pipeline.store.manifest import Manifest, read_manifest
+from levelproof.pipeline.store.origins import Origin, require_same_levels
+from levelproof.pipeline.store.paused import prune_paused
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.store.runs import ascending, merged, runs
+from levelproof.pipeline.store.split import writing
+from levelproof.pipeline.words import many
 
 
 def generate(
@@ -125,9 +125,9 @@ def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, seale
             sealer.look(scheduler.first)
 
     if job.executor == "inline":
-        from pipeline.jobs.inline import run
+        from levelproof.pipeline.jobs.inline import run
     else:
-        from pipeline.jobs.cluster import run
+        from levelproof.pipeline.jobs.cluster import run
     run(job, split, scheduler, settle, board)
 
 

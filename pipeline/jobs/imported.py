@@ -11,30 +11,30 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from configs.schema import ImportConfig
-from experts.config import RECORD_STEPS
-from experts.given import label_given
-from experts.labels import WITNESSED
-from experts.steps import EnvSteps
-from experts.train import UnitResult
-from experts.witness import LANES, take
-from levelgen.level import name_of
-from pipeline.errors import Exit, Failure, UserError
-from pipeline.jobs.progress import say
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.seal import sealing
-from pipeline.jobs.unit import commit
-from pipeline.read.kinetix.folder import Folder, open_folder, read_trajectories
-from pipeline.read.kinetix.records import dtype_of
-from pipeline.read.kinetix.zarr2 import FormatError, StoredArray
-from pipeline.runtime import interruptible, prepare_jax
-from pipeline.store.job_note import note_job
-from pipeline.store.manifest import Manifest, read_manifest
-from pipeline.store.origins import Origin, RecordPlace, can_be_noted
-from pipeline.store.remote import require_folder
-from pipeline.store.runs import runs
-from pipeline.store.split import writing
-from pipeline.words import many
+from levelproof.configs.schema import ImportConfig
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.given import label_given
+from levelproof.experts.labels import WITNESSED
+from levelproof.experts.steps import EnvSteps
+from levelproof.experts.train import UnitResult
+from levelproof.experts.witness import LANES, take
+from levelproof.levelgen.level import name_of
+from levelproof.pipeline.errors import Exit, Failure, UserError
+from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.seal import sealing
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.read.kinetix.folder import Folder, open_folder, read_trajectories
+from levelproof.pipeline.read.kinetix.records import dtype_of
+from levelproof.pipeline.read.kinetix.zarr2 import FormatError, StoredArray
+from levelproof.pipeline.runtime import interruptible, prepare_jax
+from levelproof.pipeline.store.job_note import note_job
+from levelproof.pipeline.store.manifest import Manifest, read_manifest
+from levelproof.pipeline.store.origins import Origin, RecordPlace, can_be_noted
+from levelproof.pipeline.store.remote import require_folder
+from levelproof.pipeline.store.runs import runs
+from levelproof.pipeline.store.split import writing
+from levelproof.pipeline.words import many
 
 UNIT_BYTES = 2**28  # of the records of a unit, as the reference has them; they are in memory a few times
 TOLD = 3  # records that are left out, each with its reason

@@ -3,10 +3,10 @@
 import time
 from pathlib import Path
 
-from configs.schema import JobConfig
-from pipeline.jobs.progress import STOPPING, Board
-from pipeline.jobs.schedule import ROUND, Scheduler, Settle
-from pipeline.runtime import prepare_jax, stoppable
+from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.jobs.progress import STOPPING, Board
+from levelproof.pipeline.jobs.schedule import ROUND, Scheduler, Settle
+from levelproof.pipeline.runtime import prepare_jax, stoppable
 
 HERE = "this process"
 
@@ -14,7 +14,7 @@ HERE = "this process"
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board) -> None:
     """Work until nothing is left to do."""
     prepare_jax()
-    from pipeline.jobs.worker import Worker  # imports what reads the settings just made
+    from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
     with stoppable() as stop:
         worker = Worker(job, split)

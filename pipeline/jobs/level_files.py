@@ -8,12 +8,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from configs.schema import JobConfig
-from pipeline.errors import Exit, UserError
-from pipeline.jobs.generate import generate
-from pipeline.jobs.progress import say
-from pipeline.read.level_files import Listing, levels_below
-from pipeline.runtime import prepare_jax
+from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.errors import Exit, UserError
+from levelproof.pipeline.jobs.generate import generate
+from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.read.level_files import Listing, levels_below
+from levelproof.pipeline.runtime import prepare_jax
 
 
 def generate_from_files(job: JobConfig, command: Sequence[str], console: Console) -> Exit:

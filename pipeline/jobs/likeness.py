@@ -5,8 +5,8 @@ import socket
 from functools import cache
 from pathlib import Path
 
-from configs.schema import JobConfig
-from pipeline.store.provenance import versions
+from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.store.provenance import versions
 
 Program = dict[str, str]  # versions by name
 SAME = ("levelproof", "jax", "jaxlib", "sampler")  # of `provenance.versions`

@@ -8,10 +8,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
-from configs.schema import JobConfig
-from pipeline.errors import UserError
-from pipeline.store.events import Event
-from pipeline.store.remote import is_remote
+from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.events import Event
+from levelproof.pipeline.store.remote import is_remote
 
 LIBRARIES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 FOLDER, PROJECT = "log", "levelproof"

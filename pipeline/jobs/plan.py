@@ -15,21 +15,21 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from configs.schema import MOST_FRAME_SKIP, JobConfig
-from experts.labels import WITNESSED, Label
-from experts.steps import Seconds
-from pipeline.errors import Failure, UserError
-from pipeline.jobs.forecast import LIKELY, Forecast, PerWitness, Sample, forecast
-from pipeline.jobs.generate import generate
-from pipeline.jobs.progress import say
-from pipeline.read.rows import read_rows
-from pipeline.runtime import own_cores, prepare_jax
-from pipeline.store.events import events_of, runs_in
-from pipeline.store.layout import split_path
-from pipeline.store.manifest import read_manifest
-from pipeline.store.schema import Encoding
-from pipeline.store.shard import stored_bytes, write_shard
-from pipeline.words import duration, many
+from levelproof.configs.schema import MOST_FRAME_SKIP, JobConfig
+from levelproof.experts.labels import WITNESSED, Label
+from levelproof.experts.steps import Seconds
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.jobs.forecast import LIKELY, Forecast, PerWitness, Sample, forecast
+from levelproof.pipeline.jobs.generate import generate
+from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.runtime import own_cores, prepare_jax
+from levelproof.pipeline.store.events import events_of, runs_in
+from levelproof.pipeline.store.layout import split_path
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.schema import Encoding
+from levelproof.pipeline.store.shard import stored_bytes, write_shard
+from levelproof.pipeline.words import duration, many
 
 SECONDS = 60.0  # of making levels, about
 MOST = 4096  # levels

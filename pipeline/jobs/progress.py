@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from experts.steps import NO_SECONDS, EnvSteps, Seconds
-from pipeline.jobs.schedule import Round, Summary, WorkUnit
-from pipeline.words import duration
+from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
+from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
+from levelproof.pipeline.words import duration
 
 LINE_EVERY = 30.0  # s between plain lines
 LINE_AFTER = 2.0  # s between one and the next commit that is told; the last commit always is

@@ -7,15 +7,15 @@ from typing import Any
 
 from rich.console import Console
 
-from configs.compose import compose_job, words_for
-from configs.schema import from_files
-from experts.procedure import Procedure
-from levelgen.identity.keys import SAMPLER_VERSION
-from pipeline.errors import Exit, UserError
-from pipeline.jobs.generate import generate
-from pipeline.read.select import columns_in, select
-from pipeline.store.manifest import require_manifest
-from pipeline.store.origins import origins_of
+from levelproof.configs.compose import compose_job, words_for
+from levelproof.configs.schema import from_files
+from levelproof.experts.procedure import Procedure
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
+from levelproof.pipeline.errors import Exit, UserError
+from levelproof.pipeline.jobs.generate import generate
+from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.origins import origins_of
 
 OWN = ("manifest", "where", "continue")  # words that are not settings of a job
 NOT_OURS = ("size", "levels", "first_level", "level_files", "distribution")  # settings that the manifest decides

@@ -10,20 +10,20 @@ from pathlib import Path
 
 from rich.console import Console
 
-from configs.compose import compose_job, words_for
-from configs.errors import ConfigError
-from configs.numbers import parse_count
-from configs.schema import FROM_RECORDS, JobConfig, from_files, hash_of
-from pipeline.errors import Exit, Failure, UserError
-from pipeline.jobs.generate import generate
-from pipeline.jobs.progress import say
-from pipeline.read.findings import Findings
-from pipeline.store.job_note import note_job, sound_note
-from pipeline.store.layout import EXPERTS, data_paths
-from pipeline.store.locks import nobody_commits
-from pipeline.store.mend import take_out
-from pipeline.store.runs import merged, runs, told_levels
-from pipeline.store.split import locked, taken
+from levelproof.configs.compose import compose_job, words_for
+from levelproof.configs.errors import ConfigError
+from levelproof.configs.numbers import parse_count
+from levelproof.configs.schema import FROM_RECORDS, JobConfig, from_files, hash_of
+from levelproof.pipeline.errors import Exit, Failure, UserError
+from levelproof.pipeline.jobs.generate import generate
+from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.read.findings import Findings
+from levelproof.pipeline.store.job_note import note_job, sound_note
+from levelproof.pipeline.store.layout import EXPERTS, data_paths
+from levelproof.pipeline.store.locks import nobody_commits
+from levelproof.pipeline.store.mend import take_out
+from levelproof.pipeline.store.runs import merged, runs, told_levels
+from levelproof.pipeline.store.split import locked, taken
 
 SETTINGS = ("executor", "workers", "unit")  # of `generate`, that a repair may have
 
@@ -75,7 +75,7 @@ def _examined(split: Path, inline: bool) -> Findings:
 
 
 def _examine(split: Path) -> Findings:
-    from pipeline.read.verify import examine  # starts JAX
+    from levelproof.pipeline.read.verify import examine  # starts JAX
 
     return examine(split, Console(stderr=True))
 

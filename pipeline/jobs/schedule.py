@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experts.steps import NO_SECONDS, EnvSteps, Seconds
-from pipeline.store.layout import unit_name
-from pipeline.store.origins import Origin
-from pipeline.store.runs import ascending, runs, told_levels, without
+from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
+from levelproof.pipeline.store.layout import unit_name
+from levelproof.pipeline.store.origins import Origin
+from levelproof.pipeline.store.runs import ascending, runs, told_levels, without
 
 # How many units a worker may have at once, those included that failed as often: a unit that kills its worker takes
 # fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.

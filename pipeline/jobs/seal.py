@@ -11,20 +11,20 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from configs.schema import KEY_EVERY, KEYS_EVERY, Density, stored_as
-from pipeline.errors import LevelproofError, UserError
-from pipeline.jobs.progress import say
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.runtime import prepare_jax
-from pipeline.store import seal as store
-from pipeline.store.disk import told_of
-from pipeline.store.job_note import note_density
-from pipeline.store.layout import fragment_path, unit_name
-from pipeline.store.manifest import Fragment, require_manifest, write_index
-from pipeline.store.remote import as_typed
-from pipeline.store.seal import Piece, seal
-from pipeline.store.split import taken
-from pipeline.words import many
+from levelproof.configs.schema import KEY_EVERY, KEYS_EVERY, Density, stored_as
+from levelproof.pipeline.errors import LevelproofError, UserError
+from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store import seal as store
+from levelproof.pipeline.store.disk import told_of
+from levelproof.pipeline.store.job_note import note_density
+from levelproof.pipeline.store.layout import fragment_path, unit_name
+from levelproof.pipeline.store.manifest import Fragment, require_manifest, write_index
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.store.seal import Piece, seal
+from levelproof.pipeline.store.split import taken
+from levelproof.pipeline.words import many
 
 
 def seal_split(

@@ -14,36 +14,36 @@ from typing import Any
 
 import numpy as np
 
-from configs.compose import again
-from configs.schema import JobConfig
-from experts.labels import WITNESSED, Label, Verdict
-from experts.ledger import Ledger
-from experts.pool import Pool
-from experts.train import TrainingRun, UnitResult
-from experts.witness import Record, replay, succeeds, take
-from levelgen.identity.content import content_hashes
-from levelgen.identity.keys import level_id_array
-from levelgen.identity.signature import signatures
-from levelgen.level import Level, size_of
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import TaskParams
-from pipeline.errors import Failure, StoreFailure
-from pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
-from pipeline.read.level_files import LevelUnseen, levels_at
-from pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
-from pipeline.store.disk import REFUSALS
-from pipeline.store.fields import arrays_of, unlike_fields
-from pipeline.store.layout import Attempt, new_attempt
-from pipeline.store.leases import LeaseLost
-from pipeline.store.locks import LockRefused, committing
-from pipeline.store.manifest import begin_fragment, write_fragment
-from pipeline.store.origins import RECORD, Origin
-from pipeline.store.paused import drop_paused, load_paused
-from pipeline.store.provenance import device, versions
-from pipeline.store.publish import committed_levels
-from pipeline.store.remote import is_remote
-from pipeline.store.schema import Encoding
-from pipeline.store.shard import write_shard
+from levelproof.configs.compose import again
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.labels import WITNESSED, Label, Verdict
+from levelproof.experts.ledger import Ledger
+from levelproof.experts.pool import Pool
+from levelproof.experts.train import TrainingRun, UnitResult
+from levelproof.experts.witness import Record, replay, succeeds, take
+from levelproof.levelgen.identity.content import content_hashes
+from levelproof.levelgen.identity.keys import level_id_array
+from levelproof.levelgen.identity.signature import signatures
+from levelproof.levelgen.level import Level, size_of
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.errors import Failure, StoreFailure
+from levelproof.pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
+from levelproof.pipeline.read.level_files import LevelUnseen, levels_at
+from levelproof.pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
+from levelproof.pipeline.store.disk import REFUSALS
+from levelproof.pipeline.store.fields import arrays_of, unlike_fields
+from levelproof.pipeline.store.layout import Attempt, new_attempt
+from levelproof.pipeline.store.leases import LeaseLost
+from levelproof.pipeline.store.locks import LockRefused, committing
+from levelproof.pipeline.store.manifest import begin_fragment, write_fragment
+from levelproof.pipeline.store.origins import RECORD, Origin
+from levelproof.pipeline.store.paused import drop_paused, load_paused
+from levelproof.pipeline.store.provenance import device, versions
+from levelproof.pipeline.store.publish import committed_levels
+from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.schema import Encoding
+from levelproof.pipeline.store.shard import write_shard
 
 
 def pool_for(job: JobConfig) -> Pool:

@@ -8,13 +8,13 @@ import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from configs.schema import JobConfig
-from experts.train import TrainingRun
-from pipeline.errors import LevelproofError
-from pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
-from pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
-from pipeline.store.leases import serve
-from pipeline.store.paused import save_paused
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.train import TrainingRun
+from levelproof.pipeline.errors import LevelproofError
+from levelproof.pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
+from levelproof.pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
+from levelproof.pipeline.store.leases import serve
+from levelproof.pipeline.store.paused import save_paused
 
 
 class Worker:

@@ -15,20 +15,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from configs.compose import identified
-from configs.schema import FROM_RECORDS
-from experts.config import RECORD_STEPS
-from experts.labels import Label
-from levelgen.pictures.raster import sheet, write_png
-from pipeline.errors import UserError
-from pipeline.look.figures import draw_panels, draw_shares
-from pipeline.look.preview import preview
-from pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, SplitFacts, Wishes, readme
-from pipeline.read.levels import distribution_of, writing_to
-from pipeline.store.layout import SHARDS
-from pipeline.store.manifest import Manifest, require_manifest
-from pipeline.store.shard import stored_bytes
-from pipeline.version import __version__
+from levelproof.configs.compose import identified
+from levelproof.configs.schema import FROM_RECORDS
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import Label
+from levelproof.levelgen.pictures.raster import sheet, write_png
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.figures import draw_panels, draw_shares
+from levelproof.pipeline.look.preview import preview
+from levelproof.pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, SplitFacts, Wishes, readme
+from levelproof.pipeline.read.levels import distribution_of, writing_to
+from levelproof.pipeline.store.layout import SHARDS
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.shard import stored_bytes
+from levelproof.pipeline.version import __version__
 
 README = "README.md"
 ASKED = ("label", "steps_to_goal", "content_hash", "shard", "budget", "versions", "device")

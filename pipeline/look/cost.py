@@ -7,9 +7,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from experts.labels import Label
-from experts.steps import Seconds
-from pipeline.words import number
+from levelproof.experts.labels import Label
+from levelproof.experts.steps import Seconds
+from levelproof.pipeline.words import number
 
 READ = ("label", "device", "seconds")  # columns that this is from
 

@@ -15,14 +15,14 @@ from jaxtyping import Bool
 from rich.console import Console
 from rich.table import Table
 
-from experts.labels import TRAINED, WITNESSED, Label
-from pipeline.errors import UserError
-from pipeline.look import cost
-from pipeline.look.inspect import QUANTILES, SPENT
-from pipeline.read.select import columns_in, select
-from pipeline.store.manifest import differences, require_manifest, told
-from pipeline.store.remote import as_typed
-from pipeline.words import number
+from levelproof.experts.labels import TRAINED, WITNESSED, Label
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look import cost
+from levelproof.pipeline.look.inspect import QUANTILES, SPENT
+from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.manifest import differences, require_manifest, told
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.words import number
 
 READ = (*cost.READ, "content_hash", "signature", "steps_to_goal", *SPENT)
 LABELS = [label.value for label in Label]

@@ -14,9 +14,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.errors import UserError
-from pipeline.store.columns import COLUMNS
-from pipeline.store.manifest import require_manifest
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.manifest import require_manifest
 
 COMPARED = ("content_hash", "signature")
 # The few that share a half of a signature; the same content has the same signature. Grouping hashes of 8 bytes takes a
@@ -155,9 +155,11 @@ def _pairs(connection: duckdb.DuckDBPyConnection, query: str, shown: int) -> dic
 
 
 def _of_files(files: list[Path]) -> pa.Table:
-    from levelgen.identity.content import content_hashes  # here, so that a question about a split need not wait for JAX
-    from levelgen.identity.signature import signatures
-    from pipeline.read.levels import level_file
+    from levelproof.levelgen.identity.content import (
+        content_hashes,  # here, so that a question about a split need not wait for JAX
+    )
+    from levelproof.levelgen.identity.signature import signatures
+    from levelproof.pipeline.read.levels import level_file
 
     rows = []
     for path in files:

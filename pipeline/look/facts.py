@@ -7,8 +7,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.look import cost, duplicates
-from pipeline.look.things import THINGS
+from levelproof.pipeline.look import cost, duplicates
+from levelproof.pipeline.look.things import THINGS
 
 NAMES = 33  # letters of a line before its text
 REASONS = 4  # of each label; the rest is counted

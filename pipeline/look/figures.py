@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from levelgen.level import Role
-from levelgen.pictures.raster import picture_of, write_png
-from levelgen.pictures.shapes import disc, line, rectangle, text, text_width
-from levelgen.pictures.style import FONTS, GRID, INK, MUTED, PAPER, ROLE_COLOUR
+from levelproof.levelgen.level import Role
+from levelproof.levelgen.pictures.raster import picture_of, write_png
+from levelproof.levelgen.pictures.shapes import disc, line, rectangle, text, text_width
+from levelproof.levelgen.pictures.style import FONTS, GRID, INK, MUTED, PAPER, ROLE_COLOUR
 
 LETTER, SMALL = 0.16, 0.13  # of words
 ROW = 0.34  # height of a share

@@ -16,21 +16,21 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from rich.console import Console
 
-from configs.compose import identified
-from experts.config import RECORD_STEPS
-from experts.labels import DIVERGED, Label
-from pipeline.look import cost, duplicates
-from pipeline.look.facts import print_facts
-from pipeline.look.figures import Share
-from pipeline.look.reasons import kinds_of_reasons
-from pipeline.look.rows import EVERYTHING, SHOWN, Asked, ids_of, rows_of
-from pipeline.look.shares import solved_by_things
-from pipeline.read.levels import distribution_of
-from pipeline.read.select import columns_in, select
-from pipeline.store.layout import data_path
-from pipeline.store.manifest import Manifest, require_manifest
-from pipeline.store.remote import as_typed, is_listed
-from pipeline.store.shard import stored_bytes
+from levelproof.configs.compose import identified
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import DIVERGED, Label
+from levelproof.pipeline.look import cost, duplicates
+from levelproof.pipeline.look.facts import print_facts
+from levelproof.pipeline.look.figures import Share
+from levelproof.pipeline.look.reasons import kinds_of_reasons
+from levelproof.pipeline.look.rows import EVERYTHING, SHOWN, Asked, ids_of, rows_of
+from levelproof.pipeline.look.shares import solved_by_things
+from levelproof.pipeline.read.levels import distribution_of
+from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.layout import data_path
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.remote import as_typed, is_listed
+from levelproof.pipeline.store.shard import stored_bytes
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 SPENT = ("scout_steps", "search_steps", "env_steps", "evaluation_steps")  # what levels cost, env steps

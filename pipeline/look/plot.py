@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from experts.labels import TRAINED, Label
-from pipeline.errors import UserError
-from pipeline.look.figures import draw_panels
-from pipeline.look.rows import Asked
-from pipeline.look.spread import spread
-from pipeline.read.levels import writing_to
-from pipeline.read.select import columns_in, select
-from pipeline.store.manifest import require_manifest
-from pipeline.store.remote import as_typed
-from pipeline.words import many
+from levelproof.experts.labels import TRAINED, Label
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.figures import draw_panels
+from levelproof.pipeline.look.rows import Asked
+from levelproof.pipeline.look.spread import spread
+from levelproof.pipeline.read.levels import writing_to
+from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.words import many
 
 KINDS = (".svg", ".png")
 NUMBERS = ("steps_to_goal", "steps_to_first_success", "env_steps", "success_rate", "portability")

@@ -7,20 +7,20 @@ from typing import Any
 
 import pyarrow as pa
 
-from experts.config import RECORD_STEPS
-from levelgen.level import size_of
-from levelgen.pictures.raster import rasterised
-from levelgen.pictures.scene import scene_of
-from levelgen.pictures.shapes import Scene
-from levelgen.pictures.words import Caption
-from pipeline.look.show import recorded_film
-from pipeline.look.spread import spread
-from pipeline.read.levels import levels_of, rules_of
-from pipeline.read.rows import read_rows
-from pipeline.store.columns import COLUMNS
-from pipeline.store.contents import table_for
-from pipeline.store.manifest import Manifest, require_manifest
-from pipeline.store.shown import shown
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.levelgen.level import size_of
+from levelproof.levelgen.pictures.raster import rasterised
+from levelproof.levelgen.pictures.scene import scene_of
+from levelproof.levelgen.pictures.shapes import Scene
+from levelproof.levelgen.pictures.words import Caption
+from levelproof.pipeline.look.show import recorded_film
+from levelproof.pipeline.look.spread import spread
+from levelproof.pipeline.read.levels import levels_of, rules_of
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.contents import table_for
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.shown import shown
 
 PICTURES = ("start", "goal")  # the initial world; the moment that the witness reaches the goal, where there is one
 SHOWN = (  # columns beside them

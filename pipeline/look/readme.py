@@ -9,10 +9,10 @@ import numpy as np
 import yaml
 from rich.filesize import decimal
 
-from experts.config import RECORD_STEPS
-from experts.labels import Label
-from pipeline.look.figures import Share
-from pipeline.words import number
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import Label
+from levelproof.pipeline.look.figures import Share
+from levelproof.pipeline.words import number
 
 MARK = "<!-- written by levelproof card: run it again rather than edit this -->"
 PREVIEW, FIGURES = "preview", "figures"  # folders beside the README

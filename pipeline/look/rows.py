@@ -10,10 +10,10 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from pipeline.errors import UserError
-from pipeline.read.select import TABLE, columns_in, select
-from pipeline.store.columns import COLUMNS
-from pipeline.store.manifest import require_manifest
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.select import TABLE, columns_in, select
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.manifest import require_manifest
 
 BLOCK = 2**14  # rows that are read at once
 SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps")

@@ -6,14 +6,14 @@ import jax
 import numpy as np
 from PIL import Image
 
-from configs.compose import identified
-from configs.schema import JobConfig
-from levelgen.level import size_of
-from levelgen.pictures.raster import Caption, draw, sheet, write_png
-from levelgen.sampling.sampler import sample_levels
-from pipeline.errors import UserError
-from pipeline.read.levels import writing_to
-from pipeline.runtime import prepare_jax
+from levelproof.configs.compose import identified
+from levelproof.configs.schema import JobConfig
+from levelproof.levelgen.level import size_of
+from levelproof.levelgen.pictures.raster import Caption, draw, sheet, write_png
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.levels import writing_to
+from levelproof.pipeline.runtime import prepare_jax
 
 LEVELS = 15  # unless the command says how many
 MOST_LEVELS = 100

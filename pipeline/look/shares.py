@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from configs.schema import from_files
-from experts.labels import TRAINED, Label
-from pipeline.errors import Failure, UserError
-from pipeline.look.figures import Share
-from pipeline.look.things import things_of
-from pipeline.read.levels import COLUMNS, levels_of
-from pipeline.store.manifest import Manifest, require_manifest
+from levelproof.configs.schema import from_files
+from levelproof.experts.labels import TRAINED, Label
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.look.figures import Share
+from levelproof.pipeline.look.things import things_of
+from levelproof.pipeline.read.levels import COLUMNS, levels_of
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
 SAMPLED, READ = 4096, 256  # levels that are looked at: made again from their ids, or read
 MANY = 1_000_000

@@ -11,23 +11,23 @@ from typing import Any
 import jax
 import numpy as np
 
-from experts.config import RECORD_STEPS
-from experts.witness import Record, replay, steps_to_goal, succeeds
-from levelgen.level import ACTIONS, Level, name_of
-from levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
-from levelgen.pictures.scene import scene_of
-from levelgen.pictures.shapes import Scene
-from levelgen.pictures.svg import svg_of
-from levelgen.pictures.words import Caption
-from levelgen.task.rules import TaskParams
-from physics.types import State
-from pipeline.errors import Failure, UserError
-from pipeline.look.spread import spread
-from pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of, writing_to
-from pipeline.read.rows import read_row
-from pipeline.runtime import prepare_jax
-from pipeline.store.fields import tree_of
-from pipeline.store.manifest import Manifest, require_manifest
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness import Record, replay, steps_to_goal, succeeds
+from levelproof.levelgen.level import ACTIONS, Level, name_of
+from levelproof.levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
+from levelproof.levelgen.pictures.scene import scene_of
+from levelproof.levelgen.pictures.shapes import Scene
+from levelproof.levelgen.pictures.svg import svg_of
+from levelproof.levelgen.pictures.words import Caption
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.physics.types import State
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.look.spread import spread
+from levelproof.pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of, writing_to
+from levelproof.pipeline.read.rows import read_row
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures a second
 LAST_SECONDS = 1.5  # how long a film rests on its last picture

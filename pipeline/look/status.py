@@ -4,15 +4,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import UserError
-from pipeline.store.job_note import NoteError, read_note
-from pipeline.store.layout import JOB, QUARANTINE
-from pipeline.store.locks import is_written
-from pipeline.store.manifest import read_manifest
-from pipeline.store.quarantine import given_up
-from pipeline.store.remote import as_typed
-from pipeline.store.runs import inside
-from pipeline.words import many
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.job_note import NoteError, read_note
+from levelproof.pipeline.store.layout import JOB, QUARANTINE
+from levelproof.pipeline.store.locks import is_written
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.quarantine import given_up
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.store.runs import inside
+from levelproof.pipeline.words import many
 
 
 def status(split: Path, as_json: bool) -> None:

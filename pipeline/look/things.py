@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Int
 
-from levelgen.level import Level
-from physics.types import FIXED_POLYGONS
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import FIXED_POLYGONS
 
 THINGS = ("bodies", "joints", "motors", "thrusters")
 

@@ -10,14 +10,14 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from configs.errors import readable
-from pipeline.errors import UserError
-from pipeline.look.status import look
-from pipeline.store.events import events_of, runs_in
-from pipeline.store.layout import EVENTS
-from pipeline.store.locks import is_written
-from pipeline.store.remote import as_typed
-from pipeline.words import duration, many
+from levelproof.configs.errors import readable
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.status import look
+from levelproof.pipeline.store.events import events_of, runs_in
+from levelproof.pipeline.store.layout import EVENTS
+from levelproof.pipeline.store.locks import is_written
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.words import duration, many
 
 EVERY = 2.0  # s between looks
 STALE = 30.0  # s after which a state is no more than the last that was told

@@ -8,12 +8,12 @@ files.
 import numpy as np
 import pyarrow as pa
 
-from levelgen.level import Level, size_of
-from physics.types import Size
-from pipeline.errors import UserError
-from pipeline.store.contents import ContentsError, check_numbers, level_fields
-from pipeline.store.fields import arrays_of, tree_of
-from pipeline.store.schema import FieldSpec
+from levelproof.levelgen.level import Level, size_of
+from levelproof.physics.types import Size
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.contents import ContentsError, check_numbers, level_fields
+from levelproof.pipeline.store.fields import arrays_of, tree_of
+from levelproof.pipeline.store.schema import FieldSpec
 
 
 def column_fields(size: Size) -> dict[str, FieldSpec]:

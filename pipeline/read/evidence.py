@@ -16,24 +16,24 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Int
 
-from experts.before import decide
-from experts.labels import TRAINED, WITNESSED, Label
-from experts.witness import LANES, Record, replay, steps_to_goal, succeeds
-from levelgen.identity.content import content_hashes, level_id_for
-from levelgen.identity.signature import signatures
-from levelgen.level import Level, size_of
-from levelgen.sampling.sampler import Distribution, sample_levels
-from levelgen.sampling.scenery import empty_level
-from levelgen.task.rules import TaskParams
-from pipeline.errors import Failure
-from pipeline.read.findings import Findings
-from pipeline.read.level_files import level_at
-from pipeline.read.rows import COLUMNS as PLACED
-from pipeline.read.rows import read_placed
-from pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
-from pipeline.store.origins import RECORD, origin_of
-from pipeline.store.provenance import device, versions
-from pipeline.store.shard import EngineDiffers, Shard
+from levelproof.experts.before import decide
+from levelproof.experts.labels import TRAINED, WITNESSED, Label
+from levelproof.experts.witness import LANES, Record, replay, steps_to_goal, succeeds
+from levelproof.levelgen.identity.content import content_hashes, level_id_for
+from levelproof.levelgen.identity.signature import signatures
+from levelproof.levelgen.level import Level, size_of
+from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.read.findings import Findings
+from levelproof.pipeline.read.level_files import level_at
+from levelproof.pipeline.read.rows import COLUMNS as PLACED
+from levelproof.pipeline.read.rows import read_placed
+from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
+from levelproof.pipeline.store.origins import RECORD, origin_of
+from levelproof.pipeline.store.provenance import device, versions
+from levelproof.pipeline.store.shard import EngineDiffers, Shard
 
 COLUMNS = (
     "label", "label_reason", "failed_by_noop", "content_hash", "signature", "file", "size", "steps_to_goal", "shard",

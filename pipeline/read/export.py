@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
-from pipeline.errors import UserError
-from pipeline.read.levels import find_level, levels_of, rules_of, writing_to
+from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.levels import find_level, levels_of, rules_of, writing_to
 
 
 def export(split: Path, level_id: int, out: Path) -> None:

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.store.origins import Origin
-from pipeline.store.remote import as_typed
-from pipeline.store.runs import runs, told_levels
-from pipeline.words import many
+from levelproof.pipeline.store.origins import Origin
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.store.runs import runs, told_levels
+from levelproof.pipeline.words import many
 
 
 @dataclass

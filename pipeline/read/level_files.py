@@ -8,19 +8,19 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from configs.convert import flat, plain
-from configs.schema import JobConfig
-from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
-from levelgen.identity.content import content_hashes, level_id_for
-from levelgen.level import Level, name_of, size_of
-from levelgen.task.rules import DEFAULT_RULES
-from pipeline.errors import Failure, UserError
-from pipeline.read.kinetix.folder import open_folder, read_trajectories
-from pipeline.read.kinetix.zarr2 import FormatError
-from pipeline.read.rows import read_row
-from pipeline.store.contents import level_fields
-from pipeline.store.fields import tree_of
-from pipeline.store.origins import Origin, can_be_noted, place_of
+from levelproof.configs.convert import flat, plain
+from levelproof.configs.schema import JobConfig
+from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
+from levelproof.levelgen.identity.content import content_hashes, level_id_for
+from levelproof.levelgen.level import Level, name_of, size_of
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectories
+from levelproof.pipeline.read.kinetix.zarr2 import FormatError
+from levelproof.pipeline.read.rows import read_row
+from levelproof.pipeline.store.contents import level_fields
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.origins import Origin, can_be_noted, place_of
 
 
 class LevelUnseen(Failure):

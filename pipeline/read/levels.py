@@ -9,21 +9,21 @@ import jax
 import numpy as np
 import pyarrow as pa
 
-from configs.convert import typed
-from configs.schema import from_files
-from levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
-from levelgen.level import Level, size_of
-from levelgen.sampling.sampler import Distribution, sample_levels
-from levelgen.task.rules import TaskParams
-from pipeline.errors import Failure, UserError
-from pipeline.read.level_files import levels_at
-from pipeline.read.rows import read_rows
-from pipeline.runtime import prepare_jax
-from pipeline.store.contents import level_fields
-from pipeline.store.fields import tree_of
-from pipeline.store.manifest import Manifest, require_manifest
-from pipeline.store.origins import ASKED, origin_of
-from pipeline.words import many
+from levelproof.configs.convert import typed
+from levelproof.configs.schema import from_files
+from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
+from levelproof.levelgen.level import Level, size_of
+from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.read.level_files import levels_at
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.contents import level_fields
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.origins import ASKED, origin_of
+from levelproof.pipeline.words import many
 
 COLUMNS = ("label", "label_reason", *ASKED)  # of a level that is drawn or exported
 

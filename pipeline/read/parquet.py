@@ -11,18 +11,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from experts.witness import take
-from levelgen.identity.content import content_hashes
-from levelgen.sampling.sampler import CHUNK
-from pipeline.errors import UserError
-from pipeline.read.columns import columns_for
-from pipeline.read.created import new_folder
-from pipeline.read.levels import levels_of
-from pipeline.read.pace import Pace
-from pipeline.read.select import columns_in, select
-from pipeline.store.columns import COLUMNS
-from pipeline.store.manifest import Manifest, require_manifest, settings_metadata
-from pipeline.words import many
+from levelproof.experts.witness import take
+from levelproof.levelgen.identity.content import content_hashes
+from levelproof.levelgen.sampling.sampler import CHUNK
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.columns import columns_for
+from levelproof.pipeline.read.created import new_folder
+from levelproof.pipeline.read.levels import levels_of
+from levelproof.pipeline.read.pace import Pace
+from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.manifest import Manifest, require_manifest, settings_metadata
+from levelproof.pipeline.words import many
 
 GROUP = 16 * CHUNK  # rows: what is in memory at once, and what a query reads or skips
 FILE = 25 * GROUP  # rows of a file, about as many as a sealed manifest's files have

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from pipeline.errors import Failure
-from pipeline.store.manifest import read_manifest
-from pipeline.store.remote import at_once
-from pipeline.store.shard import Shard, open_shard, read_together
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.remote import at_once
+from levelproof.pipeline.store.shard import Shard, open_shard, read_together
 
 COLUMNS = ("level_id", "size", "shard", "row")  # that rows need to be read
 

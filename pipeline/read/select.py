@@ -7,9 +7,9 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from pipeline.errors import UserError
-from pipeline.store.columns import COLUMNS
-from pipeline.store.manifest import require_manifest
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.manifest import require_manifest
 
 SOLVED = "label = 'solved'"  # exported where nothing else is asked for
 WITNESSED = ("level_id", "size", "budget", "shard", "row")  # columns that exporters read

@@ -18,24 +18,24 @@ import numpy as np
 import pyarrow as pa
 from rich.console import Console
 
-from configs.convert import typed
-from configs.errors import ConfigError
-from configs.schema import from_files
-from levelgen.identity.keys import SAMPLER_VERSION
-from levelgen.level import size_of
-from levelgen.sampling.sampler import CHUNK, Distribution
-from levelgen.task.rules import TaskParams
-from pipeline.errors import Exit, Failure
-from pipeline.read.evidence import COLUMNS, Evidence, Making, same_stack
-from pipeline.read.findings import Findings
-from pipeline.read.level_files import level_at
-from pipeline.read.levels import recorded_settings
-from pipeline.read.pace import Pace
-from pipeline.runtime import prepare_jax
-from pipeline.store.bounds import DAMAGE, MOST_ROWS, bounded
-from pipeline.store.checksums import digests_of, has_own
-from pipeline.store.job_note import JobNote, sound_note
-from pipeline.store.layout import (
+from levelproof.configs.convert import typed
+from levelproof.configs.errors import ConfigError
+from levelproof.configs.schema import from_files
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
+from levelproof.levelgen.level import size_of
+from levelproof.levelgen.sampling.sampler import CHUNK, Distribution
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.errors import Exit, Failure
+from levelproof.pipeline.read.evidence import COLUMNS, Evidence, Making, same_stack
+from levelproof.pipeline.read.findings import Findings
+from levelproof.pipeline.read.level_files import level_at
+from levelproof.pipeline.read.levels import recorded_settings
+from levelproof.pipeline.read.pace import Pace
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.bounds import DAMAGE, MOST_ROWS, bounded
+from levelproof.pipeline.store.checksums import digests_of, has_own
+from levelproof.pipeline.store.job_note import JobNote, sound_note
+from levelproof.pipeline.store.layout import (
     BEGUN,
     FRAGMENT,
     JOB,
@@ -48,12 +48,19 @@ from pipeline.store.layout import (
     made_within,
     unit_ids,
 )
-from pipeline.store.locks import is_written
-from pipeline.store.manifest import Fragment, differences, fragment_paths, read_fragment, require_manifest, told
-from pipeline.store.origins import origin_of
-from pipeline.store.remote import is_remote
-from pipeline.store.runs import runs, told_levels, without
-from pipeline.store.shard import Shard, open_shard
+from levelproof.pipeline.store.locks import is_written
+from levelproof.pipeline.store.manifest import (
+    Fragment,
+    differences,
+    fragment_paths,
+    read_fragment,
+    require_manifest,
+    told,
+)
+from levelproof.pipeline.store.origins import origin_of
+from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.runs import runs, told_levels, without
+from levelproof.pipeline.store.shard import Shard, open_shard
 
 AT_ONCE = 4 * CHUNK  # rows that are looked at together, where fragments have fewer
 ATTEMPTS = 3  # at a split of which fragments are sealed meanwhile

@@ -17,10 +17,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pipeline.store.checksums import TAIL
-from pipeline.store.columns import COLUMNS, OWN, schema_of
-from pipeline.store.remote import bytes_of, is_remote
-from pipeline.store.thrift import PLAIN, Column, footer_in, pages_in
+from levelproof.pipeline.store.checksums import TAIL
+from levelproof.pipeline.store.columns import COLUMNS, OWN, schema_of
+from levelproof.pipeline.store.remote import bytes_of, is_remote
+from levelproof.pipeline.store.thrift import PLAIN, Column, footer_in, pages_in
 
 MOST_FOOTER = 2**24  # bytes; most of them are digests
 MOST_ROWS, MOST_GROUPS = 2**20, 2**9  # of a fragment; a sealed one has 100,000 rows, in groups of 16,384

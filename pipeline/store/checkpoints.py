@@ -11,22 +11,22 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from configs.schema import JobConfig
-from experts.config import Rule
-from experts.judge import Kept
-from experts.labels import BY_EXPERT
-from experts.slots import Begun, begin
-from experts.success import no_success
-from levelgen.identity.keys import level_id_array
-from levelgen.level import size_of
-from levelgen.sampling.scenery import empty_level
-from pipeline.errors import Failure, UserError
-from pipeline.owned import OTHERS, require_own
-from pipeline.store.disk import flush
-from pipeline.store.fields import arrays_of
-from pipeline.store.layout import EXPERTS, MANIFEST, data_path
-from pipeline.store.manifest import differences, read_manifest, require_manifest, told
-from pipeline.store.remote import require_folder
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.config import Rule
+from levelproof.experts.judge import Kept
+from levelproof.experts.labels import BY_EXPERT
+from levelproof.experts.slots import Begun, begin
+from levelproof.experts.success import no_success
+from levelproof.levelgen.identity.keys import level_id_array
+from levelproof.levelgen.level import size_of
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.owned import OTHERS, require_own
+from levelproof.pipeline.store.disk import flush
+from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.layout import EXPERTS, MANIFEST, data_path
+from levelproof.pipeline.store.manifest import differences, read_manifest, require_manifest, told
+from levelproof.pipeline.store.remote import require_folder
 
 COPY = "make a copy of your own of the split that continue_from names, or leave continue_from out"
 T = TypeVar("T")

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 
-from pipeline.store.remote import at_once, bytes_of, is_listed, is_remote, stored_in
+from levelproof.pipeline.store.remote import at_once, bytes_of, is_listed, is_remote, stored_in
 
 MARK = b"levelproof.sha256:"  # before a fragment's own digest
 OWN = len(MARK) + hashlib.sha256().digest_size

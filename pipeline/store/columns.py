@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
-from experts.steps import Seconds
+from levelproof.experts.steps import Seconds
 
 MANIFEST_VERSION, OLDEST_VERSION = 7, 6  # that is written; that is still read
 

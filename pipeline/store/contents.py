@@ -13,18 +13,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from experts.config import RECORD_STEPS
-from experts.witness import Record
-from levelgen.identity.keys import MAX_LEVEL_ID
-from levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
-from levelgen.sampling.scenery import empty_level
-from levelgen.task.actions import CHOICES
-from physics.buffers import buffers_of
-from physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
-from pipeline.store.density import KEY, kept
-from pipeline.store.fields import arrays_of
-from pipeline.store.packing import pack
-from pipeline.store.schema import FLAT, ContentsError, Encoding, FieldSpec, field_table
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness import Record
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
+from levelproof.levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.physics.buffers import buffers_of
+from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
+from levelproof.pipeline.store.density import KEY, kept
+from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.packing import pack
+from levelproof.pipeline.store.schema import FLAT, ContentsError, Encoding, FieldSpec, field_table
 
 COUNTED = (  # fields with one entry for each thing of a kind, in the order of Size
     "level/model/n_vertices",

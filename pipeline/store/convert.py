@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from configs.schema import Density
-from pipeline.store.merge import Place
-from pipeline.store.shard import Shard, read_together, write_shard
+from levelproof.configs.schema import Density
+from levelproof.pipeline.store.merge import Place
+from levelproof.pipeline.store.shard import Shard, read_together, write_shard
 
 LEVELS = 256  # that are in memory at a time; of size l, 300 MB
 

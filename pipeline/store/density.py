@@ -13,14 +13,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from experts.config import RECORD_STEPS
-from experts.resume import KnownStates, Moves, checksum, resume, timesteps
-from experts.witness import take
-from levelgen.level import Level
-from levelgen.task.rules import TaskState
-from physics.types import State
-from pipeline.store.fields import tree_of
-from pipeline.store.schema import WIDE, Encoding, FieldSpec
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.resume import KnownStates, Moves, checksum, resume, timesteps
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskState
+from levelproof.physics.types import State
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.schema import WIDE, Encoding, FieldSpec
 
 MOVES = "record/action", "record/done", "record/goal"
 LAST_DISTANCE = "record/last_distance"

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure
 
 # The disk refuses: whoever tries again works for nothing.
 REFUSALS = {

@@ -4,8 +4,8 @@ import os
 import shutil
 from pathlib import Path
 
-from pipeline.store import objects
-from pipeline.store.remote import is_remote, stored_in
+from levelproof.pipeline.store import objects
+from levelproof.pipeline.store.remote import is_remote, stored_in
 
 
 def write(path: Path, data: bytes) -> None:

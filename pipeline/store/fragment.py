@@ -10,16 +10,16 @@ from typing import Any, get_args
 import numpy as np
 import pyarrow as pa
 
-from configs.schema import KEYS_EVERY, Density, hash_of, stored_as
-from experts.labels import Label, Source
-from levelgen.identity.keys import MAX_LEVEL_ID
-from levelgen.level import size_of
-from pipeline.errors import Failure
-from pipeline.store.bounds import DAMAGE, bounded
-from pipeline.store.columns import COLUMNS, MANIFEST_VERSION, VERSIONS, completed
-from pipeline.store.layout import ids_of
-from pipeline.store.remote import mended
-from pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
+from levelproof.configs.schema import KEYS_EVERY, Density, hash_of, stored_as
+from levelproof.experts.labels import Label, Source
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
+from levelproof.levelgen.level import size_of
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.bounds import DAMAGE, bounded
+from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, VERSIONS, completed
+from levelproof.pipeline.store.layout import ids_of
+from levelproof.pipeline.store.remote import mended
+from levelproof.pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 
 FULL = (stored_as("full"),)
 DENSITIES = {stored_as(density, every) for density in get_args(Density) for every in KEYS_EVERY}

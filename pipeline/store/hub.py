@@ -13,7 +13,7 @@ from urllib.error import HTTPError
 from urllib.parse import quote
 from urllib.request import Request, urlopen
 
-from pipeline.errors import StoreFailure, UserError
+from levelproof.pipeline.errors import StoreFailure, UserError
 
 ATTEMPTS = 6
 PAUSE = 0.5  # s before the second attempt, at most; twice that before each further one

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from configs.schema import JobConfig, hash_of
-from pipeline.store.files import write
-from pipeline.store.layout import JOB
-from pipeline.store.objects import get
-from pipeline.store.remote import is_remote
+from levelproof.configs.schema import JobConfig, hash_of
+from levelproof.pipeline.store.files import write
+from levelproof.pipeline.store.layout import JOB
+from levelproof.pipeline.store.objects import get
+from levelproof.pipeline.store.remote import is_remote
 
 MOST_BYTES = 2**25  # of a file; a run of level ids takes about 30
 DIGEST = "sha256"  # its key

@@ -8,9 +8,9 @@ from os import DirEntry
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.errors import Failure
-from pipeline.store.remote import INDEX, fragments_in, is_remote, names_in
-from pipeline.urls import BUCKETS
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.remote import INDEX, fragments_in, is_remote, names_in
+from levelproof.pipeline.urls import BUCKETS
 
 MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS = "manifest", "shards", "experts", "quarantine", "checkpoints"
 FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS

@@ -19,10 +19,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from pipeline.errors import Failure, LevelproofError, UserError
-from pipeline.store.layout import WRITER_LOCK
-from pipeline.store.objects import Version, get, put_if
-from pipeline.store.remote import as_typed, is_remote
+from levelproof.pipeline.errors import Failure, LevelproofError, UserError
+from levelproof.pipeline.store.layout import WRITER_LOCK
+from levelproof.pipeline.store.objects import Version, get, put_if
+from levelproof.pipeline.store.remote import as_typed, is_remote
 
 SILENCE = 60.0  # s without a renewal after which a writer counts as dead
 RENEWAL = 5.0  # s between renewals

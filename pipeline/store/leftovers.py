@@ -5,14 +5,23 @@ from itertools import chain
 from os import DirEntry
 from pathlib import Path
 
-from pipeline.store.disk import flush_entry
-from pipeline.store.files import remove, remove_data
-from pipeline.store.layout import BEGUN, INDEX_BEGUN, JOB_BEGUN, MANIFEST, begun_path, data_path, data_paths, entries
-from pipeline.store.locks import nobody_commits
-from pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_fragment, read_manifest
-from pipeline.store.objects import put
-from pipeline.store.publish import OVER, ended
-from pipeline.store.remote import is_remote
+from levelproof.pipeline.store.disk import flush_entry
+from levelproof.pipeline.store.files import remove, remove_data
+from levelproof.pipeline.store.layout import (
+    BEGUN,
+    INDEX_BEGUN,
+    JOB_BEGUN,
+    MANIFEST,
+    begun_path,
+    data_path,
+    data_paths,
+    entries,
+)
+from levelproof.pipeline.store.locks import nobody_commits
+from levelproof.pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_fragment, read_manifest
+from levelproof.pipeline.store.objects import put
+from levelproof.pipeline.store.publish import OVER, ended
+from levelproof.pipeline.store.remote import is_remote
 
 
 def clean(split: Path, say: Callable[[str], None]) -> Manifest:

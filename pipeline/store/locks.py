@@ -13,11 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from pipeline.errors import UserError
-from pipeline.store.layout import COMMIT_LOCK, WRITER_LOCK
-from pipeline.store.leases import is_leased, leased, named, require_served
-from pipeline.store.publish import publishing
-from pipeline.store.remote import is_remote
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.layout import COMMIT_LOCK, WRITER_LOCK
+from levelproof.pipeline.store.leases import is_leased, leased, named, require_served
+from levelproof.pipeline.store.publish import publishing
+from levelproof.pipeline.store.remote import is_remote
 
 PATIENCE = 1.0  # s; `is_written` holds the writer's lock for a moment
 NOTICE = 2.0  # s of waiting after which people are told for what

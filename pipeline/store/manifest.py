@@ -17,20 +17,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from configs.convert import flat
-from pipeline.errors import Failure, UserError
-from pipeline.store import files
-from pipeline.store.bounds import with_dictionaries
-from pipeline.store.checksums import digests_below, with_own
-from pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of
-from pipeline.store.disk import flush, flush_entry
-from pipeline.store.fragment import FULL, Fragment, read_fragment
-from pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
-from pipeline.store.remote import INDEX, is_remote
-from pipeline.store.runs import ascending
-from pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
-from pipeline.store.shown import shown
-from pipeline.urls import require_known
+from levelproof.configs.convert import flat
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.store import files
+from levelproof.pipeline.store.bounds import with_dictionaries
+from levelproof.pipeline.store.checksums import digests_below, with_own
+from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of
+from levelproof.pipeline.store.disk import flush, flush_entry
+from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
+from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
+from levelproof.pipeline.store.remote import INDEX, is_remote
+from levelproof.pipeline.store.runs import ascending
+from levelproof.pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
+from levelproof.pipeline.store.shown import shown
+from levelproof.pipeline.urls import require_known
 
 SHOWN = 6  # differing settings that an error lists
 # Fragments read at once: more than cores, because a shared folder takes its time for each; not many more, because what

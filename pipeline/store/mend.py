@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from pipeline.errors import Failure
-from pipeline.store.layout import data_path, data_paths, made_within, new_attempt, unit_name
-from pipeline.store.leftovers import disown
-from pipeline.store.manifest import (
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.layout import data_path, data_paths, made_within, new_attempt, unit_name
+from levelproof.pipeline.store.leftovers import disown
+from levelproof.pipeline.store.manifest import (
     DATA_COLUMNS,
     begin_fragment,
     data_named_by,
@@ -25,7 +25,7 @@ from pipeline.store.manifest import (
     with_places,
     write_fragment,
 )
-from pipeline.store.merge import Place, merge_shards
+from levelproof.pipeline.store.merge import Place, merge_shards
 
 
 def take_out(split: Path, lost: Collection[int], unlike: Collection[str], damaged: Collection[Path]) -> None:

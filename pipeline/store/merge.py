@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import google_crc32c
 import numpy as np
 
-from pipeline.errors import Failure
-from pipeline.store.chunks import CHECKSUM, Chunks, file_name, read_whole
-from pipeline.store.contents import ContentsError
-from pipeline.store.disk import flush
-from pipeline.store.shard import DAMAGE, Shard, damaged, stored_bytes
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.chunks import CHECKSUM, Chunks, file_name, read_whole
+from levelproof.pipeline.store.contents import ContentsError
+from levelproof.pipeline.store.disk import flush
+from levelproof.pipeline.store.shard import DAMAGE, Shard, damaged, stored_bytes
 
 FILE_BYTES = 64 * 2**20  # that a file has at least, if there is as much; larger: longer indices to read before a chunk
 MISSING = 2**64 - 1  # in an index, of a chunk that is not there

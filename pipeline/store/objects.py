@@ -12,9 +12,9 @@ from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.errors import StoreFailure, UserError
-from pipeline.store.remote import as_typed, ask, data_of, obstore_module, place
-from pipeline.urls import BUCKETS
+from levelproof.pipeline.errors import StoreFailure, UserError
+from levelproof.pipeline.store.remote import as_typed, ask, data_of, obstore_module, place
+from levelproof.pipeline.urls import BUCKETS
 
 PART = 2**25  # bytes; larger files are sent in parts
 

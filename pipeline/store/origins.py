@@ -11,9 +11,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.errors import UserError
-from pipeline.store.manifest import read_manifest
-from pipeline.store.remote import absolute, as_typed
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.remote import absolute, as_typed
 
 ASKED = ("content_hash", "file", "size", "shard", "row")  # columns that tell a level's origin
 

@@ -13,21 +13,21 @@ from typing import Any
 import jax
 import numpy as np
 
-from configs.schema import JobConfig
-from experts.config import RECORD_STEPS
-from experts.found import nothing_found
-from experts.judge import Evaluation
-from experts.labels import Source
-from experts.paused import Paused
-from experts.slots import Pending
-from pipeline.owned import require_own
-from pipeline.store import objects
-from pipeline.store.checkpoints import begun_like, kept, require_plain, stacked_curves, unstacked
-from pipeline.store.fields import arrays_of
-from pipeline.store.files import remove, write
-from pipeline.store.layout import CHECKPOINT, CHECKPOINT_BEGUN, CHECKPOINTS, checkpoint_path, entries, ids_of
-from pipeline.store.provenance import versions
-from pipeline.store.remote import is_remote
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.found import nothing_found
+from levelproof.experts.judge import Evaluation
+from levelproof.experts.labels import Source
+from levelproof.experts.paused import Paused
+from levelproof.experts.slots import Pending
+from levelproof.pipeline.owned import require_own
+from levelproof.pipeline.store import objects
+from levelproof.pipeline.store.checkpoints import begun_like, kept, require_plain, stacked_curves, unstacked
+from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.files import remove, write
+from levelproof.pipeline.store.layout import CHECKPOINT, CHECKPOINT_BEGUN, CHECKPOINTS, checkpoint_path, entries, ids_of
+from levelproof.pipeline.store.provenance import versions
+from levelproof.pipeline.store.remote import is_remote
 
 STAMP = "stamp"  # its array: configuration and versions, under which alone the bits are the same
 

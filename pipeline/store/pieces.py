@@ -9,7 +9,7 @@ from pathlib import Path
 
 import google_crc32c
 
-from pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure
 
 CHECKSUM = 4  # bytes of a CRC-32C behind each piece: a machine that lost its power may have kept other bytes
 USED = 60.0  # s; a piece is marked as used once in this time

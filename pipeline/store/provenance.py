@@ -5,8 +5,8 @@ import platform
 from importlib.metadata import version
 from pathlib import Path
 
-from levelgen.identity.keys import SAMPLER_VERSION
-from pipeline.version import __version__
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
+from levelproof.pipeline.version import __version__
 
 
 @functools.cache

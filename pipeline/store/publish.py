@@ -17,16 +17,24 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from configs.schema import hash_of
-from pipeline.errors import Failure
-from pipeline.store.bounds import DAMAGE
-from pipeline.store.files import remove_data
-from pipeline.store.fragment import read_fragment
-from pipeline.store.layout import MANIFEST, attempt_of, begun_path, data_paths, fragment_path, new_attempt, unit_name
-from pipeline.store.leases import LeaseLost, require_served
-from pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
-from pipeline.store.objects import Version, get, put, put_if, remove
-from pipeline.store.remote import at_once, fragments_in, is_remote
+from levelproof.configs.schema import hash_of
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.bounds import DAMAGE
+from levelproof.pipeline.store.files import remove_data
+from levelproof.pipeline.store.fragment import read_fragment
+from levelproof.pipeline.store.layout import (
+    MANIFEST,
+    attempt_of,
+    begun_path,
+    data_paths,
+    fragment_path,
+    new_attempt,
+    unit_name,
+)
+from levelproof.pipeline.store.leases import LeaseLost, require_served
+from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
+from levelproof.pipeline.store.objects import Version, get, put, put_if, remove
+from levelproof.pipeline.store.remote import at_once, fragments_in, is_remote
 
 OVER = b"over"  # in the mark of an attempt that was committed, and is no more: others have its levels
 

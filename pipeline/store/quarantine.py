@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from pipeline.store.files import write
-from pipeline.store.layout import QUARANTINE, quarantine_path
-from pipeline.store.remote import is_remote, names_in
-from pipeline.urls import BUCKETS
+from levelproof.pipeline.store.files import write
+from levelproof.pipeline.store.layout import QUARANTINE, quarantine_path
+from levelproof.pipeline.store.remote import is_remote, names_in
+from levelproof.pipeline.urls import BUCKETS
 
 
 def give_up(split: Path, unit: str, reason: str) -> Path:

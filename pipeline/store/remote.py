@@ -16,11 +16,11 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from pipeline.errors import LevelproofError, StoreFailure, UserError
-from pipeline.runtime import cache_folder
-from pipeline.store import hub
-from pipeline.store.pieces import PieceCache
-from pipeline.urls import BUCKETS, HUB, WEB
+from levelproof.pipeline.errors import LevelproofError, StoreFailure, UserError
+from levelproof.pipeline.runtime import cache_folder
+from levelproof.pipeline.store import hub
+from levelproof.pipeline.store.pieces import PieceCache
+from levelproof.pipeline.urls import BUCKETS, HUB, WEB
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore

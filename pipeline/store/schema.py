@@ -9,10 +9,10 @@ from typing import Any, get_args
 
 import numpy as np
 
-from configs.convert import plain, typed
-from configs.errors import ConfigError
-from configs.schema import KEY_EVERY, KEYS_EVERY, MOST_FRAME_SKIP, Density
-from levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.configs.convert import plain, typed
+from levelproof.configs.errors import ConfigError
+from levelproof.configs.schema import KEY_EVERY, KEYS_EVERY, MOST_FRAME_SKIP, Density
+from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 
 SHARD_VERSION = 2
 

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
-from configs.schema import Density, stored_as
-from pipeline.store.convert import convert
-from pipeline.store.files import remove
-from pipeline.store.layout import (
+from levelproof.configs.schema import Density, stored_as
+from levelproof.pipeline.store.convert import convert
+from levelproof.pipeline.store.files import remove
+from levelproof.pipeline.store.layout import (
     SHARDS,
     Attempt,
     begun_path,
@@ -27,8 +27,8 @@ from pipeline.store.layout import (
     new_attempt,
     unit_name,
 )
-from pipeline.store.leftovers import disown, drop
-from pipeline.store.manifest import (
+from levelproof.pipeline.store.leftovers import disown, drop
+from levelproof.pipeline.store.manifest import (
     THREADS,
     Fragment,
     begin_fragment,
@@ -39,11 +39,11 @@ from pipeline.store.manifest import (
     with_places,
     write_fragment,
 )
-from pipeline.store.merge import Place, merge_shards
-from pipeline.store.publish import publishing
-from pipeline.store.remote import is_remote
-from pipeline.store.schema import Encoding
-from pipeline.store.shard import Shard
+from levelproof.pipeline.store.merge import Place, merge_shards
+from levelproof.pipeline.store.publish import publishing
+from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.schema import Encoding
+from levelproof.pipeline.store.shard import Shard
 
 ROWS = 100_000  # of a sealed fragment, about; more: fewer files, and more to write again when some are added
 CROWD = 1_000  # unsealed neighbours that are merged, although they have not as many rows: small files are slow to read

@@ -16,12 +16,12 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from configs.schema import MOST_FRAME_SKIP
-from levelgen.level import name_of
-from physics.types import Size
-from pipeline.errors import Failure
-from pipeline.store.chunks import Chunks, read_whole
-from pipeline.store.contents import (
+from levelproof.configs.schema import MOST_FRAME_SKIP
+from levelproof.levelgen.level import name_of
+from levelproof.physics.types import Size
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.chunks import Chunks, read_whole
+from levelproof.pipeline.store.contents import (
     FULL,
     ContentsError,
     blank_row,
@@ -31,13 +31,13 @@ from pipeline.store.contents import (
     size_of_levels,
     table_for,
 )
-from pipeline.store.density import Restored, kept, needed, restored
-from pipeline.store.disk import flush
-from pipeline.store.fields import same_bits
-from pipeline.store.layout import data_path
-from pipeline.store.packing import empty, pack, unpack
-from pipeline.store.remote import at_once, is_remote, mended, stored_in
-from pipeline.store.schema import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
+from levelproof.pipeline.store.density import Restored, kept, needed, restored
+from levelproof.pipeline.store.disk import flush
+from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.layout import data_path
+from levelproof.pipeline.store.packing import empty, pack, unpack
+from levelproof.pipeline.store.remote import at_once, is_remote, mended, stored_in
+from levelproof.pipeline.store.schema import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
 
 FORMAT = "levelproof.shard"
 # What reading bytes that nobody vouches for can raise

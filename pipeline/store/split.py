@@ -6,16 +6,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from configs.schema import JobConfig
-from pipeline.errors import UserError
-from pipeline.store.disk import told_of
-from pipeline.store.layout import EVENTS, FOLDERS, JOB, split_path
-from pipeline.store.leftovers import clean
-from pipeline.store.locks import committing, only_writer
-from pipeline.store.manifest import Manifest, differences, told
-from pipeline.store.objects import require_conditions
-from pipeline.store.remote import is_remote
-from pipeline.urls import require_known
+from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.disk import told_of
+from levelproof.pipeline.store.layout import EVENTS, FOLDERS, JOB, split_path
+from levelproof.pipeline.store.leftovers import clean
+from levelproof.pipeline.store.locks import committing, only_writer
+from levelproof.pipeline.store.manifest import Manifest, differences, told
+from levelproof.pipeline.store.objects import require_conditions
+from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.urls import require_known
 
 
 @contextmanager

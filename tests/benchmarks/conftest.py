@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from levelgen.files.kinetix import state_to_kinetix
+from levelproof.levelgen.files.kinetix import state_to_kinetix
 from tests.golden.load import HERE, load
 
 

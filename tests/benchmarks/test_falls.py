@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks.falls import fall
-from experts.search.play import act, arena, fresh_walk, persistent
-from levelgen.level import Level, Role
-from levelgen.task.rules import DEFAULT_RULES
-from physics.types import FIXED_POLYGONS
+from levelproof.experts.search.play import act, arena, fresh_walk, persistent
+from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.physics.types import FIXED_POLYGONS
 from tests.experts.search.worlds import BALL, GOAL, world
 
 LANES = 256

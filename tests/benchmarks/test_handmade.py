@@ -9,12 +9,12 @@ from PIL import Image
 
 from benchmarks import handmade
 from benchmarks.handmade import KINDS, PIXELS, PPO_TOLD, labelled, ppo, totals, write_sheet
-from configs.compose import compose_job
-from levelgen.files.level_file import LevelFile, write_level_file
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import TaskParams
-from pipeline.read.level_files import levels_below
+from levelproof.configs.compose import compose_job
+from levelproof.levelgen.files.level_file import LevelFile, write_level_file
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.read.level_files import levels_below
 
 TRIVIAL, UNSOLVABLE = 1, 16
 

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import __main__ as command
 from benchmarks.report import Report, Run, Table, as_json, as_page, as_text
-from pipeline.errors import Exit
+from levelproof.pipeline.errors import Exit
 
 REPORT = Report(
     title="A race",

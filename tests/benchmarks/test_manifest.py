@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from benchmarks import manifest as benchmark
-from experts.config import RECORD_STEPS
-from pipeline.look.inspect import survey
-from pipeline.store.leftovers import clean
-from pipeline.store.manifest import read_manifest
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.pipeline.look.inspect import survey
+from levelproof.pipeline.store.leftovers import clean
+from levelproof.pipeline.store.manifest import read_manifest
 
 
 def test_its_split_is_sealed_and_like_a_real_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

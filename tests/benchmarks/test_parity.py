@@ -22,9 +22,9 @@ from benchmarks.parity.onestep import Pool, distinct, one_step, picked
 from benchmarks.parity.report import report_of
 from benchmarks.parity.worlds import BLOCK, contact_bodies, lanes_of, nudged
 from benchmarks.report import Report
-from experts.witness import blocks
-from physics.types import FIXED_POLYGONS, Params
-from pipeline.errors import Exit
+from levelproof.experts.witness import blocks
+from levelproof.physics.types import FIXED_POLYGONS, Params
+from levelproof.pipeline.errors import Exit
 from tests.golden.load import HERE, load
 
 ROOT = Path(__file__).parent.parent.parent

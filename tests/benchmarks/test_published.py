@@ -8,11 +8,11 @@ import pytest
 from benchmarks.alone import label
 from benchmarks.solved.results import Results, read
 from benchmarks.solved.variants import VARIANTS
-from configs.convert import plain
-from experts.config import Rule
-from experts.labels import BY_EXPERT, Label
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
+from levelproof.configs.convert import plain
+from levelproof.experts.config import Rule
+from levelproof.experts.labels import BY_EXPERT, Label
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
 
 MASTERED, NEVER = 6, 3  # levels
 

@@ -18,9 +18,9 @@ from benchmarks.levels import load_levels
 from benchmarks.race import OURS, shares, summary
 from benchmarks.reference import actions
 from benchmarks.reference.actions import sticky_actions
-from levelgen.task.actions import CHOICES
-from pipeline.errors import Exit, Failure, UserError
-from pipeline.runtime import own_cores
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.pipeline.errors import Exit, Failure, UserError
+from levelproof.pipeline.runtime import own_cores
 
 ROOT = Path(__file__).parent.parent.parent
 

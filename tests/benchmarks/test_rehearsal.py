@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.rehearsal import Rehearsal, Scene, Work, rehearsed, state_bytes
-from pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.schedule import WorkUnit
 
 NEVER = 1e12
 SECONDS = np.random.default_rng(0).gamma(0.4, 2.0, 300)

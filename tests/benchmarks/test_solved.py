@@ -19,12 +19,12 @@ from benchmarks.solved.measure import measure, rows_in, work
 from benchmarks.solved.results import Header, Results, count, made, merge, read, share
 from benchmarks.solved.variants import VARIANTS, Variant
 from benchmarks.statistics import mcnemar
-from configs.convert import flat, plain
-from experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
-from experts.labels import Label, Source
-from experts.procedure import Procedure
-from levelgen.task.actions import CHOICES
-from pipeline.errors import Exit, UserError
+from levelproof.configs.convert import flat, plain
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from levelproof.experts.labels import Label, Source
+from levelproof.experts.procedure import Procedure
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.pipeline.errors import Exit, UserError
 from tests.experts.small import untouched
 
 SMALL = ExpertConfig(

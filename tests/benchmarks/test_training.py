@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from benchmarks import networks, training
-from experts.config import ExpertConfig, Network
-from experts.slots import Mode
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
+from levelproof.experts.config import ExpertConfig, Network
+from levelproof.experts.slots import Mode
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
 
 pytestmark = pytest.mark.campaign
 CONFIG = ExpertConfig(

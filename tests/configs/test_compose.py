@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from configs.compose import FOLDERS, again, chosen, compose_job, distributions, identified, presets
-from configs.errors import ConfigError
-from configs.schema import WITHOUT_EFFECT
-from experts.config import ExpertConfig
-from levelgen.sampling.distribution import Distribution
-from levelgen.task.rules import TaskParams
+from levelproof.configs.compose import FOLDERS, again, chosen, compose_job, distributions, identified, presets
+from levelproof.configs.errors import ConfigError
+from levelproof.configs.schema import WITHOUT_EFFECT
+from levelproof.experts.config import ExpertConfig
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.task.rules import TaskParams
 
 
 def test_no_overrides_make_the_small_default_dataset() -> None:
@@ -171,7 +171,7 @@ def test_presets_are_different_and_change_little() -> None:
     assert len(set(presets.values())) == len(presets) >= 5
     default = dataclasses.asdict(Distribution())
     for name in presets:
-        written = OmegaConf.to_container(OmegaConf.load(str(files("configs") / f"distribution/{name}.yaml")))
+        written = OmegaConf.to_container(OmegaConf.load(str(files("levelproof.configs") / f"distribution/{name}.yaml")))
         assert isinstance(written, dict)
         assert all(value != default[str(key)] for key, value in written.items()), name
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from configs.convert import flat, plain, typed
-from configs.errors import ConfigError, suggestion
+from levelproof.configs.convert import flat, plain, typed
+from levelproof.configs.errors import ConfigError, suggestion
 
 
 class Colour(StrEnum):

@@ -5,9 +5,9 @@ from enum import StrEnum
 
 import pytest
 
-from configs.compose import compose_job, presets, settings
-from configs.convert import flat
-from configs.meanings import Comment, Setting, comments_in, every_setting
+from levelproof.configs.compose import compose_job, presets, settings
+from levelproof.configs.convert import flat
+from levelproof.configs.meanings import Comment, Setting, comments_in, every_setting
 
 SETTINGS = every_setting()
 

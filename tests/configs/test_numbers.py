@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from configs.errors import ConfigError
-from configs.numbers import LARGEST, parse_count
+from levelproof.configs.errors import ConfigError
+from levelproof.configs.numbers import LARGEST, parse_count
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
-from experts.procedure import Procedure
-from experts.search.config import SearchConfig
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.search.config import SearchConfig
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 
 IDS = np.array([0, 2, 3, 4, 6, 7, 9])  # levels of size s that need an expert
 CONFIG = ExpertConfig(

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from experts.before import decide, facts_of
-from experts.config import RECORD_STEPS, ExpertConfig
-from experts.labels import Label, Verdict
-from experts.procedure import Procedure
-from experts.witness import replay, succeeds, take
-from levelgen.level import SIZES, Level
-from levelgen.proofs import Proof
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts.before import decide, facts_of
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig
+from levelproof.experts.labels import Label, Verdict
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.witness import replay, succeeds, take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.proofs import Proof
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 
 COUNT = 150  # three blocks, the last one not full
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from experts import progress
-from experts.config import RECORD_STEPS, Choice, ExpertConfig
-from experts.judge import (
+from levelproof.experts import progress
+from levelproof.experts.config import RECORD_STEPS, Choice, ExpertConfig
+from levelproof.experts.judge import (
     MOST_CANDIDATES,
     Evaluation,
     Witness,
@@ -15,8 +15,8 @@ from experts.judge import (
     shares,
     successful_episodes,
 )
-from experts.labels import Source
-from experts.success import Success
+from levelproof.experts.labels import Source
+from levelproof.experts.success import Success
 
 CONFIG = ExpertConfig(environments=8, rehearsals=2, attempts=3, sticky_attempts=2, moved_attempts=2)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.ledger import Lap, Ledger, Steps, lap
+from levelproof.experts.ledger import Lap, Ledger, Steps, lap
 
 
 def test_what_is_compiled_is_apart_from_what_is_done() -> None:

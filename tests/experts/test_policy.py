@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts import policy
-from levelgen.task.actions import CHOICES
+from levelproof.experts import policy
+from levelproof.levelgen.task.actions import CHOICES
 
 ALL = np.ones((len(CHOICES), 1), bool)
 log_probability, entropy, draw = map(jax.jit, (policy.log_probability, policy.entropy, policy.sample))

@@ -6,18 +6,18 @@ import jax
 import numpy as np
 import pytest
 
-from experts.found import nothing_found
-from experts.judge import Kept, Trained, Witness
-from experts.paused import Paused
-from experts.pool import Pool, Submission, capacity_of
-from experts.portability import PORTABLE, choose
-from experts.queue import GROUP, empty_queue, enter
-from experts.slots import Pending, begin
-from experts.success import no_success
-from experts.witness import take
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts.found import nothing_found
+from levelproof.experts.judge import Kept, Trained, Witness
+from levelproof.experts.paused import Paused
+from levelproof.experts.pool import Pool, Submission, capacity_of
+from levelproof.experts.portability import PORTABLE, choose
+from levelproof.experts.queue import GROUP, empty_queue, enter
+from levelproof.experts.slots import Pending, begin
+from levelproof.experts.success import no_success
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, WHOLE, untouched
 from tests.experts.test_slots import SOLVED, same
 
@@ -123,7 +123,7 @@ def test_an_expert_that_is_paused_at_any_moment_goes_on_to_the_same(levels: Leve
 @pytest.fixture
 def never_portable(monkeypatch: pytest.MonkeyPatch) -> None:
     """No witness survives enough replays."""
-    monkeypatch.setattr("experts.pool.PORTABLE", 2)
+    monkeypatch.setattr("levelproof.experts.pool.PORTABLE", 2)
 
 
 def steadied(updates: int) -> Pool:

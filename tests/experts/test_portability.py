@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from experts import portability
-from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
-from experts.judge import Witness, repeating
-from experts.labels import Label, Source
-from experts.portability import LATE, choose, moved, survival
-from experts.procedure import Procedure
-from experts.scout import scout
-from experts.search.config import SearchConfig
-from experts.success import Success
-from experts.train import UnitResult
-from experts.witness import repeat, replay, take
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts import portability
+from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.judge import Witness, repeating
+from levelproof.experts.labels import Label, Source
+from levelproof.experts.portability import LATE, choose, moved, survival
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.scout import scout
+from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.success import Success
+from levelproof.experts.train import UnitResult
+from levelproof.experts.witness import repeat, replay, take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 
 REPLAYS = 8
 ROBUST, FRAGILE = 0, 2  # indices: what scouts find of the first survives everything, of the other next to nothing

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts import ppo
-from experts.config import ExpertConfig, Network
-from experts.policy import forward, log_probability, network_of, sample
-from experts.ppo import LevelConstants, Samples
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.actions import CHOICES
-from levelgen.task.observe.flat import dynamic_features
+from levelproof.experts import ppo
+from levelproof.experts.config import ExpertConfig, Network
+from levelproof.experts.policy import forward, log_probability, network_of, sample
+from levelproof.experts.ppo import LevelConstants, Samples
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.observe.flat import dynamic_features
 
 SIZE = SIZES["s"]
 DYNAMIC = len(dynamic_features(SIZE))

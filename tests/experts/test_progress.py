@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experts import progress
+from levelproof.experts import progress
 
 STEPS, ENVIRONMENTS = 6, 3
 follow = jax.jit(progress.follow)

@@ -7,19 +7,19 @@ import jax
 import numpy as np
 
 from benchmarks.alone import label
-from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
-from experts.judge import Witness, repeating
-from experts.labels import Source
-from experts.portability import survival
-from experts.procedure import Procedure
-from experts.rework import rework
-from experts.scout import scout
-from experts.search.config import SearchConfig
-from experts.success import Success
-from experts.witness import replay, steps_to_goal, take
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.judge import Witness, repeating
+from levelproof.experts.labels import Source
+from levelproof.experts.portability import survival
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.rework import rework
+from levelproof.experts.scout import scout
+from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.success import Success
+from levelproof.experts.witness import replay, steps_to_goal, take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 
 IDS = np.array([3, 107], np.int32)  # of size s: what scouts find of the other survives next to nothing
 STEADY, FRAGILE = 0, 1

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from experts.config import RECORD_STEPS, Rule, ScoutConfig, StopConfig
-from experts.labels import Label, Source
-from experts.scout import REDRAWN, STEPS_PER_ROUND, Scouted, persistent, scout, shortest
-from experts.witness import replay, take
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.actions import CHOICES, action_mask
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts.config import RECORD_STEPS, Rule, ScoutConfig, StopConfig
+from levelproof.experts.labels import Label, Source
+from levelproof.experts.scout import REDRAWN, STEPS_PER_ROUND, Scouted, persistent, scout, shortest
+from levelproof.experts.witness import replay, take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import IDS, untouched
 
 TWICE = ScoutConfig(rounds=2)

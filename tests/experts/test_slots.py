@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from experts import advance as advance_module
-from experts.advance import advance
-from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
-from experts.found import Looking
-from experts.judge import Trained
-from experts.labels import Label, Source
-from experts.pool import Pool, Submission, capacity_of
-from experts.queue import empty_queue, enter
-from experts.search.search import Searching
-from experts.slots import LevelQueue, Mode, empty_slots
-from experts.stop import rules_of
-from experts.success import Success, no_success
-from experts.witness import take
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts import advance as advance_module
+from levelproof.experts.advance import advance
+from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.found import Looking
+from levelproof.experts.judge import Trained
+from levelproof.experts.labels import Label, Source
+from levelproof.experts.pool import Pool, Submission, capacity_of
+from levelproof.experts.queue import empty_queue, enter
+from levelproof.experts.search.search import Searching
+from levelproof.experts.slots import LevelQueue, Mode, empty_slots
+from levelproof.experts.stop import rules_of
+from levelproof.experts.success import Success, no_success
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, IDS, SHAPED, WHOLE, untouched
 
 SOLVED = StopConfig(rule=Rule.SOLVED, successes=2, share=0.6, wait=2048)

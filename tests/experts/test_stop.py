@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts import progress, stop
-from experts.config import ExpertConfig, Rule, StopConfig, check_budget
-from experts.stop import rules_of
+from levelproof.experts import progress, stop
+from levelproof.experts.config import ExpertConfig, Rule, StopConfig, check_budget
+from levelproof.experts.stop import rules_of
 
 CONFIG = ExpertConfig(
     environments=16, horizon=64, attempts=8, sticky_attempts=4, moved_attempts=4

@@ -5,8 +5,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experts.config import RECORD_STEPS
-from experts.success import find, no_success, remember
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.success import find, no_success, remember
 
 HORIZON, ENVIRONMENTS, ROLLOUTS = 32, 3, 10
 

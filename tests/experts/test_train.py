@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from experts.config import RECORD_STEPS, ExpertConfig, StopConfig
-from experts.labels import Label
-from experts.pool import Pool
-from experts.train import UnitResult
-from experts.witness import LANES, replay, steps_to_goal, succeeds
-from levelgen.level import SIZES, Level
-from levelgen.sampling.distribution import Distribution
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig, StopConfig
+from levelproof.experts.labels import Label
+from levelproof.experts.pool import Pool
+from levelproof.experts.train import UnitResult
+from levelproof.experts.witness import LANES, replay, steps_to_goal, succeeds
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, IDS, WHOLE, untouched
 from tests.experts.test_slots import same
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from levelgen.files.kinetix import level_from_kinetix, state_from_kinetix
-from levelgen.level import Level
-from physics.types import State
+from levelproof.levelgen.files.kinetix import level_from_kinetix, state_from_kinetix
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import State
 
 HERE = Path(__file__).parent
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from levelgen.level import Level
+from levelproof.levelgen.level import Level
 from tests.golden.load import HERE, load
 
 DIGITS = 8

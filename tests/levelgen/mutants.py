@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from levelgen.level import SIZES, Level, Role
-from levelgen.sampling.sampler import Distribution, sample_levels
-from levelgen.sampling.shuffle import separate
-from physics.types import FIXED_POLYGONS
+from levelproof.levelgen.level import SIZES, Level, Role
+from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
+from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.physics.types import FIXED_POLYGONS
 
 SCENERY = slice(FIXED_POLYGONS)
 CHANCE = 0.15  # of each change

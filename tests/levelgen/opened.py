@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks import oracle
-from levelgen.files.kinetix import Fields, level_from_kinetix
-from levelgen.level import Level
+from levelproof.levelgen.files.kinetix import Fields, level_from_kinetix
+from levelproof.levelgen.level import Level
 
 
 def handmade_levels(python: Path) -> Path:

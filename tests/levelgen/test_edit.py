@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from levelgen.edit import (
+from levelproof.levelgen.edit import (
     EDITS,
     EditError,
     add_body,
@@ -24,11 +24,11 @@ from levelgen.edit import (
     set_role,
     turn,
 )
-from levelgen.files.level_file import LevelFile, from_document, to_document
-from levelgen.level import SIZES, Level, Role
-from levelgen.sampling.sampler import sample_levels
-from levelgen.sampling.scenery import empty_level
-from levelgen.task.rules import TaskParams
+from levelproof.levelgen.files.level_file import LevelFile, from_document, to_document
+from levelproof.levelgen.level import SIZES, Level, Role
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.levelgen.task.rules import TaskParams
 
 M = SIZES["m"]
 FIRST = 4  # the first polygon that is not scenery

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from levelgen.level import MOST_THINGS, SIZES, name_of, size_of
-from physics.types import Size
+from levelproof.levelgen.level import MOST_THINGS, SIZES, name_of, size_of
+from levelproof.physics.types import Size
 
 
 @given(st.builds(Size, *[st.integers(0, MOST_THINGS)] * 4))

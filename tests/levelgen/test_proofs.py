@@ -9,18 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.before import facts_of
-from experts.witness import take
-from levelgen.level import SIZES, Level, Role
-from levelgen.proofs import Facts, Proof
-from levelgen.sampling.distribution import Distribution
-from levelgen.sampling.sampler import sample_levels
-from levelgen.sampling.scenery import empty_level
-from levelgen.sampling.shuffle import separate
-from levelgen.task import rules as task
-from levelgen.task.actions import CHOICES
-from levelgen.task.rules import DEFAULT_RULES, TaskParams
-from physics.types import Params, Size
+from levelproof.experts.before import facts_of
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import SIZES, Level, Role
+from levelproof.levelgen.proofs import Facts, Proof
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.physics.types import Params, Size
 from tests.levelgen.mutants import mutants
 
 ENV_STEPS = 256

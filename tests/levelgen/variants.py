@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from levelgen.level import MOTOR_BINDINGS, SIZES, THRUSTER_BINDINGS, Level
-from levelgen.sampling.sampler import sample_levels
-from physics.types import FIXED_POLYGONS
+from levelproof.levelgen.level import MOTOR_BINDINGS, SIZES, THRUSTER_BINDINGS, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.physics.types import FIXED_POLYGONS
 
 # Fields with a row for each thing of a kind
 BODY = ("active", "inverse_mass", "inverse_inertia", "friction", "restitution", "collision_mode")

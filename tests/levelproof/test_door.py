@@ -17,7 +17,11 @@ SOURCE = Path(levelproof.__file__)
 
 def imported_for_the_checker() -> dict[str, str]:
     """Name -> module, as a type checker reads them."""
-    (block,) = [node for node in ast.parse(SOURCE.read_text()).body if isinstance(node, ast.If)]
+    (block,) = [
+        node
+        for node in ast.parse(SOURCE.read_text()).body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    ]
     return {name.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names}  # type: ignore[misc]
 
 

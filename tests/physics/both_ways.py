@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.runtime import prepare_jax
+from levelproof.pipeline.runtime import prepare_jax
 from tests.golden.load import HERE, load
 from tests.physics.worlds import PARAMS, scattered
 
@@ -25,8 +25,8 @@ AS_WRITTEN = {"xla_disable_hlo_passes": "algsimp,simplify-fp-conversions", "xla_
 
 def worlds(name: str) -> Any:
     """Golden states of a size's name, scattered worlds of four numbers; to be given to a step."""
-    from physics.block import Given
-    from physics.types import Size
+    from levelproof.physics.block import Given
+    from levelproof.physics.types import Size
 
     if name in "sml":
         of = load(HERE / f"{name}.npz")
@@ -45,7 +45,7 @@ def compare(name: str) -> dict[str, Any]:
     """Of each field of the state and of the manifold, the share of lanes that are alike."""
     import jax
 
-    from physics.step import as_machine_code, on_all_lanes
+    from levelproof.physics.step import as_machine_code, on_all_lanes
 
     given = worlds(name)
     ours = jax.jit(lambda given: as_machine_code(given, PARAMS, True))(given)

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from physics.types import MAX_VERTICES, Manifold, Model, State
+from levelproof.physics.types import MAX_VERTICES, Manifold, Model, State
 
 
 def _flip(x, axis: int = -2) -> np.ndarray:

@@ -12,10 +12,10 @@ import jax
 import numpy as np
 import pytest
 
-from physics.block import Given
-from physics.codegen.buffers import LANES
-from physics.step import as_machine_code, on_all_lanes
-from physics.types import Params, Size
+from levelproof.physics.block import Given
+from levelproof.physics.codegen.buffers import LANES
+from levelproof.physics.step import as_machine_code, on_all_lanes
+from levelproof.physics.types import Params, Size
 from tests.physics.codegen.kernels import same_bits
 from tests.physics.worlds import scattered
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from physics.step import step
+from levelproof.physics.step import step
 from tests.physics.both_ways import digest, worlds
 
 ROOT = Path(__file__).parents[2]

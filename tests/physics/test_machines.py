@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from llvmlite import binding
 
-from physics.step import step
+from levelproof.physics.step import step
 from tests.golden.load import HERE, load
 
 STEPS = 8

@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physics.mass import (
+from levelproof.physics.mass import (
     circle_area,
     circle_inertia,
     inverse,
     polygon_area,
     polygon_inertia,
 )
-from physics.types import FIXED_POLYGONS
+from levelproof.physics.types import FIXED_POLYGONS
 from tests.golden.load import HERE, load
 
 sides = st.floats(0.0625, 1.0, width=32)

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from physics.pairs import pairs_of
-from physics.step import step
-from physics.types import Params
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.step import step
+from levelproof.physics.types import Params
 from tests.golden.load import HERE, Golden, load
 
 MOTION = ("position", "rotation", "velocity", "angular_velocity")

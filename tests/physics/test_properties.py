@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from physics.step import step
+from levelproof.physics.step import step
 from tests.golden.load import HERE, load
 from tests.physics import mirror
 from tests.physics.test_oracle import errors

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physics.pairs import table_of
-from physics.step import step
-from physics.types import Params, Size
+from levelproof.physics.pairs import table_of
+from levelproof.physics.step import step
+from levelproof.physics.types import Params, Size
 from tests.golden.load import HERE, load
 from tests.physics.worlds import (
     BALL,

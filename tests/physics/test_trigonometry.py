@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physics.codegen.buffers import LANES, Buffer
-from physics.trigonometry import cos_sin, tanh
+from levelproof.physics.codegen.buffers import LANES, Buffer
+from levelproof.physics.trigonometry import cos_sin, tanh
 from tests.physics.codegen.kernels import Kernel
 
 COUNT = 4096 * LANES

@@ -8,12 +8,12 @@ import jax
 import pytest
 from jaxtyping import AbstractArray
 
-from physics.block import Scratch
-from physics.buffers import buffers_of
-from physics.codegen.buffers import Buffer
-from physics.pairs import pairs_of
-from physics.step import step
-from physics.types import FIXED_POLYGONS, Manifold, Model, Params, Size, State
+from levelproof.physics.block import Scratch
+from levelproof.physics.buffers import buffers_of
+from levelproof.physics.codegen.buffers import Buffer
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.step import step
+from levelproof.physics.types import FIXED_POLYGONS, Manifold, Model, Params, Size, State
 from tests.physics.worlds import ROOM, idle, room
 
 FEW = Size(polygons=6, circles=3, joints=4, thrusters=2)

@@ -5,9 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 
-from physics.buffers import zeros_of
-from physics.pairs import pairs_of
-from physics.types import FIXED_POLYGONS, Model, Params, Size, State
+from levelproof.physics.buffers import zeros_of
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import FIXED_POLYGONS, Model, Params, Size, State
 
 ROOM = Size(polygons=5, circles=2, joints=1, thrusters=1)  # one movable polygon (4) and two circles (5, 6)
 BOX, BALL, OTHER = 4, 5, 6

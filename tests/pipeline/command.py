@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from pipeline.cli.main import main
+from levelproof.pipeline.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 600  # s; workers are niced, so what else runs on a slow machine keeps them waiting

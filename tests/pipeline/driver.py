@@ -5,16 +5,16 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-from configs.schema import JobConfig
-from experts.labels import Label
-from experts.train import UnitResult
-from pipeline.jobs.schedule import WorkUnit, plan_units
-from pipeline.jobs.unit import commit
-from pipeline.store.fields import same_bits
-from pipeline.store.job_note import note_job
-from pipeline.store.manifest import Manifest, read_manifest, require_manifest
-from pipeline.store.shard import Shard
-from pipeline.store.split import writing
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.labels import Label
+from levelproof.experts.train import UnitResult
+from levelproof.pipeline.jobs.schedule import WorkUnit, plan_units
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.job_note import note_job
+from levelproof.pipeline.store.manifest import Manifest, read_manifest, require_manifest
+from levelproof.pipeline.store.shard import Shard
+from levelproof.pipeline.store.split import writing
 from tests.pipeline.made import made_job, made_result
 
 LEVELS, UNIT = 6, 2

@@ -7,11 +7,11 @@ import os
 import sys
 from pathlib import Path
 
-from configs.schema import JobConfig
-from pipeline.cli import main as cli
-from pipeline.jobs import cluster
-from pipeline.jobs.likeness import Program
-from pipeline.jobs.schedule import Order, Round
+from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.cli import main as cli
+from levelproof.pipeline.jobs import cluster
+from levelproof.pipeline.jobs.likeness import Program
+from levelproof.pipeline.jobs.schedule import Order, Round
 
 
 class Fragile(cluster.WorkerActor):

@@ -13,26 +13,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from configs.compose import compose_job
-from configs.schema import JobConfig
-from experts.before import decide
-from experts.config import RECORD_STEPS
-from experts.labels import WITNESSED, Label, Source, Verdict
-from experts.steps import EnvSteps
-from experts.train import UnitResult
-from experts.witness import Record, replay, steps_to_goal, succeeds, take
-from levelgen.level import ACTIONS, SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from physics.pairs import pairs_of
-from physics.types import MAX_VERTICES, Size
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
-from pipeline.store.columns import OF_THE_RUN
-from pipeline.store.contents import highest
-from pipeline.store.fields import arrays_of, tree_of
-from pipeline.store.job_note import note_job
-from pipeline.store.layout import split_path
-from pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.configs.compose import compose_job
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.before import decide
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import WITNESSED, Label, Source, Verdict
+from levelproof.experts.steps import EnvSteps
+from levelproof.experts.train import UnitResult
+from levelproof.experts.witness import Record, replay, steps_to_goal, succeeds, take
+from levelproof.levelgen.level import ACTIONS, SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import MAX_VERTICES, Size
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.store.columns import OF_THE_RUN
+from levelproof.pipeline.store.contents import highest
+from levelproof.pipeline.store.fields import arrays_of, tree_of
+from levelproof.pipeline.store.job_note import note_job
+from levelproof.pipeline.store.layout import split_path
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 
 T = TypeVar("T")
 PLAYED = 64  # levels of `played_split`

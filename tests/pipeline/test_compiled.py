@@ -4,11 +4,11 @@ import os
 import time
 from pathlib import Path
 
-from pipeline.compiled import LOOKED, remove_damaged
+from levelproof.pipeline.compiled import LOOKED, remove_damaged
 from tests.pipeline.test_runtime import python
 
 COMPILE = """
-from pipeline import runtime
+from levelproof.pipeline import runtime
 runtime.MIN_COMPILE_SECONDS = 0
 runtime.prepare_jax()
 import warnings

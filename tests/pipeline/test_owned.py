@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from experts.labels import Label
-from pipeline import runtime
-from pipeline.errors import UserError
-from pipeline.owned import own_folder, require_own
-from pipeline.runtime import CACHE_VARIABLE, cache_folder, prepare_jax
-from pipeline.store.checkpoints import load_experts, require_same_experts
+from levelproof.experts.labels import Label
+from levelproof.pipeline import runtime
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.owned import own_folder, require_own
+from levelproof.pipeline.runtime import CACHE_VARIABLE, cache_folder, prepare_jax
+from levelproof.pipeline.store.checkpoints import load_experts, require_same_experts
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_job, made_split
 

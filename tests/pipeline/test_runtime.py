@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import runtime
-from pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder, own_cores
+from levelproof.pipeline import runtime
+from levelproof.pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder, own_cores
 from tests.pipeline.command import ROOT
 
 # Orthogonal weights of several layers for several experts: batched QR factorisations side by side in one program
 FACTORISE = """
-from pipeline.runtime import prepare_jax
+from levelproof.pipeline.runtime import prepare_jax
 prepare_jax()
 import jax
 layer = jax.nn.initializers.orthogonal()
@@ -23,7 +23,7 @@ for i in range(300):
 """
 
 COUNT = """
-from pipeline.runtime import prepare_jax
+from levelproof.pipeline.runtime import prepare_jax
 prepare_jax()
 import jax, os
 jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((512, 512))))
@@ -51,7 +51,7 @@ def test_xla_has_one_thread_to_compute(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform != "linux" or len(own_cores()) < 2, reason="looks at /proc; needs a second core")
 def test_runs_with_fewer_workers_than_cores_do_not_meet_on_one(tmp_path: Path) -> None:
     program = (
-        "from pipeline.runtime import own_core, prepare_jax; prepare_jax(own_core(1)); "
+        "from levelproof.pipeline.runtime import own_core, prepare_jax; prepare_jax(own_core(1)); "
         "import os; print(*os.sched_getaffinity(0))"
     )
     one, two = (set(python(program, tmp_path).split()) for _ in range(2))
@@ -59,13 +59,18 @@ def test_runs_with_fewer_workers_than_cores_do_not_meet_on_one(tmp_path: Path) -
 
 
 def test_flags_of_the_user_stay(tmp_path: Path) -> None:
-    program = "from pipeline.runtime import prepare_jax as p; p(); p(); import os; print(os.environ['XLA_FLAGS'])"
+    program = (
+        "from levelproof.pipeline.runtime import prepare_jax as prepare; prepare(); prepare(); "
+        "import os; print(os.environ['XLA_FLAGS'])"
+    )
     flags = python(program, tmp_path, XLA_FLAGS="--xla_dump_to=/nowhere").split()
     assert flags == ["--xla_dump_to=/nowhere", *XLA_FLAGS]
 
 
 def test_compiled_code_is_kept_where_it_was_asked_for(tmp_path: Path) -> None:
-    program = "from pipeline import runtime; runtime.MIN_COMPILE_SECONDS = 0; runtime.prepare_jax(); import jax; "
+    program = (
+        "from levelproof.pipeline import runtime; runtime.MIN_COMPILE_SECONDS = 0; runtime.prepare_jax(); import jax; "
+    )
     python(program + "jax.jit(lambda x: x + 1)(1.0)", tmp_path)
     assert list((tmp_path / "jax").iterdir())
 
@@ -97,7 +102,7 @@ def test_workers_are_as_many_as_the_quota_of_a_container_keeps_busy(
 def test_every_worker_of_a_machine_has_its_own_core(tmp_path: Path) -> None:
     """Of a mask that leaves some out; what a worker had is free when it has died."""
     program = (
-        "import sys; from pipeline import runtime; runtime._allowed_cores = lambda: [5, 7]; "
+        "import sys; from levelproof.pipeline import runtime; runtime._allowed_cores = lambda: [5, 7]; "
         "runtime.cpu_count = lambda: 64; print(runtime.own_core(2), flush=True); sys.stdin.read()"
     )
     start = lambda: subprocess.Popen(

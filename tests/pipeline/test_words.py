@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.words import many
+from levelproof.pipeline.words import many
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelgen.level import Level
-from levelgen.task.observe.flat import (
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.observe.flat import (
     GRAVITY_UNIT,
     body_rows,
     joint_rows,
@@ -21,8 +21,8 @@ from levelgen.task.observe.flat import (
     tables_of,
     thruster_rows,
 )
-from physics.pairs import pairs_of
-from physics.types import Size, State
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import Size, State
 
 KINDS = 4  # polygons, circles, joints, thrusters
 

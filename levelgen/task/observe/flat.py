@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role
-from physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, Size, State
+from levelproof.levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role
+from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, Size, State
 
 LIMIT = 10.0  # features are clipped to +-LIMIT
 GRAVITY_UNIT = 10.0  # m/s^2

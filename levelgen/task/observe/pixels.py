@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from levelgen.level import WORLD_SIDE, Level, Role
-from levelgen.task.observe.flat import GRAVITY_UNIT
-from physics.types import FIXED_POLYGONS, State
+from levelproof.levelgen.level import WORLD_SIDE, Level, Role
+from levelproof.levelgen.task.observe.flat import GRAVITY_UNIT
+from levelproof.physics.types import FIXED_POLYGONS, State
 
 PIXELS_PER_METRE = 25
 SIDE = int(WORLD_SIDE * PIXELS_PER_METRE)  # pixels

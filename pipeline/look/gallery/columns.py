@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from pipeline.look.gallery.worlds import text_of
-from pipeline.look.reasons import kind_of_reason
-from pipeline.store.columns import COLUMNS
+from levelproof.pipeline.look.gallery.worlds import text_of
+from levelproof.pipeline.look.reasons import kind_of_reason
+from levelproof.pipeline.store.columns import COLUMNS
 
 PAGE = 8192  # rows
 NOTHING = 2**16 - 1  # in place of a word

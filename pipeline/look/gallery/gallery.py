@@ -17,23 +17,23 @@ from typing import Any
 import jax
 import numpy as np
 
-from experts.witness import steps_to_goal, succeeds
-from levelgen.level import Level
-from levelgen.pictures.palette import palette_css
-from pipeline.errors import Failure, UserError
-from pipeline.look import cost
-from pipeline.look.gallery.columns import NOTHING, PAGE, columns_of, page_of
-from pipeline.look.gallery.worlds import drawn_bodies, states_of, text_of, world_of
-from pipeline.look.spread import spread
-from pipeline.look.things import THINGS, things_of
-from pipeline.read.created import new_folder
-from pipeline.read.levels import levels_of, rules_of
-from pipeline.read.rows import read_rows
-from pipeline.read.select import columns_in, select
-from pipeline.store.manifest import Manifest, require_manifest
-from pipeline.store.remote import as_typed
-from pipeline.store.shown import shown
-from pipeline.words import many
+from levelproof.experts.witness import steps_to_goal, succeeds
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.pictures.palette import palette_css
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.look import cost
+from levelproof.pipeline.look.gallery.columns import NOTHING, PAGE, columns_of, page_of
+from levelproof.pipeline.look.gallery.worlds import drawn_bodies, states_of, text_of, world_of
+from levelproof.pipeline.look.spread import spread
+from levelproof.pipeline.look.things import THINGS, things_of
+from levelproof.pipeline.read.created import new_folder
+from levelproof.pipeline.read.levels import levels_of, rules_of
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.store.shown import shown
+from levelproof.pipeline.words import many
 
 SITE = Path(__file__).parent / "site"
 ABOUT = Path("data") / "about.js"  # what makes a folder a gallery

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from levelgen.level import Level
-from physics.types import MAX_VERTICES
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import MAX_VERTICES
 
 LENGTH = 1 / 2000  # m; 16 bits reach 16.4 m to either side, and the engine keeps bodies within 15 m
 ANGLE = 1 / 10_000  # rad, of -pi to pi

@@ -8,17 +8,17 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from configs.numbers import parse_count
-from experts.config import check_budget
-from experts.procedure import Procedure
-from experts.witness import steps_to_goal
-from levelgen.files.level_file import LevelFile
-from pipeline.errors import UserError
-from pipeline.look.play.server import HOST, serving
-from pipeline.look.play.session import empty_file, witness_in
-from pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of
-from pipeline.read.rows import read_row
-from pipeline.runtime import prepare_jax
+from levelproof.configs.numbers import parse_count
+from levelproof.experts.config import check_budget
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.witness import steps_to_goal
+from levelproof.levelgen.files.level_file import LevelFile
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.play.server import HOST, serving
+from levelproof.pipeline.look.play.session import empty_file, witness_in
+from levelproof.pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of
+from levelproof.pipeline.read.rows import read_row
+from levelproof.pipeline.runtime import prepare_jax
 
 
 def play(source: Path | None, level_id: int | None, size: str, budget: str, port: int, browser: bool) -> None:

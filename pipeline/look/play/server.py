@@ -18,13 +18,13 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
-from experts.procedure import Procedure
-from levelgen.files.level_file import LevelFile
-from levelgen.pictures.palette import palette_css
-from pipeline.errors import UserError
-from pipeline.look.gallery.gallery import SITE
-from pipeline.look.play.session import Session
-from pipeline.look.play.training import Message, trained
+from levelproof.experts.procedure import Procedure
+from levelproof.levelgen.files.level_file import LevelFile
+from levelproof.levelgen.pictures.palette import palette_css
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.gallery.gallery import SITE
+from levelproof.pipeline.look.play.session import Session
+from levelproof.pipeline.look.play.training import Message, trained
 
 HOST = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"

@@ -9,19 +9,19 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from experts.config import RECORD_STEPS
-from experts.witness import replay, steps_to_goal, succeeds
-from levelgen.edit import EDITS, EditError, bodies_at, one_of
-from levelgen.files.entries import LevelFileError
-from levelgen.files.level_file import LevelFile, from_document, to_document
-from levelgen.level import ACTIONS, SIZES, Level, Role, name_of, size_of
-from levelgen.sampling.scenery import empty_level
-from levelgen.task import rules as task
-from levelgen.task.actions import CHOICES
-from levelgen.task.rules import TaskParams, TaskState
-from pipeline.errors import UserError
-from pipeline.look.gallery.worlds import drawn_bodies, world_of
-from pipeline.version import __version__
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness import replay, steps_to_goal, succeeds
+from levelproof.levelgen.edit import EDITS, EditError, bodies_at, one_of
+from levelproof.levelgen.files.entries import LevelFileError
+from levelproof.levelgen.files.level_file import LevelFile, from_document, to_document
+from levelproof.levelgen.level import ACTIONS, SIZES, Level, Role, name_of, size_of
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.rules import TaskParams, TaskState
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.gallery.worlds import drawn_bodies, world_of
+from levelproof.pipeline.version import __version__
 
 WITNESS = "witness"  # entry of a level file: actions that solve the level, which other programs do not read
 MOST_UNDONE = 200  # edits that can be taken back

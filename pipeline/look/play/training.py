@@ -9,14 +9,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from experts.attempts import attempts
-from experts.labels import WITNESSED
-from experts.pool import Pool
-from experts.procedure import Procedure
-from experts.train import TrainingRun
-from levelgen.files.level_file import LevelFile
-from levelgen.identity.content import content_hashes, level_id_for
-from pipeline.look.play.session import places_of
+from levelproof.experts.attempts import attempts
+from levelproof.experts.labels import WITNESSED
+from levelproof.experts.pool import Pool
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.train import TrainingRun
+from levelproof.levelgen.files.level_file import LevelFile
+from levelproof.levelgen.identity.content import content_hashes, level_id_for
+from levelproof.pipeline.look.play.session import places_of
 
 ATTEMPTS = 12  # that a page shows at once
 SHOWN_STEPS = 128  # env steps of each

@@ -9,12 +9,12 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from experts.witness import Record
-from levelgen.level import Level
-from physics.types import Size, State
-from pipeline.errors import UserError
-from pipeline.store.contents import table_for
-from pipeline.store.fields import tree_of
+from levelproof.experts.witness import Record
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import Size, State
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.contents import table_for
+from levelproof.pipeline.store.fields import tree_of
 
 T = TypeVar("T")
 

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from pipeline.errors import UserError
-from pipeline.read.dataset.batch import Batch
-from pipeline.runtime import own_cores
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.dataset.batch import Batch
+from levelproof.pipeline.runtime import own_cores
 
 
 class Batches(Iterator[Batch]):

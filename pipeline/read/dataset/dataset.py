@@ -17,29 +17,29 @@ import pyarrow.compute as pc
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from experts.config import RECORD_STEPS
-from levelgen.level import Level, size_of
-from levelgen.task.actions import action_mask
-from levelgen.task.environment import EnvState, ObservationType
-from levelgen.task.rules import TaskParams
-from physics.types import Size, State
-from pipeline.errors import Failure, UserError
-from pipeline.read.dataset.batch import Batch, named
-from pipeline.read.dataset.batches import Batches
-from pipeline.read.dataset.observations import kind_of, observed
-from pipeline.read.dataset.order import EpochOrder
-from pipeline.read.dataset.parts import check_share, in_part
-from pipeline.read.dataset.sources import TrajectorySource
-from pipeline.read.dataset.windows import Windows
-from pipeline.read.levels import rules_of
-from pipeline.read.rows import COLUMNS, moved_rows, read_placed, same_places
-from pipeline.read.select import columns_in, select
-from pipeline.runtime import own_cores
-from pipeline.store.columns import schema_of
-from pipeline.store.fields import tree_of
-from pipeline.store.manifest import require_manifest
-from pipeline.store.shard import open_shard
-from pipeline.words import many
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.levelgen.level import Level, size_of
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.environment import EnvState, ObservationType
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.physics.types import Size, State
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.read.dataset.batch import Batch, named
+from levelproof.pipeline.read.dataset.batches import Batches
+from levelproof.pipeline.read.dataset.observations import kind_of, observed
+from levelproof.pipeline.read.dataset.order import EpochOrder
+from levelproof.pipeline.read.dataset.parts import check_share, in_part
+from levelproof.pipeline.read.dataset.sources import TrajectorySource
+from levelproof.pipeline.read.dataset.windows import Windows
+from levelproof.pipeline.read.levels import rules_of
+from levelproof.pipeline.read.rows import COLUMNS, moved_rows, read_placed, same_places
+from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.runtime import own_cores
+from levelproof.pipeline.store.columns import schema_of
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.shard import open_shard
+from levelproof.pipeline.words import many
 
 READ = ("content_hash", "label", "steps_to_goal", *COLUMNS)  # columns of the manifest that are always read
 OPEN_SHARDS = 256  # whose indices are kept in memory

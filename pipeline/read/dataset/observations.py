@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from levelgen.level import Level
-from levelgen.task.environment import LOOKS, ObservationType
-from physics.types import State
-from pipeline.errors import UserError
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.environment import LOOKS, ObservationType
+from levelproof.physics.types import State
+from levelproof.pipeline.errors import UserError
 
 COMPILING = Lock()  # threads that meet a program for the first time would compile it side by side
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int
 
-from pipeline.errors import UserError
+from levelproof.pipeline.errors import UserError
 
 ROUNDS = 6
 

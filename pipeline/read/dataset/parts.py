@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline.errors import Failure, UserError
+from levelproof.pipeline.errors import Failure, UserError
 
 PARTS = TRAIN, VALIDATION = "train", "validation"
 DIGITS = 8  # at the end of a content hash; its first ones make ids of level files

@@ -8,10 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from levelgen.task.environment import ObservationType
-from pipeline.errors import UserError
-from pipeline.read.dataset.batch import Batch
-from pipeline.read.dataset.windows import Windows
+from levelproof.levelgen.task.environment import ObservationType
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.dataset.batch import Batch
+from levelproof.pipeline.read.dataset.windows import Windows
 
 
 class Readable(Protocol):

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
-from experts.config import RECORD_STEPS
-from pipeline.errors import UserError
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.pipeline.errors import UserError
 
 
 class Windows(NamedTuple):

@@ -2,20 +2,20 @@
 
 from pathlib import Path
 
-from experts.config import RECORD_STEPS
-from experts.witness import Record
-from levelgen.level import Level, size_of
-from pipeline.read.created import new_folder
-from pipeline.read.kinetix.records import dtype_of, trajectories_of
-from pipeline.read.kinetix.zarr2 import ROWS, write_array, write_chunk, write_group
-from pipeline.read.rows import read_rows
-from pipeline.read.select import SOLVED, witnessed
-from pipeline.runtime import prepare_jax
-from pipeline.store.fields import tree_of
-from pipeline.store.remote import as_typed
-from pipeline.store.shard import stored_bytes
-from pipeline.store.shown import shown
-from pipeline.words import many
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness import Record
+from levelproof.levelgen.level import Level, size_of
+from levelproof.pipeline.read.created import new_folder
+from levelproof.pipeline.read.kinetix.records import dtype_of, trajectories_of
+from levelproof.pipeline.read.kinetix.zarr2 import ROWS, write_array, write_chunk, write_group
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.read.select import SOLVED, witnessed
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.store.shard import stored_bytes
+from levelproof.pipeline.store.shown import shown
+from levelproof.pipeline.words import many
 
 BLOCK = 4 * ROWS  # trajectories in memory at a time
 ARRAY = 64 * ROWS  # trajectories of an array: the reference shuffles arrays, and what they have

@@ -9,16 +9,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from experts.config import RECORD_STEPS
-from levelgen.files.kinetix import Fields, level_from_kinetix
-from levelgen.files.level_file import flaws
-from levelgen.level import ACTIONS, MOST_THINGS, Level, name_of
-from levelgen.task.actions import CHOICES
-from physics.types import FIXED_POLYGONS, Size
-from pipeline.read.kinetix.records import LEVEL_FIELDS, WORLD, dtype_of
-from pipeline.read.kinetix.zarr2 import FormatError, StoredArray, arrays_in
-from pipeline.store.contents import highest
-from pipeline.store.fields import arrays_of
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.levelgen.files.kinetix import Fields, level_from_kinetix
+from levelproof.levelgen.files.level_file import flaws
+from levelproof.levelgen.level import ACTIONS, MOST_THINGS, Level, name_of
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.physics.types import FIXED_POLYGONS, Size
+from levelproof.pipeline.read.kinetix.records import LEVEL_FIELDS, WORLD, dtype_of
+from levelproof.pipeline.read.kinetix.zarr2 import FormatError, StoredArray, arrays_in
+from levelproof.pipeline.store.contents import highest
+from levelproof.pipeline.store.fields import arrays_of
 
 COUNTED = ("polygon/n_vertices", "circle/radius", "joint/active", "thruster/active")  # in the order of Size
 MOST = 100_000_000  # trajectories of a folder; the largest that is released has 6 million

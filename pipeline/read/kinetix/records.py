@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experts.config import RECORD_STEPS
-from experts.witness import Record
-from levelgen.files.kinetix import (
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness import Record
+from levelproof.levelgen.files.kinetix import (
     BODIES,
     MANIFOLD,
     MANIFOLDS,
@@ -24,10 +24,10 @@ from levelgen.files.kinetix import (
     level_to_kinetix,
     to_kinetix,
 )
-from levelgen.level import Level
-from levelgen.task.actions import action_mask
-from physics.types import Size
-from pipeline.store.contents import none_of
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.physics.types import Size
+from levelproof.pipeline.store.contents import none_of
 
 T = TypeVar("T")
 

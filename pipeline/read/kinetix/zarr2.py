@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numcodecs.blosc import Blosc
 
-from configs.errors import readable
-from experts.config import RECORD_STEPS
+from levelproof.configs.errors import readable
+from levelproof.experts.config import RECORD_STEPS
 
 ARRAY, GROUP = ".zarray", ".zgroup"
 ROWS = 16  # trajectories of a chunk

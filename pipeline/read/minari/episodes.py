@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from experts.config import RECORD_STEPS
-from experts.witness import Record, blocks, take
-from levelgen.level import MOTOR_BINDINGS, Level
-from levelgen.task.actions import CHOICES, action_mask
-from levelgen.task.observe.flat import symbolic_flat
-from levelgen.task.rules import TaskParams, TaskState, advance
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness import Record, blocks, take
+from levelproof.levelgen.level import MOTOR_BINDINGS, Level
+from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.observe.flat import symbolic_flat
+from levelproof.levelgen.task.rules import TaskParams, TaskState, advance
 
 BLOCK = 16  # records that are looked at together, in one compiled program
 

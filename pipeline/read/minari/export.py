@@ -11,23 +11,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from experts.witness import Record
-from levelgen.level import MOTOR_BINDINGS, Level, size_of
-from levelgen.task.actions import CHOICES
-from levelgen.task.observe.flat import LIMIT, feature_count
-from levelgen.task.rules import TaskParams
-from pipeline.errors import UserError
-from pipeline.read.created import new_folder
-from pipeline.read.levels import rules_of
-from pipeline.read.minari.episodes import BLOCK, ActionKind, Episode, episodes_of
-from pipeline.read.rows import read_rows
-from pipeline.read.select import SOLVED, witnessed
-from pipeline.runtime import prepare_jax
-from pipeline.store.fields import tree_of
-from pipeline.store.manifest import require_manifest
-from pipeline.store.shown import shown
-from pipeline.version import __version__
-from pipeline.words import many
+from levelproof.experts.witness import Record
+from levelproof.levelgen.level import MOTOR_BINDINGS, Level, size_of
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.observe.flat import LIMIT, feature_count
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.created import new_folder
+from levelproof.pipeline.read.levels import rules_of
+from levelproof.pipeline.read.minari.episodes import BLOCK, ActionKind, Episode, episodes_of
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.read.select import SOLVED, witnessed
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.shown import shown
+from levelproof.pipeline.version import __version__
+from levelproof.pipeline.words import many
 
 if TYPE_CHECKING:
     import h5py

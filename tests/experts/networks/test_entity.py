@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experts.networks.entity import EntityNetwork
-from experts.policy import Params, forward, initial
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.sampling.scenery import empty_level
-from levelgen.sampling.shuffle import OrderDraws, shuffle, shuffled_rows
-from levelgen.task.observe.entities import EntityObservation, entities
-from levelgen.task.observe.flat import BODY_ROWS, LIMIT, UNSEEN_WALLS, state_features
-from physics.types import FIXED_POLYGONS, State
+from levelproof.experts.networks.entity import EntityNetwork
+from levelproof.experts.policy import Params, forward, initial
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.levelgen.sampling.shuffle import OrderDraws, shuffle, shuffled_rows
+from levelproof.levelgen.task.observe.entities import EntityObservation, entities
+from levelproof.levelgen.task.observe.flat import BODY_ROWS, LIMIT, UNSEEN_WALLS, state_features
+from levelproof.physics.types import FIXED_POLYGONS, State
 
 LEVELS = 6
 NAMES = ["s", *(pytest.param(name, marks=pytest.mark.campaign) for name in "ml")]

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.networks.flat import FlatNetwork, resting_features
-from experts.policy import Params, forward, initial
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.observe.flat import dynamic_features, feature_count, level_features
+from levelproof.experts.networks.flat import FlatNetwork, resting_features
+from levelproof.experts.policy import Params, forward, initial
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.observe.flat import dynamic_features, feature_count, level_features
 
 SIZE = SIZES["s"]
 MOVING, STILL = dynamic_features(SIZE), resting_features(SIZE)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from experts.networks.layers import orthogonal
+from levelproof.experts.networks.layers import orthogonal
 
 
 @pytest.mark.parametrize("shape", [(64, 140), (16, 64), (64, 21), (1, 64)])

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from experts.config import Network
-from experts.judge import Trained
-from experts.witness import take
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
+from levelproof.experts.config import Network
+from levelproof.experts.judge import Trained
+from levelproof.experts.witness import take
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
 from tests.experts.small import CONFIG
 from tests.experts.test_slots import SOLVED, UPDATES, same, train
 

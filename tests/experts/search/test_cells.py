@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experts.search.cells import TURN, features
-from experts.search.config import SearchConfig
-from levelgen.level import SIZES, Level, Role
-from levelgen.proofs import driven
-from levelgen.sampling.sampler import sample_levels
+from levelproof.experts.search.cells import TURN, features
+from levelproof.experts.search.config import SearchConfig
+from levelproof.levelgen.level import SIZES, Level, Role
+from levelproof.levelgen.proofs import driven
+from levelproof.levelgen.sampling.sampler import sample_levels
 
 CONFIG = SearchConfig(driven_weight=0.5)
 

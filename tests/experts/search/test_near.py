@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from experts.search.near import FAR, gap, goals_of
-from levelgen.level import Level, Role
+from levelproof.experts.search.near import FAR, gap, goals_of
+from levelproof.levelgen.level import Level, Role
 from tests.experts.search.worlds import BALL, BARS, GOAL, side_by_side, switchback
 
 BAR = BARS.start

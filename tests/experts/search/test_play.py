@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experts.search.play import Arena, Walk, arena, decode, encode, fresh_walk, play
-from experts.search.rows import from_rows, to_rows
-from experts.witness import take
-from levelgen.task import rules as task
-from levelgen.task.actions import CHOICES
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts.search.play import Arena, Walk, arena, decode, encode, fresh_walk, play
+from levelproof.experts.search.rows import from_rows, to_rows
+from levelproof.experts.witness import take
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.search.worlds import broken, side_by_side, switchback, valley
 
 LANES, STEPS = 16, 256

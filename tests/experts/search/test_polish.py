@@ -6,18 +6,18 @@ import jax
 import numpy as np
 import pytest
 
-from experts.config import ExpertConfig
-from experts.judge import repeating
-from experts.labels import Source
-from experts.procedure import Procedure
-from experts.rework import IN_CACHE, rework
-from experts.search.config import SearchConfig
-from experts.search.polish import LANES, polish
-from experts.search.shorten import Shortened
-from experts.success import Success
-from experts.witness import at_once, replay, steps_to_goal, take
-from levelgen.level import ACTIONS, MOTOR_BINDINGS, Level, Role
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.judge import repeating
+from levelproof.experts.labels import Source
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.rework import IN_CACHE, rework
+from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.search.polish import LANES, polish
+from levelproof.experts.search.shorten import Shortened
+from levelproof.experts.success import Success
+from levelproof.experts.witness import at_once, replay, steps_to_goal, take
+from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, Level, Role
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.search.worlds import world
 
 WIDTH = at_once(LANES, IN_CACHE)  # levels that one program polishes

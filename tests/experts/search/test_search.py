@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
-from experts.labels import Label, Source
-from experts.procedure import Procedure
-from experts.scout import STEPS_PER_ROUND
-from experts.search.config import SearchConfig
-from experts.search.explore import NEARER, Search, _explore, begin, draw, explore, under_way
-from experts.search.near import FAR
-from experts.search.play import arena, fresh_walk, play
-from experts.search.search import AHEAD, Searching, side_by_side
-from experts.search.shorten import shorten
-from experts.search.stage import Searched
-from experts.steps import EnvSteps
-from experts.success import Success
-from experts.witness import replay, take
-from levelgen.identity.keys import GENERATOR
-from levelgen.level import Level
-from levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.labels import Label, Source
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.scout import STEPS_PER_ROUND
+from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.search.explore import NEARER, Search, _explore, begin, draw, explore, under_way
+from levelproof.experts.search.near import FAR
+from levelproof.experts.search.play import arena, fresh_walk, play
+from levelproof.experts.search.search import AHEAD, Searching, side_by_side
+from levelproof.experts.search.shorten import shorten
+from levelproof.experts.search.stage import Searched
+from levelproof.experts.steps import EnvSteps
+from levelproof.experts.success import Success
+from levelproof.experts.witness import replay, take
+from levelproof.levelgen.identity.keys import GENERATOR
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from tests.experts.search.worlds import broken, switchback, tower, valley
 from tests.experts.search.worlds import side_by_side as together
 

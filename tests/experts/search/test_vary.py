@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experts.search.config import SearchConfig
-from experts.search.explore import NEARER, success_of
-from experts.search.near import FAR, gap
-from experts.search.play import act, arena, decode, encode, fresh_walk
-from experts.search.search import Searching, side_by_side
-from experts.search.vary import (
+from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.search.explore import NEARER, success_of
+from levelproof.experts.search.near import FAR, gap
+from levelproof.experts.search.play import act, arena, decode, encode, fresh_walk
+from levelproof.experts.search.search import Searching, side_by_side
+from levelproof.experts.search.vary import (
     CHANGES,
     KEPT,
     Approaches,
@@ -27,10 +27,10 @@ from experts.search.vary import (
     varied,
     vary,
 )
-from experts.witness import replay, take
-from levelgen.identity.keys import GENERATOR
-from levelgen.level import ACTIONS, MOTOR_BINDINGS, Level
-from levelgen.task.rules import DEFAULT_RULES
+from levelproof.experts.witness import replay, take
+from levelproof.levelgen.identity.keys import GENERATOR
+from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, Level
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.search.worlds import broken, cannon
 from tests.experts.search.worlds import side_by_side as together
 

@@ -5,9 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 
-from levelgen.level import Level, Role
-from levelgen.sampling.scenery import FLOOR_TOP, empty_level
-from physics.types import FIXED_POLYGONS, Size
+from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.sampling.scenery import FLOOR_TOP, empty_level
+from levelproof.physics.types import FIXED_POLYGONS, Size
 
 SIZE = Size(polygons=7, circles=2, joints=1, thrusters=2)
 BARS = slice(FIXED_POLYGONS, SIZE.polygons)

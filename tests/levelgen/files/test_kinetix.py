@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from levelgen.files.kinetix import MANIFOLDS, level_from_kinetix, state_from_kinetix, state_to_kinetix
-from levelgen.level import SIZES, Level
-from physics.pairs import pairs_of
-from physics.types import Model, Size, State
+from levelproof.levelgen.files.kinetix import MANIFOLDS, level_from_kinetix, state_from_kinetix, state_to_kinetix
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import Model, Size, State
 
 LANES = 3
 INTEGERS = {

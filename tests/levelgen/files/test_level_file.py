@@ -16,9 +16,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from levelgen.files.entries import LevelFileError
-from levelgen.files.kinetix import MANIFOLDS
-from levelgen.files.level_file import (
+from levelproof.levelgen.files.entries import LevelFileError
+from levelproof.levelgen.files.kinetix import MANIFOLDS
+from levelproof.levelgen.files.level_file import (
     MOST_BYTES,
     LevelFile,
     from_document,
@@ -27,11 +27,11 @@ from levelgen.files.level_file import (
     to_document,
     write_level_file,
 )
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import Distribution, sample_levels
-from levelgen.sampling.scenery import empty_level
-from levelgen.task.rules import TaskParams
-from physics.types import Params, Size
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.physics.types import Params, Size
 
 RULES = TaskParams(frame_skip=3, max_timesteps=100, dense_reward_scale=0.5, physics=Params(dt=0.01, motor_power=500.0))
 MOST_MEMORY = 250e6  # bytes, for the worst that MOST_BYTES can say

@@ -7,12 +7,12 @@ import jax
 import numpy as np
 import pytest
 
-from levelgen.files.kinetix import level_from_kinetix
-from levelgen.files.level_file import LevelFile, read_level_file, write_level_file
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import Distribution, sample_levels
-from levelgen.task.rules import TaskParams, TaskState, advance
-from physics.types import Size
+from levelproof.levelgen.files.kinetix import level_from_kinetix
+from levelproof.levelgen.files.level_file import LevelFile, read_level_file, write_level_file
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
+from levelproof.levelgen.task.rules import TaskParams, TaskState, advance
+from levelproof.physics.types import Size
 from tests.levelgen.opened import Played, handmade_levels, open_in_reference
 
 pytestmark = pytest.mark.campaign

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from levelgen.identity.content import content_hashes
-from levelgen.identity.form import NO_ENTRY, Push, Side, World, canonical_form
-from levelgen.identity.signature import signatures
-from levelgen.level import MOTOR_BINDINGS, SIZES, Level
-from levelgen.task.rules import TaskParams, reset, step
+from levelproof.levelgen.identity.content import content_hashes
+from levelproof.levelgen.identity.form import NO_ENTRY, Push, Side, World, canonical_form
+from levelproof.levelgen.identity.signature import signatures
+from levelproof.levelgen.level import MOTOR_BINDINGS, SIZES, Level
+from levelproof.levelgen.task.rules import TaskParams, reset, step
 from tests.levelgen.variants import (
     COUNT,
     edited,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION, Stream, key_for, level_id_array
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION, Stream, key_for, level_id_array
 
 
 def data(level_id: int, stream: Stream) -> tuple[int, ...]:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from levelgen.level import WORLD_SIDE, Role
-from levelgen.pictures.raster import draw, sheet, write_gif, write_png
-from levelgen.pictures.style import BINDING_COLOUR, BORDER, HEADER, ROLE_COLOUR
-from levelgen.pictures.words import Caption, live_entries
+from levelproof.levelgen.level import WORLD_SIDE, Role
+from levelproof.levelgen.pictures.raster import draw, sheet, write_gif, write_png
+from levelproof.levelgen.pictures.style import BINDING_COLOUR, BORDER, HEADER, ROLE_COLOUR
+from levelproof.levelgen.pictures.words import Caption, live_entries
 from tests.golden.load import HERE, load
 
 OFF = np.zeros(6, np.int32)

@@ -13,11 +13,11 @@ import pytest
 import resvg_py
 from PIL import Image
 
-from levelgen.pictures.raster import rasterised
-from levelgen.pictures.scene import scene_of
-from levelgen.pictures.shapes import Scene
-from levelgen.pictures.svg import svg_of
-from levelgen.pictures.words import Caption
+from levelproof.levelgen.pictures.raster import rasterised
+from levelproof.levelgen.pictures.scene import scene_of
+from levelproof.levelgen.pictures.shapes import Scene
+from levelproof.levelgen.pictures.svg import svg_of
+from levelproof.levelgen.pictures.words import Caption
 from tests.golden.load import HERE, load
 
 SVG = "{http://www.w3.org/2000/svg}"

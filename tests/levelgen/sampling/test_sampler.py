@@ -11,19 +11,19 @@ import pytest
 from scipy import stats
 
 from benchmarks.reference.level_statistics import statistics
-from configs.compose import distributions
-from levelgen.files.kinetix import state_to_kinetix
-from levelgen.level import SIZES, WORLD_SIDE, Level, Role
-from levelgen.sampling.distribution import Distribution
-from levelgen.sampling.overlap import WorldCircles, count_contacts
-from levelgen.sampling.sampler import CHUNK, sample_levels
-from levelgen.sampling.scenery import FLOOR_TOP, empty_level
-from levelgen.sampling.shuffle import separate
-from levelgen.task.actions import action_mask
-from physics.pairs import pairs_of
-from physics.step import step
-from physics.types import FIXED_POLYGONS, Size
-from physics.vector import Vec
+from levelproof.configs.compose import distributions
+from levelproof.levelgen.files.kinetix import state_to_kinetix
+from levelproof.levelgen.level import SIZES, WORLD_SIDE, Level, Role
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.sampling.overlap import WorldCircles, count_contacts
+from levelproof.levelgen.sampling.sampler import CHUNK, sample_levels
+from levelproof.levelgen.sampling.scenery import FLOOR_TOP, empty_level
+from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.step import step
+from levelproof.physics.types import FIXED_POLYGONS, Size
+from levelproof.physics.vector import Vec
 from tests.golden.load import HERE, load
 
 COUNTS = {"s": 1024, "m": 1024, "l": 512}  # levels

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelgen.level import ACTIONS, MOTOR_BINDINGS, SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.actions import CHOICES, action_mask, controls
-from physics.types import Model
+from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.actions import CHOICES, action_mask, controls
+from levelproof.physics.types import Model
 
 
 @pytest.fixture(scope="module")

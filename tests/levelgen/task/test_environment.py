@@ -5,14 +5,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task import rules as task
-from levelgen.task.actions import CHOICES
-from levelgen.task.environment import ActionType, Environment, EnvParams, EnvState, ObservationType, make, starts
-from levelgen.task.observe.flat import symbolic_flat
-from levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete
-from physics.types import Size
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.environment import (
+    ActionType,
+    Environment,
+    EnvParams,
+    EnvState,
+    ObservationType,
+    make,
+    starts,
+)
+from levelproof.levelgen.task.observe.flat import symbolic_flat
+from levelproof.levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete
+from levelproof.physics.types import Size
 
 LEVELS, STEPS = 24, 12
 

@@ -7,9 +7,9 @@ import pytest
 from gymnax.environments import spaces
 from rejax import PPO
 
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.environment import ActionType, Environment, EnvParams, make
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.environment import ActionType, Environment, EnvParams, make
 
 STEPS = 262_144
 EPISODES = 128  # of an evaluation

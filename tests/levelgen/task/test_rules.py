@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelgen.level import Level, Role
-from levelgen.task.rules import (
+from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.task.rules import (
     NO_DISTANCE,
     TaskParams,
     TaskState,
@@ -22,8 +22,8 @@ from levelgen.task.rules import (
     step,
     touches,
 )
-from physics.pairs import pairs_of
-from physics.types import Manifold
+from levelproof.physics.pairs import pairs_of
+from levelproof.physics.types import Manifold
 from tests.golden.load import HERE, Golden, load
 
 OFF = 0  # every entry of an action

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 
-from physics.codegen.buffers import LANES, Buffer
-from physics.codegen.compile import register, write
+from levelproof.physics.codegen.buffers import LANES, Buffer
+from levelproof.physics.codegen.compile import register, write
 
 Arrays = Sequence[np.ndarray]
 

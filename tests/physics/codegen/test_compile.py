@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from physics.codegen import compile as compile_module
-from physics.codegen.buffers import LANES, Buffer
+from levelproof.physics.codegen import compile as compile_module
+from levelproof.physics.codegen.buffers import LANES, Buffer
 
 
 def test_the_same_kernel_is_compiled_and_registered_once(monkeypatch: pytest.MonkeyPatch) -> None:

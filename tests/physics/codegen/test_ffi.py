@@ -7,7 +7,7 @@ from pathlib import Path
 import jaxlib
 import pytest
 
-from physics.codegen import ffi
+from levelproof.physics.codegen import ffi
 
 HEADER = Path(jaxlib.__file__).parent / "include" / "xla" / "ffi" / "api" / "c_api.h"
 READ = (ffi.ExtensionBase, ffi.ApiVersion, ffi.Metadata, ffi.MetadataExtension)

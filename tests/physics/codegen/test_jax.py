@@ -8,11 +8,11 @@ import jax
 import pytest
 from jax.extend import core
 
-from physics.block import Given
-from physics.buffers import buffers_like
-from physics.codegen.buffers import LANES
-from physics.step import block_buffers, trace
-from physics.types import Params, Size
+from levelproof.physics.block import Given
+from levelproof.physics.buffers import buffers_like
+from levelproof.physics.codegen.buffers import LANES
+from levelproof.physics.step import block_buffers, trace
+from levelproof.physics.types import Params, Size
 from tests.physics.worlds import scattered
 
 SIZE = Size(polygons=6, circles=3, joints=4, thrusters=2)  # one of everything

@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from physics.codegen import kept as module
-from physics.codegen.kept import kept, kept_while_sources_stay
+from levelproof.physics.codegen import kept as module
+from levelproof.physics.codegen.kept import kept, kept_while_sources_stay
 
 # A process that steps a world, and says how often it wrote a kernel, and optimised one, and what came of the step
 PROGRAM = """
@@ -20,8 +20,8 @@ jax.config.update("jax_compilation_cache_dir", sys.argv[1])
 from llvmlite import binding
 emit, made = binding.TargetMachine.emit_object, []
 binding.TargetMachine.emit_object = lambda self, module: made.append(module) or emit(self, module)
-from physics import step
-from physics.codegen import kept
+from levelproof.physics import step
+from levelproof.physics.codegen import kept
 kept.BEGAN = float("inf")  # whoever runs this may have changed a source a moment ago
 write, written = step.write, []
 step.write = lambda *given: written.append(given) or write(*given)

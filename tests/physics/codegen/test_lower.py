@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from jax import lax
 from jax.extend import core, linear_util
 
-from physics.codegen.buffers import LANES, Buffer
+from levelproof.physics.codegen.buffers import LANES, Buffer
 from tests.physics.codegen.kernels import Kernel, rows, same_bits
 
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from physics.codegen.buffers import LANES, Buffer
+from levelproof.physics.codegen.buffers import LANES, Buffer
 from tests.physics.codegen.kernels import Kernel, rows, same_bits
 
 SMALLEST = np.finfo(np.float32).tiny

@@ -12,11 +12,11 @@ from typing import NoReturn
 
 import pytest
 
-from pipeline.cli import main
-from pipeline.store import seal
-from pipeline.store.layout import data_paths
-from pipeline.store.locks import only_writer
-from pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.cli import main
+from levelproof.pipeline.store import seal
+from levelproof.pipeline.store.layout import data_paths
+from levelproof.pipeline.store.locks import only_writer
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import ROOT, TINY, assert_refused, here, run
 from tests.pipeline.made import lasting
 
@@ -279,7 +279,7 @@ def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path, monkeypat
     def broken(*_: object) -> NoReturn:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("pipeline.jobs.unit.sample_levels", broken)
+    monkeypatch.setattr("levelproof.pipeline.jobs.unit.sample_levels", broken)
     done = here(["generate", "levels=1", "budget=5k", "executor=inline"], tmp_path)
     assert done.returncode == 3, done.stderr
     assert done.stderr.count("trying again") == 2

@@ -6,9 +6,9 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from pipeline.cli.columns import as_markdown
-from pipeline.cli.main import main
-from pipeline.store.columns import DESCRIBED, ManifestColumn
+from levelproof.pipeline.cli.columns import as_markdown
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.store.columns import DESCRIBED, ManifestColumn
 
 DOCS = Path(__file__).parents[3] / "docs"
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from configs.meanings import every_setting
-from pipeline.cli.generate import OFTEN
-from pipeline.cli.main import main
-from pipeline.cli.settings import as_markdown
+from levelproof.configs.meanings import every_setting
+from levelproof.pipeline.cli.generate import OFTEN
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.cli.settings import as_markdown
 
 DOCS = Path(__file__).parents[3] / "docs"
 

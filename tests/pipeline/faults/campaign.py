@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from configs import compose
+from levelproof.configs import compose
 from tests.pipeline.faults.content import Rows, Tree, content_of, differences, require_sound, rows_of
 from tests.pipeline.faults.effects import lose_power
 from tests.pipeline.faults.process import DRIVER, DRIVER_PID, HAPPENED, ROLES, WORKER, WORKER_PID, Command, Happening

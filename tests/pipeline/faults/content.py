@@ -5,11 +5,11 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from pipeline.store.checksums import digests_of
-from pipeline.store.columns import OF_THE_RUN
-from pipeline.store.fragment import read_fragment
-from pipeline.store.layout import ATTEMPT, COMMIT_LOCK, EVENTS, WRITER_LOCK
-from pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.checksums import digests_of
+from levelproof.pipeline.store.columns import OF_THE_RUN
+from levelproof.pipeline.store.fragment import read_fragment
+from levelproof.pipeline.store.layout import ATTEMPT, COMMIT_LOCK, EVENTS, WRITER_LOCK
+from levelproof.pipeline.store.manifest import read_manifest
 
 Tree = dict[str, list[str]]  # of files: their paths, without what tells attempts apart, and what is in each
 Rows = dict[int, str]  # what lasts of a level's row

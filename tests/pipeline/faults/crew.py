@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from configs.schema import JobConfig
-from experts.judge import Kept
-from experts.labels import Label
-from experts.steps import EnvSteps
-from experts.train import UnitResult
-from pipeline.jobs.progress import Board
-from pipeline.jobs.schedule import Order, Round, Scheduler, Settle, Summary, UnitOutcome, WorkUnit
-from pipeline.jobs.unit import commit, failure
-from pipeline.store.leases import serve
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.judge import Kept
+from levelproof.experts.labels import Label
+from levelproof.experts.steps import EnvSteps
+from levelproof.experts.train import UnitResult
+from levelproof.pipeline.jobs.progress import Board
+from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, Summary, UnitOutcome, WorkUnit
+from levelproof.pipeline.jobs.unit import commit, failure
+from levelproof.pipeline.store.leases import serve
 from tests.pipeline.made import made_level, made_record, made_verdict
 
 WANTED = 2  # levels for which a worker has room

@@ -24,10 +24,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from configs import compose
-from pipeline.cli.main import main
-from pipeline.jobs import inline, unit
-from pipeline.store import density, events, leases, remote, seal, shard
+from levelproof.configs import compose
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.jobs import inline, unit
+from levelproof.pipeline.store import density, events, leases, remote, seal, shard
 from tests.pipeline.faults import crew
 from tests.pipeline.faults.effects import Effects, Tell
 from tests.pipeline.faults.schedules import LEVELS
@@ -236,10 +236,10 @@ def set_up() -> None:
     unit.device = lambda: "cpu: none"
     compose.compose_job = cache_of(compose.compose_job)
     for name in (
-        "pipeline.jobs.generate",
-        "pipeline.jobs.regenerate",
-        "pipeline.jobs.seal",
-        "pipeline.jobs.level_files",
+        "levelproof.pipeline.jobs.generate",
+        "levelproof.pipeline.jobs.regenerate",
+        "levelproof.pipeline.jobs.seal",
+        "levelproof.pipeline.jobs.level_files",
     ):
         import_module(name)
     import_module("obstore.store")

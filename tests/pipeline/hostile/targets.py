@@ -24,16 +24,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numcodecs import blosc  # pyright: ignore[reportAttributeAccessIssue]
 
-from configs.compose import _parsed, compose_job
-from configs.convert import plain, typed
-from configs.errors import ConfigError
-from configs.numbers import parse_count
-from configs.schema import JobConfig
-from experts.judge import Kept
-from experts.labels import Label
-from experts.slots import begin
-from experts.success import no_success
-from levelgen.files.level_file import (
+from levelproof.configs.compose import _parsed, compose_job
+from levelproof.configs.convert import plain, typed
+from levelproof.configs.errors import ConfigError
+from levelproof.configs.numbers import parse_count
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.judge import Kept
+from levelproof.experts.labels import Label
+from levelproof.experts.slots import begin
+from levelproof.experts.success import no_success
+from levelproof.levelgen.files.level_file import (
     LevelFile,
     LevelFileError,
     flaws,
@@ -41,24 +41,24 @@ from levelgen.files.level_file import (
     to_document,
     write_level_file,
 )
-from levelgen.identity.keys import MAX_LEVEL_ID
-from levelgen.level import size_of
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import TaskParams
-from pipeline.errors import LevelproofError
-from pipeline.read.kinetix.folder import open_folder, read_trajectories
-from pipeline.read.kinetix.zarr2 import BLOSC, FormatError
-from pipeline.store import bounds, hub, remote
-from pipeline.store.checkpoints import load_experts, save_experts
-from pipeline.store.contents import check_numbers, table_for
-from pipeline.store.fields import arrays_of
-from pipeline.store.job_note import NoteError, note_job, read_note
-from pipeline.store.layout import BEGUN, DATA, FRAGMENT, JOB, MANIFEST, entries
-from pipeline.store.manifest import differences, fragment_paths, read_fragment, read_manifest, told
-from pipeline.store.origins import place_of
-from pipeline.store.pieces import PieceCache
-from pipeline.store.schema import CONFIG_KEY, HASH_KEY, Encoding
-from pipeline.store.shard import Shard, write_shard
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
+from levelproof.levelgen.level import size_of
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.errors import LevelproofError
+from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectories
+from levelproof.pipeline.read.kinetix.zarr2 import BLOSC, FormatError
+from levelproof.pipeline.store import bounds, hub, remote
+from levelproof.pipeline.store.checkpoints import load_experts, save_experts
+from levelproof.pipeline.store.contents import check_numbers, table_for
+from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
+from levelproof.pipeline.store.layout import BEGUN, DATA, FRAGMENT, JOB, MANIFEST, entries
+from levelproof.pipeline.store.manifest import differences, fragment_paths, read_fragment, read_manifest, told
+from levelproof.pipeline.store.origins import place_of
+from levelproof.pipeline.store.pieces import PieceCache
+from levelproof.pipeline.store.schema import CONFIG_KEY, HASH_KEY, Encoding
+from levelproof.pipeline.store.shard import Shard, write_shard
 from tests.pipeline.hostile.mutations import (
     changed_bytes,
     changed_document,
@@ -281,7 +281,7 @@ def fragments(folder: Path) -> Target:
 
 
 def _hash_like(config: bytes) -> bytes:
-    from configs.schema import hash_of
+    from levelproof.configs.schema import hash_of
 
     try:
         return hash_of(json.loads(config)).encode()

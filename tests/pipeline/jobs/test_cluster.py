@@ -13,14 +13,14 @@ from urllib.request import urlopen
 import pytest
 from rich.console import Console
 
-from pipeline.errors import UserError
-from pipeline.jobs import cluster
-from pipeline.jobs.address import require_reachable
-from pipeline.jobs.likeness import program_of, unlike
-from pipeline.jobs.progress import Board, Tally
-from pipeline.jobs.schedule import COMPANY, Scheduler, WorkUnit
-from pipeline.store.layout import JOB
-from pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.jobs import cluster
+from levelproof.pipeline.jobs.address import require_reachable
+from levelproof.pipeline.jobs.likeness import program_of, unlike
+from levelproof.pipeline.jobs.progress import Board, Tally
+from levelproof.pipeline.jobs.schedule import COMPANY, Scheduler, WorkUnit
+from levelproof.pipeline.store.layout import JOB
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import PATIENCE, assert_refused, descendants, run, start, title, until
 from tests.pipeline.made import lasting, made_job
 

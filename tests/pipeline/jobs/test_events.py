@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from experts.steps import EnvSteps, Seconds
-from pipeline.jobs import events as events_file
-from pipeline.jobs.events import MOST, Events
-from pipeline.jobs.progress import Tally
-from pipeline.jobs.schedule import Order, Scheduler, Summary, UnitOutcome, WorkUnit
+from levelproof.experts.steps import EnvSteps, Seconds
+from levelproof.pipeline.jobs import events as events_file
+from levelproof.pipeline.jobs.events import MOST, Events
+from levelproof.pipeline.jobs.progress import Tally
+from levelproof.pipeline.jobs.schedule import Order, Scheduler, Summary, UnitOutcome, WorkUnit
 
 
 def test_the_latest_events_and_the_state_are_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experts.labels import Label
-from pipeline.jobs.forecast import PerWitness, Sample, forecast
-from pipeline.jobs.seal import seal_split
-from pipeline.store.merge import FILE_BYTES
-from pipeline.store.seal import ROWS
-from pipeline.store.shard import stored_bytes
+from levelproof.experts.labels import Label
+from levelproof.pipeline.jobs.forecast import PerWitness, Sample, forecast
+from levelproof.pipeline.jobs.seal import seal_split
+from levelproof.pipeline.store.merge import FILE_BYTES
+from levelproof.pipeline.store.seal import ROWS
+from levelproof.pipeline.store.shard import stored_bytes
 from tests.pipeline.made import made_split
 
 

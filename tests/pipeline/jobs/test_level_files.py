@@ -10,22 +10,22 @@ import jax
 import numpy as np
 import pytest
 
-from configs.compose import compose_job
-from configs.errors import ConfigError
-from levelgen.files.level_file import LevelFile, read_level_file, write_level_file
-from levelgen.identity.content import content_hashes, level_id_for
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import TaskParams
-from pipeline.jobs.schedule import WorkUnit, plan_units
-from pipeline.jobs.unit import failure
-from pipeline.look.inspect import survey
-from pipeline.look.rows import Asked
-from pipeline.look.status import look
-from pipeline.read.level_files import LevelUnseen, level_at, levels_below
-from pipeline.read.verify import examine
-from pipeline.store.manifest import fragment_paths, read_manifest
-from pipeline.store.origins import Origin
+from levelproof.configs.compose import compose_job
+from levelproof.configs.errors import ConfigError
+from levelproof.levelgen.files.level_file import LevelFile, read_level_file, write_level_file
+from levelproof.levelgen.identity.content import content_hashes, level_id_for
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.jobs.schedule import WorkUnit, plan_units
+from levelproof.pipeline.jobs.unit import failure
+from levelproof.pipeline.look.inspect import survey
+from levelproof.pipeline.look.rows import Asked
+from levelproof.pipeline.look.status import look
+from levelproof.pipeline.read.level_files import LevelUnseen, level_at, levels_below
+from levelproof.pipeline.read.verify import examine
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.origins import Origin
 from tests.experts.search.worlds import switchback
 from tests.pipeline.command import assert_refused, here, run
 from tests.pipeline.made import lasting
@@ -208,14 +208,14 @@ def test_what_cannot_be_is_refused(folder: Path) -> None:
 
 
 def test_two_levels_with_one_id_are_told_apart(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.read.level_files.level_id_for", lambda _: 7)
+    monkeypatch.setattr("levelproof.pipeline.read.level_files.level_id_for", lambda _: 7)
     write(tmp_path / "two", TRIVIAL, "a.json")
     write(tmp_path / "two", UNSOLVABLE, "b.json")
     listing = levels_below(tmp_path / "two", compose_job([f"level_files={tmp_path}"]))
     assert list(listing.levels["s"]) == [7]
     assert "b.json: its level has by chance the id of the one in" in listing.refused[0]
     row = rows_of(folder / "data/5k/s")["a.json"]
-    monkeypatch.setattr("pipeline.read.level_files.level_id_for", lambda _: row["level_id"])
+    monkeypatch.setattr("levelproof.pipeline.read.level_files.level_id_for", lambda _: row["level_id"])
     done = here(["generate", f"level_files={tmp_path / 'two/b.json'}", *WORDS], folder)
     assert_refused(done, 2, "have by chance one id", "out=NAME")
 

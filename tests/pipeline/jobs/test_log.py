@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.jobs.log import TensorBoardWriter, logged, scalars
+from levelproof.pipeline.jobs.log import TensorBoardWriter, logged, scalars
 from tests.pipeline.command import TINY, assert_refused, here
 from tests.pipeline.made import made_job
 

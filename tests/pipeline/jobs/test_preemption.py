@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from configs.compose import compose_job
-from pipeline.store.paused import load_paused
+from levelproof.configs.compose import compose_job
+from levelproof.pipeline.store.paused import load_paused
 from tests.pipeline.command import heed_ctrl_c, here, run, start, until
 from tests.pipeline.made import lasting
 

@@ -5,10 +5,10 @@ import io
 import pytest
 from rich.console import Console
 
-from experts.steps import EnvSteps
-from pipeline.jobs.progress import Board, Tally
-from pipeline.jobs.schedule import Summary, WorkUnit
-from pipeline.words import duration, number
+from levelproof.experts.steps import EnvSteps
+from levelproof.pipeline.jobs.progress import Board, Tally
+from levelproof.pipeline.jobs.schedule import Summary, WorkUnit
+from levelproof.pipeline.words import duration, number
 
 UNIT = WorkUnit(tuple(range(16)))
 
@@ -94,7 +94,7 @@ def test_lines_where_there_is_no_terminal() -> None:
 def test_commits_are_told_when_the_last_line_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
     text = io.StringIO()
     board = Board(tally(), Console(file=text))
-    monkeypatch.setattr("pipeline.jobs.progress.LINE_AFTER", 0.0)
+    monkeypatch.setattr("levelproof.pipeline.jobs.progress.LINE_AFTER", 0.0)
     board.refresh()
     board.ended(UNIT, Summary(16, 5, EnvSteps(trained=16_000)))
     assert "16/64 levels · 5 solved" in text.getvalue().splitlines()[1]

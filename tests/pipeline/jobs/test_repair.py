@@ -11,14 +11,20 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pipeline.jobs import repair as repairing
-from pipeline.jobs.seal import seal_split
-from pipeline.read.verify import examine
-from pipeline.store import mend
-from pipeline.store.fields import same_bits
-from pipeline.store.layout import JOB, WRITER_LOCK, new_attempt
-from pipeline.store.manifest import begin_fragment, fragment_paths, read_fragment, read_manifest, write_fragment
-from pipeline.store.shard import Shard
+from levelproof.pipeline.jobs import repair as repairing
+from levelproof.pipeline.jobs.seal import seal_split
+from levelproof.pipeline.read.verify import examine
+from levelproof.pipeline.store import mend
+from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.layout import JOB, WRITER_LOCK, new_attempt
+from levelproof.pipeline.store.manifest import (
+    begin_fragment,
+    fragment_paths,
+    read_fragment,
+    read_manifest,
+    write_fragment,
+)
+from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.command import assert_refused, here, run
 from tests.pipeline.made import lasting
 from tests.pipeline.read.test_damage import files_of, flip

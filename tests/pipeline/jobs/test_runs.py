@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.store.events import events_of, runs_in
-from pipeline.store.fields import same_bits
-from pipeline.store.manifest import fragment_paths, read_manifest
-from pipeline.store.shard import Shard
+from levelproof.pipeline.store.events import events_of, runs_in
+from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, listening, run, start, status, title, until
 from tests.pipeline.jobs.test_log import tensorboard_file
 from tests.pipeline.made import lasting
@@ -139,7 +139,8 @@ def test_kill_9_of_a_worker_then_stopped_and_again(undisturbed: Path, tmp_path: 
 def test_the_command_itself_does_not_start_jax(tmp_path: Path) -> None:
     """On a GPU it would take the memory that the worker needs; and threads and cache are set before JAX starts."""
     program = (
-        "from configs.compose import compose_job; compose_job([]); import pipeline.jobs.generate, pipeline.jobs.cluster"
+        "from levelproof.configs.compose import compose_job; compose_job([]); "
+        "from levelproof.pipeline.jobs import cluster, generate"
     )
     environment = os.environ | {"JAX_PLATFORMS": "no_such_platform", "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)

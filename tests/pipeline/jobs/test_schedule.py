@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.jobs.schedule import (
+from levelproof.pipeline.jobs.schedule import (
     COMPANY,
     Cut,
     Round,

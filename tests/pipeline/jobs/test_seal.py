@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from experts.labels import Label
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.seal import Sealer, sealing
-from pipeline.store import seal as store
-from pipeline.store.manifest import read_manifest
+from levelproof.experts.labels import Label
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.seal import Sealer, sealing
+from levelproof.pipeline.store import seal as store
+from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import commit_copy, made_split
 
 Make = Callable[[Sealer, WorkUnit, Collection[WorkUnit]], None]

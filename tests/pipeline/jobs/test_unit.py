@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from configs.schema import JobConfig
-from experts.labels import Label
-from experts.train import UnitResult
-from experts.witness import Record, replay
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from pipeline.errors import Failure
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import check_witnesses, commit
-from pipeline.store.fields import arrays_of, same_bits, tree_of
-from pipeline.store.manifest import read_manifest
-from pipeline.store.shard import Shard
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.labels import Label
+from levelproof.experts.train import UnitResult
+from levelproof.experts.witness import Record, replay
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import check_witnesses, commit
+from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.made import made_job, made_result
 
 UNIT = WorkUnit((0, 1, 2, 3))

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from configs.schema import JobConfig
-from experts import pool as pool_module
-from experts.config import ScoutConfig
-from experts.labels import WITNESSED
-from experts.search.config import SearchConfig
-from pipeline.jobs import worker as worker_module
-from pipeline.jobs.schedule import Order, Round, UnitOutcome, WorkUnit
-from pipeline.jobs.worker import Worker
-from pipeline.store.fields import same_bits
-from pipeline.store.manifest import read_manifest
-from pipeline.store.paused import load_paused, prune_paused
-from pipeline.store.shard import Shard
+from levelproof.configs.schema import JobConfig
+from levelproof.experts import pool as pool_module
+from levelproof.experts.config import ScoutConfig
+from levelproof.experts.labels import WITNESSED
+from levelproof.experts.search.config import SearchConfig
+from levelproof.pipeline.jobs import worker as worker_module
+from levelproof.pipeline.jobs.schedule import Order, Round, UnitOutcome, WorkUnit
+from levelproof.pipeline.jobs.worker import Worker
+from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.paused import load_paused, prune_paused
+from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.made import lasting, made_job
 
 UNITS = [WorkUnit((0, 1, 2)), WorkUnit((3,)), WorkUnit((4, 5))]

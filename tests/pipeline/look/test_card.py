@@ -11,13 +11,13 @@ import pytest
 import yaml
 from PIL import Image
 
-from experts.labels import Label
-from pipeline.cli.main import main
-from pipeline.look import card as cards
-from pipeline.look.figures import Share
-from pipeline.look.preview import PICTURES, PIXELS, SHOWN
-from pipeline.look.readme import SplitFacts, Wishes, readme
-from pipeline.store.manifest import read_manifest
+from levelproof.experts.labels import Label
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.look import card as cards
+from levelproof.pipeline.look.figures import Share
+from levelproof.pipeline.look.preview import PICTURES, PIXELS, SHOWN
+from levelproof.pipeline.look.readme import SplitFacts, Wishes, readme
+from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import made_split, played_split
 
 pytestmark = pytest.mark.slow

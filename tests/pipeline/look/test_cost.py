@@ -3,9 +3,9 @@
 import pyarrow as pa
 import pytest
 
-from experts.steps import Seconds
-from pipeline.look.cost import cost_of, cost_told
-from pipeline.store.columns import COLUMNS
+from levelproof.experts.steps import Seconds
+from levelproof.pipeline.look.cost import cost_of, cost_told
+from levelproof.pipeline.store.columns import COLUMNS
 
 
 def table(labels: list[str], seconds: list[Seconds | None], device: str = "cpu: of some kind") -> pa.Table:

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from scipy.stats import binomtest
 
-from experts.labels import Label
-from experts.ledger import Ledger
-from pipeline.errors import UserError
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
-from pipeline.look.diff import compare, diff, exact_p
-from pipeline.store.layout import split_path
+from levelproof.experts.labels import Label
+from levelproof.experts.ledger import Ledger
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.look.diff import compare, diff, exact_p
+from levelproof.pipeline.store.layout import split_path
 from tests.pipeline.made import made_job, made_result, made_split
 
 S, U, T = Label.SOLVED, Label.UNSOLVED, Label.TRIVIAL

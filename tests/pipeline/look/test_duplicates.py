@@ -9,20 +9,20 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from experts.labels import Label
-from levelgen.files.level_file import LevelFile, read_level_file, write_level_file
-from levelgen.identity.content import content_hashes
-from levelgen.identity.signature import signatures
-from levelgen.level import Level
-from levelgen.task.rules import TaskParams
-from pipeline.errors import UserError
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
-from pipeline.look.duplicates import _numbers, between, compared_in, told, within
-from pipeline.look.inspect import survey
-from pipeline.look.rows import Asked
-from pipeline.store.layout import split_path
-from pipeline.store.manifest import require_manifest
+from levelproof.experts.labels import Label
+from levelproof.levelgen.files.level_file import LevelFile, read_level_file, write_level_file
+from levelproof.levelgen.identity.content import content_hashes
+from levelproof.levelgen.identity.signature import signatures
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.look.duplicates import _numbers, between, compared_in, told, within
+from levelproof.pipeline.look.inspect import survey
+from levelproof.pipeline.look.rows import Asked
+from levelproof.pipeline.store.layout import split_path
+from levelproof.pipeline.store.manifest import require_manifest
 from tests.levelgen.opened import handmade_levels
 from tests.levelgen.variants import edited, more_room, one, renamed, renumbered, turned
 from tests.pipeline.command import assert_refused, here

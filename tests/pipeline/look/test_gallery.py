@@ -9,18 +9,18 @@ import jax
 import numpy as np
 import pytest
 
-from experts.witness import steps_to_goal
-from pipeline.cli.gallery import MOST
-from pipeline.errors import Failure, UserError
-from pipeline.look.gallery import gallery as module
-from pipeline.look.gallery.columns import FLAGS, NOTHING, NUMBERS
-from pipeline.look.gallery.gallery import BLOCK, gallery
-from pipeline.look.gallery.worlds import ANGLE, LENGTH, angles
-from pipeline.look.reasons import kind_of_reason
-from pipeline.look.things import things_of
-from pipeline.read.levels import levels_of
-from pipeline.read.rows import read_row
-from pipeline.store.manifest import Manifest, require_manifest
+from levelproof.experts.witness import steps_to_goal
+from levelproof.pipeline.cli.gallery import MOST
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.look.gallery import gallery as module
+from levelproof.pipeline.look.gallery.columns import FLAGS, NOTHING, NUMBERS
+from levelproof.pipeline.look.gallery.gallery import BLOCK, gallery
+from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH, angles
+from levelproof.pipeline.look.reasons import kind_of_reason
+from levelproof.pipeline.look.things import things_of
+from levelproof.pipeline.read.levels import levels_of
+from levelproof.pipeline.read.rows import read_row
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from tests.pipeline.made import PLAYED
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from benchmarks.browser import browser
-from experts.witness import steps_to_goal
-from pipeline.errors import Failure
-from pipeline.look.gallery.gallery import gallery
-from pipeline.look.gallery.worlds import ANGLE, LENGTH
-from pipeline.read.rows import read_row
-from pipeline.store.manifest import require_manifest
+from levelproof.experts.witness import steps_to_goal
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.look.gallery.gallery import gallery
+from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH
+from levelproof.pipeline.read.rows import read_row
+from levelproof.pipeline.store.manifest import require_manifest
 from tests.pipeline.command import ROOT
 from tests.pipeline.made import PLAYED
 

@@ -14,27 +14,27 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from experts.labels import Label, unsolved_reason
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from pipeline.errors import Failure, UserError
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
-from pipeline.look import rows as rows_module
-from pipeline.look import shares
-from pipeline.look.facts import print_facts
-from pipeline.look.inspect import inspect, survey
-from pipeline.look.plot import plot
-from pipeline.look.reasons import kind_of_reason
-from pipeline.look.rows import SHOWN, Asked, write_csv
-from pipeline.look.shares import solved_by_things
-from pipeline.look.things import things_of
-from pipeline.read import levels as levels_module
-from pipeline.read.select import columns_in
-from pipeline.store import manifest
-from pipeline.store.columns import COLUMNS
-from pipeline.store.layout import split_path
-from pipeline.store.manifest import Fragment, read_fragment, read_manifest
+from levelproof.experts.labels import Label, unsolved_reason
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.look import rows as rows_module
+from levelproof.pipeline.look import shares
+from levelproof.pipeline.look.facts import print_facts
+from levelproof.pipeline.look.inspect import inspect, survey
+from levelproof.pipeline.look.plot import plot
+from levelproof.pipeline.look.reasons import kind_of_reason
+from levelproof.pipeline.look.rows import SHOWN, Asked, write_csv
+from levelproof.pipeline.look.shares import solved_by_things
+from levelproof.pipeline.look.things import things_of
+from levelproof.pipeline.read import levels as levels_module
+from levelproof.pipeline.read.select import columns_in
+from levelproof.pipeline.store import manifest
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.layout import split_path
+from levelproof.pipeline.store.manifest import Fragment, read_fragment, read_manifest
 from tests.pipeline.made import made_job, made_result, made_split, made_verdict
 
 LABELS = [Label.SOLVED, Label.TRIVIAL, Label.UNSOLVED, Label.UNSOLVABLE]

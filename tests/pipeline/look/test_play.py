@@ -14,15 +14,15 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from experts.config import RECORD_STEPS, ScoutConfig, StopConfig
-from experts.witness import replay, succeeds
-from levelgen.files.level_file import from_document, write_level_file
-from pipeline.errors import UserError
-from pipeline.look.play import training
-from pipeline.look.play.open import level_to_play
-from pipeline.look.play.server import HOST, serving
-from pipeline.look.play.session import empty_file
-from pipeline.store.manifest import require_manifest
+from levelproof.experts.config import RECORD_STEPS, ScoutConfig, StopConfig
+from levelproof.experts.witness import replay, succeeds
+from levelproof.levelgen.files.level_file import from_document, write_level_file
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.play import training
+from levelproof.pipeline.look.play.open import level_to_play
+from levelproof.pipeline.look.play.server import HOST, serving
+from levelproof.pipeline.look.play.session import empty_file
+from levelproof.pipeline.store.manifest import require_manifest
 from tests.experts.small import untouched
 from tests.pipeline.command import assert_refused, here
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from levelgen.files.level_file import from_document
-from pipeline.look.play.server import HOST, serving
-from pipeline.look.play.session import empty_file
+from levelproof.levelgen.files.level_file import from_document
+from levelproof.pipeline.look.play.server import HOST, serving
+from levelproof.pipeline.look.play.session import empty_file
 from tests.pipeline.look.test_gallery_browser import UNNAMED, chromium
 from tests.pipeline.look.test_play import QUICK
 

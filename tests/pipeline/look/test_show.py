@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experts.config import RECORD_STEPS
-from experts.witness import succeeds
-from levelgen.files.level_file import LevelFile, write_level_file
-from levelgen.level import SIZES
-from levelgen.pictures.raster import draw, rasterised
-from levelgen.proofs import examine
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import TaskParams, advance, reset
-from pipeline.errors import Failure, UserError
-from pipeline.look import show as show_module
-from pipeline.look.show import do_nothing, film_of, show, witness_film
-from pipeline.read.levels import find_level
-from pipeline.store.manifest import require_manifest
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness import succeeds
+from levelproof.levelgen.files.level_file import LevelFile, write_level_file
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.pictures.raster import draw, rasterised
+from levelproof.levelgen.proofs import examine
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import TaskParams, advance, reset
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.look import show as show_module
+from levelproof.pipeline.look.show import do_nothing, film_of, show, witness_film
+from levelproof.pipeline.read.levels import find_level
+from levelproof.pipeline.store.manifest import require_manifest
 from tests.pipeline.made import PLAYED, made_job
 
 pytestmark = pytest.mark.slow

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from experts.labels import Label
-from pipeline.look.status import look
-from pipeline.store.layout import JOB
+from levelproof.experts.labels import Label
+from levelproof.pipeline.look.status import look
+from levelproof.pipeline.store.layout import JOB
 from tests.pipeline.made import made_split
 
 

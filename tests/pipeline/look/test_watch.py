@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from experts.labels import Label
-from pipeline.look.watch import now, shown, watch
-from pipeline.store.events import new_run, tell
-from pipeline.store.locks import only_writer
+from levelproof.experts.labels import Label
+from levelproof.pipeline.look.watch import now, shown, watch
+from levelproof.pipeline.store.events import new_run, tell
+from levelproof.pipeline.store.locks import only_writer
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
 

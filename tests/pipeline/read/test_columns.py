@@ -4,12 +4,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from levelgen.level import SIZES, Level, size_of
-from levelgen.sampling.scenery import empty_level
-from pipeline.errors import UserError
-from pipeline.read.columns import column_fields, columns_for, levels_from
-from pipeline.store.columns import COLUMNS
-from pipeline.store.fields import arrays_of, same_bits
+from levelproof.levelgen.level import SIZES, Level, size_of
+from levelproof.levelgen.sampling.scenery import empty_level
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.columns import column_fields, columns_for, levels_from
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.fields import arrays_of, same_bits
 from tests.pipeline.made import made_level
 
 EMPTY = "8-8-0-0"  # no joints, no thrusters

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from configs.schema import Density
-from pipeline.jobs.seal import seal_split
-from pipeline.read.findings import Findings
-from pipeline.read.verify import examine
-from pipeline.store.layout import JOB
-from pipeline.store.manifest import fragment_paths, read_fragment
+from levelproof.configs.schema import Density
+from levelproof.pipeline.jobs.seal import seal_split
+from levelproof.pipeline.read.findings import Findings
+from levelproof.pipeline.read.verify import examine
+from levelproof.pipeline.store.layout import JOB
+from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
 from tests.pipeline.made import honest_split
 
 pytestmark = pytest.mark.slow
@@ -224,7 +224,7 @@ def test_what_is_exchanged(kind: str, copied: Callable[[Path], Path], request: p
 
 
 def _hits(levels: set[int]) -> str:
-    from pipeline.read.findings import _levels
+    from levelproof.pipeline.read.findings import _levels
 
     return _levels(levels)
 

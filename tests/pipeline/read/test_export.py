@@ -10,18 +10,18 @@ import jax
 import numpy as np
 import pytest
 
-from experts.witness import Record, replay, succeeds
-from levelgen.files.level_file import MOST_BYTES, LevelFile, read_level_file, write_level_file
-from levelgen.level import SIZES, Level
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import TaskParams
-from pipeline.cli.main import main
-from pipeline.errors import UserError
-from pipeline.read.export import export
-from pipeline.store.fields import tree_of
-from pipeline.store.layout import SHARDS
-from pipeline.store.manifest import require_manifest
-from pipeline.store.shard import Shard
+from levelproof.experts.witness import Record, replay, succeeds
+from levelproof.levelgen.files.level_file import MOST_BYTES, LevelFile, read_level_file, write_level_file
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.export import export
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.layout import SHARDS
+from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.shard import Shard
 from tests.levelgen.opened import open_in_reference
 from tests.pipeline.made import PLAYED, made_job, played_split
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from experts.labels import Label
-from pipeline.errors import Failure, UserError
-from pipeline.read.levels import COLUMNS, distribution_of, find_level, rules_of
-from pipeline.store import manifest
-from pipeline.store.manifest import Manifest, read_fragment, read_manifest
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.read.levels import COLUMNS, distribution_of, find_level, rules_of
+from levelproof.pipeline.store import manifest
+from levelproof.pipeline.store.manifest import Manifest, read_fragment, read_manifest
 from tests.pipeline.made import made_split
 
 

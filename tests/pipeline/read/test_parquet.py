@@ -9,12 +9,12 @@ import pyarrow.parquet as pq
 import pytest
 
 import levelproof
-from pipeline.cli.main import main
-from pipeline.read import parquet
-from pipeline.store.columns import COLUMNS
-from pipeline.store.layout import MANIFEST
-from pipeline.store.manifest import read_manifest
-from pipeline.store.schema import CONFIG_KEY
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.read import parquet
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.layout import MANIFEST
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.schema import CONFIG_KEY
 from tests.pipeline.made import PLAYED, made_job, played_split
 
 pytestmark = pytest.mark.slow

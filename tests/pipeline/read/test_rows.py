@@ -8,12 +8,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from experts.labels import Label
-from pipeline.errors import Failure
-from pipeline.read.rows import read_rows
-from pipeline.store.fields import same_bits
-from pipeline.store.manifest import read_manifest
-from pipeline.store.shard import Shard
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.made import made_split
 
 UNITS = [[Label.SOLVED] * 2, [Label.UNSOLVED, Label.SOLVED, Label.SOLVED], [Label.SOLVED] * 4]

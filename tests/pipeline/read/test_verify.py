@@ -13,19 +13,19 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from experts.labels import WITNESSED, Label
-from experts.witness import replay
-from levelgen.identity.keys import MAX_LEVEL_ID
-from pipeline.errors import StoreFailure
-from pipeline.read import evidence
-from pipeline.read.verify import examine
-from pipeline.store import remote
-from pipeline.store.checksums import digests_of, with_own
-from pipeline.store.job_note import note_job
-from pipeline.store.layout import MANIFEST, unit_name
-from pipeline.store.manifest import fragment_paths, read_manifest, write_index
-from pipeline.store.schema import DIGESTS_KEY
-from pipeline.store.shard import Shard, write_shard
+from levelproof.experts.labels import WITNESSED, Label
+from levelproof.experts.witness import replay
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
+from levelproof.pipeline.errors import StoreFailure
+from levelproof.pipeline.read import evidence
+from levelproof.pipeline.read.verify import examine
+from levelproof.pipeline.store import remote
+from levelproof.pipeline.store.checksums import digests_of, with_own
+from levelproof.pipeline.store.job_note import note_job
+from levelproof.pipeline.store.layout import MANIFEST, unit_name
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, write_index
+from levelproof.pipeline.store.schema import DIGESTS_KEY
+from levelproof.pipeline.store.shard import Shard, write_shard
 from tests.pipeline.made import honest_split, made_job
 from tests.pipeline.servers import files_of, serving
 
@@ -231,7 +231,7 @@ def test_of_a_damaged_fragment_no_more_levels_are_lost_than_one_has(
     split: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever its name and the note say."""
-    monkeypatch.setattr("pipeline.read.verify.MOST_ROWS", 100)
+    monkeypatch.setattr("levelproof.pipeline.read.verify.MOST_ROWS", 100)
     (split / MANIFEST / f"{unit_name(0, MAX_LEVEL_ID)}.parquet").write_bytes(b"PAR1")
     assert len(examine(split).lost) <= 102
     note_job(split, made_job(), ["levelproof", "generate"], [(0, MAX_LEVEL_ID)])

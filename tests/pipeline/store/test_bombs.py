@@ -8,11 +8,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from experts.labels import Label
-from pipeline.errors import Failure
-from pipeline.store.checkpoints import load_experts
-from pipeline.store.manifest import fragment_paths, read_fragment
-from pipeline.store.shard import Shard
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.checkpoints import load_experts
+from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
+from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.made import made_job, made_split
 
 MOST = 2**27  # bytes

@@ -15,11 +15,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from experts.labels import Label
-from pipeline.errors import Failure
-from pipeline.store.columns import COLUMNS, OWN
-from pipeline.store.manifest import fragment_paths, read_fragment, read_manifest
-from pipeline.store.thrift import footer_in, pages_in
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.columns import COLUMNS, OWN
+from levelproof.pipeline.store.manifest import fragment_paths, read_fragment, read_manifest
+from levelproof.pipeline.store.thrift import footer_in, pages_in
 from tests.pipeline.command import ROOT
 from tests.pipeline.made import made_split
 
@@ -27,8 +27,8 @@ MOST = 100 * 2**20  # bytes that reading all of them may take besides those of r
 PEAK = """
 import json, resource, sys
 from pathlib import Path
-from pipeline.errors import Failure
-from pipeline.store.manifest import read_fragment
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.manifest import read_fragment
 peak = lambda: 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 good, *others = map(Path, sys.argv[1:])
 read_fragment(good)

@@ -8,16 +8,16 @@ import jax
 import numpy as np
 import pytest
 
-from configs.schema import JobConfig
-from experts.judge import Kept
-from experts.labels import Label, Source
-from experts.slots import begin
-from experts.success import no_success
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from pipeline.store import checkpoints, manifest
-from pipeline.store.checkpoints import SourceUnseen, experts_for, load_experts, save_experts
-from pipeline.store.manifest import read_fragment
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.judge import Kept
+from levelproof.experts.labels import Label, Source
+from levelproof.experts.slots import begin
+from levelproof.experts.success import no_success
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.store import checkpoints, manifest
+from levelproof.pipeline.store.checkpoints import SourceUnseen, experts_for, load_experts, save_experts
+from levelproof.pipeline.store.manifest import read_fragment
 from tests.pipeline.made import made_job, made_split
 
 UNITS = 3

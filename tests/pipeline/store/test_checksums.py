@@ -8,10 +8,10 @@ import duckdb
 import pyarrow.parquet as pq
 import pytest
 
-from experts.labels import Label
-from pipeline.store.checksums import digests_of, has_own
-from pipeline.store.layout import data_path
-from pipeline.store.manifest import fragment_paths, read_fragment
+from levelproof.experts.labels import Label
+from levelproof.pipeline.store.checksums import digests_of, has_own
+from levelproof.pipeline.store.layout import data_path
+from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
 from tests.pipeline.made import made_split
 
 

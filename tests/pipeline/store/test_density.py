@@ -16,34 +16,34 @@ import pytest
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from configs.compose import compose_job
-from configs.errors import ConfigError
-from configs.schema import KEYS_EVERY
-from experts import resume
-from experts.resume import checksum, timesteps
-from experts.steps import EnvSteps
-from experts.train import UnitResult
-from experts.witness import Record, replay
-from levelgen.level import SIZES, Level
-from levelgen.sampling.distribution import Distribution
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.rules import DEFAULT_RULES, TaskParams
-from pipeline.cli.main import main
-from pipeline.errors import Failure, UserError
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
-from pipeline.read.rows import read_rows
-from pipeline.store import convert, density, seal
-from pipeline.store.contents import blank_row, table_for
-from pipeline.store.density import CHECKSUM, key_rows, task_states
-from pipeline.store.fields import arrays_of, same_bits, tree_of
-from pipeline.store.layout import split_path
-from pipeline.store.manifest import fragment_paths, read_manifest
-from pipeline.store.merge import Place
-from pipeline.store.packing import pack, unpack
-from pipeline.store.schema import Encoding, field_table
-from pipeline.store.shard import EngineDiffers, Shard, read_together, stored_bytes, write_shard
-from pipeline.store.split import writing
+from levelproof.configs.compose import compose_job
+from levelproof.configs.errors import ConfigError
+from levelproof.configs.schema import KEYS_EVERY
+from levelproof.experts import resume
+from levelproof.experts.resume import checksum, timesteps
+from levelproof.experts.steps import EnvSteps
+from levelproof.experts.train import UnitResult
+from levelproof.experts.witness import Record, replay
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.store import convert, density, seal
+from levelproof.pipeline.store.contents import blank_row, table_for
+from levelproof.pipeline.store.density import CHECKSUM, key_rows, task_states
+from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
+from levelproof.pipeline.store.layout import split_path
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.merge import Place
+from levelproof.pipeline.store.packing import pack, unpack
+from levelproof.pipeline.store.schema import Encoding, field_table
+from levelproof.pipeline.store.shard import EngineDiffers, Shard, read_together, stored_bytes, write_shard
+from levelproof.pipeline.store.split import writing
 from tests.pipeline.made import made_fields, made_job, made_verdict
 
 IDS = [5, 9, 12, 13]

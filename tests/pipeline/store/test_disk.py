@@ -10,18 +10,18 @@ import jax
 import numpy as np
 import pytest
 
-from experts.judge import Kept
-from experts.slots import begin as begin_experts
-from experts.success import no_success
-from levelgen.level import SIZES
-from levelgen.sampling.sampler import sample_levels
-from pipeline.errors import Failure
-from pipeline.store.checkpoints import save_experts
-from pipeline.store.disk import told_of
-from pipeline.store.fields import arrays_of
-from pipeline.store.layout import new_attempt, unit_name
-from pipeline.store.manifest import begin_fragment, write_fragment
-from pipeline.store.shard import write_shard
+from levelproof.experts.judge import Kept
+from levelproof.experts.slots import begin as begin_experts
+from levelproof.experts.success import no_success
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.checkpoints import save_experts
+from levelproof.pipeline.store.disk import told_of
+from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.layout import new_attempt, unit_name
+from levelproof.pipeline.store.manifest import begin_fragment, write_fragment
+from levelproof.pipeline.store.shard import write_shard
 from tests.pipeline.made import made_job, made_level, made_record
 
 

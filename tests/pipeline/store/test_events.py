@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import UserError
-from pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
-from pipeline.store.layout import EVENTS
-from pipeline.store.split import locked
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
+from levelproof.pipeline.store.layout import EVENTS
+from levelproof.pipeline.store.split import locked
 
 
 def test_a_run_s_file_is_replaced_and_old_runs_make_room(tmp_path: Path) -> None:

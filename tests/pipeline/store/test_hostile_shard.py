@@ -13,14 +13,14 @@ import pytest
 import zarr
 from zarr.codecs import GzipCodec
 
-from experts.config import RECORD_STEPS
-from experts.labels import Label
-from pipeline.cli.main import main
-from pipeline.errors import Failure
-from pipeline.store.contents import table_for
-from pipeline.store.layout import data_path
-from pipeline.store.manifest import fragment_paths, read_manifest
-from pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import Label
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.contents import table_for
+from levelproof.pipeline.store.layout import data_path
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
 from tests.pipeline.made import made_fields, made_split
 
 LEVELS = [5, 9, 12]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.store.job_note import NoteError, note_density, note_job, read_note
-from pipeline.store.layout import JOB
+from levelproof.pipeline.store.job_note import NoteError, note_density, note_job, read_note
+from levelproof.pipeline.store.layout import JOB
 from tests.pipeline.made import made_job
 
 COMMAND = ["levelproof", "regenerate", "where=label = 'solved'"]

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from experts.labels import Label
-from pipeline.errors import Failure
-from pipeline.jobs import unit
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
-from pipeline.store.layout import attempt_of, unit_name
-from pipeline.store.leftovers import clean
-from pipeline.store.locks import committing
-from pipeline.store.manifest import fragment_paths
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.jobs import unit
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.store.layout import attempt_of, unit_name
+from levelproof.pipeline.store.leftovers import clean
+from levelproof.pipeline.store.locks import committing
+from levelproof.pipeline.store.manifest import fragment_paths
 from tests.pipeline.made import made_job, made_result
 
 

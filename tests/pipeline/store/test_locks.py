@@ -14,14 +14,14 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import Exit, UserError
-from pipeline.jobs.schedule import Order, UnitOutcome, WorkUnit
-from pipeline.jobs.worker import Worker
-from pipeline.store import leases, locks
-from pipeline.store.layout import COMMIT_LOCK
-from pipeline.store.leases import LeaseLost
-from pipeline.store.locks import LockRefused, committing, is_written, nobody_commits, only_writer
-from pipeline.store.split import writing
+from levelproof.pipeline.errors import Exit, UserError
+from levelproof.pipeline.jobs.schedule import Order, UnitOutcome, WorkUnit
+from levelproof.pipeline.jobs.worker import Worker
+from levelproof.pipeline.store import leases, locks
+from levelproof.pipeline.store.layout import COMMIT_LOCK
+from levelproof.pipeline.store.leases import LeaseLost
+from levelproof.pipeline.store.locks import LockRefused, committing, is_written, nobody_commits, only_writer
+from levelproof.pipeline.store.split import writing
 from tests.pipeline.command import ROOT, heed_ctrl_c, start
 from tests.pipeline.made import made_job
 
@@ -57,7 +57,7 @@ def test_a_worker_of_an_earlier_command_commits_nothing_beside_the_next(
 HOLDER = """
 import fcntl, pathlib, sys
 fcntl.flock = fcntl.lockf
-from pipeline.store import locks
+from levelproof.pipeline.store import locks
 with getattr(locks, sys.argv[1])(*[pathlib.Path(sys.argv[2]), print][: 1 + (sys.argv[1] == "only_writer")]):
     print("held", flush=True)
     sys.stdin.read()
@@ -121,7 +121,7 @@ def test_a_worker_whose_file_system_has_no_locks_stops_the_run(tmp_path: Path, m
     def refuse(*_: Any) -> None:
         raise LockRefused("no locks here")
 
-    monkeypatch.setattr("pipeline.jobs.worker.begin_unit", refuse)
+    monkeypatch.setattr("levelproof.pipeline.jobs.worker.begin_unit", refuse)
     unit = WorkUnit((0,))
     (ended,) = Worker(made_job(), tmp_path).work(Order([unit]), 1.0).outcomes
     assert ended == UnitOutcome(unit, reason=ended.reason, fatal="no locks here")

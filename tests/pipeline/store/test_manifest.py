@@ -10,15 +10,15 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from configs.schema import JobConfig
-from experts.labels import Label
-from pipeline.errors import Failure, UserError
-from pipeline.jobs.unit import manifest_row
-from pipeline.store import manifest as manifest_file
-from pipeline.store import shown
-from pipeline.store.columns import COLUMNS
-from pipeline.store.layout import new_attempt, unit_name
-from pipeline.store.manifest import (
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.jobs.unit import manifest_row
+from levelproof.pipeline.store import manifest as manifest_file
+from levelproof.pipeline.store import shown
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.layout import new_attempt, unit_name
+from levelproof.pipeline.store.manifest import (
     begin_fragment,
     differences,
     fragment_paths,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import zarr
 
-from pipeline.errors import Failure
-from pipeline.store.fields import same_bits
-from pipeline.store.merge import Place, merge_shards
-from pipeline.store.shard import Shard, write_shard
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.merge import Place, merge_shards
+from levelproof.pipeline.store.shard import Shard, write_shard
 from tests.pipeline.made import made_fields
 
 

@@ -7,16 +7,16 @@ import jax
 import numpy as np
 import pytest
 
-from experts.config import RECORD_STEPS
-from experts.found import nothing_found
-from experts.judge import Evaluation, Kept
-from experts.labels import Source
-from experts.paused import Paused
-from experts.slots import Pending
-from pipeline.store import paused as store
-from pipeline.store.checkpoints import begun_like
-from pipeline.store.layout import checkpoint_path, unit_name
-from pipeline.store.paused import drop_paused, load_paused, prune_paused, save_paused
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.found import nothing_found
+from levelproof.experts.judge import Evaluation, Kept
+from levelproof.experts.labels import Source
+from levelproof.experts.paused import Paused
+from levelproof.experts.slots import Pending
+from levelproof.pipeline.store import paused as store
+from levelproof.pipeline.store.checkpoints import begun_like
+from levelproof.pipeline.store.layout import checkpoint_path, unit_name
+from levelproof.pipeline.store.paused import drop_paused, load_paused, prune_paused, save_paused
 from tests.pipeline.made import made_job
 
 JOB = made_job("data", "budget=5k")

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import Failure
-from pipeline.store.pieces import CHECKSUM, PARTS, PieceCache
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.pieces import CHECKSUM, PARTS, PieceCache
 
 LONGEST = 40  # bytes of a piece
 

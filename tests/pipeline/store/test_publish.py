@@ -16,17 +16,17 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import Failure, StoreFailure, UserError
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.store import leases, remote
-from pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
-from pipeline.store.layout import FRAGMENT, data_paths, new_attempt, unit_name
-from pipeline.store.leases import Lease, LeaseLost
-from pipeline.store.leftovers import clean
-from pipeline.store.locks import is_written
-from pipeline.store.manifest import fragment_paths, read_manifest
-from pipeline.store.objects import get, put, remove, require_conditions
-from pipeline.store.publish import ended
+from levelproof.pipeline.errors import Failure, StoreFailure, UserError
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.store import leases, remote
+from levelproof.pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
+from levelproof.pipeline.store.layout import FRAGMENT, data_paths, new_attempt, unit_name
+from levelproof.pipeline.store.leases import Lease, LeaseLost
+from levelproof.pipeline.store.leftovers import clean
+from levelproof.pipeline.store.locks import is_written
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.objects import get, put, remove, require_conditions
+from levelproof.pipeline.store.publish import ended
 from tests.pipeline.command import ROOT, TINY, run
 from tests.pipeline.command import here as command
 from tests.pipeline.driver import LEVELS, SPLIT, UNIT, commit_made, drive, require_same_content

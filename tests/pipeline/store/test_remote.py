@@ -22,16 +22,16 @@ from hypothesis import strategies as st
 from obstore.store import MemoryStore, S3Store
 
 import levelproof
-from experts.labels import Label
-from pipeline.errors import Failure, LevelproofError, StoreFailure, UserError
-from pipeline.read.rows import read_rows
-from pipeline.store import events, hub, job_note, leases, remote
-from pipeline.store.events import events_of
-from pipeline.store.fields import same_bits
-from pipeline.store.job_note import NoteError, note_job, read_note
-from pipeline.store.layout import WRITER_LOCK
-from pipeline.store.leases import is_leased
-from pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import Failure, LevelproofError, StoreFailure, UserError
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.store import events, hub, job_note, leases, remote
+from levelproof.pipeline.store.events import events_of
+from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
+from levelproof.pipeline.store.layout import WRITER_LOCK
+from levelproof.pipeline.store.leases import is_leased
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
 from tests.pipeline.command import ROOT, assert_refused
 from tests.pipeline.command import here as command
 from tests.pipeline.made import made_job, made_split, played_split
@@ -333,7 +333,7 @@ def test_a_server_that_lies_about_sizes_is_one_sentence() -> None:
 def test_processes_share_a_cache_and_may_be_killed(bucket: Bucket, split: Path) -> None:
     code = (
         "import sys, hashlib\nfrom pathlib import Path\nfrom pipeline.read.rows import read_rows\n"
-        "from pipeline.store.manifest import read_manifest\nsplit = Path(sys.argv[1])\n"
+        "from levelproof.pipeline.store.manifest import read_manifest\nsplit = Path(sys.argv[1])\n"
         "table = read_manifest(split).table\nprint('at work', flush=True)\n"
         "found = read_rows(split, table.filter(table['shard'].is_valid()))\n"
         "print(hashlib.sha256(b''.join(found[name].tobytes() for name in sorted(found))).hexdigest())"

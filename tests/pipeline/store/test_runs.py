@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.store.runs import inside, runs, told_levels, without
+from levelproof.pipeline.store.runs import inside, runs, told_levels, without
 
 
 def test_runs_of_numbers() -> None:

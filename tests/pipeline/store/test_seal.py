@@ -17,18 +17,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from experts.labels import Label
-from pipeline.errors import Failure
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
-from pipeline.read.rows import read_row
-from pipeline.store import manifest
-from pipeline.store import seal as sealing
-from pipeline.store.layout import fragment_path, unit_name
-from pipeline.store.leftovers import clean
-from pipeline.store.manifest import fragment_paths, read_manifest
-from pipeline.store.seal import CROWD, Piece, due, plan, seal
-from pipeline.store.shard import Shard
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.read.rows import read_row
+from levelproof.pipeline.store import manifest
+from levelproof.pipeline.store import seal as sealing
+from levelproof.pipeline.store.layout import fragment_path, unit_name
+from levelproof.pipeline.store.leftovers import clean
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.seal import CROWD, Piece, due, plan, seal
+from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.command import PATIENCE
 from tests.pipeline.made import commit_copy, made_job, made_result, made_split
 

@@ -8,14 +8,14 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from experts.config import RECORD_STEPS
-from experts.witness import Record
-from levelgen.level import SIZES, Level
-from pipeline.errors import Failure
-from pipeline.store.fields import arrays_of, same_bits, tree_of
-from pipeline.store.packing import pack, unpack
-from pipeline.store.schema import ALONG_TIME, field_table
-from pipeline.store.shard import Shard, stored_bytes, write_shard
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness import Record
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
+from levelproof.pipeline.store.packing import pack, unpack
+from levelproof.pipeline.store.schema import ALONG_TIME, field_table
+from levelproof.pipeline.store.shard import Shard, stored_bytes, write_shard
 from tests.pipeline.made import made_fields, made_level, made_record
 
 LEVELS = [5, 9, 12]

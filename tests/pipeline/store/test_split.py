@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from configs.schema import JobConfig
-from experts.labels import Label
-from pipeline.errors import UserError
-from pipeline.jobs.schedule import WorkUnit
-from pipeline.jobs.unit import commit
-from pipeline.store.layout import FOLDERS
-from pipeline.store.locks import is_written
-from pipeline.store.split import writing
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.store.layout import FOLDERS
+from levelproof.pipeline.store.locks import is_written
+from levelproof.pipeline.store.split import writing
 from tests.pipeline.made import made_job, made_result
 
 

@@ -4,10 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from levelgen.level import SIZES
-from levelgen.task.actions import continuous_controls, discrete_controls
-from levelgen.task.observe.entities import entities, padded_shape, symbolic_padded
-from levelgen.task.observe.flat import symbolic_flat
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.task.actions import continuous_controls, discrete_controls
+from levelproof.levelgen.task.observe.entities import entities, padded_shape, symbolic_padded
+from levelproof.levelgen.task.observe.flat import symbolic_flat
 from tests.golden.load_seen import Seen, assert_seen, load_seen
 
 

@@ -7,17 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelgen.level import SIZES, Level, Role
-from levelgen.sampling.sampler import sample_levels
-from levelgen.task.observe import flat
-from levelgen.task.observe.flat import (
+from levelproof.levelgen.level import SIZES, Level, Role
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.observe import flat
+from levelproof.levelgen.task.observe.flat import (
     CIRCLE_ROWS,
     LIMIT,
     POLYGON_ROWS,
     dynamic_features,
     feature_count,
 )
-from physics.types import FIXED_POLYGONS, State
+from levelproof.physics.types import FIXED_POLYGONS, State
 
 LANES = 16
 level_features, state_features, symbolic_flat = map(

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelgen.level import Level
-from levelgen.task.observe.pixels import SIDE, pixels
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.observe.pixels import SIDE, pixels
 from tests.golden.load_seen import load_seen
 
 

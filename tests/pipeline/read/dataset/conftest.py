@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.read.dataset.dataset import Dataset, open
+from levelproof.pipeline.read.dataset.dataset import Dataset, open
 from tests.pipeline.made import played_split
 
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import UserError
-from pipeline.read.dataset.batches import Batches
-from pipeline.read.dataset.dataset import Dataset
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.dataset.batches import Batches
+from levelproof.pipeline.read.dataset.dataset import Dataset
 
 PLAIN: dict[str, Any] = {"observation": None, "seed": 3}
 

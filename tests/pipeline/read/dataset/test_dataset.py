@@ -11,13 +11,13 @@ import pyarrow.parquet as pq
 import pytest
 
 import levelproof
-from levelgen.task.actions import action_mask
-from levelgen.task.environment import ObservationType, make
-from pipeline.errors import Failure, UserError
-from pipeline.read.dataset.dataset import Dataset, open
-from pipeline.read.rows import read_rows
-from pipeline.store.fields import arrays_of, same_bits
-from pipeline.store.manifest import read_manifest
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.environment import ObservationType, make
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.read.dataset.dataset import Dataset, open
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.store.fields import arrays_of, same_bits
+from levelproof.pipeline.store.manifest import read_manifest
 
 STEPS = 48
 

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from pipeline.errors import UserError
-from pipeline.read.dataset.order import EpochOrder, permuted
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.dataset.order import EpochOrder, permuted
 
 
 @settings(max_examples=50, deadline=None)

@@ -5,8 +5,8 @@ import hashlib
 import numpy as np
 import pytest
 
-from pipeline.errors import Failure, UserError
-from pipeline.read.dataset.parts import check_share, in_part
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.read.dataset.parts import check_share, in_part
 
 HASHES = [f"c1:{hashlib.sha256(str(i).encode()).hexdigest()[:32]}" for i in range(5000)]
 

@@ -6,8 +6,8 @@ import pickle
 import numpy as np
 import pytest
 
-from pipeline.errors import UserError
-from pipeline.read.dataset.dataset import Dataset
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.dataset.dataset import Dataset
 
 
 def test_elements_are_windows_by_name(data: Dataset) -> None:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from experts.config import RECORD_STEPS
-from pipeline.errors import UserError
-from pipeline.read.dataset.windows import Windows
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.dataset.windows import Windows
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numcodecs import get_codec
 
-from experts.witness import Record
-from levelgen.files.kinetix import MANIFOLD, _ours, level_from_kinetix, state_from_kinetix
-from levelgen.level import Level
-from physics.types import Manifold
+from levelproof.experts.witness import Record
+from levelproof.levelgen.files.kinetix import MANIFOLD, _ours, level_from_kinetix, state_from_kinetix
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import Manifold
 
 GOLDEN = Path(__file__).parents[3] / "golden/kinetix"  # benchmarks/reference/trajectories.py wrote it
 SOLVED, OTHERS = 5, 2  # trajectories of each size there: first those that are solved

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experts.labels import Label
-from levelgen.level import SIZES
-from physics.pairs import pairs_of
-from pipeline.read.kinetix import export as module
-from pipeline.read.kinetix import zarr2
-from pipeline.read.kinetix.records import dtype_of
-from pipeline.read.kinetix.zarr2 import write_group
-from pipeline.read.rows import read_rows
-from pipeline.store.manifest import require_manifest
-from pipeline.words import many
+from levelproof.experts.labels import Label
+from levelproof.levelgen.level import SIZES
+from levelproof.physics.pairs import pairs_of
+from levelproof.pipeline.read.kinetix import export as module
+from levelproof.pipeline.read.kinetix import zarr2
+from levelproof.pipeline.read.kinetix.records import dtype_of
+from levelproof.pipeline.read.kinetix.zarr2 import write_group
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.words import many
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
 from tests.pipeline.read.kinetix.folder import trajectories_in

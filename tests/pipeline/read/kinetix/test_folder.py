@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numcodecs import Blosc
 
-from levelgen.level import SIZES
-from pipeline.read.kinetix.folder import open_folder, read_trajectories
-from pipeline.read.kinetix.zarr2 import FormatError
+from levelproof.levelgen.level import SIZES
+from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectories
+from levelproof.pipeline.read.kinetix.zarr2 import FormatError
 from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, ours_of, trajectories_in
 
 MOST_MEMORY = 20e6  # bytes; a chunk of four trajectories has 1.5 MB

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from benchmarks import oracle
-from experts.witness import Record
-from levelgen.level import SIZES, Level
-from levelgen.task.observe.pixels import pixels
-from pipeline.read.kinetix.records import dtype_of, trajectories_of
-from pipeline.read.rows import read_rows
-from pipeline.store.fields import tree_of
-from pipeline.store.manifest import require_manifest
+from levelproof.experts.witness import Record
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.task.observe.pixels import pixels
+from levelproof.pipeline.read.kinetix.records import dtype_of, trajectories_of
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.manifest import require_manifest
 from tests.pipeline.command import here
 
 pytestmark = pytest.mark.campaign

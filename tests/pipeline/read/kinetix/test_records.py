@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from experts.witness import replay, succeeds
-from levelgen.level import SIZES
-from pipeline.read.kinetix.records import dtype_of, fields_of, trajectories_of
+from levelproof.experts.witness import replay, succeeds
+from levelproof.levelgen.level import SIZES
+from levelproof.pipeline.read.kinetix.records import dtype_of, fields_of, trajectories_of
 from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, ours_of, trajectories_in
 
 UNREAD = "env_state/circle/vertices"  # the reference draws it, and nothing reads it

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 import levelproof
-from experts.witness import Record
-from levelgen.task.actions import CHOICES, continuous_controls, controls
-from levelgen.task.observe.flat import symbolic_flat
-from levelgen.task.rules import TaskParams
-from pipeline.cli.main import main
-from pipeline.read.minari.episodes import ActionKind, episodes_of, written
-from pipeline.store.fields import tree_of
-from pipeline.store.manifest import read_manifest
+from levelproof.experts.witness import Record
+from levelproof.levelgen.task.actions import CHOICES, continuous_controls, controls
+from levelproof.levelgen.task.observe.flat import symbolic_flat
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.read.minari.episodes import ActionKind, episodes_of, written
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import made_job, played_split
 
 pytestmark = pytest.mark.slow

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import levelproof
-from levelgen.task.actions import CHOICES
-from pipeline.read.minari.episodes import ActionKind
-from pipeline.read.minari.export import export_minari
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.pipeline.read.minari.episodes import ActionKind
+from levelproof.pipeline.read.minari.export import export_minari
 from tests.pipeline.made import played_split
 
 pytestmark = pytest.mark.campaign
