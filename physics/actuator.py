@@ -1,6 +1,10 @@
-"""Motors turn the bodies of a revolute joint, thrusters push one body.
+"""Actuators: motors turn the bodies of a revolute joint, thrusters push one body.
 
-Facts: `jax2d.joint.apply_motor`, `jax2d.engine`.
+A motor is a speed control with a torque limit: the torque is power * tanh(decay * error in speed), so it saturates far
+from the commanded speed and fades close to it. Within `motor_limit_zone` of a joint limit it weakens linearly to zero;
+at full torque it would fight the limit's correction in every step.
+
+Sources: `jax2d.joint.apply_motor`, `jax2d.engine`.
 """
 
 import jax.numpy as jnp
@@ -14,7 +18,7 @@ from levelproof.physics.vector import Vec
 
 
 def drive_motors(block: Block, params: Params) -> None:
-    """Angular impulses that bring each motor's joint to its speed, weakened near the joint limits."""
+    """Add the motors' angular impulses, which drive each joint to its commanded speed."""
     model, joints, control = block.model, block.scratch.joints, block.given.motor
 
     def one(j):
@@ -45,7 +49,7 @@ def _drive(block: Block, params: Params, j: Scalar, runs: Bool[Array, " lane"]) 
 
 
 def fire_thrusters(block: Block, params: Params) -> None:
-    """A force on one body, along the thruster, where it sits."""
+    """Add the thrusters' impulses: a force on one body, along the thruster, at its mount."""
     model, control = block.model, block.given.thrust
 
     def one(t):

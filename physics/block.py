@@ -1,6 +1,7 @@
-"""What a step of a block of lanes works on: references to the worlds before and after, and to scratch memory.
+"""The data of one step for a block of lanes: references to the worlds before and after, and to scratch memory.
 
-The annotations say shapes and dtypes, and nothing else does: the scratch memory is made from them (`physics.buffers`).
+The annotations are the only place where shapes and dtypes are stated; `physics.buffers` allocates scratch memory from
+them.
 """
 
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from levelproof.physics.types import Manifold, Model, State
 
 
 class Given(NamedTuple):
-    """What a step reads."""
+    """Inputs of a step."""
 
     model: Model
     before: State
@@ -22,7 +23,7 @@ class Given(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """What the solver moves, and what it adds up to push it with."""
+    """The bodies' motion, and the impulses they have not taken up yet."""
 
     motion: Float[Ref, "body 5 lane"]  # position x, y (m), velocity x, y (m/s), angular velocity (rad/s)
     push: Float[Ref, "body 3 lane"]  # sum of impulses x, y (N s), angular (N m s), since the body last yielded to them
@@ -30,7 +31,7 @@ class Bodies(NamedTuple):
 
 
 class Outlines(NamedTuple):
-    """Each polygon's geometry, x and y apart."""
+    """The polygons' geometry, with x and y in separate rows."""
 
     start: Float[Ref, "2 polygon vertex lane"]  # first vertex of each face, in the polygon's frame
     edge: Float[Ref, "2 polygon vertex lane"]  # from there to the next
@@ -43,7 +44,7 @@ class Outlines(NamedTuple):
 
 
 class Joints(NamedTuple):
-    """Joints as constraints: constant over a step but for the impulses. Masses are 0 where it may not act."""
+    """Joints as constraints: constant during a step, except the impulses. Masses are 0 where a joint may not act."""
 
     acts: Bool[Ref, "joint lane"]  # active, with active bodies, not both immovable
     turns: Bool[Ref, "joint lane"]  # whether an angular impulse applies
@@ -56,24 +57,23 @@ class Joints(NamedTuple):
 
 
 class Constraints(NamedTuple):
-    """Contacts as constraints. Only rows of contacts that act in any lane are ever read.
-
-    A group are the first points of polygon pairs, their second points, circle-polygon pairs, or pairs of circles.
-    """
+    """Contacts as constraints; only rows of contacts that push in some lane are ever read. Groups: see `pairs`."""
 
     geometry: Float[Ref, "contact 4 lane"]  # normal x, y, point x, y
     effort: Float[Ref, "contact 5 lane"]  # target (m/s along the normal), friction, both inverse masses, inertias
     impulse: Float[Ref, "contact 2 lane"]  # accumulated, normal and tangent, N s
-    batch: Float[Ref, "contact lane"]  # number of the solver batch; NONE where it does not push
-    touching: Float[Ref, "kind lane"]  # how many pairs of a kind touch
-    acting: Int[Ref, "contact"]  # numbers of the contacts that push in any lane, each group from its first contact on
-    counts: Int[Ref, "group"]  # how many these are
-    listed: Int[Ref, "listing"]  # the same, by solver batch
-    ends: Int[Ref, "boundary"]  # where each batch begins and ends in `listed`
+    batch: Float[Ref, "contact lane"]  # index of the solver batch; NO_BATCH where it does not push
+    touching: Float[Ref, "kind lane"]  # number of touching pairs
+    acting: Int[
+        Ref, "contact"
+    ]  # indices of the contacts that push in some lane; each group starts at its first contact
+    counts: Int[Ref, "group"]  # number of contacts in `acting`
+    listed: Int[Ref, "listing"]  # indices of the contacts that push, grouped by solver batch
+    ends: Int[Ref, "boundary"]  # where each solver batch begins and ends in `listed`
 
 
 class Scratch(NamedTuple):
-    """What a step works in."""
+    """Scratch memory of a step."""
 
     bodies: Bodies
     outlines: Outlines
@@ -86,8 +86,8 @@ class Block(NamedTuple):
 
     table: Table  # lookup tables of the size
     given: Given  # the worlds before
-    after: State  # is given the worlds after
-    seen: Manifold | None  # is given the contacts, where somebody wants to see them
+    after: State  # receives the worlds after the step
+    seen: Manifold | None  # receives the contacts; None unless the caller asked for them
     scratch: Scratch
 
     @property

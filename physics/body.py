@@ -1,4 +1,8 @@
-"""The bodies: they fall, yield to what pushes them, and go where their velocities take them."""
+"""Bodies: gravity, impulses and integration.
+
+Solvers add impulses to `push`; a body *yields* when its accumulated push changes its velocity. The two are kept apart
+so that all contacts of a solver batch read the same velocities.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -19,7 +23,7 @@ def velocity(motion: Float[Array, "5 lane"]) -> Vec:
 
 
 def start(block: Block, params: Params) -> None:
-    """Read the bodies, and let those of finite mass fall."""
+    """Load the bodies' motion, and add gravity to the velocities of those with finite mass."""
     model, before, bodies = block.model, block.given.before, block.scratch.bodies
 
     def read(i):
@@ -34,7 +38,7 @@ def start(block: Block, params: Params) -> None:
 
 
 def yield_one(block: Block, i: Scalar) -> None:
-    """Let the impulses in `push` change the velocities of body i."""
+    """Apply the impulses in `push` to the velocities of body i, and reset them."""
     model, bodies = block.model, block.scratch.bodies
     mass, push = model.inverse_mass[i], bodies.push[i]
     bodies.motion[i, 2] += mass * push[0]
@@ -44,19 +48,19 @@ def yield_one(block: Block, i: Scalar) -> None:
 
 
 def yield_all(block: Block) -> None:
-    """The same for every body; the scenery never moves."""
+    """Apply `yield_one` to every body except the immovable scenery."""
     each(block.scratch.bodies.motion.shape[0], lambda i: yield_one(block, i), first=FIXED_POLYGONS)
 
 
 def integrate(block: Block, params: Params) -> None:
-    """Euler step, then bounds on positions and speeds."""
+    """Take a semi-implicit Euler step, then clip positions and speeds."""
     before, after, bodies = block.given.before, block.after, block.scratch.bodies
 
     def clip(x, most):
         return jnp.clip(x, -most, most)
 
     def write(i):
-        # -0 becomes 0: a push of nothing, because of another lane, would make it so
+        # -0 becomes 0, as when another lane forces a zero impulse here
         x, y, v_x, v_y, w = (jnp.where(row == 0, 0.0, row) for row in bodies.motion[i])
         after.position[i, 0] = clip(x + v_x * params.dt, params.max_position)
         after.position[i, 1] = clip(y + v_y * params.dt, params.max_position)

@@ -1,4 +1,4 @@
-"""Bounds of settings, looked at where a dataclass of them is made."""
+"""Bounds of settings, checked when a dataclass of them is created."""
 
 from collections.abc import Iterable
 from math import inf, isfinite
@@ -23,6 +23,6 @@ def require(settings: Any, names: Iterable[str], least: float, most: float = inf
 
 
 def require_32_bits() -> None:
-    """Raises ValueError where JAX makes numbers of 64 bits: levels would be others, and no kernel is for them."""
+    """Raise ValueError if `jax_enable_x64` is on: levels would differ, and kernels are 32-bit."""
     if jax.dtypes.canonicalize_dtype(np.int64) == np.int64:
-        raise ValueError("jax_enable_x64 is on, and levels and physics are of 32 bits: turn it off")
+        raise ValueError("jax_enable_x64 is on, but levels and physics are 32-bit: turn it off")

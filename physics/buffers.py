@@ -28,7 +28,8 @@ def axes_of(size: Size) -> dict[str, int]:
         "contact": pairs.contacts,
         "kind": KINDS,
         "group": GROUPS,
-        "listing": sum(len(kind) * kind.batches for kind in pairs.by_group) + 1,  # one more: see `contact.share_out`
+        "listing": sum(len(kind) * kind.batches for kind in pairs.by_group)
+        + 1,  # one more: `contact.assign_batches` writes past the last
         "boundary": sum(kind.batches for kind in pairs.by_group) + 1,
     }
 

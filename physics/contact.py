@@ -1,7 +1,33 @@
-"""The contact constraint: non-penetration with friction, by accumulated impulses (Catto's sequential impulses).
+"""The contact constraint: non-penetration with friction, solved by sequential impulses.
 
-All contacts of a solver batch read the same velocities; what they do to a body adds up.
-Facts: `jax2d.collision.resolve_collision`.
+**Velocity.** Bodies a and b touch at the point p, with the unit normal n from a to b. A body's point moves with
+v + w x r, where r = p - centre, so the bodies approach each other along n with
+
+    u = (v_b + w_b x r_b - v_a - w_a x r_a) . n        m/s; negative: they approach
+
+**Impulse.** A normal impulse j at p adds -j n to the momentum of a and j n to that of b, and changes u by K j:
+
+    K = 1/m_a + 1/m_b + (r_a x n)^2 / I_a + (r_b x n)^2 / I_b        1/kg; 1/K is the effective mass
+
+so j = (target - u) / K brings this one contact to its target velocity. The target has two parts. Position correction
+(Baumgarte) undoes a share of the penetration: contact_bias / dt * max(penetration - slop, 0). The slop stays, so that a
+resting contact is found again in the next step instead of flickering. Restitution adds -e u0, with u0 the velocity
+before the solver starts and e the smaller coefficient of the two bodies.
+
+**Accumulation.** One contact's impulse disturbs its neighbours, so `solve` passes over all of them ten times. Each pass
+clamps the *sum* of a contact's impulses to j >= 0, not the increment: a later pass may take back what an earlier one
+pushed too much. Friction does the same along the tangent t = (n.y, -n.x), where Coulomb's cone bounds the sum by
+|j_t| <= friction * j. Friction combines as sqrt((f a)^2 + (f b)^2), f = base_friction.
+
+**Warm starting.** A contact that was active in the last step starts from the impulses that it ended with there. A stack
+at rest then starts from its solution, where ten passes from zero would let it sag.
+
+**Batches.** All contacts of a solver batch read the same velocities, and their impulses add up (Jacobi); batches follow
+one another (Gauss-Seidel). The reference batches pairs this way for its accelerator, so batches are part of its result.
+
+Sources: E. Catto, "Fast and Simple Physics using Sequential Impulses", GDC 2006, and Box2D-Lite, for the method;
+`jax2d.collision.resolve_collision` for the constants and the order. Joints move bodies within an iteration, so each
+pass recomputes the lever arms r; Box2D-Lite computes them once a step.
 """
 
 import functools
@@ -18,11 +44,11 @@ from levelproof.physics.pairs import GROUPS
 from levelproof.physics.types import FIXED_POLYGONS, Params
 from levelproof.physics.vector import Vec, nonzero, spin
 
-NONE = -1.0  # instead of a batch
+NO_BATCH = -1.0  # the contact does not push in this lane
 
 
 class Contact(NamedTuple):
-    """One contact of a pair of bodies, as geometry finds it; leaves [lane]."""
+    """One contact of a pair of bodies, as collision detection finds it; leaves [lane]."""
 
     active: Array
     normal: Vec  # from the pair's first body to its second
@@ -31,7 +57,7 @@ class Contact(NamedTuple):
 
 
 class Levers(NamedTuple):
-    """Geometry of a contact; r goes from a body's centre to the contact point."""
+    """Lever arms of a contact; r goes from a body's centre to the contact point."""
 
     normal: Vec  # n
     cross_a: Array  # r x n
@@ -41,7 +67,7 @@ class Levers(NamedTuple):
 
 
 def clear(block: Block) -> None:
-    """No contact acts, none is remembered, and none is active, if anybody looks."""
+    """Reset all contacts: none pushes, none is remembered, none is recorded as active."""
     constraints, after, seen = block.scratch.constraints, block.after, block.seen
 
     def blank(ref):
@@ -63,7 +89,10 @@ def clear(block: Block) -> None:
 
 
 def count_touching(block: Block, kind: int, contacts: list[Contact]) -> Float[Array, " lane"]:
-    """The how-manieth touching pair of its kind a pair is, from 1: it touches where any of its contacts is active."""
+    """Count the pair, if touching, for its kind; return the running count.
+
+    A pair touches in the lanes in which any of its contacts is active. The count decides its solver batch.
+    """
     touching = functools.reduce(jnp.logical_or, (contact.active for contact in contacts))
     so_far = block.scratch.constraints.touching[kind] + touching
     block.scratch.constraints.touching[kind] = so_far
@@ -71,7 +100,7 @@ def count_touching(block: Block, kind: int, contacts: list[Contact]) -> Float[Ar
 
 
 def bounce(block: Block, a: Scalar, b: Scalar, contact: Contact) -> Float[Array, " lane"]:
-    """Velocity along the normal that restitution asks for, m/s."""
+    """Return e u0, m/s: the approach velocity times the smaller restitution (negative where the bodies approach)."""
     model, bodies = block.model, block.scratch.bodies
 
     def point_velocity(body):
@@ -82,8 +111,8 @@ def bounce(block: Block, a: Scalar, b: Scalar, contact: Contact) -> Float[Array,
     return approach * jnp.minimum(model.restitution[a], model.restitution[b])
 
 
-def see(block: Block, c: Scalar, contact: Contact) -> None:
-    """Write a contact down, zero where it is not active, if anybody looks."""
+def record(block: Block, c: Scalar, contact: Contact) -> None:
+    """Record a contact in `block.seen`, if the caller asked for contacts; zero in inactive lanes."""
     seen, table = block.seen, block.table
     if seen is None:
         return
@@ -98,7 +127,13 @@ def see(block: Block, c: Scalar, contact: Contact) -> None:
 def prepare(
     block: Block, params: Params, c: Scalar, contact: Contact, group: int, so_far: Float[Array, " lane"]
 ) -> None:
-    """Contact c as a constraint, pushing with what it remembers; `so_far`: see `count_touching`."""
+    """Prepare contact c as a constraint and warm-start it.
+
+    Args:
+        c: index of the contact.
+        group: index of its group (`pairs.KIND_OF_GROUP`).
+        so_far: running count of touching pairs, from `count_touching`.
+    """
     model, a, b = block.model, block.table.a[c], block.table.b[c]
     mass_a, mass_b = model.inverse_mass[a], model.inverse_mass[b]
     acts = contact.active & model.collides[a, b] & ((mass_a != 0) | (mass_b != 0))
@@ -118,7 +153,7 @@ def prepare(
         last = jnp.stack([before.contact_normal_impulse[c], before.contact_tangent_impulse[c]])
         impulse = jnp.where(remembered, last, 0.0)
         to.impulse[c] = impulse
-        to.batch[c] = jnp.where(acts, so_far, NONE)  # until `share_out` knows the batch
+        to.batch[c] = jnp.where(acts, so_far, NO_BATCH)  # the count stands in until `assign_batches` knows the batch
         to.acting[block.table.start[group] + to.counts[group]] = c
         to.counts[group] += 1
         normal, point = _geometry(to, c)
@@ -128,11 +163,12 @@ def prepare(
     when(anywhere(acts), constrain)
 
 
-def share_out(block: Block) -> None:
-    """Share the contacts that act out into solver batches.
+def assign_batches(block: Block) -> None:
+    """Assign each contact that pushes to its solver batch, and list the contacts of every batch.
 
-    The reference sorts the pairs of a kind stably, those that do not touch first, and the pair of rank p, from 0,
-    belongs to batch p mod batches: the k-th of A touching pairs among N, k from 1, has rank N - A + k - 1.
+    The reference sorts the pairs of a kind stably, those that do not touch first, and puts the pair of rank p, from 0,
+    into batch p mod batches. Of N pairs A touch; the k-th of them, k from 1, has rank N - A + k - 1. That arithmetic
+    replaces the sort.
     """
     to, table = block.scratch.constraints, block.table
 
@@ -143,8 +179,8 @@ def share_out(block: Block) -> None:
         def one(k):
             c = to.acting[k]
             rank = first + to.batch[c]
-            turn = rank - batches * jnp.floor((rank + 0.5) / batches)  # exact: whole numbers
-            to.batch[c] = jnp.where(to.batch[c] == NONE, NONE, turn)
+            turn = rank - batches * jnp.floor((rank + 0.5) / batches)  # rank mod batches, exact for these integers
+            to.batch[c] = jnp.where(to.batch[c] == NO_BATCH, NO_BATCH, turn)
 
         each(table.start[group] + to.counts[group], one, first=table.start[group])
 
@@ -153,7 +189,7 @@ def share_out(block: Block) -> None:
 
         def list_if_in(k, filled):
             c = to.acting[k]
-            to.listed[filled] = c  # the next one overwrites it if it is in another batch
+            to.listed[filled] = c  # overwritten by the next contact if no lane has c in this batch
             return filled + anywhere(to.batch[c] == turn)
 
         first = table.start[group]
@@ -167,7 +203,11 @@ def share_out(block: Block) -> None:
 
 
 def solve(block: Block) -> None:
-    """One pass over the contacts, batch by batch."""
+    """Run one pass over the contacts, batch by batch.
+
+    A batch only adds to `push`; the bodies take up its impulses when the batch is over. Where a batch has few contacts
+    their own bodies do so, else all bodies: the result is the same, and the loop over contacts is the shorter one.
+    """
     bodies, to, table = block.scratch.bodies, block.scratch.constraints, block.table
 
     def batch(s):
@@ -188,7 +228,7 @@ def solve(block: Block) -> None:
 
 
 def remember(block: Block) -> None:
-    """Hand the accumulated impulses to the next step."""
+    """Store the accumulated impulses for the warm start of the next step."""
     after, to, table = block.after, block.scratch.constraints, block.table
 
     def write(k):
@@ -210,9 +250,9 @@ def _levers(motion_a: Array, motion_b: Array, normal: Vec, point: Vec) -> Levers
 
 
 def _solve_one(block: Block, c: Scalar, segment: Scalar) -> None:
-    """The accumulated impulses that bring a contact to its target, clamped to push and to the friction cone.
+    """Bring contact c to its target velocity, with accumulated impulses clamped to j >= 0 and to the friction cone.
 
-    Only in the lanes in which the contact belongs to the batch whose turn it is.
+    Acts in the lanes in which the contact belongs to the batch of this segment; other lanes keep their impulses.
     """
     bodies, to, table = block.scratch.bodies, block.scratch.constraints, block.table
     a, b, mine, kept = table.a[c], table.b[c], to.batch[c] == table.turn[segment], table.kept[c]
@@ -223,7 +263,8 @@ def _solve_one(block: Block, c: Scalar, segment: Scalar) -> None:
     lever = _levers(motion_a, motion_b, n, point)
     mass_normal = 1 / nonzero(mass + inertia_a * jnp.square(lever.cross_a) + inertia_b * jnp.square(lever.cross_b))
     mass_tangent = 1 / nonzero(mass + inertia_a * jnp.square(lever.dot_a) + inertia_b * jnp.square(lever.dot_b))
-    # how a normal impulse changes the tangential velocity
+    # Friction is solved after the normal impulse, but from the velocities before it: this is how much of the tangential
+    # velocity a unit of normal impulse changes, by turning the bodies
     coupling = inertia_a * lever.cross_a * lever.dot_a + inertia_b * lever.cross_b * lever.dot_b
 
     v, w_a, w_b = velocity(motion_b) - velocity(motion_a), motion_a[4], motion_b[4]
@@ -232,7 +273,7 @@ def _solve_one(block: Block, c: Scalar, segment: Scalar) -> None:
     slide = v.x * n.y - v.y * n.x - w_b * lever.dot_b + w_a * lever.dot_a - (normal - before_normal) * coupling
     limit = friction * normal
     tangent = jnp.clip(before_tangent - mass_tangent * slide, -limit, limit)
-    # the padding defect forgets the accumulated impulses of some pairs: kept is 0
+    # kept is 0 for the pairs whose accumulated impulses the reference's padding defect resets (docs/physics.md)
     to.impulse[c] = jnp.stack(
         [jnp.where(mine, normal * kept, before_normal), jnp.where(mine, tangent * kept, before_tangent)]
     )
@@ -242,7 +283,11 @@ def _solve_one(block: Block, c: Scalar, segment: Scalar) -> None:
 def _push(
     bodies: Bodies, a: Scalar, b: Scalar, lever: Levers, mine: Bool[Array, " lane"], impulse: tuple[Array, Array]
 ) -> None:
-    """Push both bodies of a contact apart, in the lanes that it is `mine` in; `impulse`: normal and tangent, N s."""
+    """Add a contact's impulses to both bodies, in the lanes where `mine` holds.
+
+    Args:
+        impulse: along the normal and along the tangent, N s.
+    """
     n, (normal, tangent) = lever.normal, impulse
     only = lambda x: jnp.where(mine, x, 0.0)
     x, y = only(normal * n.x + tangent * n.y), only(normal * n.y - tangent * n.x)

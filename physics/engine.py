@@ -1,5 +1,13 @@
 """One physics step of a block of lanes: gravity, contacts, actuators, solver, integration.
 
+The stages work on velocities and move bodies last (semi-implicit Euler):
+
+    fall           v += dt g
+    find_contacts  which bodies touch; their warm-start impulses go to `push`
+    act            motors, thrusters and the joints' warm start go to `push`; then all of `push` goes to v
+    solve          ten times: joints, one after another; contacts, batch by batch
+    integrate      x += dt v; impulses are stored for the next step's warm start
+
 The order is part of the reference's result (`jax2d.engine.PhysicsEngine.step`).
 """
 
@@ -15,27 +23,27 @@ Stage = Callable[[Block, Params], None]
 
 
 def fall(block: Block, params: Params) -> None:
-    """Gravity into the velocities; where every polygon is."""
+    """Add gravity to the velocities, and place every polygon's outline in the world."""
     body.start(block, params)
     manifold.outline_polygons(block)
 
 
 def find_contacts(block: Block, params: Params) -> None:
-    """Contacts of the pairs that come near each other, as constraints; they push with what they remember."""
+    """Detect contacts, prepare them as constraints, and warm-start them."""
     contact.clear(block)
 
     def found(kind: int, numbers: list, contacts: list[contact.Contact]) -> None:
         so_far = contact.count_touching(block, kind, contacts)
         for group, (c, one) in enumerate(zip(numbers, contacts, strict=True), KIND_OF_GROUP.index(kind)):
             contact.prepare(block, params, c, one, group, so_far)
-            contact.see(block, c, one)
+            contact.record(block, c, one)
 
     manifold.find_contacts(block, found)
-    contact.share_out(block)
+    contact.assign_batches(block)
 
 
 def act(block: Block, params: Params) -> None:
-    """Joints as constraints, motors, thrusters; then everything that pushes changes the velocities."""
+    """Prepare joints, drive motors, fire thrusters, warm-start joints; then apply all impulses so far."""
     joint.prepare(block, params)
     actuator.drive_motors(block, params)
     actuator.fire_thrusters(block, params)
@@ -44,7 +52,7 @@ def act(block: Block, params: Params) -> None:
 
 
 def solve(block: Block, params: Params) -> None:
-    """Ten iterations of joints, then contacts."""
+    """Run the solver's iterations, each over joints and then contacts."""
 
     def iteration(_):
         joint.solve(block, params)
@@ -54,7 +62,7 @@ def solve(block: Block, params: Params) -> None:
 
 
 def integrate(block: Block, params: Params) -> None:
-    """What the next step remembers, and where the bodies go."""
+    """Store impulses for the next step, and move the bodies."""
     contact.remember(block)
     joint.remember(block)
     body.integrate(block, params)

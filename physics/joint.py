@@ -1,6 +1,25 @@
-"""The joint constraint: two anchors held together; angles held (fixed joint) or limited (revolute joint).
+"""The joint constraint: two anchors held together; the angle held (fixed joint) or limited (revolute joint).
 
-Facts: `jax2d.joint`. Joints are solved one after another; each also moves its bodies towards each other.
+A joint pins a point of body a to a point of body b. With the anchors' world positions p_a and p_b, the gap is
+g = p_b - p_a and the anchors drift apart with d = v_b + w_b x r_b - v_a - w_a x r_a.
+
+**Linear part.** Box2D solves the two equations d = 0 with a 2x2 matrix. The reference solves one, along the direction
+of the drift, with that direction's effective mass, and adds the gap to what has to be undone:
+
+    impulse = stiffness * (d + joint_bias_velocity * g) / (1/m_a + 1/m_b + (r_a x e)^2 / I_a + (r_b x e)^2 / I_b),
+    e = d / |d|
+
+A stiffness below 1 under-relaxes: the joints of a chain disturb each other, and full impulses would overshoot.
+
+**Position.** Velocities alone leave joints drifting apart, so each iteration also moves the bodies by the share
+joint_bias_position of the gap, the lighter body farther. Bodies therefore move *within* the solver, and contacts
+recompute their lever arms.
+
+**Angle.** A fixed joint pulls b back to its resting angle; a revolute joint with limits does so beyond a limit, and
+only while the bodies do not already turn back (`corrects`).
+
+Joints are solved one after another, each seeing what the last one changed (Gauss-Seidel).
+Source: `jax2d.joint`. The accumulated linear impulse is never reset there, nor here.
 """
 
 import jax.numpy as jnp
@@ -13,7 +32,7 @@ from levelproof.physics.vector import Vec, nonzero, spin
 
 
 def prepare(block: Block, params: Params) -> None:
-    """All joints as constraints."""
+    """Prepare every joint as a constraint: arms in the world, masses, angle and its bias."""
     model, before, to = block.model, block.given.before, block.scratch.joints
 
     def one(j):
@@ -56,7 +75,7 @@ def _prepare_one(block: Block, params: Params, j: Scalar) -> None:
 
 
 def warm_start(block: Block) -> None:
-    """Push with the impulses that the last step ended with."""
+    """Apply the impulses that the last step ended with."""
     model, bodies, to = block.model, block.scratch.bodies, block.scratch.joints
 
     def one(j):
@@ -71,7 +90,7 @@ def warm_start(block: Block) -> None:
 
 
 def solve(block: Block, params: Params) -> None:
-    """One pass over the joints, one after another."""
+    """Run one pass over the joints, one after another."""
     acts = block.scratch.joints.acts
     each(acts.shape[0], lambda j: when(anywhere(acts[j]), lambda: _solve_one(block, params, j)))
 
@@ -85,8 +104,8 @@ def _solve_one(block: Block, params: Params, j: Scalar) -> None:
     arm_a, arm_b, fixed = Vec(a_x, a_y), Vec(b_x, b_y), model.joint_fixed[j]
     x_a, x_b, w_a, w_b = position(motion_a), position(motion_b), motion_a[4], motion_b[4]
 
-    # anchors first, then their difference: a gap of exactly zero must come out as zero, because the
-    # angle correction below looks at signs
+    # Subtract the anchors, not the arms and the centres: a gap of exactly zero must come out as zero, because the
+    # angle correction below compares signs
     anchor_a, anchor_b = x_a + arm_a, x_b + arm_b
     gap = anchor_b - anchor_a
     point = anchor_a.scale(to.weight[j]) + anchor_b.scale(1 - to.weight[j])
@@ -102,7 +121,7 @@ def _solve_one(block: Block, params: Params, j: Scalar) -> None:
     turn_a, turn_b = inertia_a * arm_a.cross(pull), -inertia_b * arm_b.cross(pull)
 
     spin_difference = w_b + turn_b - w_a - turn_a
-    # a limit that is already being left (by a motor, say) gets no correction
+    # no correction beyond a limit that the bodies are already leaving (driven by a motor, say)
     corrects = fixed | (jnp.sign(spin_difference) == jnp.sign(to.angle_bias[j]))
     twist = (spin_difference + to.angle_bias[j]) / nonzero(inertia_a + inertia_b)
     twist = jnp.where(to.turns[j] & corrects, twist, 0.0)
@@ -118,7 +137,7 @@ def _solve_one(block: Block, params: Params, j: Scalar) -> None:
 
 
 def remember(block: Block) -> None:
-    """Hand the accumulated impulses to the next step."""
+    """Store the accumulated impulses for the warm start of the next step."""
     after, to = block.after, block.scratch.joints
 
     def write(j):

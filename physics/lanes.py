@@ -1,12 +1,13 @@
-"""How a kernel is written: for a block of lanes, over references to arrays whose last axis are the lanes.
+"""The vocabulary of kernels: functions of a block of lanes, over references whose last axis is the lanes.
 
-A reference reads and writes rows: `ref[i]` is a row of lanes, i a number that may be known only at run time. What
-differs between lanes is computed in all of them and selected; what no lane needs is skipped. The same source becomes
-machine code (`physics.codegen`), or plain XLA operations on all lanes at once.
+A reference reads and writes rows: `ref[i]` is a row of lanes, and the index i may be known only at run time. A kernel
+computes what differs between lanes in all of them and selects; it skips what no lane needs. The same source becomes
+machine code (`levelproof.physics.codegen`), or plain XLA operations on all lanes at once.
 
-Whether something is skipped depends on the other lanes, so computing it must change nothing in a lane that does not
-need it. Select what is added there, for 0 times infinity is not 0; let a lane's own condition decide, not a guess that
-the computation would find nothing; and let no result show the sign of a zero, for -0 + 0 is 0.
+Whether a computation is skipped depends on the other lanes, so running it must change nothing in a lane that does not
+need it. Three rules follow. Select the addend instead of scaling it: 0 times infinity is not 0. Let the lane's own
+condition decide, not the expectation that the computation would find nothing. Let no result depend on the sign of a
+zero: -0 + 0 is 0.
 """
 
 import functools
@@ -19,7 +20,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-NOBODY = -1  # instead of a body's number
+NOBODY = -1  # stands for "no body" in an index
 
 Scalar = Int[Array, ""] | int
 
@@ -43,9 +44,9 @@ class Ref(Rows, Protocol):
 
 
 def each(count: Scalar, do: Callable[[Any], None], first: Scalar = 0) -> None:
-    """do(i) for i = first, ..., count - 1."""
+    """Call do(i) for i = first, ..., count - 1."""
     if isinstance(count, int) and isinstance(first, int) and first >= count:
-        return  # not even traced: there may be no row to speak of
+        return  # without tracing `do`: the arrays may have no rows
 
     def body(i, _):
         do(i)
@@ -54,19 +55,19 @@ def each(count: Scalar, do: Callable[[Any], None], first: Scalar = 0) -> None:
 
 
 def when(condition: Bool[Array, ""], do: Callable[[], None]) -> None:
-    """do() if the condition holds."""
+    """Call do() if the condition holds."""
     jax.lax.cond(condition, do, lambda: None)
 
 
 def anywhere(condition: Bool[Array, " lane"]) -> Bool[Array, ""]:
-    """Whether it holds in any lane."""
+    """Whether the condition holds in any lane."""
     return jnp.any(condition)
 
 
 def pick(
     count: int, read: Callable[[Any], Array], a: Int[Array, " lane"], b: Int[Array, " lane"]
 ) -> tuple[Array, Array]:
-    """read(a[lane])[..., lane] and read(b[lane])[..., lane], of `count` rows, where the number differs by lane."""
+    """Gather two of `count` rows by indices that differ by lane: read(a[lane])[..., lane] and the same for b."""
 
     def look(i, found):
         def choose():
@@ -80,8 +81,10 @@ def pick(
 
 
 def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]], first: int = 0) -> None:
-    """ref[number[lane], ..., lane] += change, for each (number, change); numbers below `first`, NOBODY
-    among them, are left alone."""
+    """Scatter-add: ref[index[lane], ..., lane] += change for each (index, change).
+
+    Indices below `first`, NOBODY among them, change nothing.
+    """
 
     def add(i):
         here = [number == i for number, _ in changes]

@@ -1,9 +1,14 @@
-"""Where bodies touch: polygon-polygon, circle-polygon, circle-circle.
+"""Collision detection: where polygons and circles touch, how deep, and along which normal.
 
-Geometry of Jax2D 1.0.1 (`jax2d.collision`): separating axes over the face normals of both polygons,
-two contact points clipped to the reference face; a circle is clipped to the nearest edge.
-Polygons are clockwise; face k goes from vertex k to vertex k + 1. A triangle's fourth vertex repeats its first, so
-that its third face closes it; its fourth face does not exist.
+**Polygon and polygon.** Two convex shapes are apart if and only if some face normal separates them (the separating axis
+theorem). The face with the largest separation, over both polygons, is the *reference face*; if its separation is
+negative, the polygons overlap by that much along its normal. The other polygon's two vertices that lie deepest behind
+the reference face, clipped to its ends, become the two contact points.
+
+**Circle and polygon.** The circle's centre is clipped to the nearest edge.
+
+Polygons are clockwise; face k runs from vertex k to vertex k + 1. A triangle's fourth vertex repeats its first, so that
+its third face closes it; its fourth face does not exist. Geometry and tie-breaks: `jax2d.collision` of Jax2D 1.0.1.
 """
 
 from collections.abc import Callable
@@ -26,11 +31,11 @@ FLIP_BIAS = 0.01  # m; b must separate this much more than a to become the refer
 # by that much, so of equally deep corners the one nearer to the face's start is first (docs/physics.md, "Ties")
 TILT = 4.371139e-8
 FAR = 1e30  # m; stands for a vertex or edge that does not exist
-# m; bodies whose boxes are farther apart do not touch: convex clockwise polygons could not, whatever the rounding, and
-# of others the axes may find a contact at a distance, which is then none
+# m; pairs whose bounding boxes are farther apart are skipped. Convex clockwise polygons cannot touch there, whatever
+# the rounding; for degenerate ones the separating axes may report a distant contact, which this margin discards
 MARGIN = 0.01
 
-# found(kind, contact numbers, contacts): what to do with the contacts of a pair
+# found(kind, contact indices, contacts): called with the contacts of each pair that comes near
 Found = Callable[[int, list, list[Contact]], None]
 
 
@@ -67,7 +72,7 @@ def faces(start: Vec) -> Faces:
 
 
 def outline_polygons(block: Block) -> None:
-    """All polygons' geometry, in their own frames and in the world."""
+    """Compute every polygon's geometry, in its own frame and in the world."""
     model, bodies, to = block.model, block.scratch.bodies, block.scratch.outlines
 
     def one(i):
@@ -96,7 +101,7 @@ def outline_polygons(block: Block) -> None:
 
 
 def find_contacts(block: Block, found: Found) -> None:
-    """All pairs that may touch, in the order of `pairs.py`; `found` for those that come near each other."""
+    """Test all pairs that can touch, in the order of `pairs`, and call `found` for those that come near each other."""
     pairs = pairs_of(block.model.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
     each(n, lambda p: _polygons(block, p, n, found))
@@ -105,7 +110,7 @@ def find_contacts(block: Block, found: Found) -> None:
 
 
 def _polygons(block: Block, p: Scalar, count: int, found: Found) -> None:
-    """Pair p of `count` pairs of polygons."""
+    """Test pair p of `count` pairs of polygons."""
     a, b = block.table.a[p], block.table.b[p]
     box = block.scratch.outlines.box
     mine, other = box[a], box[b]
@@ -147,7 +152,7 @@ def _disc(block: Block, i: Scalar) -> tuple[Vec, Array]:
 
 
 def may_touch(model: Model, a: ArrayLike, b: ArrayLike) -> Bool[Array, " lane"]:
-    """Both bodies are active and their collision modes allow it (joined bodies still have manifolds)."""
+    """Whether both bodies are active and their collision modes match (joined bodies still have manifolds)."""
     mode_a, mode_b = model.collision_mode[a], model.collision_mode[b]
     modes = (mode_a == 2) | (mode_b == 2) | (mode_a * mode_b > 0)
     return modes & model.active[a] & model.active[b]
@@ -168,13 +173,13 @@ class Face(NamedTuple):
 
 
 def _first(found: Bool[Array, "vertex lane"]) -> Int[Array, " lane"]:
-    """Number of the first vertex for which it holds."""
+    """Return the index of the first vertex where `found` holds."""
     number = jnp.arange(len(found), dtype=jnp.int32)[:, None]
     return jnp.where(found, number, len(found)).min(0)
 
 
 def _pick(x: Float[Array, "vertex lane"], number: Int[Array, " lane"]) -> Float[Array, " lane"]:
-    """x[number] for a vertex number that differs by lane."""
+    """Return x[number] for a vertex index that differs by lane."""
     chosen = x[0]
     for k in range(1, len(x)):
         chosen = jnp.where(number == k, x[k], chosen)
@@ -182,7 +187,7 @@ def _pick(x: Float[Array, "vertex lane"], number: Int[Array, " lane"]) -> Float[
 
 
 def _best_face(a: Outline, b: Outline) -> Face:
-    """The face of a along whose normal b is farthest out; the first of equals, as the reference."""
+    """Find the face of a that separates b the most; the first of equals, as in the reference."""
     normal, offset = a.normal.map(lambda x: x[:, None]), (b.vertex - a.centre).map(lambda x: x[None])
     separation = normal.dot(offset).min(1) - a.support
     most = separation.max(0)
@@ -192,7 +197,7 @@ def _best_face(a: Outline, b: Outline) -> Face:
 
 
 def _polygon_polygon(a: Outline, b: Outline) -> list[Contact]:
-    """Two contact points: the incident polygon's two deepest vertices, clipped to the reference face."""
+    """Find two contact points: the incident polygon's two deepest vertices, clipped to the reference face."""
     face_a, face_b = _best_face(a, b), _best_face(b, a)
     by_b = face_a.separation + FLIP_BIAS < face_b.separation
     separation = jnp.maximum(face_a.separation, face_b.separation)
@@ -221,7 +226,7 @@ def _polygon_polygon(a: Outline, b: Outline) -> list[Contact]:
 
 
 def _circle_polygon(block: Block, centre: Vec, radius: Array, i: Scalar) -> Contact:
-    """The circle's centre clipped to the polygon's nearest edge."""
+    """Find the contact of a circle: its centre, clipped to the polygon's nearest edge."""
     bodies, outlines = block.scratch.bodies, block.scratch.outlines
     cos, sin = bodies.turn[i]
     polygon = position(bodies.motion[i])

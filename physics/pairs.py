@@ -1,6 +1,6 @@
-"""Which bodies can touch, in the reference's fixed index order, and how pairs share out into solver batches.
+"""Which bodies can touch, in the reference's fixed order, and how many solver batches their pairs fill.
 
-Contacts are numbered: first contact points of the polygon pairs, second contact points of the polygon
+Contacts are indexed in four groups: first contact points of the polygon pairs, second contact points of the polygon
 pairs, circle-polygon pairs, circle-circle pairs.
 """
 
@@ -22,7 +22,7 @@ KIND_OF_GROUP = (POLYGONS, POLYGONS, CIRCLE_POLYGON, CIRCLES)
 
 @dataclass(frozen=True)
 class PairKind:
-    """All pairs of one kind: `a[i]` and `b[i]` are the body numbers of pair i."""
+    """All pairs of one kind: `a[i]` and `b[i]` are the indices of the bodies of pair i."""
 
     a: tuple[int, ...]
     b: tuple[int, ...]
@@ -54,7 +54,7 @@ class Pairs:
 
 @cache
 def pairs_of(size: Size) -> Pairs:
-    """All pairs that may touch: i < j, not both fixed scenery; circles with every polygon; circles."""
+    """List all pairs that can touch: polygons i < j, not both scenery; circles with every polygon; circles i < j."""
     polygons, bodies = range(size.polygons), range(size.polygons, size.bodies)
     polygon = [(i, j) for i in polygons for j in polygons if i < j and j >= FIXED_POLYGONS]
     circle_polygon = [(i, j) for i in bodies for j in polygons]
@@ -66,17 +66,17 @@ def pairs_of(size: Size) -> Pairs:
 
 
 class Table(NamedTuple):
-    """What kernels look up by number: references, or the arrays behind them. A segment is a solver batch of a group."""
+    """Lookup tables of a kernel: references, or the arrays behind them. A segment is one solver batch of one group."""
 
     a: Int[Rows, "contact"]  # first body
     b: Int[Rows, "contact"]  # second body
     kept: Float[Rows, "contact"]  # 0 where the padding defect forgets the accumulated impulses, else 1
     start: Int[Rows, "group"]  # first contact
     kind: Int[Rows, "group"]  # of its pairs
-    pairs: Float[Rows, "group"]  # how many pairs the kind has
-    batches: Float[Rows, "group"]  # how many solver batches the kind has
+    pairs: Float[Rows, "group"]  # number of pairs of the kind
+    batches: Float[Rows, "group"]  # number of solver batches of the kind
     group: Int[Rows, "segment"]
-    turn: Float[Rows, "segment"]  # number of the batch
+    turn: Float[Rows, "segment"]  # index of the batch within its group
 
     @property
     def segments(self) -> int:
@@ -84,7 +84,7 @@ class Table(NamedTuple):
 
 
 def table_of(size: Size, faithful_padding: bool) -> Table:
-    """The lookup tables of a size. Whole numbers that lanes calculate with are floats, exact ones."""
+    """Build the lookup tables of a size. Integers that lanes calculate with are stored as floats, exact up to 2^24."""
     kinds = pairs_of(size).by_group
     kept = [np.ones(len(pair), np.float32) for pair in kinds]
     for pair, row in zip(kinds, kept, strict=True):

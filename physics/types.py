@@ -20,13 +20,13 @@ from levelproof.physics.bounds import require
 
 FIXED_POLYGONS = 4  # floor, left wall, right wall, ceiling; pairs among them are never tested
 MAX_VERTICES = 4  # of a polygon; a triangle leaves its fourth vertex unused
-SOLVER_BATCH = 16  # pairs that read the same velocities; part of the reference's result
-SOLVER_ITERATIONS = 10
-MOST = 1e6  # of a constant of the engine
+SOLVER_BATCH = 16  # pairs that read the same velocities; the reference's result depends on it
+SOLVER_ITERATIONS = 10  # fewer: stacks sag and chains stretch; more: slower, and no longer the reference's result
+MAX_CONSTANT = 1e6  # upper bound of every constant in Params: beyond any use, and products stay finite in float32
 
 
 class Size(NamedTuple):
-    """How many things a world has room for (static, decides array shapes)."""
+    """Capacity of a world: the number of bodies, joints and thrusters it has room for. Static: decides array shapes."""
 
     polygons: int  # the fixed ones included
     circles: int
@@ -42,14 +42,16 @@ class Size(NamedTuple):
 class Params:
     """Constants of the engine (hashable: pass as a static argument). Defaults: `SimParams` of Jax2D 1.0.1."""
 
-    dt: float = 1 / 60  # s; larger is faster and less stable
-    slop: float = 0.01  # m; larger: visible overlap, smaller: jitter
-    contact_bias: float = 0.2  # share of the penetration beyond the slop undone per step
-    joint_bias_velocity: float = 2.0  # 1/s; pull of a joint's ends towards each other
-    joint_bias_position: float = 0.7  # share of the gap closed per solver iteration
+    dt: float = 1 / 60  # s; larger: faster and less stable
+    slop: float = 0.01  # m of penetration left alone; larger: visible overlap, smaller: jitter
+    contact_bias: float = (
+        0.2  # share of the penetration beyond the slop undone per step; near 1: bodies are thrown apart
+    )
+    joint_bias_velocity: float = 2.0  # 1/s; pull of a joint's ends towards each other; larger: stiffer, then unstable
+    joint_bias_position: float = 0.7  # share of the gap closed per solver iteration; above 1: overshoots
     fixed_joint_bias: float = 2.0  # 1/s; pull of a fixed joint to its angle
     joint_limit_bias: float = 5.0  # 1/s; pull of a joint back within its limits
-    joint_stiffness: float = 0.6  # share of the joint impulse applied per solver iteration
+    joint_stiffness: float = 0.6  # share of the joint impulse applied per solver iteration; near 1: chains oscillate
     max_position: float = 15.0  # m, to either side; bodies are kept within
     max_velocity: float = 100.0  # m/s, of each axis, to either side
     max_angular_velocity: float = 50.0  # rad/s, to either side
@@ -62,7 +64,7 @@ class Params:
     faithful_padding: bool = True  # reproduce the reference's padding defect, see docs/physics.md
 
     def __post_init__(self) -> None:
-        require(self, [field.name for field in fields(self) if field.type is float], 0, MOST)
+        require(self, [field.name for field in fields(self) if field.type is float], 0, MAX_CONSTANT)
         require(self, ("dt",), 1e-6, 1)
 
 
@@ -72,7 +74,7 @@ DEFAULT_PARAMS = Params()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Model:
-    """What is constant within a level. Every field has the lanes last (size 1 broadcasts)."""
+    """Everything that is constant within a level. Lanes are the last axis of every field (size 1 broadcasts)."""
 
     gravity: Float[Array, "2 lane"]  # m/s^2
     # bodies: polygons, then circles
@@ -88,8 +90,8 @@ class Model:
     radius: Float[Array, "circle lane"]
     # joints
     joint_active: Bool[Array, "joint lane"]
-    joint_a: Int[Array, "joint lane"]  # body number
-    joint_b: Int[Array, "joint lane"]
+    joint_a: Int[Array, "joint lane"]  # index of its first body
+    joint_b: Int[Array, "joint lane"]  # index of its second body
     joint_anchor_a: Float[Array, "joint 2 lane"]  # in the frame of body a
     joint_anchor_b: Float[Array, "joint 2 lane"]
     joint_fixed: Bool[Array, "joint lane"]  # else revolute
@@ -117,10 +119,7 @@ class Model:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class State:
-    """What evolves: enough to resume the simulation bit for bit.
-
-    Contacts are numbered as `pairs.py` says.
-    """
+    """Everything that evolves: enough to resume the simulation bit for bit. `pairs` defines the order of contacts."""
 
     position: Float[Array, "body 2 lane"]  # m, of the centroid
     rotation: Float[Array, "body lane"]  # rad
