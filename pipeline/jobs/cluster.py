@@ -35,6 +35,7 @@ from levelproof.pipeline.jobs.likeness import Program, program_of, unlike
 from levelproof.pipeline.jobs.progress import STOPPING, Board, Tally
 from levelproof.pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, Settle, UnitOutcome, levels_text
 from levelproof.pipeline.runtime import GRACE, own_core, own_cores, prepare_jax, stoppable
+from levelproof.pipeline.store.leases import serve, served
 from levelproof.pipeline.store.remote import absolute, as_typed
 from levelproof.pipeline.words import duration
 
@@ -50,13 +51,15 @@ MOST_SILENT = 1800.0  # s without a word after which a worker is given up; a lar
 class WorkerActor:
     """A worker in a process of its own. Calls are short (see `schedule.ROUND`), so that one thread suffices."""
 
-    def begin(self, program: Program, job: JobConfig, split: Path, neighbours: int) -> str:
-        """Get ready; why not, where another program runs here. `neighbours` as in `runtime.own_core`."""
+    def begin(self, program: Program, job: JobConfig, split: Path, neighbours: int, writer: str) -> str:
+        """Get ready; why not, where another program runs here. `neighbours` as in `runtime.own_core`, `writer` as in
+        `leases.serve`."""
         if refusal := unlike(program, job):
             return refusal
         prepare_jax(own_core(neighbours))
         from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
+        serve(split, writer)
         self._worker, self._at_work = Worker(job, split), False
         self._before = signal.signal(signal.SIGTERM, self._asked_to_go)
         return ""
@@ -131,7 +134,7 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
         KeyboardInterrupt: somebody asked for the end; what could be kept is committed.
     """
     with connected() as stop:
-        crew = Crew(_seen_from_elsewhere(job), absolute(split), scheduler, board)
+        crew = Crew(_seen_from_elsewhere(job), absolute(split), scheduler, board, served(split))
         while not scheduler.over:
             crew.follow_cluster()
             crew.start_workers()
@@ -153,8 +156,9 @@ def _seen_from_elsewhere(job: JobConfig) -> JobConfig:
 class Crew:
     """All workers of a job: a place for each core or GPU of each machine."""
 
-    def __init__(self, job: JobConfig, split: Path, scheduler: Scheduler, board: Board) -> None:
-        self._job, self._split, self._scheduler, self._board = job, split, scheduler, board
+    def __init__(self, job: JobConfig, split: Path, scheduler: Scheduler, board: Board, writer: str = "") -> None:
+        """`writer` is the name under which the driver has the split; workers that get none commit beside no writer."""
+        self._job, self._split, self._scheduler, self._board, self._writer = job, split, scheduler, board, writer
         units = -(-scheduler.waiting // job.levels_per_unit)
         self._most = max(1, min(job.workers or units, units))
         self._gpus = _on_gpus()
@@ -191,7 +195,8 @@ class Crew:
             self._started += 1
             name = f"levelproof {self._job.budget}/{self._job.size} worker {self._started}"
             neighbours = 0 if self._gpus else sum(of.node == handle.node for of in self._handles)
-            handle.start(name, int(self._gpus), program_of(self._job), self._job, self._split, neighbours)
+            begin = program_of(self._job), self._job, self._split, neighbours, self._writer
+            handle.start(name, int(self._gpus), *begin)
 
     def order(self) -> None:
         """Give units to the workers that have reported, and let them go on."""

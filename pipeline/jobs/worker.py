@@ -13,7 +13,6 @@ from levelproof.experts.train import TrainingRun
 from levelproof.pipeline.errors import LevelproofError
 from levelproof.pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
-from levelproof.pipeline.store.leases import serve
 from levelproof.pipeline.store.paused import save_paused
 
 
@@ -21,7 +20,6 @@ class Worker:
     """Units under way in this process."""
 
     def __init__(self, job: JobConfig, split: Path) -> None:
-        serve(split)
         self._job, self._split = job, split
         self._pool = pool_for(job)
         self._runs: dict[WorkUnit, TrainingRun] = {}

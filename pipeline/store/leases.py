@@ -121,18 +121,22 @@ def named(split: Path, lock: IO[str]) -> Iterator[None]:
 
 @contextmanager
 def serving(split: Path, writer: str) -> Iterator[None]:
-    """This process, and those that it starts, work for this writer meanwhile."""
-    _served[split] = writer
+    """Have this process, and those to which it hands the name, work for this writer in the `with` block."""
+    serve(split, writer)
     try:
         yield
     finally:
         del _served[split]
 
 
-def serve(split: Path) -> None:
-    """Work from now on for whoever writes to a split now."""
-    if split not in _served:
-        _served[split] = _writer(split)
+def serve(split: Path, writer: str) -> None:
+    """Work from now on for this writer, as the process that is it says. The lock may have another one's name by now."""
+    _served[split] = writer
+
+
+def served(split: Path) -> str:
+    """Name the writer of a split for whom this process works, for those that it starts; none is empty."""
+    return _served.get(split, "")
 
 
 def require_served(split: Path) -> None:

@@ -19,10 +19,10 @@ class Fragile(cluster.WorkerActor):
 
     deadly = int(sys.argv[1])
 
-    def begin(self, program: Program, job: JobConfig, split: Path, neighbours: int) -> str:
+    def begin(self, program: Program, job: JobConfig, split: Path, neighbours: int, writer: str) -> str:
         if self.deadly < 0:
             os._exit(1)
-        return super().begin(program, job, split, neighbours)
+        return super().begin(program, job, split, neighbours, writer)
 
     def work(self, order: Order, seconds: float) -> Round:
         if any(self.deadly in unit.level_ids for unit in order.units):

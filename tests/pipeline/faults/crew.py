@@ -22,7 +22,7 @@ from levelproof.experts.train import UnitResult
 from levelproof.pipeline.jobs.progress import Board
 from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, Summary, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.unit import commit, failure
-from levelproof.pipeline.store.leases import serve
+from levelproof.pipeline.store.leases import serve, served
 from tests.pipeline.made import made_level, made_record, made_verdict
 
 WANTED = 2  # levels for which a worker has room
@@ -46,7 +46,7 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
     while not scheduler.over:
         if worker is None:
             worker = waiting.pop(0)
-            worker.send((job, split))
+            worker.send((job, split, served(split)))
             scheduler.join(worker, time.monotonic())
         try:
             worker.send(scheduler.order(worker, time.monotonic()))
@@ -70,9 +70,9 @@ def fork_worker(begin: Callable[[], None]) -> None:
     try:
         for others in [mine, *waiting]:
             others.close()
-        job, split = theirs.recv()
+        job, split, writer = theirs.recv()
         begin()
-        serve(split)
+        serve(split, writer)
         while True:
             order: Order = theirs.recv()
             theirs.send(Round([_done(job, split, unit) for unit in order.units], {}, WANTED))

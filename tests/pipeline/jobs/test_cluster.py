@@ -5,6 +5,7 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import COMPANY, Scheduler, WorkUnit
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
-from tests.pipeline.command import PATIENCE, assert_refused, descendants, run, start, title, until
+from tests.pipeline.command import PATIENCE, ROOT, assert_refused, descendants, run, start, title, until
 from tests.pipeline.made import lasting, made_job
 
 LEVELS, DEADLY = 8, 2
@@ -72,6 +73,58 @@ def test_an_address_that_cannot_be_one_is_named(address: str, monkeypatch: pytes
     monkeypatch.setenv("RAY_ADDRESS", address)
     with pytest.raises(UserError, match=f"There is no Ray cluster at RAY_ADDRESS={re.escape(address)} "):
         require_reachable(address)
+
+
+# A command that still runs when another one has its folder, which was made again before any worker starts. Its worker
+# commits ready-made results by the real commit.
+CUT_OFF = """
+import os, pathlib, shutil, sys
+from rich.console import Console
+from levelproof.pipeline.jobs import cluster
+from levelproof.pipeline.jobs.progress import Board, Tally
+from levelproof.pipeline.jobs.schedule import Round, Scheduler, UnitOutcome, WorkUnit
+from levelproof.pipeline.store.locks import only_writer
+from tests.pipeline.made import made_job
+
+class Ready(cluster.WorkerActor):
+    def begin(self, program, job, split, *more):
+        self.split = split
+        return super().begin(program, job, split, *more)
+
+    def work(self, order, seconds):
+        from levelproof.pipeline.jobs.unit import failure
+        from tests.pipeline.driver import commit_made
+
+        (unit,) = order.units
+        try:
+            commit_made(self.split, unit)
+        except Exception as error:
+            return Round([failure(self.split, unit, error)], {}, 0)
+        return Round([UnitOutcome(unit, reason="It was committed.")], {}, 0)
+
+def settle(outcomes):
+    for outcome in outcomes:
+        sys.exit(outcome.fatal or outcome.reason)
+
+cluster.WorkerActor = Ready
+split = pathlib.Path(sys.argv[1])
+with only_writer(split, print):
+    shutil.rmtree(split)
+    split.mkdir()
+    with only_writer(pathlib.Path(os.path.relpath(split)), print):  # the other command, by another path to the folder
+        board = Board(Tally(2, 0, 0), Console(stderr=True))
+        cluster.run(made_job("data", "unit=2", "workers=1"), split, Scheduler([WorkUnit((0, 1))], 2), settle, board)
+"""
+
+
+@pytest.mark.slow
+def test_a_worker_that_starts_late_commits_for_its_own_driver_only(tmp_path: Path) -> None:
+    split = tmp_path / SPLIT
+    split.mkdir(parents=True)
+    program = [sys.executable, "-c", CUT_OFF, str(split)]
+    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert "Another command has taken over" in done.stderr, done.stderr
+    assert not fragment_paths(split)
 
 
 def test_workers_read_no_relative_path() -> None:

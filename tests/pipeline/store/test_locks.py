@@ -40,7 +40,7 @@ def test_a_worker_of_an_earlier_command_commits_nothing_beside_the_next(
     monkeypatch.setattr(leases, "_served", {})
     worker = Path(os.path.relpath(tmp_path))  # as another process has it
     with only_writer(tmp_path, print):
-        leases.serve(worker)
+        leases.serve(worker, leases.served(tmp_path))
     with committing(worker):
         pass
     for _ in range(2):
