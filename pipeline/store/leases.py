@@ -66,18 +66,35 @@ class Lease:
         self._thread.join(RENEWAL)
         if not (self.lost or self._thread.is_alive()):
             with suppress(LevelproofError):
-                put_if(self._path, b"{}", self._version)
+                self._put(b"{}")
 
     def _keep(self) -> None:
         while not self._over.wait(RENEWAL):
             self._renewals += 1
             with suppress(LevelproofError):  # a store that is gone is told by who has something to write
-                version = put_if(self._path, self._text(), self._version)
-                if version is None:
+                if not self._put(self._text()):
                     self.lost = True
                     signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
                     return
-                self._version = version
+
+    def _put(self, text: bytes) -> bool:
+        """Replace the lock's text; False: another writer has the lease.
+
+        The version that the store has may be that of an older text of this writer, whose answer was lost.
+        """
+        version = put_if(self._path, text, self._version)
+        if version is None and (own := self._own()):
+            version = put_if(self._path, text, own)
+        self._version = version or self._version
+        return version is not None
+
+    def _own(self) -> Version | None:
+        """The version that the store has, if this writer put it."""
+        try:
+            found = get(self._path)
+        except FileNotFoundError:
+            return None
+        return found.version if _said(found.data).get("writer") == self.token else None
 
     def _text(self) -> bytes:
         return _about(self.token, renewals=self._renewals).encode()
