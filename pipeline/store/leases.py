@@ -29,6 +29,7 @@ RENEWAL = 5.0  # s between renewals
 NOTICE = 2.0  # s of waiting after which people are told for what
 POLL = 0.5  # s between two looks
 MOST_BYTES = 2**16  # of a lock file
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # another one on each machine, and after each start
 
 _served: dict[Path, str] = {}  # the writer of each split for whom this process works
 
@@ -213,7 +214,7 @@ def _writer(split: Path) -> str:
 
 def _about(token: str, **more: int) -> str:
     """A lock file's text."""
-    return json.dumps({"writer": token, "host": _here(), "pid": os.getpid(), **more})
+    return json.dumps({"writer": token, "host": socket.gethostname(), "pid": os.getpid(), "within": _here(), **more})
 
 
 def _said(data: bytes) -> dict[str, Any]:
@@ -225,15 +226,20 @@ def _said(data: bytes) -> dict[str, Any]:
 
 
 def _here() -> str:
-    """Where a process's number means this process: containers of one machine may share its name."""
-    space = Path("/proc/self/ns/pid")
-    return f"{socket.gethostname()} {os.readlink(space) if space.exists() else ''}".strip()
+    """Name the start of this machine and the PID namespace, within which a PID is unique; empty if they are unknown.
+
+    Machines may share a host name, and outside of containers all of them have the same number for the namespace.
+    """
+    try:
+        return f"{BOOT_ID.read_text().strip()} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return ""
 
 
 def _died_here(holder: dict[str, Any]) -> bool:
-    """Whether it was a process of this machine, and is gone."""
-    pid = holder.get("pid")
-    if holder.get("host") != _here() or type(pid) is not int or pid == os.getpid():
+    """Whether a lock's text is of a process of this machine that has ended; False also if that cannot be known."""
+    pid, here = holder.get("pid"), _here()
+    if not here or holder.get("within") != here or type(pid) is not int or pid == os.getpid():
         return False
     try:
         os.kill(pid, 0)
