@@ -1,6 +1,8 @@
 """`levelproof status`: how far a split is."""
 
 import argparse
+import sys
+from functools import partial
 
 from levelproof.pipeline.cli.command import add_json, add_split
 
@@ -26,4 +28,4 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.watch:
         watch(arguments.split, arguments.json, Console(markup=False))
     else:
-        status(arguments.split, arguments.json)
+        status(arguments.split, arguments.json, partial(print, file=sys.stderr))

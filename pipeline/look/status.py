@@ -1,6 +1,7 @@
 """How far a split is: what the last command wanted, what is committed, what was given up, whether a run is at work."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,14 @@ from levelproof.pipeline.store.runs import inside
 from levelproof.pipeline.words import many
 
 
-def status(split: Path, as_json: bool) -> None:
-    """Print how far `split` is.
+def status(split: Path, as_json: bool, say: Callable[[str], None]) -> None:
+    """Print how far `split` is; `say` is told what is waited for.
 
     Raises:
         UserError: there is no split.
         Failure: a fragment is damaged.
     """
-    facts = look(split)
+    facts = look(split, say)
     if as_json:
         print(json.dumps(facts, indent=2))
         return
@@ -36,7 +37,7 @@ def status(split: Path, as_json: bool) -> None:
         print(f"No run is at work. To go on: {facts['command']}")
 
 
-def look(split: Path) -> dict[str, Any]:
+def look(split: Path, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """The facts that `status` prints."""
     try:
         note = read_note(split)
@@ -55,6 +56,6 @@ def look(split: Path) -> dict[str, Any]:
         "done": int(done.sum()),
         "labels": dict(sorted(manifest.counts(done).items())),
         "quarantined": [path.name for path in given_up(split)],
-        "running": is_written(split),
+        "running": is_written(split, say),
         "command": note.command,
     }

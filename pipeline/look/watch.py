@@ -1,8 +1,10 @@
 """How a job goes on, from its split alone: by what its latest run tells there. Knows nothing of workers."""
 
 import json
+import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +34,7 @@ def watch(split: Path, as_json: bool, console: Console, every: float = EVERY) ->
     Raises:
         UserError: there is no split, or no run has told anything.
     """
-    look(split)  # that there is a split
+    look(split, partial(print, file=sys.stderr))  # that there is a split
     if as_json:
         _follow(split, every, lambda facts: print(json.dumps(facts), flush=True))
     else:

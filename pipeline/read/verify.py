@@ -121,8 +121,10 @@ def _examined(split: Path, console: Console | None) -> Findings:
             named |= {name for fragment, _ in parts for name in fragment.digests}
     there = np.unique(np.concatenate(known))
     findings.there = runs(there)
-    _damaged(split, note, there, named, findings)
-    if note and not is_written(split):
+    say = lambda text: console and console.print(text, highlight=False, markup=False, soft_wrap=True)
+    running = is_written(split, say)
+    _damaged(split, note, there, named, running, findings)
+    if note and not running:
         gone = without(without(note.level_ids.tolist(), there), np.array(sorted(findings.lost), np.int64))
         if gone:
             findings.missing = gone
@@ -269,8 +271,10 @@ def _note_losses(rows: pa.Table, making: Making, findings: Findings) -> None:
             findings.unlike -= {row["shard"], row["experts"]}
 
 
-def _damaged(split: Path, note: JobNote | None, there: np.ndarray, named: set[str], findings: Findings) -> None:
-    """Whose levels are lost with fragments that are damaged or missing."""
+def _damaged(
+    split: Path, note: JobNote | None, there: np.ndarray, named: set[str], running: bool, findings: Findings
+) -> None:
+    """Find whose levels are lost with fragments that are damaged or, unless a run is writing, missing."""
     unnamed = [path for path in data_paths(split) if path.relative_to(split).as_posix() not in named]
     for fragment, wrong in findings.fragments.items():
         first, last = ids_of(fragment)
@@ -278,7 +282,7 @@ def _damaged(split: Path, note: JobNote | None, there: np.ndarray, named: set[st
         unnamed = [path for path in unnamed if path not in mine]
         ids = _ids_in(mine) | {first, last} | _between(first, last, note, findings)
         findings.tell(wrong, _not_in(there, ids))
-    if is_written(split):
+    if running:
         return
     begun = {attempt_of(path) for path in entries(split, MANIFEST, BEGUN, DirEntry.is_file)}
     for path in unnamed:

@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from math import inf
 from pathlib import Path
 from typing import IO, Any
 
@@ -26,9 +27,11 @@ from levelproof.pipeline.store.remote import as_typed, is_remote
 
 SILENCE = 60.0  # s without a renewal after which a writer counts as dead
 RENEWAL = 5.0  # s between renewals
+SIGHT = 12.0  # s of looking on without a renewal after which no writer is said to be there; two renewals and more
 NOTICE = 2.0  # s of waiting after which people are told for what
 POLL = 0.5  # s between two looks
 MOST_BYTES = 2**16  # of a lock file
+RENEWALS = "renewals"  # in a lock's text: of a lease; a folder's lock, which may be copied to a store, has none
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # another one on each machine, and after each start
 
 _served: dict[Path, str] = {}  # the writer of each split for whom this process works
@@ -98,7 +101,7 @@ class Lease:
         return found.version if _said(found.data).get("writer") == self.token else None
 
     def _text(self) -> bytes:
-        return _about(self.token, renewals=self._renewals).encode()
+        return _about(self.token, **{RENEWALS: self._renewals}).encode()
 
 
 @contextmanager
@@ -164,13 +167,31 @@ def require_served(split: Path) -> None:
         raise LeaseLost(split)
 
 
-def is_leased(split: Path) -> bool:
-    """Whether a writer has renewed its lease a short while ago."""
-    try:
-        found = get(split / WRITER_LOCK, MOST_BYTES)
-    except OSError:  # there is none, or what is there is none
-        return False
-    return "writer" in _said(found.data) and time.time() - found.written.timestamp() < SILENCE
+def is_leased(split: Path, say: Callable[[str], None]) -> bool:
+    """Whether a writer holds the lease of a split: whether it renews it within SIGHT seconds, by this process's clock.
+
+    `say` is told what is waited for, when that takes long.
+    """
+    first, begun, notice = b"", 0.0, NOTICE
+    while True:
+        asked = time.monotonic()
+        try:
+            found = get(split / WRITER_LOCK, MOST_BYTES).data
+        except OSError:  # there is none, or what is there is none
+            return False
+        holder = _said(found)
+        if RENEWALS not in holder or _died_here(holder):
+            return False
+        if not first:
+            first, begun = found, time.monotonic()
+        elif found != first:
+            return True
+        elif asked - begun > SIGHT:
+            return False
+        elif asked - begun > notice:
+            say(f"Looking whether a run still writes to {as_typed(split)}, which takes up to {SIGHT:.0f} s.")
+            notice = inf
+        time.sleep(POLL)
 
 
 def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
@@ -198,7 +219,7 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
                 f"Waiting whether process {holder.get('pid')} on {holder.get('host')} still writes to "
                 f"{as_typed(path.parent)}: after {SILENCE:.0f} s of silence it does not."
             )
-            begun = float("inf")
+            begun = inf
         time.sleep(POLL)
 
 

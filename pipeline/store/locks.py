@@ -88,10 +88,13 @@ def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
         yield
 
 
-def is_written(split: Path) -> bool:
-    """Whether a `levelproof generate` is at work on this split now; writes nothing, and needs to read only."""
+def is_written(split: Path, say: Callable[[str], None] = lambda _: None) -> bool:
+    """Whether a `levelproof generate` is running on this split now; writes nothing, and needs to read only.
+
+    `say` is told what is waited for, when that takes long, as it does only in a store.
+    """
     if is_remote(split):
-        return is_leased(split)
+        return is_leased(split, say)
     try:
         with (split / WRITER_LOCK).open() as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

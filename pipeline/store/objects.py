@@ -6,7 +6,6 @@ was first looks whether it was itself. Knows nothing of what is in the files.
 
 from collections.abc import Iterable
 from contextlib import suppress
-from datetime import datetime
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -39,7 +38,6 @@ class StoredFile(NamedTuple):
 
     data: bytes
     version: Version
-    written: datetime  # by the store's clock
 
 
 def get(path: Path, most: float = inf) -> StoredFile:
@@ -55,8 +53,7 @@ def get(path: Path, most: float = inf) -> StoredFile:
 
     def request() -> StoredFile:
         answer = obstore_module().get(store, key)
-        about = answer.meta
-        return StoredFile(data_of(answer, most), Version.of(about), about["last_modified"])
+        return StoredFile(data_of(answer, most), Version.of(answer.meta))
 
     found = ask(path, request)
     if len(found.data) > most:

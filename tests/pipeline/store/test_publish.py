@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from datetime import timedelta
@@ -20,17 +20,17 @@ from levelproof.pipeline.errors import Failure, StoreFailure, UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.store import leases, remote
 from levelproof.pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
-from levelproof.pipeline.store.layout import FRAGMENT, data_paths, new_attempt, unit_name
+from levelproof.pipeline.store.layout import FRAGMENT, WRITER_LOCK, data_paths, new_attempt, unit_name
 from levelproof.pipeline.store.leases import Lease, LeaseLost
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.objects import get, put, remove, require_conditions
 from levelproof.pipeline.store.publish import ended
-from tests.pipeline.command import ROOT, TINY, run
+from tests.pipeline.command import PATIENCE, ROOT, TINY, run
 from tests.pipeline.command import here as command
 from tests.pipeline.driver import LEVELS, SPLIT, UNIT, commit_made, drive, require_same_content
-from tests.pipeline.servers import AZURE_KEY, AZURE_NAME, Server, azure_process, bucket_of, s3_process, serving
+from tests.pipeline.servers import AZURE_KEY, AZURE_NAME, Answer, Server, azure_process, bucket_of, s3_process, serving
 from tests.pipeline.servers import before as before_it
 
 OUT = "s3://bucket/data"
@@ -346,6 +346,93 @@ def test_a_writer_that_is_silent_is_waited_for_and_replaced_and_notices(
     theirs[0].release()
     (sentence,) = said
     assert "still writes to s3://bucket/data/128k/s: after 0 s" in sentence
+
+
+def left_by_a_killed_writer(**other: Any) -> bytes:
+    """A lease's text; its process has ended, on this machine but for what is `other`."""
+    with subprocess.Popen(["true"]) as ended_process:
+        pass
+    text = json.loads(leases._about("theirs", renewals=7))
+    return json.dumps(text | {"pid": ended_process.pid} | other).encode()
+
+
+def test_a_lease_of_a_dead_process_is_taken_at_once_on_its_own_machine_only(
+    server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Not on another one of the same host name, which outside of containers has the same PID namespace, too."""
+    monkeypatch.setattr(leases, "NOTICE", 0.0)
+    said: list[str] = []
+    put(THERE / WRITER_LOCK, left_by_a_killed_writer())
+    Lease(THERE, said.append).release()
+    assert not said
+    monkeypatch.setattr(leases, "SILENCE", 0.3)
+    for boot_id in ("a55af8d1-3d1c-4b2c-8a5e-5f0c2a9b0001", None):  # of the other machine; None: it cannot be known
+        put(THERE / WRITER_LOCK, left_by_a_killed_writer())
+        with monkeypatch.context() as elsewhere:
+            (tmp_path / "boot_id").write_text(boot_id or "")
+            elsewhere.setattr(leases, "BOOT_ID", tmp_path / ("boot_id" if boot_id else "none"))
+            said.clear()
+            Lease(THERE, said.append).release()
+        (sentence,) = said
+        assert "still writes to s3://bucket/data/128k/s" in sentence
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_a_writer_keeps_its_lease_when_answers_to_renewals_are_lost(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.1))
+    monkeypatch.setattr(leases, "RENEWAL", 0.05)
+    try:
+        lease = Lease(THERE, print)
+        for _ in range(2):
+            server.spoil(1, "lost")  # done, without an answer
+            await_renewals(lambda: lease._renewals, 3)  # of which at least two were given up
+            server.spoil(0)
+            await_renewals(lambda: json.loads(get(THERE / WRITER_LOCK).data)["renewals"], 3)
+    except KeyboardInterrupt:
+        pytest.fail("it takes itself for another writer")
+    lease.release()
+    assert get(THERE / WRITER_LOCK).data == b"{}"
+
+
+def await_renewals(count: Callable[[], int], more: int) -> None:
+    """Wait until there are so many more."""
+    before, end = count(), time.monotonic() + PATIENCE
+    while count() < before + more:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("day", ["Thu, 01 Jan 1981 00:00:00 GMT", "Fri, 01 Jan 2038 00:00:00 GMT"])
+def test_no_clock_decides_whether_a_store_s_split_is_written(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, day: str
+) -> None:
+    """The store's, by which a lease was put on this `day`, or this machine's."""
+    monkeypatch.setattr(leases, "RENEWAL", 0.1)
+    monkeypatch.setattr(leases, "NOTICE", 0.0)
+    bucket, said = bucket_of(tmp_path / "s3"), list[str]()
+
+    def on_that_day(*request: Any) -> Answer:
+        answer = bucket(*request)
+        return answer._replace(headers=answer.headers | {"Last-Modified": day})
+
+    with serving(on_that_day) as other, pytest.MonkeyPatch.context() as patched:
+        patched.setenv("AWS_ENDPOINT_URL", other.url)
+        forget()
+        assert not is_written(THERE, said.append)
+        with leases.leased(THERE, print):
+            assert is_written(THERE, print)
+        assert not is_written(THERE, said.append)
+        put(THERE / WRITER_LOCK, left_by_a_killed_writer())
+        assert not is_written(THERE, said.append)
+        put(THERE / WRITER_LOCK, json.dumps({"writer": "a folder's, copied here"}).encode())
+        assert not is_written(THERE, said.append)
+        assert not said, "each of these is known at once"
+        put(THERE / WRITER_LOCK, left_by_a_killed_writer(within="another machine"))
+        patched.setattr(leases, "SIGHT", 0.3)
+        assert not is_written(THERE, said.append)
+        assert said == ["Looking whether a run still writes to s3://bucket/data/128k/s, which takes up to 0 s."]
 
 
 @pytest.mark.parametrize(("every", "how"), [(0, ""), (2, "lost")])

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import timedelta
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -304,18 +305,25 @@ def test_what_is_longer_than_it_can_be_is_not_read_to_its_end(tmp_path: Path, mo
     """What tells of a run: its note, its lease, its events."""
     (tmp_path / "s").mkdir()
     note_job(tmp_path / "s", made_job(), ["levelproof", "generate"], [(0, 7)])
-    (tmp_path / "s" / WRITER_LOCK).write_text('{"writer": "somebody"}')
+    lock, renewals = tmp_path / "s" / WRITER_LOCK, count()
+    lock.touch()
+
+    def answers(*request: Any) -> Answer:
+        if request[1].endswith(WRITER_LOCK):
+            lock.write_text(json.dumps({"writer": "somebody", "renewals": next(renewals)}))
+        return files_of(tmp_path)(*request)
+
     (tmp_path / "s/run.jsonl").write_text('{"time": 1.0, "event": "started"}\n')
-    with serving(files_of(tmp_path)) as server:
+    with serving(answers) as server:
         there = Path(f"{server.url}/s")
         assert read_note(there).intact
-        assert is_leased(there)
+        assert is_leased(there, print)
         assert len(events_of(there / "run.jsonl")) == 1
         for module in (job_note, leases, events):
             monkeypatch.setattr(module, "MOST_BYTES", 20)
         with pytest.raises(NoteError, match="OSError"):
             read_note(there)
-        assert not is_leased(there)
+        assert not is_leased(there, print)
         assert events_of(there / "run.jsonl") == []
 
 
