@@ -65,6 +65,8 @@ def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[
         # A store takes no files that grow
         folder = Path(FOLDER, *split.parts[-2:]) if is_remote(split) else split / FOLDER
         with harmless():
+            if not is_remote(split) and folder.is_symlink():
+                raise UserError(f"{folder} is a link, and the folders of a split must be in it")
             opened = (TensorBoardWriter if job.log == "tensorboard" else WandbWriter)(job, folder)
             say(f"Scalars for {job.log}: {opened.place}")
             writer = opened

@@ -6,7 +6,7 @@ from its manifest; a person is asked only for what no program can decide, the li
 
 import io
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -47,12 +47,14 @@ def card(splits: Sequence[Path], out: Path | None, wishes: Wishes) -> None:
     out = out or splits[0].absolute().parent.parent / README
     folder = out.absolute().parent.resolve()
     _require_ours(out)
+    _require_no_links([out])
     paths = [_below(folder, split) for split in splits]
     manifests = [require_manifest(split, ASKED, compact=True) for split in splits]
     facts = [_facts(path, manifest) for path, manifest in zip(paths, manifests, strict=True)]
     with writing_to(out):
         for name in (PREVIEW, FIGURES):
             (folder / name).mkdir(parents=True, exist_ok=True)
+            _require_no_links([folder / name, *(folder / name).iterdir()])
         tables = [preview(manifest, SAMPLE) for manifest in manifests]
         for of, table in zip(facts, tables, strict=True):
             pq.write_table(table, folder / PREVIEW / f"{of.subset}.parquet", row_group_size=100)
@@ -69,6 +71,12 @@ def card(splits: Sequence[Path], out: Path | None, wishes: Wishes) -> None:
 def _require_ours(out: Path) -> None:
     if out.exists() and not (out.is_file() and MARK in out.read_text(encoding="utf-8", errors="replace")):
         raise UserError(f"{out} is there already, and `levelproof card` did not write it: name another file with -o.")
+
+
+def _require_no_links(paths: Iterable[Path]) -> None:
+    """Refuse to write through links: whoever made the dataset may have made them, too."""
+    if links := [path for path in paths if path.is_symlink()]:
+        raise UserError(f"{links[0]} is a link: remove it, and run the same command again.")
 
 
 def _below(folder: Path, split: Path) -> str:

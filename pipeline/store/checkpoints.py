@@ -22,7 +22,7 @@ from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.owned import OTHERS, require_own
-from levelproof.pipeline.store.disk import flush
+from levelproof.pipeline.store.disk import flush, regular
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.layout import EXPERTS, MANIFEST, data_path
 from levelproof.pipeline.store.manifest import differences, read_manifest, require_manifest, told
@@ -45,7 +45,10 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
     rows = [experts[level_id] for level_id in sorted(experts)]
     begun, curves = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows)), stacked_curves(rows)
     path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-    np.savez(path, allow_pickle=False, level_id=np.array(sorted(experts)), curve=curves, **arrays_of(begun, "begun/"))
+    with open(path, "xb", opener=regular) as file:
+        np.savez(
+            file, allow_pickle=False, level_id=np.array(sorted(experts)), curve=curves, **arrays_of(begun, "begun/")
+        )
     path.chmod(path.stat().st_mode & ~OTHERS)
     flush(path)
 

@@ -1,12 +1,13 @@
-"""What is on the disk for good, and why a disk refuses."""
+"""Files opened and written without harm to others, what is on the disk for good, and why a disk refuses."""
 
 import errno
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure, UserError
 
 # The disk refuses: whoever tries again works for nothing.
 REFUSALS = {
@@ -18,6 +19,52 @@ REFUSALS = {
     errno.EPERM: "writing is not permitted: check the folder's permissions",
 }
 FAILS = {errno.EIO: "the disk fails: see `dmesg`"}  # or did once, so a unit is tried again
+
+
+class NotRegular(UserError):
+    """A link, a pipe or the like is where a split has a regular file."""
+
+    def __init__(self, path: str | Path) -> None:
+        super().__init__(
+            f"{path} must be a regular file without another name, and is a link, a pipe or the like: remove it, then "
+            "run the same command again."
+        )
+
+
+def regular(path: str | Path, flags: int) -> int:
+    """Open a regular file, as an `opener` of `open`: for files in a split, which anyone may have made.
+
+    It follows no link at the end of `path`, writes to no file that has another name too, and waits for no pipe.
+
+    Raises:
+        NotRegular: it is another kind of file, or has another name.
+        OSError: it cannot be opened.
+    """
+    try:
+        how = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        descriptor = os.open(path, flags & ~os.O_TRUNC | how, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO, errno.EISDIR):  # a link; a pipe that no process reads, a socket
+            raise NotRegular(path) from None
+        raise
+    about, writes = os.fstat(descriptor), flags & (os.O_WRONLY | os.O_RDWR)
+    if not stat.S_ISREG(about.st_mode) or (writes and about.st_nlink > 1):
+        os.close(descriptor)
+        raise NotRegular(path)
+    if flags & os.O_TRUNC:
+        os.ftruncate(descriptor, 0)
+    return descriptor
+
+
+def write_new(path: Path, data: bytes) -> None:
+    """Write a file in place of what has its name, of which no byte changes.
+
+    Raises:
+        OSError: the disk refuses, or a folder has this name.
+    """
+    path.unlink(missing_ok=True)
+    with open(path, "xb", opener=regular) as file:
+        file.write(data)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 from levelproof.pipeline.store import objects
+from levelproof.pipeline.store.disk import write_new
 from levelproof.pipeline.store.remote import is_remote, stored_in
 
 
@@ -19,7 +20,7 @@ def write(path: Path, data: bytes) -> None:
         objects.put(path, data)
         return
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_bytes(data)
+    write_new(temporary, data)
     temporary.replace(path)
 
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from levelproof.pipeline.errors import Failure, LevelproofError, UserError
+from levelproof.pipeline.store.disk import NotRegular, regular
 from levelproof.pipeline.store.layout import WRITER_LOCK
 from levelproof.pipeline.store.objects import Version, get, put_if
 from levelproof.pipeline.store.remote import as_typed, is_remote
@@ -227,10 +228,15 @@ def _writer(split: Path) -> str:
     """The name of the writer that a split has, or had last; nobody's is empty."""
     path = split / WRITER_LOCK
     try:
-        data = get(path).data if is_remote(path) else path.read_bytes()
-    except FileNotFoundError:
+        data = get(path).data if is_remote(path) else _lock_text(path)
+    except (FileNotFoundError, NotRegular):
         return ""
     return str(_said(data).get("writer", "")) if data else ""
+
+
+def _lock_text(path: Path) -> bytes:
+    with open(path, "rb", opener=regular) as file:
+        return file.read(MOST_BYTES)
 
 
 def _about(token: str, **more: int) -> str:

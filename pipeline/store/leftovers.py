@@ -1,11 +1,12 @@
 """What attempts that died have left in a split, and what of it may go; and what was merged into sealed fragments."""
 
+import os
 from collections.abc import Callable, Iterable
 from itertools import chain
 from os import DirEntry
 from pathlib import Path
 
-from levelproof.pipeline.store.disk import flush_entry
+from levelproof.pipeline.store.disk import flush_entry, regular
 from levelproof.pipeline.store.files import remove, remove_data
 from levelproof.pipeline.store.layout import (
     BEGUN,
@@ -64,11 +65,12 @@ def disown(data: Iterable[Path]) -> None:
     """Note that shards or experts go with the fragments that name them: as of attempts that were never committed.
 
     Raises:
+        NotRegular: a link or the like has the name of a mark.
         OSError: the disk refuses.
     """
     marks = [begun_path(path) for path in data]
     for mark in marks:
-        put(mark, OVER) if is_remote(mark) else mark.touch()
+        put(mark, OVER) if is_remote(mark) else os.close(regular(mark, os.O_WRONLY | os.O_CREAT))
     for folder in {mark.parent for mark in marks if not is_remote(mark)}:
         flush_entry(folder)
 

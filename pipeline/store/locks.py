@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO
 
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.disk import NotRegular, regular
 from levelproof.pipeline.store.layout import COMMIT_LOCK, WRITER_LOCK
 from levelproof.pipeline.store.leases import is_leased, leased, named, require_served
 from levelproof.pipeline.store.publish import publishing
@@ -33,14 +34,14 @@ def only_writer(split: Path, say: Callable[[str], None]) -> Iterator[None]:
     """Held by the one `levelproof generate` that may write to a split; `say` is told what is waited for.
 
     Raises:
-        UserError: another one is at work.
+        UserError: another one is at work, or the lock is not a regular file.
         LeaseLost: another one is, by now.
     """
     if is_remote(split):
         with leased(split, say):
             yield
         return
-    with (split / WRITER_LOCK).open("a+") as file:
+    with open(split / WRITER_LOCK, "a+", opener=regular) as file:
         if not _taken_within(PATIENCE, file):
             raise UserError(f"Another `levelproof generate` is writing to {split}: wait for it, or stop it first.")
         with named(split, file):
@@ -62,7 +63,7 @@ def committing(split: Path) -> Iterator[Path]:
         with publishing(split) as folder:
             yield folder
         return
-    with (split / COMMIT_LOCK).open("a+") as file:
+    with open(split / COMMIT_LOCK, "a+", opener=regular) as file:
         _take(file, fcntl.LOCK_SH)
         require_served(split)
         yield split
@@ -78,7 +79,7 @@ def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
         yield
         return
     path = split / COMMIT_LOCK
-    with path.open("a+") as file:
+    with open(path, "a+", opener=regular) as file:
         if not _taken_within(NOTICE, file):
             say(
                 f"Waiting for a worker of an earlier run, which still writes and holds {path}: "
@@ -96,9 +97,9 @@ def is_written(split: Path, say: Callable[[str], None] = lambda _: None) -> bool
     if is_remote(split):
         return is_leased(split, say)
     try:
-        with (split / WRITER_LOCK).open() as file:
+        with open(split / WRITER_LOCK, opener=regular) as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError as error:  # of other kinds: never written to, or not ours to ask
+    except (OSError, NotRegular) as error:  # of other kinds: never written to, not ours to ask, or no lock
         return isinstance(error, BlockingIOError)
     return False
 

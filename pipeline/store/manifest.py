@@ -23,7 +23,7 @@ from levelproof.pipeline.store import files
 from levelproof.pipeline.store.bounds import with_dictionaries
 from levelproof.pipeline.store.checksums import digests_below, with_own
 from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of
-from levelproof.pipeline.store.disk import flush, flush_entry
+from levelproof.pipeline.store.disk import flush, flush_entry, regular
 from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
 from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
 from levelproof.pipeline.store.remote import INDEX, is_remote
@@ -82,7 +82,8 @@ def write_fragment(
     whole = pa.BufferOutputStream()
     how: Any = {"compression": "zstd", "use_dictionary": with_dictionaries(), "write_page_checksum": True}
     pq.write_table(table, whole, row_group_size=ROW_GROUP, **how)
-    attempt.begun.write_bytes(with_own(whole.getvalue().to_pybytes()))
+    with open(attempt.begun, "wb", opener=regular) as file:
+        file.write(with_own(whole.getvalue().to_pybytes()))
     flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
     flush_entry(attempt.fragment.parent)  # the new name itself

@@ -2,7 +2,6 @@
 
 import os
 import secrets
-import stat
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import google_crc32c
 
 from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.disk import NotRegular, regular, write_new
 
 CHECKSUM = 4  # bytes of a CRC-32C behind each piece: a machine that lost its power may have kept other bytes
 USED = 60.0  # s; a piece is marked as used once in this time
@@ -35,15 +35,15 @@ class PieceCache:
         """Bytes of a piece; None: it is not there, or was damaged and is not there any more."""
         path = self.folder / name
         try:
-            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-        except OSError:
+            descriptor = regular(path, os.O_RDONLY)
+        except (OSError, NotRegular):
             return None
         try:
             about = os.fstat(descriptor)
-            if not stat.S_ISREG(about.st_mode) or about.st_size > MOST_PIECE:
+            if about.st_size > MOST_PIECE:
                 return None
             if time.time() - about.st_mtime > USED:
-                os.utime(path)
+                os.utime(path, follow_symlinks=False)
             if name in self._checked:
                 return os.pread(descriptor, last - first, first)
             data = os.pread(descriptor, about.st_size, 0)
@@ -67,7 +67,7 @@ class PieceCache:
         temporary = self.folder / f".{name}.{secrets.token_hex(4)}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(piece + google_crc32c.value(piece).to_bytes(CHECKSUM, "little"))
+            write_new(temporary, piece + google_crc32c.value(piece).to_bytes(CHECKSUM, "little"))
             temporary.replace(self.folder / name)
         except OSError as error:
             with suppress(OSError):

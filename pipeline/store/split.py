@@ -8,7 +8,7 @@ from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.store.disk import told_of
+from levelproof.pipeline.store.disk import told_of, write_new
 from levelproof.pipeline.store.layout import EVENTS, FOLDERS, JOB, split_path
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import committing, only_writer
@@ -84,7 +84,7 @@ def _make_writable(split: Path) -> None:
     try:
         split.mkdir(parents=True, exist_ok=True)
         probe = split / f".{JOB}.{os.getpid()}"
-        probe.touch()
+        write_new(probe, b"")
         probe.unlink()
     except OSError as error:
         reason = error.strerror or type(error).__name__

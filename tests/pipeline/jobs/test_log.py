@@ -88,6 +88,18 @@ def test_a_log_that_fails_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Mo
     assert said[-1].endswith("the run goes on without.")
 
 
+def test_a_log_folder_that_leads_out_of_the_split_is_not_written_to(tmp_path: Path) -> None:
+    for name in ("split", "elsewhere"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "split/log").symlink_to(tmp_path / "elsewhere")
+    said: list[str] = []
+    with logged(made_job("data", "log=tensorboard"), tmp_path / "split", said.append) as log:
+        log([BEGAN, STATE])
+    assert [text for text in said if "split/log is a link" in text] == said
+    assert len(said) == 1
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 @pytest.mark.parametrize(("log", "library"), [("tensorboard", "tensorboardX"), ("wandb", "wandb")])
 def test_without_its_library_nothing_begins(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: str, library: str

@@ -148,3 +148,15 @@ def test_the_page_s_python_runs(dataset: Path, tmp_path: Path, monkeypatch: pyte
     seen: dict[str, Any] = {}
     exec(compile(block, "README.md", "exec"), seen)
     assert seen["batch"].observation.shape[:2] == (64, 256)
+
+
+@pytest.mark.parametrize("name", ["README.md", "preview", "preview/128k-s.parquet", "figures/solved.svg"])
+def test_a_card_is_not_written_through_links(tmp_path: Path, name: str) -> None:
+    split = made_split(tmp_path / "levels", [[Label.UNSOLVED]])
+    mine = tmp_path / "mine"
+    mine.mkdir() if name == "preview" else mine.write_text("mine")
+    link = tmp_path / "levels" / name
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(mine)
+    assert main(["card", str(split)]) == 2
+    assert not [*mine.iterdir()] if mine.is_dir() else mine.read_text() == "mine"
