@@ -1,6 +1,7 @@
 """Files opened and written without harm to others, what is on the disk for good, and why a disk refuses."""
 
 import errno
+import fcntl
 import os
 import stat
 from collections.abc import Iterator
@@ -102,6 +103,24 @@ def flush_entry(path: Path) -> None:
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        to_drive(descriptor)
     finally:
         os.close(descriptor)
+
+
+def to_drive(descriptor: int) -> None:
+    """Have what a descriptor's file holds, or the names in its folder, outlast a loss of power.
+
+    On macOS `fsync` leaves it in the drive's cache, and F_FULLFSYNC does not; not every file system there has that.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    if full := getattr(fcntl, "F_FULLFSYNC", None):
+        try:
+            fcntl.fcntl(descriptor, full)
+            return
+        except OSError as error:
+            if error.errno not in (errno.ENOTSUP, errno.EINVAL, errno.ENOTTY):
+                raise
+    os.fsync(descriptor)

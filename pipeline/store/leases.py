@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from levelproof.pipeline.errors import Failure, LevelproofError, UserError
-from levelproof.pipeline.store.disk import NotRegular, regular
+from levelproof.pipeline.store.disk import NotRegular, regular, to_drive
 from levelproof.pipeline.store.layout import WRITER_LOCK
 from levelproof.pipeline.store.objects import Version, get, put_if
 from levelproof.pipeline.store.remote import as_typed, is_remote
@@ -136,7 +136,7 @@ def named(split: Path, lock: IO[str]) -> Iterator[None]:
     lock.truncate(0)
     lock.write(_about(token))
     lock.flush()
-    os.fsync(lock.fileno())  # workers on other machines read it
+    to_drive(lock.fileno())  # workers on other machines read it
     with serving(split, token):
         yield
 

@@ -1,10 +1,13 @@
 """A disk that is full refuses every writer in the same way; what is flushed."""
 
 import errno
+import fcntl
 import os
 import subprocess
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,13 +19,19 @@ from levelproof.experts.success import no_success
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.store.checkpoints import save_experts
-from levelproof.pipeline.store.disk import told_of
+from levelproof.pipeline.store.disk import flush_entry, told_of
 from levelproof.pipeline.store.fields import arrays_of
-from levelproof.pipeline.store.layout import new_attempt, unit_name
-from levelproof.pipeline.store.manifest import begin_fragment, write_fragment
+from levelproof.pipeline.store.layout import WRITER_LOCK, new_attempt, unit_name
+from levelproof.pipeline.store.locks import only_writer
+from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
 from levelproof.pipeline.store.shard import write_shard
+from tests.pipeline.command import ROOT
+from tests.pipeline.driver import commit_made
 from tests.pipeline.made import made_job, made_level, made_record
+
+FULLFSYNC = 51  # macOS's number of F_FULLFSYNC
 
 
 @pytest.fixture
@@ -78,6 +87,52 @@ def test_a_fragment_on_a_full_disk(tiny: Path) -> None:
         write_fragment(paths, [], job.hash, job.results)
     assert refused.value.errno == errno.ENOSPC
     assert not paths.fragment.exists()
+
+
+@pytest.mark.parametrize("has_it", [True, False], ids=["the file system can", "it cannot"])
+def test_macos_flushes_the_drive_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_it: bool) -> None:
+    """No such system is at hand: what it has beside Linux is put in its place."""
+    flushed: dict[str, set[Path]] = {"drive": set(), "fsync": set()}
+    fsync, control = os.fsync, fcntl.fcntl
+
+    def note(how: str, descriptor: int) -> None:
+        fsync(descriptor)
+        flushed[how].add(Path(os.readlink(f"/proc/self/fd/{descriptor}")))
+
+    def fcntl_of_macos(descriptor: int, command: int, *argument: Any) -> Any:
+        if command != FULLFSYNC:
+            return control(descriptor, command, *argument)
+        if not has_it:
+            raise OSError(errno.ENOTSUP, "Operation not supported")
+        note("drive", descriptor)
+        return 0
+
+    monkeypatch.setattr(fcntl, "F_FULLFSYNC", FULLFSYNC, raising=False)
+    monkeypatch.setattr(fcntl, "fcntl", fcntl_of_macos)
+    monkeypatch.setattr(os, "fsync", partial(note, "fsync"))
+    with only_writer(tmp_path, print):
+        commit_made(tmp_path, WorkUnit((0, 1)))
+    (fragment,), files = fragment_paths(tmp_path), [path for path in tmp_path.rglob("shards/**/*") if path.is_file()]
+    wanted = {tmp_path / WRITER_LOCK, tmp_path, fragment.parent, *files, *(path.parent for path in files)}
+    assert len(files) > 1
+    assert flushed["drive" if has_it else "fsync"] >= wanted
+    assert not flushed["fsync" if has_it else "drive"]
+
+
+def test_a_drive_that_fails_is_not_asked_for_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(fcntl, "F_FULLFSYNC", FULLFSYNC, raising=False)
+    monkeypatch.setattr(fcntl, "fcntl", fail)
+    with pytest.raises(OSError, match="Input/output error"):
+        flush_entry(tmp_path)
+
+
+def test_one_function_alone_flushes() -> None:
+    """Whoever calls `fsync` elsewhere leaves data in the drive's cache on macOS."""
+    calls = {path.name for path in (ROOT / "pipeline").rglob("*.py") if "fsync(" in path.read_text()}
+    assert calls == {"disk.py"}
 
 
 @pytest.mark.slow
