@@ -27,6 +27,7 @@ from levelproof.pipeline.store.layout import (
     new_attempt,
     unit_name,
 )
+from levelproof.pipeline.store.leases import require_served
 from levelproof.pipeline.store.leftovers import disown, drop
 from levelproof.pipeline.store.manifest import (
     THREADS,
@@ -108,6 +109,7 @@ def seal(
 
     Raises:
         Failure: a fragment or a shard is damaged, or the engine cannot convert it; nothing has changed.
+        LeaseLost: another writer has the split now; nothing has changed.
         OSError: the disk refuses; nothing has changed.
     """
     paths = {piece.path for piece in pieces}
@@ -129,6 +131,7 @@ def seal(
         merged = dict(zip((attempt.shard for attempt in attempts), places.values(), strict=False))
         for shard, of in merged.items():
             merge_shards(shard, of, moved, rows_a_file)
+        require_served(folder)
         disown(replaced)
         write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, elsewhere)
     sealed = fragment_path(split, unit)

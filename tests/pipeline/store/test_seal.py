@@ -25,7 +25,9 @@ from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store import manifest
 from levelproof.pipeline.store import seal as sealing
 from levelproof.pipeline.store.layout import fragment_path, unit_name
+from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.leftovers import clean
+from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.seal import CROWD, Piece, due, plan, seal
 from levelproof.pipeline.store.shard import Shard
@@ -97,6 +99,21 @@ def test_a_plan_merges_neighbours_and_leaves_what_is_large() -> None:
     crowd = [piece(100 + i, 1, False) for i in range(CROWD)]
     assert due([few, *crowd[1:]], 2 * CROWD) is None
     assert due([few, *crowd], 2 * CROWD) == crowd
+
+
+def test_a_command_whose_folder_another_one_has_seals_nothing_there(split: Path, made: Path) -> None:
+    """It was removed and made again, by another path to it as another process has it."""
+    same = Path(os.path.relpath(split))
+    with only_writer(split, print):
+        shutil.rmtree(split)
+        shutil.copytree(made, split)
+        with only_writer(same, print):
+            with pytest.raises(LeaseLost):
+                seal(split, pieces(split))
+            assert whole(split) == whole(made)
+            assert_tidy(split, UNITS)
+            seal(same, pieces(same))
+    assert_tidy(split, 1)
 
 
 def test_units_commit_meanwhile_and_afterwards_into_the_same_range(
