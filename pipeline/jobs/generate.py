@@ -62,7 +62,7 @@ def generate(
         require_same_levels(split, origins or {}, done)
         units = plan_units(asked, done, job.levels_per_unit, origins)
         scheduler = Scheduler(units, len(wanted) - len(done), job.levels_per_unit)
-        prune_paused(split, manifest.level_ids)
+        prune_paused(split, manifest.level_ids, partial(say, console))
         if not repaired:
             note_job(split, job, command, merged(runs(wanted), runs(manifest.level_ids)))
         if scheduler.waiting:
@@ -84,7 +84,7 @@ def generate(
                 board.say(f"Stopped: {done}; the same command goes on.")
                 raise
             manifest = read_manifest(split, ["label", "env_steps"], compact=True)
-            prune_paused(split, manifest.level_ids)
+            prune_paused(split, manifest.level_ids, board.say)
             spent = _spent(manifest, np.setdiff1d(wanted, done), board.tally.spent) if board.tally.spent.shown else ""
         else:
             print(f"Nothing to do: {many(len(wanted), 'level')} there already.")

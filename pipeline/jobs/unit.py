@@ -38,7 +38,7 @@ from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.locks import LockRefused, committing
 from levelproof.pipeline.store.manifest import begin_fragment, write_fragment
 from levelproof.pipeline.store.origins import RECORD, Origin
-from levelproof.pipeline.store.paused import drop_paused, load_paused
+from levelproof.pipeline.store.paused import CheckpointUnread, drop_paused, load_paused
 from levelproof.pipeline.store.provenance import device, versions
 from levelproof.pipeline.store.publish import committed_levels
 from levelproof.pipeline.store.remote import is_remote
@@ -55,7 +55,8 @@ def begin_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool) -> Train
     """Sample or read a unit's levels and submit to the pool those that need an expert.
 
     Raises:
-        Failure: levels cannot be read, or the experts that should go on.
+        Failure: levels cannot be read, or the experts to resume.
+        StoreFailure: the store does not answer.
     """
     ids, ledger = level_id_array(unit.level_ids), Ledger(len(unit.level_ids))
     with ledger.timing("sampling"):
@@ -85,7 +86,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     """A failed attempt as a value: exceptions do not travel between processes."""
     reason, fatal = "".join(traceback.format_exception(error)), ""
-    if isinstance(error, (LockRefused, SourceUnseen, LevelUnseen, LeaseLost, StoreFailure)):
+    if isinstance(error, (LockRefused, SourceUnseen, LevelUnseen, LeaseLost, StoreFailure, CheckpointUnread)):
         fatal = str(error)
     elif isinstance(error, OSError) and (what := REFUSALS.get(error.errno or 0)):
         where = gettempdir() if is_remote(split) else split

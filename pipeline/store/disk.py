@@ -6,6 +6,7 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from levelproof.pipeline.errors import Failure, UserError
@@ -32,7 +33,7 @@ class NotRegular(UserError):
         )
 
 
-def regular(path: str | Path, flags: int) -> int:
+def regular(path: str | Path, flags: int, mode: int = 0o666) -> int:
     """Open a regular file, as an `opener` of `open`: for files in a split, which anyone may have made.
 
     It follows no link at the end of `path`, writes to no file that has another name too, and waits for no pipe.
@@ -43,7 +44,7 @@ def regular(path: str | Path, flags: int) -> int:
     """
     try:
         how = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        descriptor = os.open(path, flags & ~os.O_TRUNC | how, 0o666)
+        descriptor = os.open(path, flags & ~os.O_TRUNC | how, mode)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.ENXIO, errno.EISDIR):  # a link; a pipe that no process reads, a socket
             raise NotRegular(path) from None
@@ -57,14 +58,14 @@ def regular(path: str | Path, flags: int) -> int:
     return descriptor
 
 
-def write_new(path: Path, data: bytes) -> None:
-    """Write a file in place of what has its name, of which no byte changes.
+def write_new(path: Path, data: bytes, mode: int = 0o666) -> None:
+    """Write a file in place of what has its name, of which no byte changes; the umask narrows `mode`.
 
     Raises:
         OSError: the disk refuses, or a folder has this name.
     """
     path.unlink(missing_ok=True)
-    with open(path, "xb", opener=regular) as file:
+    with open(path, "xb", opener=partial(regular, mode=mode)) as file:
         file.write(data)
 
 

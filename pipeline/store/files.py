@@ -9,8 +9,8 @@ from levelproof.pipeline.store.disk import write_new
 from levelproof.pipeline.store.remote import is_remote, stored_in
 
 
-def write(path: Path, data: bytes) -> None:
-    """A file, in place of what was there.
+def write(path: Path, data: bytes, mode: int = 0o666) -> None:
+    """Write a file in one step, in place of what was there; in a folder it gets this mode, less the umask.
 
     Raises:
         OSError: the disk refuses.
@@ -20,7 +20,7 @@ def write(path: Path, data: bytes) -> None:
         objects.put(path, data)
         return
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    write_new(temporary, data)
+    write_new(temporary, data, mode)
     temporary.replace(path)
 
 

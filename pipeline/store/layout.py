@@ -23,8 +23,9 @@ ATTEMPT = rf"{UNIT}-[0-9a-f]{{8}}"
 FRAGMENT = re.compile(rf"{MANIFEST}/{UNIT}\.parquet")
 BEGUN = re.compile(rf"{MANIFEST}/\.{ATTEMPT}\.begun")
 DATA = re.compile(rf"{SHARDS}/{ATTEMPT}\.zarr|{EXPERTS}/{ATTEMPT}\.npz")
-CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.npz")  # of experts under way
-CHECKPOINT_BEGUN = re.compile(rf"{CHECKPOINTS}/\.{UNIT}\.npz\.[0-9]+")
+CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.paused")  # experts in training
+OLD_CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.npz")  # written by earlier versions
+CHECKPOINT_BEGUN = re.compile(rf"{CHECKPOINTS}/\.{UNIT}\.(paused|npz)\.[0-9]+")
 JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # by the process of this number
 INDEX_BEGUN = re.compile(rf"{MANIFEST}/\.{re.escape(INDEX)}\.[0-9]+")
 
@@ -108,7 +109,7 @@ def begun_path(data: Path) -> Path:
 
 
 def checkpoint_path(split: Path, unit: str) -> Path:
-    return split / CHECKPOINTS / f"{unit}.npz"
+    return split / CHECKPOINTS / f"{unit}.paused"
 
 
 def ids_of(path: Path) -> tuple[int, int]:

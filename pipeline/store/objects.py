@@ -61,6 +61,17 @@ def get(path: Path, most: float = inf) -> StoredFile:
     return found
 
 
+def begin_of(path: Path, most: int) -> tuple[bytes, int]:
+    """The first bytes of a file, at most so many, and the size of the whole, past any cache. Raises as `get`."""
+    store, key = place(path)
+
+    def request() -> tuple[bytes, int]:
+        answer = obstore_module().get(store, key, options={"range": (0, most)})
+        return data_of(answer, most), answer.meta["size"]
+
+    return ask(path, request)
+
+
 def put(path: Path, data: bytes | Path) -> None:
     """A file, or the bytes of one on this machine, whatever was there before. Raises as `get`."""
     store, key = place(path)

@@ -1,14 +1,19 @@
-"""Experts under way on the disk, so that who takes up their levels goes on where they were: an archive a unit.
+"""Checkpoints of experts in training, from which a later process resumes them: one file per unit.
 
-Whatever is wrong with one costs its experts' training, and nothing else.
+A file is a line, its head, which says whose experts they are, and a numpy archive. The head alone says whether a file
+is still needed. A file goes when its levels are committed or when its bytes prove it damaged. One that cannot be read
+now (a permission, a store's time-out) stays, and whoever needs it ends with a sentence.
 """
 
+import hashlib
 import io
 import json
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import jax
 import numpy as np
@@ -20,27 +25,57 @@ from levelproof.experts.judge import Evaluation
 from levelproof.experts.labels import Source
 from levelproof.experts.paused import Paused
 from levelproof.experts.slots import Pending
+from levelproof.pipeline.errors import Failure, LevelproofError, StoreFailure
 from levelproof.pipeline.owned import require_own
 from levelproof.pipeline.store import objects
 from levelproof.pipeline.store.checkpoints import begun_like, kept, require_plain, stacked_curves, unstacked
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.files import remove, write
-from levelproof.pipeline.store.layout import CHECKPOINT, CHECKPOINT_BEGUN, CHECKPOINTS, checkpoint_path, entries, ids_of
+from levelproof.pipeline.store.layout import (
+    CHECKPOINT,
+    CHECKPOINT_BEGUN,
+    CHECKPOINTS,
+    OLD_CHECKPOINT,
+    checkpoint_path,
+    entries,
+    ids_of,
+)
 from levelproof.pipeline.store.provenance import versions
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.remote import as_typed, at_once, is_remote
 
-STAMP = "stamp"  # its array: configuration and versions, under which alone the bits are the same
+MAGIC = b"levelproof checkpoint "  # begins a head
+VERSION = 1  # of the format
+MOST_HEAD = 2**20  # bytes; a level id takes 12
+MALFORMED = (BadZipFile, EOFError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
+OWN = 0o600  # mode of a file: `require_own` refuses one that others can write to, whatever the umask
+
+
+class CheckpointUnread(Failure):
+    """A checkpoint whose experts a unit needs cannot be read now."""
+
+
+class _DamagedError(Exception):
+    """The bytes of a checkpoint are not those that `save_paused` wrote."""
+
+
+class _Head(NamedTuple):
+    """The first line of a checkpoint."""
+
+    level_ids: tuple[int, ...]
+    stamp: str  # configuration and versions; under others the bits would differ
+    start: int  # of the archive, in bytes
+    sha256: str  # of the archive
 
 
 def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobConfig) -> None:
     """Keep these experts of a unit, by level id, in place of those kept before; in one step.
 
     Raises:
-        OSError, UserError, StoreFailure: the disk or the store refuses; those kept before stay.
+        OSError, UserError, StoreFailure: the write fails; those kept before stay.
     """
     rows = [paused[level_id] for level_id in sorted(paused)]
     stacked = jax.tree.map(lambda *xs: np.stack(xs), *map(_arrays, rows))
-    arrays = arrays_of(stacked, "paused/") | {STAMP: _stamp(job), "level_id": np.array(sorted(paused))}
+    arrays = arrays_of(stacked, "paused/") | {"level_id": np.array(sorted(paused))}
     arrays["curve"] = stacked_curves([row.expert for row in rows])
     arrays["source"] = np.array([row.found.source[0] for row in rows])
     if evaluations := [(i, of) for i, row in enumerate(rows) for of in row.evaluations]:
@@ -50,18 +85,30 @@ def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobCo
     np.savez(file, allow_pickle=False, **arrays)
     if not is_remote(split):
         path.parent.mkdir(parents=True, exist_ok=True)
-    write(path, file.getvalue())
+    archive = file.getvalue()
+    head = {
+        "levels": sorted(paused),
+        "stamp": _stamp(job),
+        "bytes": len(archive),
+        "sha256": hashlib.sha256(archive).hexdigest(),
+    }
+    write(path, MAGIC + f"{VERSION} {json.dumps(head)}\n".encode() + archive, OWN)
 
 
 def load_paused(split: Path, level_ids: Collection[int], job: JobConfig) -> dict[int, Paused]:
-    """Experts that are kept of these levels, each as far as it came."""
+    """Experts of these levels that checkpoints of this job and these versions hold, each at its latest.
+
+    Raises:
+        CheckpointUnread: a checkpoint that may hold one of them cannot be read.
+        StoreFailure: the store does not answer.
+    """
     wanted, found = set(level_ids), dict[int, Paused]()
-    for path in _paths(split):
+    for path in _paths(split, CHECKPOINT):
         first, last = ids_of(path)
         if not any(first <= level_id <= last for level_id in wanted):
             continue
-        for level_id, of in _load(path, job).items():
-            if level_id in wanted and (level_id not in found or _updates(of) > _updates(found[level_id])):
+        for level_id, of in _load(path, wanted, job).items():
+            if level_id not in found or _updates(of) > _updates(found[level_id]):
                 found[level_id] = of
     return found
 
@@ -71,22 +118,45 @@ def drop_paused(split: Path, unit: str) -> None:
     remove(checkpoint_path(split, unit))
 
 
-def prune_paused(split: Path, done: np.ndarray) -> None:
-    """Remove what no level needs any more: all of its levels are done, or nobody can read which they are. While nobody
-    works."""
+def prune_paused(split: Path, done: np.ndarray, say: Callable[[str], None]) -> None:
+    """Remove checkpoints whose levels are all `done` (ascending ids), and damaged ones; call while no worker is active.
+
+    `say` is told which are damaged, and which stay because they cannot be read.
+    """
     for path in entries(split, CHECKPOINTS, CHECKPOINT_BEGUN, os.DirEntry.is_file):
         remove(path)
-    for path in _paths(split):
-        try:
-            needed = not np.isin(_read(path)["level_id"], done).all()
-        except Exception:  # numpy and zipfile raise many kinds
-            needed = False
-        if not needed:
+    paths = [*_paths(split, CHECKPOINT), *_paths(split, OLD_CHECKPOINT)]
+    for path, (why, is_over) in zip(paths, at_once(split, lambda path: _judged(path, done), paths), strict=True):
+        if is_over:
             remove(path)
+        if why:
+            say(f"The checkpoint {as_typed(path)} {why}.")
 
 
-def _paths(split: Path) -> Iterable[Path]:
-    return sorted(entries(split, CHECKPOINTS, CHECKPOINT, os.DirEntry.is_file))
+def _judged(path: Path, done: np.ndarray) -> tuple[str, bool]:
+    """What is wrong with a checkpoint, if anything, and whether it can go."""
+    first, last = ids_of(path)
+    low, high = np.searchsorted(done, [first, last + 1])
+    if high - low == last - first + 1:
+        return "", True
+    if OLD_CHECKPOINT.fullmatch(f"{CHECKPOINTS}/{path.name}"):
+        return "is of an earlier levelproof, and this one does not resume it: it stays until its levels are done", False
+    try:
+        return "", bool(np.isin(_head(path).level_ids, done).all())
+    except FileNotFoundError:
+        return "", False
+    except _DamagedError as error:
+        return f"is damaged ({error}) and was removed: its experts train from the start", True
+    except (OSError, LevelproofError) as error:
+        return f"cannot be read ({_reason(error)}): it stays until its levels are done", False
+
+
+def _paths(split: Path, of: re.Pattern[str]) -> list[Path]:
+    return sorted(entries(split, CHECKPOINTS, of, os.DirEntry.is_file))
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error).rstrip(".")
 
 
 def _updates(paused: Paused) -> int:
@@ -99,27 +169,79 @@ def _arrays(paused: Paused) -> Any:
     return expert.begun, pending, np.int64(rollouts), found._replace(source=())
 
 
-def _stamp(job: JobConfig) -> np.ndarray:
-    return np.array(json.dumps([job.hash, versions()], sort_keys=True))
+def _stamp(job: JobConfig) -> str:
+    return json.dumps([job.hash, versions()], sort_keys=True)
 
 
-def _load(path: Path, job: JobConfig) -> dict[int, Paused]:
-    """All experts of an archive that is of this job and this program; of any other one, none."""
+def _load(path: Path, wanted: set[int], job: JobConfig) -> dict[int, Paused]:
+    """Those of the `wanted` experts that a checkpoint has; none if it is damaged, or of another job or version."""
     try:
-        arrays = _read(path)
-        return dict(_experts(arrays, job)) if str(arrays[STAMP]) == str(_stamp(job)) else {}
-    except Exception:  # numpy and zipfile raise many kinds
+        head = _head(path)
+        if head.stamp != _stamp(job) or wanted.isdisjoint(head.level_ids):
+            return {}
+        data = objects.get(path).data if is_remote(path) else path.read_bytes()
+        return {level_id: of for level_id, of in _experts_in(data, path, job).items() if level_id in wanted}
+    except (FileNotFoundError, _DamagedError):  # another worker has committed its unit
         return {}
+    except StoreFailure:
+        raise
+    except (OSError, LevelproofError) as error:
+        raise CheckpointUnread(
+            f"The checkpoint {as_typed(path)} cannot be read ({_reason(error)}): make it readable, or remove it to "
+            "train its experts from the start."
+        ) from error
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    """Raises ValueError and others where it is no archive as `save_paused` writes it."""
-    if not is_remote(path):
-        require_own(path, "remove it")
-    file = io.BytesIO(objects.get(path).data if is_remote(path) else path.read_bytes())
-    require_plain(file, len(file.getvalue()))
-    with np.load(file, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+def _head(path: Path) -> _Head:
+    """Read the head of a checkpoint, and nothing else.
+
+    Raises:
+        OSError, UserError, StoreFailure: it cannot be read, or others can write to it.
+        Failure: it is of another version.
+        _DamagedError: it is damaged.
+    """
+    if is_remote(path):
+        return _head_in(*objects.begin_of(path, MOST_HEAD), path)
+    require_own(path, "remove it")
+    with path.open("rb") as file:
+        return _head_in(file.readline(MOST_HEAD), os.fstat(file.fileno()).st_size, path)
+
+
+def _head_in(data: bytes, size: int, path: Path) -> _Head:
+    """The head of the checkpoint of `size` bytes that begins with `data`. Raises as `_head`."""
+    line, end, _ = data.partition(b"\n")
+    first, last = ids_of(path)
+    try:
+        version, text = line.removeprefix(MAGIC).decode().split(maxsplit=1)
+        if not (line.startswith(MAGIC) and end and version.isdecimal()):
+            raise ValueError
+        if int(version) != VERSION:
+            raise Failure(f"it has version {int(version)}, this levelproof reads {VERSION}")
+        told = json.loads(text)
+        head = _Head(tuple(told["levels"]), str(told["stamp"]), len(line) + 1, str(told["sha256"]))
+        whole = head.start + int(told["bytes"])
+        if not all(type(level_id) is int and first <= level_id <= last for level_id in head.level_ids):
+            raise ValueError
+    except (ValueError, LookupError, TypeError, RecursionError):
+        raise _DamagedError("its first line is invalid") from None
+    if size != whole:
+        raise _DamagedError("it is cut off, or too long")
+    return head
+
+
+def _experts_in(data: bytes, path: Path, job: JobConfig) -> dict[int, Paused]:
+    """The experts of a whole checkpoint. Raises as `_head_in`."""
+    head = _head_in(data, len(data), path)
+    archive = data[head.start :]
+    if hashlib.sha256(archive).hexdigest() != head.sha256:
+        raise _DamagedError("its bytes have changed")
+    file = io.BytesIO(archive)
+    try:
+        require_plain(file, len(archive))
+        with np.load(file, allow_pickle=False) as arrays:
+            return dict(_experts({name: arrays[name] for name in arrays.files}, job))
+    except MALFORMED as error:
+        raise _DamagedError("its arrays are none") from error
 
 
 def _experts(arrays: dict[str, np.ndarray], job: JobConfig) -> Iterator[tuple[int, Paused]]:

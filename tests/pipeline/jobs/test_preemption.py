@@ -46,7 +46,7 @@ def test_the_same_command_goes_on_where_experts_were(
 ) -> None:
     split, command = tmp_path / SPLIT, [*COMMAND, f"executor={executor}"]
     process = start(command, tmp_path, preexec_fn=heed_ctrl_c)
-    until(lambda: list(split.glob("checkpoints/[0-9]*.npz")), process)
+    until(lambda: list(split.glob("checkpoints/[0-9]*.paused")), process)
     begin = time.monotonic()
     process.send_signal(number)
     _, err = process.communicate(timeout=60)

@@ -17,6 +17,7 @@ from levelproof.pipeline.jobs import worker as worker_module
 from levelproof.pipeline.jobs.schedule import Order, Round, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.worker import Worker
 from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.layout import checkpoint_path
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.paused import load_paused, prune_paused
 from levelproof.pipeline.store.shard import Shard
@@ -181,8 +182,19 @@ def test_experts_that_are_kept_go_on_where_they_were(tmp_path: Path, job: JobCon
     assert later.summary
     decided = sum(row["env_steps"] for row in two if row["level_id"] not in rest.level_ids)
     assert later.summary.spent.trained == alone.summary.spent.trained - decided - steps
-    prune_paused(tmp_path / "kept", np.arange(8))
+    prune_paused(tmp_path / "kept", np.arange(8), print)
     assert not path.exists()
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o666])
+def test_a_checkpoint_that_cannot_be_read_ends_the_job(tmp_path: Path, job: JobConfig, mode: int) -> None:
+    path = checkpoint_path(tmp_path, UNITS[0].name)
+    path.parent.mkdir()
+    path.write_bytes(b"levelproof checkpoint 2 of another format\n")
+    path.chmod(mode)
+    (outcome,) = outcomes(Worker(replace(job, checkpoint="1h"), tmp_path), UNITS[:1]).values()
+    assert outcome.fatal.startswith(f"The checkpoint {path} cannot be read (")
+    assert path.exists()
 
 
 @pytest.mark.parametrize("phase", ["begin_unit", "finish_unit"])

@@ -1,6 +1,9 @@
-"""Experts under way on the disk: what is kept comes back bit for bit, and what is damaged or of others is nothing."""
+"""Experts in training on the disk: they come back bit for bit, and only what is damaged or finished is removed."""
 
+import os
+from collections.abc import Iterator
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 
 import jax
@@ -13,11 +16,14 @@ from levelproof.experts.judge import Evaluation, Kept
 from levelproof.experts.labels import Source
 from levelproof.experts.paused import Paused
 from levelproof.experts.slots import Pending
+from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.store import paused as store
+from levelproof.pipeline.store import remote
 from levelproof.pipeline.store.checkpoints import begun_like
 from levelproof.pipeline.store.layout import checkpoint_path, unit_name
-from levelproof.pipeline.store.paused import drop_paused, load_paused, prune_paused, save_paused
+from levelproof.pipeline.store.paused import CheckpointUnread, drop_paused, load_paused, prune_paused, save_paused
 from tests.pipeline.made import made_job
+from tests.pipeline.servers import Server, bucket_of, serving
 
 JOB = made_job("data", "budget=5k")
 UNIT = unit_name(3, 7)
@@ -87,7 +93,128 @@ def test_what_is_damaged_is_nothing(split: Path) -> None:
 def test_what_no_level_needs_goes(split: Path) -> None:
     path = checkpoint_path(split, UNIT)
     (split / "checkpoints" / f".{path.name}.17").touch()
-    prune_paused(split, np.array([7]))
+    said: list[str] = []
+    prune_paused(split, np.array([7]), said.append)
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
-    prune_paused(split, np.array([3, 7, 8]))
+    prune_paused(split, np.array([3, 7, 8]), said.append)
     assert not list(path.parent.iterdir())
+    assert not said
+
+
+def pruned(split: Path, *done: int) -> list[str]:
+    """What `prune_paused` says of the only checkpoint."""
+    said: list[str] = []
+    prune_paused(split, np.array(done), said.append)
+    return said
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="the system has no such users")
+@pytest.mark.parametrize("umask", [0o002, 0o000, 0o077])
+def test_save_keeps_other_users_out_under_any_umask(tmp_path: Path, kept: dict[int, Paused], umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        save_paused(tmp_path, UNIT, kept, JOB)
+    finally:
+        os.umask(before)
+    assert checkpoint_path(tmp_path, UNIT).stat().st_mode & 0o777 == 0o600
+    assert pruned(tmp_path, 7) == []
+    same(load_paused(tmp_path, range(8), JOB), kept)
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="the system has no such users")
+def test_a_checkpoint_that_others_can_write_to_stays(split: Path, kept: dict[int, Paused]) -> None:
+    path = checkpoint_path(split, UNIT)
+    path.chmod(0o664)
+    (said,) = pruned(split, 7)
+    assert f"{path} cannot be read (Other users can write to {path}" in said
+    with pytest.raises(CheckpointUnread, match="make it readable, or remove it to train its experts from the start"):
+        load_paused(split, range(8), JOB)
+    path.chmod(0o600)
+    same(load_paused(split, range(8), JOB), kept)
+    path.chmod(0o664)
+    assert pruned(split, *range(3, 8)) == []
+    assert not path.exists(), "its levels are committed"
+
+
+def test_a_damaged_checkpoint_is_removed_with_a_sentence(split: Path) -> None:
+    path = checkpoint_path(split, UNIT)
+    whole = path.read_bytes()
+    for damaged in (
+        b"",
+        whole[: len(whole) // 2],
+        whole[1:],
+        whole + b"x",
+        whole.replace(b'"levels": [3', b'"levels": [9'),
+    ):
+        path.write_bytes(damaged)
+        (said,) = pruned(split, 7)
+        assert f"{path} is damaged (" in said
+        assert not path.exists()
+
+
+def test_prune_reads_heads_alone(split: Path) -> None:
+    path = checkpoint_path(split, UNIT)
+    whole = path.read_bytes()
+    head = whole.index(b"\n") + 1
+    path.write_bytes(whole[:head])
+    os.truncate(path, len(whole))  # a hole in place of the archive
+    assert pruned(split, 7) == []
+    assert path.exists()
+    assert load_paused(split, range(8), JOB) == {}, "its bytes have changed"
+
+
+def test_a_checkpoint_of_another_version_stays(split: Path) -> None:
+    path = checkpoint_path(split, UNIT)
+    older = path.with_suffix(".npz")
+    older.write_bytes(b"PK of an earlier version")
+    path.write_bytes(path.read_bytes().replace(b"checkpoint 1 ", b"checkpoint 2 ", 1))
+    newer, old = pruned(split, 7)
+    assert f"{path} cannot be read (it has version 2, this levelproof reads 1)" in newer
+    assert f"{older} is of an earlier levelproof, and this one does not resume it" in old
+    with pytest.raises(CheckpointUnread, match="version 2"):
+        load_paused(split, range(8), JOB)
+    assert pruned(split, *range(3, 8)) == []
+    assert not list(path.parent.iterdir())
+
+
+@pytest.fixture
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    """A store with an empty bucket, and a process that waits a second for its answers."""
+    monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=1))
+    monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
+    (tmp_path / "s3/bucket").mkdir(parents=True)
+    with serving(bucket_of(tmp_path / "s3")) as server:
+        for name in [name for name in os.environ if name.startswith("AWS_")]:
+            monkeypatch.delenv(name)
+        known = {"ACCESS_KEY_ID": "any", "SECRET_ACCESS_KEY": "any", "REGION": "us-east-1", "ENDPOINT_URL": server.url}
+        for name, value in known.items():
+            monkeypatch.setenv(f"AWS_{name}", value)
+        remote._store.cache_clear()
+        yield server
+    remote._store.cache_clear()
+
+
+def test_a_checkpoint_in_a_store_survives_its_time_outs(
+    server: Server, kept: dict[int, Paused], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    split = Path("s3://bucket/data/5k/s")
+    save_paused(split, UNIT, kept, JOB)
+    same(load_paused(split, range(8), JOB), kept)
+    monkeypatch.setattr(store, "MOST_HEAD", 2**12)
+    server.log.clear()
+    assert pruned(split, 7) == []
+    assert [line.rpartition(" ")[2] for line in server.log if ".paused" in line] == ["bytes=0-4095"]
+
+    def silent_of_the_file(_: int) -> None:
+        server.spoil(1 if ".paused" in server.log[-1] else 0)
+
+    server.meanwhile = silent_of_the_file
+    (said,) = pruned(split, 7)
+    assert "cannot be read (Cannot read s3://bucket/data/5k/s/checkpoints/" in said
+    with pytest.raises(StoreFailure):
+        load_paused(split, range(8), JOB)
+    server.meanwhile = lambda _: server.spoil(0)
+    same(load_paused(split, range(8), JOB), kept)
+    assert pruned(split, 3, 7) == []
+    assert load_paused(split, range(8), JOB) == {}
