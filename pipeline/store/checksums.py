@@ -42,11 +42,15 @@ def digests_of(path: Path, known: Iterable[str] = ()) -> dict[str, str]:
 
 
 def digests_below(
-    split: Path, names: Iterable[str], elsewhere: Mapping[str, dict[str, str]]
+    split: Path, names: Iterable[str], carried: Mapping[str, dict[str, str]]
 ) -> dict[str, dict[str, str]]:
-    """Of the files of shards and checkpoints with these names, as they are on the disk now, or `elsewhere`."""
-    there = {name: digests_of(split / name) for name in names if (split / name).exists()}
-    return dict(sorted(({name: elsewhere[name] for name in names if name in elsewhere} | there).items()))
+    """Digests of the files of shards and checkpoints with these names: those `carried` over as they are, and those of
+    new ones from the disk.
+
+    Hashing a file again that stays would make any damage to it the truth.
+    """
+    there = {name: digests_of(split / name) for name in names if name not in carried and (split / name).exists()}
+    return dict(sorted(({name: carried[name] for name in names if name in carried} | there).items()))
 
 
 def _is_below(name: str) -> bool:

@@ -61,11 +61,11 @@ def write_fragment(
     config: Mapping[str, Any],
     sealed: bool = False,
     densities: Iterable[str] = FULL,
-    elsewhere: Mapping[str, dict[str, str]] | None = None,
+    carried: Mapping[str, dict[str, str]] | None = None,
 ) -> None:
     """Commit a unit, or many that are sealed: write their rows to the attempt's fragment, durably and in one step.
 
-    `elsewhere` has the digests of shards and checkpoints that are not beside it.
+    `carried` has the digests of shards and checkpoints that earlier fragments committed and that stay as they are.
 
     Raises:
         OSError: the disk refuses; no fragment is there then, or the one that was there before.
@@ -75,7 +75,7 @@ def write_fragment(
     names = data_named_by(table)
     metadata = settings_metadata(config_hash, config) | {
         DENSITIES_KEY: json.dumps(sorted(densities)).encode(),
-        DIGESTS_KEY: json.dumps(digests_below(attempt.fragment.parent.parent, names, elsewhere or {})).encode(),
+        DIGESTS_KEY: json.dumps(digests_below(attempt.fragment.parent.parent, names, carried or {})).encode(),
     }
     metadata |= {SEALED_KEY: b"1"} if sealed else {}
     table = table.replace_schema_metadata(metadata)

@@ -69,7 +69,8 @@ def _mend(split: Path, path: Path, lost: np.ndarray, unlike: frozenset[str]) -> 
     named = {name for of in theirs for name in data_named_by(read_fragment(of, DATA_COLUMNS)[1])}
     _disown_named(split, named - data_named_by(rows))
     if ids:
-        write_fragment(attempts[-1], rows, fragment.config_hash, fragment.config, fragment.sealed, fragment.densities)
+        settings = fragment.config_hash, fragment.config
+        write_fragment(attempts[-1], rows, *settings, fragment.sealed, fragment.densities, fragment.digests)
     if not ids or attempts[-1].fragment != path:
         path.unlink()
 

@@ -100,9 +100,9 @@ def seal(
 ) -> Piece:
     """Merge these fragments, and their shards of each density. Only the writer of a split may.
 
-    Kept experts stay where they are. `moved` and `rows_a_file` are those of `merge_shards`; `moved` is called before
-    each fragment is read, too. With a `density` and its `key_every`, all shards get that one; `converted` is called
-    with how many levels have.
+    Kept experts stay where they are, unread: their digests are carried over. `moved` and `rows_a_file` are those of
+    `merge_shards`; `moved` is called before each fragment is read, too. With a `density` and its `key_every`, all
+    shards get that one; `converted` is called with how many levels have.
 
     Returns:
         The sealed fragment.
@@ -119,7 +119,7 @@ def seal(
     table, about = each_once(parts)[0], parts[0][0]
     shards = {name: data_path(split, name) for name in named_by([of for _, of in parts], "shard")}
     replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
-    elsewhere = {name: files for of, _ in parts for name, files in of.digests.items()} if is_remote(split) else None
+    carried = {name: files for of, _ in parts for name, files in of.digests.items()}  # of kept experts, which stay
     places, between = _places(table, shards), list[Path]()
     densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(of.densities for of, _ in parts))
     first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
@@ -133,7 +133,7 @@ def seal(
             merge_shards(shard, of, moved, rows_a_file)
         require_served(folder)
         disown(replaced)
-        write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, elsewhere)
+        write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, carried)
     sealed = fragment_path(split, unit)
     for path in paths - {sealed}:
         remove(path)

@@ -17,6 +17,7 @@ from levelproof.configs.compose import compose_job
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.before import decide
 from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.judge import Kept
 from levelproof.experts.labels import WITNESSED, Label, Source, Verdict
 from levelproof.experts.steps import EnvSteps
 from levelproof.experts.train import UnitResult
@@ -145,8 +146,11 @@ def played_split(folder: Path, held: int = 16) -> Path:
     return path
 
 
-def honest_split(folder: Path, unit: int, units: int) -> Path:
-    """A split without training in which everything is true: random actions solve what they solve."""
+def honest_split(folder: Path, unit: int, units: int, *, experts: bool = False) -> Path:
+    """A split without training in which everything is true: random actions solve what they solve.
+
+    With `experts` each unit keeps some, of which nothing but their file is real.
+    """
     job, ids = made_job(str(folder), "size=s"), np.arange(unit * units)
     levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
     before, failed = decide(levels, job.task)
@@ -166,7 +170,9 @@ def honest_split(folder: Path, unit: int, units: int) -> Path:
             dataclasses.replace(verdicts[i], steps_to_goal=int(steps[i]) if verdicts[i].label in WITNESSED else None)
             for i in lanes
         ]
-        result = UnitResult(lanes, take(levels, lanes), take(record, lanes), told, SPENT)
+        weights: Any = {"weights": np.arange(4.0)}
+        kept = {int(i): Kept(weights, [0.5]) for i in lanes if experts}
+        result = UnitResult(lanes, take(levels, lanes), take(record, lanes), told, SPENT, kept)
         commit(job, path, WorkUnit(tuple(lanes.tolist())), result)
     return path
 

@@ -13,7 +13,10 @@ from levelproof.pipeline.jobs.seal import seal_split
 from levelproof.pipeline.read.findings import Findings
 from levelproof.pipeline.read.verify import examine
 from levelproof.pipeline.store.layout import JOB
+from levelproof.pipeline.store.locks import nobody_commits
 from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
+from levelproof.pipeline.store.mend import take_out
+from tests.pipeline.command import here
 from tests.pipeline.made import honest_split
 
 pytestmark = pytest.mark.slow
@@ -242,3 +245,28 @@ def test_what_is_missing(copied: Callable[[Path], Path], unsealed: Path) -> None
     assert hit(found) | {i for a, b in found.missing for i in range(a, b + 1)} == files[first] | levels
     (split / JOB).unlink()
     assert any("nobody knows which levels" in sentence for sentence in examine(split).sentences)
+
+
+def test_a_seal_and_a_repair_keep_the_digests_of_experts(tmp_path: Path) -> None:
+    """They neither read the experts nor take damage for the truth."""
+    split = honest_split(tmp_path, 4, 2, experts=True)
+    first, second = sorted((split / "experts").iterdir())
+    committed = {name: of for path in fragment_paths(split) for name, of in read_fragment(path)[0].digests.items()}
+    data = bytearray(first.read_bytes())
+    data[len(data) // 2] ^= 1
+    first.write_bytes(data)
+    (split / "experts").rename(tmp_path / "away")
+    seal_split(split, 8, Console(quiet=True))
+    (tmp_path / "away").rename(split / "experts")
+    (path,) = fragment_paths(split)
+    names = {f"experts/{file.name}" for file in (first, second)}
+    assert {name: read_fragment(path)[0].digests[name] for name in names} == {name: committed[name] for name in names}
+    done = here(["verify", str(split)], tmp_path)
+    assert done.returncode == 1
+    assert f"The file {first} is not what was committed" in done.stdout
+    with nobody_commits(split, print):
+        take_out(split, [4], [], [])
+    (path,) = fragment_paths(split)
+    fragment, rows = read_fragment(path)
+    assert 4 not in rows.column("level_id").to_pylist()
+    assert {name: fragment.digests[name] for name in names} == {name: committed[name] for name in names}
