@@ -21,7 +21,6 @@ from levelproof.pipeline.jobs.seal import Sealer, sealing
 from levelproof.pipeline.runtime import cache_folder
 from levelproof.pipeline.store import quarantine
 from levelproof.pipeline.store.checkpoints import require_same_experts
-from levelproof.pipeline.store.files import remove
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import quarantine_path
 from levelproof.pipeline.store.manifest import Manifest, read_manifest
@@ -62,6 +61,7 @@ def generate(
         require_same_levels(split, origins or {}, done)
         units = plan_units(asked, done, job.levels_per_unit, origins)
         scheduler = Scheduler(units, len(wanted) - len(done), job.levels_per_unit)
+        quarantine.drop_notes(split, manifest.level_ids)
         prune_paused(split, manifest.level_ids, partial(say, console))
         if not repaired:
             note_job(split, job, command, merged(runs(wanted), runs(manifest.level_ids)))
@@ -84,6 +84,7 @@ def generate(
                 board.say(f"Stopped: {done}; the same command goes on.")
                 raise
             manifest = read_manifest(split, ["label", "env_steps"], compact=True)
+            quarantine.drop_notes(split, manifest.level_ids)
             prune_paused(split, manifest.level_ids, board.say)
             spent = _spent(manifest, np.setdiff1d(wanted, done), board.tally.spent) if board.tally.spent.shown else ""
         else:
@@ -95,7 +96,6 @@ def generate(
 
 def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, sealer: Sealer, events: Events) -> None:
     """Have every unit done or given up, by workers or in this process."""
-    notes = set(quarantine.given_up(split))
 
     def settle(outcomes: Sequence[UnitOutcome]) -> None:
         """Account for attempts that ended together."""
@@ -106,19 +106,16 @@ def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, seale
             if outcome.fatal:
                 events.ended(outcome)
                 raise Failure(outcome.fatal)
-            note = quarantine_path(split, unit.name)
             if outcome.summary:
                 events.ended(outcome)
                 sealer.committed(unit)
-                if note in notes:
-                    remove(note)
                 continue
             last = scheduler.failed(unit)
             events.ended(outcome, last)
             failed.setdefault((outcome.cause, last), []).append(unit)
             if last:
                 reason = f"Failed {scheduler.attempts[unit]} times, the last time with:\n\n{outcome.reason}\n"
-                quarantine.give_up(split, unit.name, reason)
+                quarantine.give_up(split, unit.level_ids, reason)
         for (cause, last), units in failed.items():
             board.say(f"{levels_text(units).capitalize()} failed ({cause}): {'given up' if last else 'trying again'}.")
         if outcomes:

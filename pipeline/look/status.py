@@ -12,7 +12,7 @@ from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.quarantine import given_up
 from levelproof.pipeline.store.remote import as_typed
-from levelproof.pipeline.store.runs import inside
+from levelproof.pipeline.store.runs import inside, told_levels
 from levelproof.pipeline.words import many
 
 
@@ -29,8 +29,8 @@ def status(split: Path, as_json: bool, say: Callable[[str], None]) -> None:
         return
     counts = "".join(f", {count} {label}" for label, count in facts["labels"].items())
     print(f"{as_typed(split)}: {facts['done']:,} of {many(facts['wanted'], 'level')} committed{counts}.")
-    for note in facts["quarantined"]:
-        print(f"Given up: {as_typed(split / QUARANTINE / note)}")
+    for note, levels in facts["given_up"].items():
+        print(f"Given up: {told_levels(levels)}, for the reason in {as_typed(split / QUARANTINE / note)}")
     if facts["running"]:
         print("A run is at work now.")
     elif facts["done"] < facts["wanted"]:
@@ -50,12 +50,14 @@ def look(split: Path, say: Callable[[str], None] = lambda _: None) -> dict[str, 
     wanted = note.level_ids
     manifest = read_manifest(split, ["label"], compact=True)
     done = inside(manifest.level_ids, wanted)
+    notes = {note.name: left for note, left in given_up(split, manifest.level_ids).items()}
     return {
         "split": as_typed(split),
         "wanted": int((wanted[:, 1] - wanted[:, 0] + 1).sum()),
         "done": int(done.sum()),
         "labels": dict(sorted(manifest.counts(done).items())),
-        "quarantined": [path.name for path in given_up(split)],
+        "quarantined": [*notes],
+        "given_up": notes,  # levels of each note, first and last id of each run
         "running": is_written(split, say),
         "command": note.command,
     }

@@ -26,6 +26,7 @@ DATA = re.compile(rf"{SHARDS}/{ATTEMPT}\.zarr|{EXPERTS}/{ATTEMPT}\.npz")
 CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.paused")  # experts in training
 OLD_CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.npz")  # written by earlier versions
 CHECKPOINT_BEGUN = re.compile(rf"{CHECKPOINTS}/\.{UNIT}\.(paused|npz)\.[0-9]+")
+NOTE = re.compile(rf"{QUARANTINE}/{UNIT}\.txt")  # why a unit was given up
 JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # by the process of this number
 INDEX_BEGUN = re.compile(rf"{MANIFEST}/\.{re.escape(INDEX)}\.[0-9]+")
 
@@ -113,7 +114,7 @@ def checkpoint_path(split: Path, unit: str) -> Path:
 
 
 def ids_of(path: Path) -> tuple[int, int]:
-    """The lowest and the highest level id in a fragment, or in a checkpoint of experts under way, by its name."""
+    """The lowest and the highest level id in a fragment, a checkpoint or a note of a unit, by its name."""
     first, last = path.stem.split("-")
     return int(first), int(last)
 

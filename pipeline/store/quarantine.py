@@ -1,29 +1,71 @@
-"""Why units were given up: a note for each, until it is committed."""
+"""Why units were given up: a note for each, which goes when all of its levels are committed, by whatever units."""
 
+import os
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
-from levelproof.pipeline.store.files import write
-from levelproof.pipeline.store.layout import QUARANTINE, quarantine_path
-from levelproof.pipeline.store.remote import is_remote, names_in
-from levelproof.pipeline.urls import BUCKETS
+import numpy as np
+
+from levelproof.pipeline.errors import LevelproofError
+from levelproof.pipeline.store import objects
+from levelproof.pipeline.store.files import remove, write
+from levelproof.pipeline.store.layout import NOTE, QUARANTINE, entries, ids_of, quarantine_path, unit_name
+from levelproof.pipeline.store.remote import at_once, is_remote
+from levelproof.pipeline.store.runs import runs, without
+
+MOST_LINE = 2**20  # bytes of a note's first line, which names its levels
+LEVELS = re.compile(r"Levels: ([0-9]{1,12}-[0-9]{1,12}(?:, [0-9]{1,12}-[0-9]{1,12})*)\n")
 
 
-def give_up(split: Path, unit: str, reason: str) -> Path:
-    """Note why; where. Raises as `files.write`."""
-    note = quarantine_path(split, unit)
+def give_up(split: Path, level_ids: Sequence[int], reason: str) -> None:
+    """Note why these levels (ascending) were given up. Raises as `files.write`."""
+    note = quarantine_path(split, unit_name(level_ids[0], level_ids[-1]))
     if not is_remote(split):
         note.parent.mkdir(exist_ok=True)
-    write(note, reason.encode())
-    return note
+    levels = ", ".join(f"{first}-{last}" for first, last in runs(level_ids))
+    write(note, f"Levels: {levels}\n{reason}".encode())
 
 
-def given_up(split: Path) -> list[Path]:
-    """The notes of a split.
+def given_up(split: Path, done: np.ndarray) -> dict[Path, list[tuple[int, int]]]:
+    """Notes with their levels that are not among `done` (ascending ids), as runs; none of what is done.
 
     Raises:
         UserError, StoreFailure: the store refuses.
     """
-    folder = split / QUARANTINE
-    if not is_remote(split):
-        return sorted(folder.glob("*.txt"))
-    return sorted(names_in(folder)) if split.parts[0] in BUCKETS else []
+    return {note: left for note, left in _left(split, done).items() if left}
+
+
+def drop_notes(split: Path, done: np.ndarray) -> None:
+    """Remove the notes whose levels are all `done` (ascending ids). Raises as `files.remove`."""
+    for note, left in _left(split, done).items():
+        if not left:
+            remove(note)
+
+
+def _left(split: Path, done: np.ndarray) -> dict[Path, list[tuple[int, int]]]:
+    """Levels of every note that are not done."""
+    notes = sorted(entries(split, QUARANTINE, NOTE, os.DirEntry.is_file))
+    return dict(zip(notes, at_once(split, lambda note: _left_of(note, done), notes), strict=True))
+
+
+def _left_of(note: Path, done: np.ndarray) -> list[tuple[int, int]]:
+    """Levels of a note that are not done. It is read only where its name leaves that open."""
+    by_name = [ids_of(note)]
+    left = without(by_name, done)
+    return without(_levels_in(note) or by_name, done) if left and left != by_name else left
+
+
+def _levels_in(note: Path) -> list[tuple[int, int]]:
+    """Runs of level ids in the first line of a note; none in one of an earlier version, or if it cannot be read."""
+    try:
+        if is_remote(note):
+            data, _ = objects.begin_of(note, MOST_LINE)
+        else:
+            with note.open("rb") as file:
+                data = file.readline(MOST_LINE)
+    except (OSError, LevelproofError):
+        return []
+    found = LEVELS.match(data.decode(errors="replace"))
+    pairs = [of.split("-") for of in found[1].split(", ")] if found else []
+    return [(int(first), int(last)) for first, last in pairs]

@@ -290,6 +290,22 @@ def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
+def test_a_note_goes_when_other_units_commit_its_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> NoReturn:
+        raise ZeroDivisionError("a bug")
+
+    command = ["generate", "levels=2", "budget=5k", "executor=inline"]
+    with monkeypatch.context() as patched:
+        patched.setattr("levelproof.pipeline.jobs.unit.sample_levels", broken)
+        assert here([*command, "unit=2"], tmp_path).returncode == 3
+    split = tmp_path / "data/5k/s"
+    assert "Given up: levels 0 to 1, for the reason in " in here(["status", str(split)], tmp_path).stdout
+    assert here([*command, "unit=1"], tmp_path).returncode == 0
+    assert not list((split / "quarantine").iterdir())
+    assert "Given up" not in here(["status", str(split)], tmp_path).stdout
+
+
+@pytest.mark.slow
 def test_a_closed_pipe_is_no_error(made: Path) -> None:
     command = f"{sys.executable} -m levelproof inspect data/5k/s --json | head -c 1"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
