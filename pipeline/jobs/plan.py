@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pyarrow as pa
@@ -28,6 +27,7 @@ from levelproof.pipeline.store.events import events_of, runs_in
 from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.schema import Encoding
+from levelproof.pipeline.store.scratch import scratch
 from levelproof.pipeline.store.shard import stored_bytes, write_shard
 from levelproof.pipeline.words import duration, many
 
@@ -83,16 +83,16 @@ def measured(job: JobConfig, console: Console, seconds: float = SECONDS) -> Samp
     """What some of a job's first levels take here: a few that say how many are made in so many seconds, then those."""
     levels, unit = len(job.level_ids), job.levels_per_unit
     here = 1 if job.executor == "inline" else min(job.workers or len(own_cores()), len(own_cores()))
-    with TemporaryDirectory(prefix="levelproof-plan-") as folder, _told(console, seconds):
-        split, begun = split_path(folder, job.budget, job.size), time.monotonic()
+    with scratch() as folder, _told(console, seconds):
+        split, begun = split_path(str(folder), job.budget, job.size), time.monotonic()
         some = min(levels, here * unit)
-        first = _made(job, Path(folder), some, here)
+        first = _made(job, folder, some, here)
         here = _workers_of(split)  # fewer where each has a GPU
         _, busy, _ = costs_of(split)
         more = int(seconds * here / max(busy.mean(), 1e-6)) // unit * unit
         count, wall = min(levels, MOST, max(some, more)), first
         if count > some:
-            wall = _made(job, Path(folder), count, here)
+            wall = _made(job, folder, count, here)
         table, busy, compiling = costs_of(split)
         new = busy[some:] if count > some else busy
         labels = np.array(table.column("label").to_pylist())
@@ -107,7 +107,7 @@ def measured(job: JobConfig, console: Console, seconds: float = SECONDS) -> Samp
             solved=labels == Label.SOLVED,
             witnessed=np.isin(labels, [label.value for label in WITNESSED]),
             row_bytes=_row_bytes(table),
-            stored=_stored(job, split, table, Path(folder)),
+            stored=_stored(job, split, table, folder),
         )
 
 

@@ -7,14 +7,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.scratch import scratch
 
 
 @contextmanager
 def new_folder(out: Path, replaces: Callable[[Path], bool] = lambda _: False) -> Iterator[Path]:
     """Where to write what shall be in `out`: a folder beside it, under a hidden name until all of it is there.
 
-    What an exception ends is removed; a killed process leaves the hidden folder, and `out` as it was. A folder that is
-    there makes way for the new one if `replaces` says that it may.
+    What an exception ends is removed. A killed process leaves `out` as it was, and the hidden folder to the next one
+    that writes `out`. A folder that is there makes way for the new one if `replaces` says that it may.
 
     Raises:
         UserError: `out` is there and stays, or cannot be written.
@@ -23,15 +24,14 @@ def new_folder(out: Path, replaces: Callable[[Path], bool] = lambda _: False) ->
     if there and (out.is_symlink() or not out.is_dir() or not replaces(out)):
         raise UserError(f"There is something at {out} already: name a new folder with -o, or remove that one.")
     whole = out.absolute()  # `gallery/` and `.` have names
-    unfinished, replaced = (whole.with_name(f".{whole.name}.{os.getpid()}{end}") for end in ("", ".old"))
+    replaced = whole.with_name(f".{whole.name}.{os.getpid()}.old")
     try:
-        unfinished.mkdir(parents=True)
-        yield unfinished
-        if there:
-            whole.rename(replaced)
-        unfinished.rename(whole)
-        shutil.rmtree(replaced, ignore_errors=True)
+        whole.parent.mkdir(parents=True, exist_ok=True)
+        with scratch(whole.parent, f".{whole.name}.unfinished-") as unfinished:
+            yield unfinished
+            if there:
+                whole.rename(replaced)
+            unfinished.rename(whole)
+            shutil.rmtree(replaced, ignore_errors=True)
     except OSError as error:
         raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another folder with -o.") from None
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)

@@ -11,7 +11,6 @@ import secrets
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import pyarrow as pa
@@ -35,6 +34,7 @@ from levelproof.pipeline.store.leases import LeaseLost, require_served
 from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
 from levelproof.pipeline.store.objects import Version, get, put, put_if, remove
 from levelproof.pipeline.store.remote import at_once, fragments_in, is_remote
+from levelproof.pipeline.store.scratch import scratch
 
 OVER = b"over"  # in the mark of an attempt that was committed, and is no more: others have its levels
 
@@ -51,9 +51,9 @@ def publishing(split: Path, replaced: Collection[Path] = ()) -> Iterator[Path]:
         Failure: another attempt was committed first, without some of the levels.
         UserError, StoreFailure: the store refuses.
     """
-    with TemporaryDirectory(prefix="levelproof-", ignore_cleanup_errors=True) as name:
-        yield Path(name)
-        _carry_over(Path(name), split, replaced)
+    with scratch() as folder:
+        yield folder
+        _carry_over(folder, split, replaced)
 
 
 def _carry_over(folder: Path, split: Path, replaced: Collection[Path]) -> None:
@@ -141,8 +141,8 @@ def _ids(data: bytes) -> frozenset[int]:
 def _fence() -> bytes:
     """A fragment without rows, other bytes each time."""
     nobody = {"fence": secrets.token_hex(8)}
-    with TemporaryDirectory(prefix="levelproof-") as folder:
-        attempt = new_attempt(Path(folder), unit_name(0, 0))
+    with scratch() as folder:
+        attempt = new_attempt(folder, unit_name(0, 0))
         begin_fragment(attempt)
         write_fragment(attempt, [], hash_of(nobody), nobody)
         return attempt.fragment.read_bytes()

@@ -1,0 +1,130 @@
+"""Temporary folders that no process leaves behind: each is locked while its process lives, and who needs one later
+removes those whose lock is free.
+
+A folder has a lock file, which names its machine, and `files` for its maker. Only folders of this user and this machine
+are removed: on a file system that machines share, locks may hold on one machine alone.
+"""
+
+import fcntl
+import json
+import os
+import shutil
+import socket
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from tempfile import gettempdir, mkdtemp
+
+PREFIX = "levelproof-scratch-"
+LOCK, FILES = "lock", "files"
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+MOST_ABOUT = 2**12  # bytes of a lock file
+
+
+@contextmanager
+def scratch(parent: Path | None = None, prefix: str = PREFIX) -> Iterator[Path]:
+    """Give an empty folder that lasts for the block.
+
+    The first call of a process removes what killed ones have left under this prefix.
+
+    Args:
+        parent: of the folder (default: the system's folder for temporary files).
+        prefix: begins the folder's name; no other files have it.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    parent = parent or Path(gettempdir())
+    _sweep_once(parent, prefix)
+    folder, lock = _made(parent, prefix)
+    try:
+        yield folder / FILES
+    finally:
+        _remove(folder)
+        os.close(lock)
+
+
+def _made(parent: Path, prefix: str) -> tuple[Path, int]:
+    """Make a folder; return it with the descriptor that holds its lock. One that others sweep before is given up."""
+    while True:
+        folder = Path(mkdtemp(prefix=prefix, dir=parent))
+        with suppress(FileNotFoundError):  # it was swept
+            lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            try:
+                with suppress(OSError):  # without locks no process can sweep it, either
+                    fcntl.flock(lock, fcntl.LOCK_EX)
+                os.write(lock, json.dumps(_machine()).encode())
+                if _is_at(lock, folder / LOCK):
+                    (folder / FILES).mkdir()
+                    return folder, lock
+            except BaseException:
+                _remove(folder)
+                os.close(lock)
+                raise
+            os.close(lock)
+
+
+@cache
+def _sweep_once(parent: Path, prefix: str) -> None:
+    with suppress(OSError), os.scandir(parent) as found:  # a folder that cannot be listed keeps what is in it
+        for entry in found:
+            if entry.name.startswith(prefix) and entry.is_dir(follow_symlinks=False):
+                with suppress(OSError):  # others sweep, too
+                    _sweep(Path(entry.path))
+
+
+def _sweep(folder: Path) -> None:
+    """Remove a folder if its process is dead. Raises OSError where that cannot be, or cannot be known."""
+    if folder.lstat().st_uid != os.getuid():
+        return
+    try:
+        lock = os.open(folder / LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        folder.rmdir()  # if it is empty; a process that has just made it makes another one
+        return
+    try:
+        about = os.fstat(lock)
+        if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid():
+            return
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        is_empty = not (folder / FILES).exists()  # its maker died before it wrote anything
+        if _is_at(lock, folder / LOCK) and (is_empty or _is_here(os.read(lock, MOST_ABOUT))):
+            _remove(folder)
+    finally:
+        os.close(lock)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder whose lock is held. What cannot go now keeps its lock file, so that a later sweep finds it."""
+    shutil.rmtree(folder / FILES, ignore_errors=True)
+    with suppress(OSError):
+        if not (folder / FILES).exists():
+            (folder / LOCK).unlink(missing_ok=True)
+            folder.rmdir()
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.lstat())
+    except FileNotFoundError:
+        return False
+
+
+def _machine() -> dict[str, str]:
+    """Names of this machine: the second differs after each start, the first may be another machine's, too."""
+    try:
+        boot = BOOT_ID.read_text().strip()
+    except OSError:
+        boot = ""
+    return {"host": socket.gethostname(), "boot": boot}
+
+
+def _is_here(about: bytes) -> bool:
+    """Whether a lock file is of this machine."""
+    try:
+        theirs = json.loads(about)
+    except ValueError:
+        return False
+    return isinstance(theirs, dict) and any(of and theirs.get(name) == of for name, of in _machine().items())
