@@ -27,6 +27,7 @@ CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.paused")  # experts in training
 OLD_CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.npz")  # written by earlier versions
 CHECKPOINT_BEGUN = re.compile(rf"{CHECKPOINTS}/\.{UNIT}\.(paused|npz)\.[0-9]+")
 NOTE = re.compile(rf"{QUARANTINE}/{UNIT}\.txt")  # why a unit was given up
+NOTE_BEGUN = re.compile(rf"{QUARANTINE}/\.{UNIT}\.txt\.[0-9]+")
 JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # by the process of this number
 INDEX_BEGUN = re.compile(rf"{MANIFEST}/\.{re.escape(INDEX)}\.[0-9]+")
 

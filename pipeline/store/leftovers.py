@@ -13,6 +13,8 @@ from levelproof.pipeline.store.layout import (
     INDEX_BEGUN,
     JOB_BEGUN,
     MANIFEST,
+    NOTE_BEGUN,
+    QUARANTINE,
     begun_path,
     data_path,
     data_paths,
@@ -52,7 +54,8 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
         for path in dead:
             remove_data(path)
         stuck = {begun_path(path) for path in dead if path.exists()}
-        half = (entries(split, *of, DirEntry.is_file) for of in (("", JOB_BEGUN), (MANIFEST, INDEX_BEGUN)))
+        kinds = ("", JOB_BEGUN), (MANIFEST, INDEX_BEGUN), (QUARANTINE, NOTE_BEGUN)
+        half = (entries(split, *kind, DirEntry.is_file) for kind in kinds)
         for path in [*(over - stuck), *chain(*half)]:
             remove(path)
     if kept := sorted(path for path in set(unnamed) - set(dead) if begun_path(path) not in begun):

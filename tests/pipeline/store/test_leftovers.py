@@ -69,7 +69,9 @@ def said() -> list[str]:
 
 
 def test_what_a_dead_attempt_left_goes_and_what_is_committed_stays(split: Path, dead: str, said: list[str]) -> None:
-    half = {split / ".job.json.123", split / "manifest/.index.txt.123"}
+    note = split / "quarantine/.000000000004-000000000005.txt.123"
+    note.parent.mkdir()
+    half = {split / ".job.json.123", split / "manifest/.index.txt.123", note}
     for path in half:
         path.touch()
     before = everything(split)
