@@ -31,7 +31,7 @@ def digests_of(path: Path, known: Iterable[str] = ()) -> dict[str, str]:
     if is_remote(path):
         below = stored_in(path) if is_listed(path) else [path / name for name in known if _is_below(name)]
         files = [*below] or [path]
-        found = at_once(path, lambda file: hashlib.sha256(bytes_of(file)).hexdigest(), files)
+        found = at_once(path, _digest, files)
         return {
             "" if file == path else file.relative_to(path).as_posix(): of for file, of in zip(files, found, strict=True)
         }
@@ -58,7 +58,20 @@ def _is_below(name: str) -> bool:
     return not (name.startswith("/") or ".." in name.split("/"))
 
 
+def altered(path: Path, digests: Mapping[str, str], name: str) -> list[str]:
+    """Files of a shard, by their paths there, that have this file name and are not what their digests say.
+
+    Raises:
+        OSError: one cannot be read.
+    """
+    files = [file for file in digests if file.rpartition("/")[2] == name and _is_below(file)]
+    found = at_once(path, lambda file: _digest(path / file), files)
+    return [file for file, digest in zip(files, found, strict=True) if digest != digests[file]]
+
+
 def _digest(path: Path) -> str:
+    if is_remote(path):
+        return hashlib.sha256(bytes_of(path)).hexdigest()
     if not stat.S_ISREG(path.lstat().st_mode):
         return "no file"
     with path.open("rb") as file:

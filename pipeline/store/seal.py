@@ -15,6 +15,8 @@ from typing import NamedTuple
 import pyarrow as pa
 
 from levelproof.configs.schema import Density, stored_as
+from levelproof.pipeline.store.checksums import altered
+from levelproof.pipeline.store.contents import ContentsError
 from levelproof.pipeline.store.convert import convert
 from levelproof.pipeline.store.files import remove
 from levelproof.pipeline.store.layout import (
@@ -44,7 +46,7 @@ from levelproof.pipeline.store.merge import Place, merge_shards
 from levelproof.pipeline.store.publish import publishing
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.schema import Encoding
-from levelproof.pipeline.store.shard import Shard
+from levelproof.pipeline.store.shard import Shard, damaged
 
 ROWS = 100_000  # of a sealed fragment, about; more: fewer files, and more to write again when some are added
 CROWD = 1_000  # unsealed neighbours that are merged, although they have not as many rows: small files are slow to read
@@ -119,7 +121,8 @@ def seal(
     table, about = each_once(parts)[0], parts[0][0]
     shards = {name: data_path(split, name) for name in named_by([of for _, of in parts], "shard")}
     replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
-    carried = {name: files for of, _ in parts for name, files in of.digests.items()}  # of kept experts, which stay
+    digests = {name: files for of, _ in parts for name, files in of.digests.items()}
+    _require_committed(shards, digests)
     places, between = _places(table, shards), list[Path]()
     densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(of.densities for of, _ in parts))
     first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
@@ -133,7 +136,7 @@ def seal(
             merge_shards(shard, of, moved, rows_a_file)
         require_served(folder)
         disown(replaced)
-        write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, carried)
+        write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, digests)
     sealed = fragment_path(split, unit)
     for path in paths - {sealed}:
         remove(path)
@@ -151,6 +154,21 @@ def _read(paths: Iterable[Path], moved: Callable[[int], None]) -> list[tuple[Fra
 
     with ThreadPoolExecutor(THREADS) as threads:
         return list(threads.map(read, sorted(paths)))
+
+
+def _require_committed(shards: Mapping[str, Path], digests: Mapping[str, Mapping[str, str]]) -> None:
+    """Check the metadata of shards against their digests; chunks are checked one by one, as they are copied.
+
+    Raises:
+        Failure: some has changed, and the digest of its copy would make that the truth.
+    """
+    for name, path in shards.items():
+        try:
+            wrong = altered(path, digests.get(name, {}), "zarr.json")
+        except OSError as error:
+            raise damaged(path, error) from error
+        if wrong:
+            raise damaged(path, ContentsError(f"its {wrong[0]} is not what was committed"))
 
 
 def _places(table: pa.Table, shards: Mapping[str, Path]) -> dict[Encoding, list[Place]]:

@@ -24,11 +24,17 @@ from levelproof.pipeline.jobs.unit import commit
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store import manifest
 from levelproof.pipeline.store import seal as sealing
-from levelproof.pipeline.store.layout import fragment_path, unit_name
+from levelproof.pipeline.store.layout import fragment_of, fragment_path, new_attempt, unit_name
 from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import only_writer
-from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.manifest import (
+    begin_fragment,
+    fragment_paths,
+    read_fragment,
+    read_manifest,
+    write_fragment,
+)
 from levelproof.pipeline.store.seal import CROWD, Piece, due, plan, seal
 from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.command import PATIENCE
@@ -82,6 +88,18 @@ def test_rows_and_bits_stay_the_same(split: Path, made: Path, rows: int, fragmen
     clean(split, said.append)
     assert not said
     assert_tidy(split, fragments)
+
+
+def test_seal_refuses_a_shard_with_altered_metadata(split: Path) -> None:
+    shard = next((split / "shards").iterdir())
+    group = shard / "zarr.json"
+    assert '"frame_skip": 2' in group.read_text()
+    group.write_text(group.read_text().replace('"frame_skip": 2', '"frame_skip": 3'))
+    before = {path: path.is_file() and path.read_bytes() for path in split.rglob("*")}
+    (piece,) = [piece for piece in pieces(split) if shard.stem.startswith(piece.path.stem)]
+    with pytest.raises(Failure, match=r"its zarr.json is not what was committed"):
+        seal(split, [piece])
+    assert {path: path.is_file() and path.read_bytes() for path in split.rglob("*")} == before
 
 
 def test_a_plan_merges_neighbours_and_leaves_what_is_large() -> None:
@@ -268,10 +286,14 @@ def test_what_is_damaged_is_not_sealed(split: Path, made: Path) -> None:
 
 
 def test_shards_of_several_densities_stay_apart(split: Path, made: Path) -> None:
-    group = next(iter((split / "shards").iterdir())) / "zarr.json"
-    document = json.loads(group.read_text())
+    shard = next(iter((split / "shards").iterdir()))
+    document = json.loads((shard / "zarr.json").read_text())
     document["attributes"]["task"]["frame_skip"] = 3  # another encoding of the same fields
-    group.write_text(json.dumps(document))
+    (shard / "zarr.json").write_text(json.dumps(document))
+    fragment, rows = read_fragment(fragment_of(shard))
+    attempt = new_attempt(split, fragment.path.stem)
+    begin_fragment(attempt)
+    write_fragment(attempt, rows, fragment.config_hash, fragment.config)
     for _ in range(2):
         seal(split, pieces(split))
         assert whole(split) == whole(made)
