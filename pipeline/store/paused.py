@@ -11,6 +11,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from zipfile import BadZipFile
@@ -113,9 +114,15 @@ def load_paused(split: Path, level_ids: Collection[int], job: JobConfig) -> dict
     return found
 
 
-def drop_paused(split: Path, unit: str) -> None:
-    """The unit is committed, and its experts are no longer under way."""
-    remove(checkpoint_path(split, unit))
+def drop_paused(split: Path, unit: str, level_ids: Collection[int]) -> None:
+    """Remove the checkpoint of a committed unit of these levels. `prune_paused` judges one that cannot be read now.
+
+    One that has experts of other levels stays: a unit keeps its name when levels in its middle are given back.
+    """
+    path = checkpoint_path(split, unit)
+    with suppress(OSError, LevelproofError, _DamagedError):
+        if set(level_ids).issuperset(_head(path).level_ids):
+            remove(path)
 
 
 def prune_paused(split: Path, done: np.ndarray, say: Callable[[str], None]) -> None:

@@ -66,9 +66,14 @@ def test_what_is_kept_comes_back(split: Path, kept: dict[int, Paused]) -> None:
     same(load_paused(split, range(8), JOB), kept)
     same(load_paused(split, [7, 9], JOB), {7: kept[7]})
     assert load_paused(split, [5, 8], JOB) == {}
-    drop_paused(split, UNIT)
+    drop_paused(split, UNIT, range(3, 8))
     assert load_paused(split, range(8), JOB) == {}
-    drop_paused(split, UNIT)
+    drop_paused(split, UNIT, range(3, 8))
+
+
+def test_drop_keeps_experts_of_levels_that_were_cut_from_the_unit(split: Path, kept: dict[int, Paused]) -> None:
+    drop_paused(split, UNIT, [3, 4, 5, 6])
+    same(load_paused(split, range(8), JOB), kept)
 
 
 def test_of_two_the_one_that_came_further_counts(split: Path, kept: dict[int, Paused]) -> None:
