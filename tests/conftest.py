@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import jax
 import pytest
 from xdist.scheduler import LoadScopeScheduling
@@ -17,6 +18,7 @@ from xdist.scheduler import LoadScopeScheduling
 from benchmarks import oracle
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.runtime import CACHE_VARIABLE, prepare_jax
+from tests import pace
 
 ROOT = Path(__file__).parent.parent
 DEMANDED = "LEVELPROOF_TEST_ORACLE"
@@ -34,10 +36,23 @@ BEGAN = time.monotonic()
 
 os.environ.setdefault(CACHE_VARIABLE, str(ROOT / ".pytest_cache" / "levelproof"))
 prepare_jax()  # before any test touches JAX; commands that tests start inherit the folder
+# Hypothesis's own clocks fail tests on a slow machine, without a defect.
+hypothesis.settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("any machine")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--within", type=float, help="seconds after which no test begins; what is left is skipped")
+
+
+def pytest_configure() -> None:
+    pace.share()
+
+
+def pytest_report_header() -> str:
+    return f"slowness: {pace.slowness():.1f} (multiplies the limits of all waits; {pace.SLOWNESS} sets it)"
 
 
 @pytest.hookimpl(tryfirst=True)

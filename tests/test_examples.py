@@ -6,13 +6,13 @@ import re
 import shlex
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
 import yaml
 
 from levelproof.configs.compose import compose_job
+from tests.pace import patience, wait_until
 
 FOLDER = Path(__file__).parent.parent / "docs" / "examples"
 SCRIPTS = sorted(FOLDER.glob("*.sh"))
@@ -78,12 +78,15 @@ def log(folder: Path) -> list[str]:
 
 def test_a_spot_machine_runs_the_same_command_until_it_is_done(tmp_path: Path, stand_ins: dict[str, str]) -> None:
     (tmp_path / "codes").write_text("137\n130\n0\n")
-    done = subprocess.run(["bash", str(FOLDER / "spot.sh")], cwd=tmp_path, env=stand_ins, timeout=60)
+    done = subprocess.run(["bash", str(FOLDER / "spot.sh")], cwd=tmp_path, env=stand_ins, timeout=patience(60))
     assert done.returncode == 0
     first, second, third = log(tmp_path)
     assert first == second == third
     (tmp_path / "codes").write_text("2\n")
-    assert subprocess.run(["bash", str(FOLDER / "spot.sh")], cwd=tmp_path, env=stand_ins, timeout=60).returncode == 2
+    assert (
+        subprocess.run(["bash", str(FOLDER / "spot.sh")], cwd=tmp_path, env=stand_ins, timeout=patience(60)).returncode
+        == 2
+    )
 
 
 @pytest.mark.parametrize(("name", "again"), [("slurm-array", "requeue 7_1"), ("slurm-ray", "requeue 7"), ("spot", "")])
@@ -92,12 +95,9 @@ def test_the_end_of_an_allocation_stops_the_command_and_queues_it_again(
 ) -> None:
     (tmp_path / "codes").write_text("wait\n")
     process = subprocess.Popen(["bash", str(FOLDER / f"{name}.sh")], cwd=tmp_path, env=stand_ins)
-    end = time.monotonic() + 60
-    while not (tmp_path / "waits").exists():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until((tmp_path / "waits").exists, 60, name)
     process.send_signal(signal.SIGTERM)
-    assert process.wait(timeout=60) == (0 if again else 130)
+    assert process.wait(timeout=patience(60)) == (0 if again else 130)
     assert "stopped" in log(tmp_path)
     assert not again or log(tmp_path)[-1] == f"scontrol {again}"
     if name == "slurm-ray":

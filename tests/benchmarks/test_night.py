@@ -3,13 +3,13 @@
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from benchmarks.__main__ import parser
 from benchmarks.night import memory_of, run
+from tests.pace import wait_until
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -18,9 +18,8 @@ def test_memory_of_a_process_and_those_below_it() -> None:
     script = f"import subprocess, sys; subprocess.run([sys.executable, '-c', '{child}'])"
     process = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE)
     try:
-        end = time.monotonic() + 30
-        while (found := memory_of(process.pid))["ray"] < 40_000_000 and time.monotonic() < end:
-            time.sleep(0.1)
+        wait_until(lambda: memory_of(process.pid)["ray"] >= 40_000_000, 30, "its child takes too little memory")
+        found = memory_of(process.pid)
         assert 1_000_000 < found["driver"] < 40_000_000 < found["ray"]
         assert (found["workers"], found["worker_count"]) == (0, 0)
     finally:

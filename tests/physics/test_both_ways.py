@@ -10,6 +10,7 @@ import jax
 import pytest
 
 from levelproof.physics.step import step
+from tests.pace import patience
 from tests.physics.both_ways import digest, worlds
 
 ROOT = Path(__file__).parents[2]
@@ -32,7 +33,7 @@ def here(name: str):
 )
 def test_both_ways_are_one(names: tuple[str, ...]) -> None:
     command = [sys.executable, "-m", "tests.physics.both_ways", *names]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=patience(600))
     assert done.returncode == 0, done.stderr[-2000:]
     for name, said in json.loads(done.stdout).items():
         assert said["touching"] > 0.1

@@ -6,16 +6,16 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 from levelproof.pipeline.cli.main import main
+from tests.pace import patience, wait_until
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 600  # s; workers are niced, so what else runs on a slow machine keeps them waiting
+COMMAND_SECONDS = 600  # limit of a whole command; workers are niced, so any other load makes them wait
 TINY = ("levels=4", "unit=1", "budget=5k")  # four real units with two updates each
 
 
@@ -43,7 +43,7 @@ def start(
 
 def run(arguments: Sequence[str], cwd: Path, **options: Any) -> subprocess.CompletedProcess[str]:
     process = start(arguments, cwd, **options)
-    out, err = process.communicate(timeout=PATIENCE)
+    out, err = process.communicate(timeout=patience(COMMAND_SECONDS))
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
@@ -66,12 +66,15 @@ def heed_ctrl_c() -> None:
 
 
 def until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
-    """Wait for the condition while the process runs."""
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert process.poll() is None, f"it ended early: {process.communicate()}"
-        assert time.monotonic() < end, "it took too long"
-        time.sleep(0.05)
+    """Wait until the condition holds; fail if the process ends before."""
+
+    def met() -> bool:
+        if condition():
+            return True
+        assert process.poll() is None, f"the command ended early: {process.communicate()}"
+        return False
+
+    wait_until(met, COMMAND_SECONDS, process.args)
 
 
 def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:

@@ -21,8 +21,10 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import pytest
 
+from tests.pace import patience, wait_until
+
 HOST = "127.0.0.1"
-PATIENCE = 60  # s
+ANSWER_SECONDS = 60  # limit of a server's start and of its answers
 # What Microsoft's emulator has one account for, the same everywhere: docs of Azurite, "default storage account"
 AZURE_NAME, AZURE_VERSION = "devstoreaccount1", "2021-08-06"
 AZURE_KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr/KBHBeksoGMGw=="
@@ -69,7 +71,7 @@ class Server:
                     self.give(Answer(503, {}, b"<Error><Code>SlowDown</Code></Error>"))
                     return
                 if spoiled == "slow":
-                    time.sleep(SLOW)
+                    time.sleep(patience(SLOW))
                 given = answers(self.command, self.path, headers, body) if spoiled != "gone" else None
                 if given is None or spoiled == "lost":  # the connection, before or after it was done
                     self.close_connection = True
@@ -248,7 +250,7 @@ def before(host: str, port: int) -> Answers:
     """A server that asks another one."""
 
     def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
-        connection = HTTPConnection(host, port, timeout=PATIENCE)
+        connection = HTTPConnection(host, port, timeout=patience(ANSWER_SECONDS))
         try:
             connection.request(method, path, body, headers)
             given = connection.getresponse()
@@ -283,7 +285,7 @@ def azure_process(azurite: str, folder: Path) -> Iterator[tuple[str, int]]:
         path, about = f"/{AZURE_NAME}/bucket", f"x-ms-date:{date}\nx-ms-version:{AZURE_VERSION}\n"
         signed = "PUT" + "\n" * 12 + f"{about}/{AZURE_NAME}{path}\nrestype:container"
         signature = b64encode(hmac.digest(b64decode(AZURE_KEY), signed.encode(), "sha256")).decode()
-        connection = HTTPConnection(HOST, port, timeout=PATIENCE)
+        connection = HTTPConnection(HOST, port, timeout=patience(ANSWER_SECONDS))
         headers = {"x-ms-date": date, "x-ms-version": AZURE_VERSION, "Content-Length": "0"}
         headers |= {"Authorization": f"SharedKey {AZURE_NAME}:{signature}"}
         connection.request("PUT", f"{path}?restype=container", headers=headers)
@@ -297,6 +299,14 @@ def _free_port() -> int:
         return probe.getsockname()[1]
 
 
+def _accepts(port: int) -> bool:
+    try:
+        socket.create_connection((HOST, port)).close()
+    except OSError:
+        return False
+    return True
+
+
 @contextmanager
 def _listening(words: Sequence[str], port: int, **environment: str) -> Iterator[None]:
     """A process, from when it listens."""
@@ -304,14 +314,7 @@ def _listening(words: Sequence[str], port: int, **environment: str) -> Iterator[
         words, env=os.environ | environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     try:
-        end = time.monotonic() + PATIENCE
-        while process.poll() is None:
-            try:
-                socket.create_connection((HOST, port)).close()
-                break
-            except OSError:
-                assert time.monotonic() < end
-                time.sleep(0.05)
+        wait_until(lambda: process.poll() is not None or _accepts(port), ANSWER_SECONDS, words)
         yield
     finally:
         process.terminate()

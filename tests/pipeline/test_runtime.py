@@ -9,6 +9,7 @@ import pytest
 
 from levelproof.pipeline import runtime
 from levelproof.pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder, own_cores
+from tests.pace import patience
 from tests.pipeline.command import ROOT
 
 # Orthogonal weights of several layers for several experts: batched QR factorisations side by side in one program
@@ -35,7 +36,9 @@ def python(program: str, folder: Path, **environment: str) -> str:
     ours = {CACHE_VARIABLE: str(folder), "PYTHONPATH": str(ROOT)} | environment
     inherited = {k: v for k, v in os.environ.items() if k not in ("NPROC", "PJRT_NPROC", "XLA_FLAGS")}
     command = [sys.executable, "-c", program]
-    done = subprocess.run(command, env=inherited | ours, capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(
+        command, env=inherited | ours, capture_output=True, text=True, timeout=patience(120), check=True
+    )
     return done.stdout
 
 

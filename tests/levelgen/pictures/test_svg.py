@@ -19,6 +19,7 @@ from levelproof.levelgen.pictures.shapes import Scene
 from levelproof.levelgen.pictures.svg import svg_of
 from levelproof.levelgen.pictures.words import Caption
 from tests.golden.load import HERE, load
+from tests.pace import patience
 
 SVG = "{http://www.w3.org/2000/svg}"
 WORLD = slice(40, 500)  # rows without words, for which machines have other letters
@@ -162,5 +163,5 @@ def photograph(svg: str, second: float, folder: Path) -> np.ndarray:
     width, height = picture(svg).shape[1::-1]
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--screenshot={shot}"]
     command = [str(BROWSER), *options, f"--window-size={width},{height + 200}", str(page)]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    subprocess.run(command, check=True, capture_output=True, timeout=patience(60))
     return np.asarray(Image.open(shot).convert("RGB")).astype(int)[:height, :width]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from levelproof.configs import compose
+from tests.pace import patience
 from tests.pipeline.faults.content import Rows, Tree, content_of, differences, require_sound, rows_of
 from tests.pipeline.faults.effects import lose_power
 from tests.pipeline.faults.process import DRIVER, DRIVER_PID, HAPPENED, ROLES, WORKER, WORKER_PID, Command, Happening
@@ -245,7 +246,7 @@ def _in_its_store(world: World, schedule: Schedule, whole: Undisturbed) -> Comma
                 os.kill(command.shared[whose] or command.pid, signal.SIGKILL)
         elif fault == SECOND:
             asked.set()
-            answered.wait(20)
+            answered.wait(patience(20))
 
     server.meanwhile = meanwhile
     while not command.over():

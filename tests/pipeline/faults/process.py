@@ -28,11 +28,12 @@ from levelproof.configs import compose
 from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.jobs import inline, unit
 from levelproof.pipeline.store import density, events, leases, remote, seal, shard
+from tests.pace import patience
 from tests.pipeline.faults import crew
 from tests.pipeline.faults.effects import Effects, Tell
 from tests.pipeline.faults.schedules import LEVELS
 
-PATIENCE = 60.0  # s after which a command hangs
+HANGS = 60.0  # s after which a command hangs
 HELD = 0.5  # s that a worker that has outlived its driver waits for the next command, at most
 SLOW, FOR = 0.02, 10  # s of each of so many effects
 DAY = 86_400.0  # s
@@ -71,7 +72,7 @@ class Command:
         self.control, theirs = socket.socketpair()
         reads, alive = os.pipe()  # closed when the last process that has it ends
         self._alive: int | None = reads
-        self._output, self._end = output, time.monotonic() + PATIENCE
+        self._output, self._end = output, time.monotonic() + patience(HANGS)
         self._code: int | None = None
         self.pid = os.fork()
         if self.pid:
@@ -119,7 +120,7 @@ class Command:
     def ended(self) -> None:
         """Wait until all that it has forked have ended, too."""
         while self._alive is not None:
-            if select.select([self._alive], [], [], PATIENCE)[0]:
+            if select.select([self._alive], [], [], patience(HANGS))[0]:
                 os.close(self._alive)
                 self._alive = None
                 self.control.close()
@@ -196,9 +197,9 @@ def _tell(happening: Happening, control: socket.socket, shared: memoryview) -> T
             os.killpg(0, signal.SIGKILL)
         elif now and fault == "a kill of the driver, the worker goes on":
             os.kill(shared[DRIVER_PID], signal.SIGKILL)
-            _ask(control, HELD)
+            _ask(control, patience(HELD))
         elif now and fault in ("a second command", "go on"):
-            _ask(control, PATIENCE if fault == "a second command" else 0.0)
+            _ask(control, patience(HANGS) if fault == "a second command" else 0.0)
         elif now and fault == "a clock that goes back":
             _set_clock_back()
         elif fault == "slow writes" and at <= number < at + FOR:
@@ -252,8 +253,12 @@ def set_up() -> None:
         arrays = unit.shard_arrays(result.levels, result.record, [0, 1])
         stored |= {arrays["record/action"][..., i].tobytes(): (arrays, i) for i in (0, 1)}
     shard.restored = _looked_up(stored)
-    remote.RETRIES |= {"retry_timeout": timedelta(seconds=0.5), "backoff": {"init_backoff": timedelta(milliseconds=5)}}
-    leases.POLL, leases.RENEWAL, leases.SILENCE = 0.02, 0.2, 3.0
+    retries = {
+        "retry_timeout": timedelta(seconds=patience(0.5)),
+        "backoff": {"init_backoff": timedelta(milliseconds=5)},
+    }
+    remote.RETRIES |= retries
+    leases.POLL, leases.RENEWAL, leases.SILENCE = 0.02, 0.2, patience(3.0)  # a slow writer is not a dead one
 
 
 def cache_of(function: Callable) -> Callable:

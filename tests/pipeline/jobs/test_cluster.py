@@ -22,17 +22,18 @@ from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import COMPANY, Scheduler, WorkUnit
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
-from tests.pipeline.command import PATIENCE, ROOT, assert_refused, descendants, run, start, title, until
+from tests.pace import patience
+from tests.pipeline.command import COMMAND_SECONDS, ROOT, assert_refused, descendants, run, start, title, until
 from tests.pipeline.made import lasting, made_job
 
 LEVELS, DEADLY = 8, 2
 SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k")
 SPLIT = Path("data/5k/s")
-STALLED = 150  # s; compiling keeps a worker silent for less
+STALLED = 150  # s; compiling keeps a worker of a fast machine silent for less
 
 
 def fragile(deadly: int, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return run([str(deadly), str(PATIENCE), *SETTINGS], cwd, module="tests.pipeline.fragile")
+    return run([str(deadly), str(patience(COMMAND_SECONDS)), *SETTINGS], cwd, module="tests.pipeline.fragile")
 
 
 @pytest.mark.campaign
@@ -122,7 +123,7 @@ def test_a_worker_that_starts_late_commits_for_its_own_driver_only(tmp_path: Pat
     split = tmp_path / SPLIT
     split.mkdir(parents=True)
     program = [sys.executable, "-c", CUT_OFF, str(split)]
-    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=patience(COMMAND_SECONDS), check=False)
     assert "Another command has taken over" in done.stderr, done.stderr
     assert not fragment_paths(split)
 
@@ -231,7 +232,7 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
         before = len(fragment_paths(tmp_path / SPLIT))
         until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before + LEVELS, process)
         process.terminate()
-        _, err = process.communicate(timeout=PATIENCE)
+        _, err = process.communicate(timeout=patience(COMMAND_SECONDS))
         assert process.returncode == 130, err
         assert " is gone; others go on with level" in err
         assert "Traceback" not in err
@@ -265,7 +266,7 @@ def test_prometheus_gets_the_progress_from_ray(tmp_path: Path) -> None:
     told: dict[str, float] = {}
 
     def scraped() -> bool:
-        with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
+        with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/metrics", timeout=patience(10)) as answer:
             for line in answer.read().decode().splitlines():
                 if found := re.fullmatch(r'ray_levelproof_(\w+)\{.*split="5k/s".*\} (\S+)', line):
                     told[found[1]] = float(found[2])
@@ -276,7 +277,7 @@ def test_prometheus_gets_the_progress_from_ray(tmp_path: Path) -> None:
         until(scraped, process)
         committed = len(fragment_paths(tmp_path / SPLIT))
         process.terminate()
-        process.communicate(timeout=PATIENCE)
+        process.communicate(timeout=patience(COMMAND_SECONDS))
     finally:
         machines.shutdown()
     assert told.keys() == {"levels", "solved", "env_steps"}
@@ -289,12 +290,12 @@ def test_prometheus_gets_the_progress_from_ray(tmp_path: Path) -> None:
 def test_a_worker_that_stalls_is_given_up_and_another_does_its_levels(tmp_path: Path) -> None:
     alone = ("scout.rounds=0", "search.env_steps=0", "stop.rule=budget")  # so that experts train long
     command = ["generate", f"levels={LEVELS}", "unit=1", "budget=1M", "workers=1", *alone]
-    process = start([str(LEVELS), str(STALLED), *command], tmp_path, module="tests.pipeline.fragile")
+    process = start([str(LEVELS), str(patience(STALLED)), *command], tmp_path, module="tests.pipeline.fragile")
     split, at_work = tmp_path / "data/1M/s", "ray::Fragile.work"
     working = lambda: [pid for pid in descendants(process.pid) if title(pid).startswith(at_work)]
     until(lambda: fragment_paths(split) and working(), process)
     os.kill(working()[0], signal.SIGSTOP)
-    _, err = process.communicate(timeout=PATIENCE)
+    _, err = process.communicate(timeout=patience(COMMAND_SECONDS))
     assert process.returncode == 0, err
     assert "was silent for" in err
     assert read_manifest(split).level_ids.tolist() == list(range(LEVELS))

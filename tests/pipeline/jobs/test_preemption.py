@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from levelproof.configs.compose import compose_job
+from levelproof.pipeline.runtime import LAST
 from levelproof.pipeline.store.paused import load_paused
+from tests.pace import patience
 from tests.pipeline.command import heed_ctrl_c, here, run, start, until
 from tests.pipeline.made import lasting
 
@@ -49,8 +51,9 @@ def test_the_same_command_goes_on_where_experts_were(
     until(lambda: list(split.glob("checkpoints/[0-9]*.paused")), process)
     begin = time.monotonic()
     process.send_signal(number)
-    _, err = process.communicate(timeout=60)
-    assert time.monotonic() - begin < 30
+    _, err = process.communicate(timeout=patience(60))
+    # the command's own clock ends it after LAST s, however slow the machine is: only its exit may take longer there
+    assert time.monotonic() - begin < LAST + patience(2)
     assert process.returncode == (-9 if number == signal.SIGKILL else 130), err
     kept = load_paused(split, range(LEVELS), compose_job(SETTINGS))
     steps = sum(int(of.expert.begun.training.progress.env_steps) for of in kept.values())

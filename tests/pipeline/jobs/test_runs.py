@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from levelproof.pipeline.store.events import events_of, runs_in
 from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.shard import Shard
+from tests.pace import patience, wait_until
 from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, listening, run, start, status, title, until
 from tests.pipeline.jobs.test_log import tensorboard_file
 from tests.pipeline.made import lasting
@@ -67,10 +67,7 @@ def workers(process: subprocess.Popen[str]) -> list[int]:
 
 
 def assert_all_gone(pids: set[int]) -> None:
-    end = time.monotonic() + 30
-    while left := {pid for pid in pids if (state := status(pid)) and state[0] != "Z"}:
-        assert time.monotonic() < end, f"orphans: {left}"
-        time.sleep(0.1)
+    wait_until(lambda: not any((state := status(pid)) and state[0] != "Z" for pid in pids), 30, "processes are left")
 
 
 def test_an_undisturbed_run_is_whole(undisturbed: Path) -> None:
@@ -124,7 +121,7 @@ def test_kill_9_of_a_worker_then_stopped_and_again(undisturbed: Path, tmp_path: 
     until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before, process)
     family = descendants(process.pid)
     os.killpg(process.pid, number)  # as a terminal does
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=patience(60))
     assert process.returncode == 130, err
     assert "trying again" in err
     assert "Stopped: " in err

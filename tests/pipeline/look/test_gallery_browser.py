@@ -16,6 +16,7 @@ from levelproof.pipeline.look.gallery.gallery import gallery
 from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store.manifest import require_manifest
+from tests.pace import patience
 from tests.pipeline.command import ROOT
 from tests.pipeline.made import PLAYED
 
@@ -49,7 +50,7 @@ def address(split: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """Skips where there is none; fails there with LEVELPROOF_TEST_BROWSER=1."""
+    """Start Chromium; skip where there is none, or fail there with LEVELPROOF_TEST_BROWSER=1."""
     try:
         with browser() as opened:
             yield opened
@@ -63,7 +64,7 @@ def chromium() -> Iterator[Any]:
 def page(chromium: Any) -> Iterator[Any]:
     """A page that must not complain, nor ask another host for anything."""
     context = chromium.new_context(viewport=DESKTOP, reduced_motion="reduce")
-    opened, said = context.new_page(), list[str]()
+    opened, said = patient(context.new_page()), list[str]()
     opened.on("console", lambda message: said.append(message.text))
     opened.on("pageerror", lambda error: said.append(str(error)))
     opened.on(
@@ -72,6 +73,12 @@ def page(chromium: Any) -> Iterator[Any]:
     yield opened
     assert said == []
     context.close()
+
+
+def patient(page: Any) -> Any:
+    """Lengthen a page's own limits, 30 s each, by the machine's slowness."""
+    page.set_default_timeout(1000 * patience(30))
+    return page
 
 
 def rows(split: Path) -> list[dict[str, Any]]:
@@ -143,8 +150,7 @@ def test_a_level_plays_what_its_record_has(page: Any, address: str, split: Path)
     page.keyboard.press("ArrowLeft")
     assert page.locator("#clock").inner_text().startswith(f"step {steps - 1} of {steps} · ")
     page.get_by_role("button", name="Play", exact=True).click()
-    page.wait_for_timeout(200)
-    assert page.locator("#play").inner_text() == "Pause"
+    page.wait_for_selector("#play:text-is('Pause')")
     assert page.locator("#command").inner_text().startswith("levelproof generate")
     assert page.locator("#reason").inner_text() == "Made for a test."
     assert "to 50%" in page.locator("#curve").get_attribute("aria-label")
@@ -179,10 +185,10 @@ def test_search_keyboard_and_the_way_back(page: Any, address: str) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_phone_by_day_and_by_night(chromium: Any, address: str, split: Path, scheme: str) -> None:
     context = chromium.new_context(viewport=PHONE, color_scheme=scheme, device_scale_factor=2, has_touch=True)
-    page = context.new_page()
+    page = patient(context.new_page())
     for at in ("", f"#level={solved(split)}"):
         page.goto(address + at)
-        page.wait_for_timeout(400)
+        page.wait_for_selector("#title:has-text('Level')" if at else ".cell:visible")
         assert page.evaluate("document.scrollingElement.scrollWidth") <= PHONE["width"]
     page.goto(address)
     drawn(page)

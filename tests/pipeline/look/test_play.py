@@ -24,9 +24,10 @@ from levelproof.pipeline.look.play.server import HOST, serving
 from levelproof.pipeline.look.play.session import empty_file
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.experts.small import untouched
+from tests.pace import patience
 from tests.pipeline.command import assert_refused, here
 
-PATIENCE = 120  # s
+ANSWER_SECONDS = 120  # limit of an answer from the page's server
 QUICK = replace(untouched(StopConfig()), scout=ScoutConfig(rounds=4))
 
 
@@ -42,13 +43,14 @@ def address(split: Path) -> Iterator[str]:
 
 @pytest.fixture
 def page(address: str) -> Iterator[ClientConnection]:
-    with connect(f"{address.replace('http', 'ws')}/socket", origin=address, max_size=2**26) as connection:  # pyright: ignore[reportArgumentType]
+    limits = {"max_size": 2**26, "open_timeout": patience(10)}
+    with connect(f"{address.replace('http', 'ws')}/socket", origin=address, **limits) as connection:  # pyright: ignore[reportArgumentType]
         yield connection
 
 
 def ask(page: ClientConnection, question: str, /, **words: Any) -> dict[str, Any]:
     page.send(json.dumps({"ask": question, "id": 1, **words}))
-    while "training" in (answer := json.loads(page.recv(PATIENCE))):
+    while "training" in (answer := json.loads(page.recv(patience(ANSWER_SECONDS)))):
         pass
     return answer
 
@@ -97,7 +99,7 @@ def test_edits_are_made_taken_back_and_refused(page: ClientConnection) -> None:
         assert ask(page, "edit", name=name, **{"with": words})["error"].endswith(".")
     for nonsense in ({"ask": "__init__"}, {"ask": "edit"}, {"ask": "step", "action": [9] * 6}, {"ask": ["step"]}, {}):
         page.send(json.dumps(nonsense))
-        assert json.loads(page.recv(PATIENCE))["error"].endswith(".")
+        assert json.loads(page.recv(patience(ANSWER_SECONDS)))["error"].endswith(".")
     assert ask(page, "load", document={"env_state": 1})["error"]
 
 
@@ -105,10 +107,10 @@ def test_edits_are_made_taken_back_and_refused(page: ClientConnection) -> None:
 def test_an_expert_is_trained_while_the_page_looks_on(page: ClientConnection, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "BETWEEN", 0.0)
     assert "error" not in ask(page, "train")
-    told, end = [], time.monotonic() + PATIENCE
+    told, end = [], time.monotonic() + patience(ANSWER_SECONDS)
     while not told or told[-1].get("stage") not in ("done", "failed"):
         assert time.monotonic() < end
-        message = json.loads(page.recv(PATIENCE))
+        message = json.loads(page.recv(patience(ANSWER_SECONDS)))
         told.append(message["training"])
     assert told[-1]["label"] == "solved", told[-1]
     assert any("curve" in message for message in told)

@@ -10,7 +10,8 @@ import pytest
 from levelproof.levelgen.files.level_file import from_document
 from levelproof.pipeline.look.play.server import HOST, serving
 from levelproof.pipeline.look.play.session import empty_file
-from tests.pipeline.look.test_gallery_browser import UNNAMED, chromium
+from tests.pace import patience
+from tests.pipeline.look.test_gallery_browser import UNNAMED, chromium, patient
 from tests.pipeline.look.test_play import QUICK
 
 __all__ = ["chromium"]  # a fixture
@@ -21,7 +22,7 @@ VIEW, BORDER, TOP = 5.16, 0.08, 5.08  # m, of the canvas
 @pytest.fixture
 def page(chromium: Any) -> Iterator[Any]:
     with serving(empty_file("m"), None, QUICK, 20_000, 0) as server:
-        opened = chromium.new_page(viewport={"width": 1280, "height": 900}, accept_downloads=True)
+        opened = patient(chromium.new_page(viewport={"width": 1280, "height": 900}, accept_downloads=True))
         opened.failures = []
         opened.on("pageerror", lambda error: opened.failures.append(str(error)))
         opened.goto(f"http://{HOST}:{server.socket.getsockname()[1]}/")
@@ -69,7 +70,9 @@ def test_a_level_is_built_edited_played_and_saved(page: Any, tmp_path: Path) -> 
     assert not page.evaluate(UNNAMED)
 
     page.keyboard.down("1")
-    page.wait_for_function("document.querySelector('#outcome').textContent.startsWith('Solved')", timeout=60_000)
+    page.wait_for_function(
+        "document.querySelector('#outcome').textContent.startsWith('Solved')", timeout=1000 * patience(60)
+    )
     page.keyboard.up("1")
     with page.expect_download() as saved:
         button(page, "Save level with witness")
@@ -96,7 +99,7 @@ def test_an_expert_trains_in_sight(page: Any, tmp_path: Path) -> None:
     page.wait_for_selector("#pads button")
     button(page, "Train an expert for this level")
     done = "/^(solved|unsolved|trivial|unsolvable):/.test(document.querySelector('#stage-of-training').textContent)"
-    page.wait_for_function(done, timeout=240_000)
+    page.wait_for_function(done, timeout=1000 * patience(240))
     assert page.locator("#learning").is_hidden() == (page.locator("#curve path").count() == 0)
 
 

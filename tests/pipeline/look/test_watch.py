@@ -12,6 +12,7 @@ from levelproof.experts.labels import Label
 from levelproof.pipeline.look.watch import now, shown, watch
 from levelproof.pipeline.store.events import new_run, tell
 from levelproof.pipeline.store.locks import only_writer
+from tests.pace import patience
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
 
@@ -32,7 +33,7 @@ def test_each_look_is_a_line_until_the_run_ends(split: Path, capsys: pytest.Capt
     run = new_run(split)
     failed = {"time": time.time(), "event": "failed", "unit": "0-1", "cause": "of this one"}
     tell(run, [failed, state("progress")])
-    timer = threading.Timer(0.5, lambda: tell(run, [failed, state("ended", done=8)]))
+    timer = threading.Timer(patience(0.5), lambda: tell(run, [failed, state("ended", done=8)]))
     with only_writer(split, print):
         timer.start()
         watch(split, True, Console(), every=0.1)

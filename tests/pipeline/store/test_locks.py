@@ -22,6 +22,7 @@ from levelproof.pipeline.store.layout import COMMIT_LOCK
 from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.locks import LockRefused, committing, is_written, nobody_commits, only_writer
 from levelproof.pipeline.store.split import writing
+from tests.pace import patience
 from tests.pipeline.command import ROOT, heed_ctrl_c, start
 from tests.pipeline.made import made_job
 
@@ -138,6 +139,6 @@ def test_waiting_for_a_worker_of_an_earlier_run_is_told_and_can_be_stopped(tmp_p
         assert f"data/5k/s/{COMMIT_LOCK}" in told
         assert "fuser" in told
         os.killpg(process.pid, signal.SIGINT)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=patience(60))
     assert process.returncode == Exit.INTERRUPTED
     assert err == ""

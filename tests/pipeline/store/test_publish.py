@@ -27,7 +27,8 @@ from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.objects import get, put, remove, require_conditions
 from levelproof.pipeline.store.publish import ended
-from tests.pipeline.command import PATIENCE, ROOT, TINY, run
+from tests.pace import patience
+from tests.pipeline.command import ROOT, TINY, run
 from tests.pipeline.command import here as command
 from tests.pipeline.driver import LEVELS, SPLIT, UNIT, commit_made, drive, require_same_content
 from tests.pipeline.servers import AZURE_KEY, AZURE_NAME, Answer, Server, azure_process, bucket_of, s3_process, serving
@@ -56,7 +57,7 @@ def server(
 ) -> Iterator[Server]:
     """A store with an empty bucket, a process without patience, and nothing known of any store."""
     monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=2))
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=patience(2)))
     monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
     monkeypatch.setattr(leases, "POLL", 0.02)
     (tmp_path / "s3/bucket").mkdir(parents=True)
@@ -117,7 +118,7 @@ def test_a_store_gets_what_a_folder_gets(server: Server, here: Path, every: int,
 
 
 def test_a_store_that_is_slow_is_asked_again(server: Server, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(remote.PATIENCE, "timeout", timedelta(seconds=0.5))
+    monkeypatch.setitem(remote.PATIENCE, "timeout", timedelta(seconds=patience(0.5)))
     forget()
     server.spoil(25, "slow")
     drive(OUT)
@@ -338,11 +339,11 @@ def test_a_writer_that_is_silent_is_waited_for_and_replaced_and_notices(
 ) -> None:
     monkeypatch.setattr(leases, "SILENCE", 0.3)
     monkeypatch.setattr(leases, "NOTICE", 0.1)
-    monkeypatch.setattr(leases, "RENEWAL", 2.0)
+    monkeypatch.setattr(leases, "RENEWAL", patience(2.0))
     said, theirs = list[str](), list[Lease]()
     with pytest.raises(LeaseLost), leases.leased(THERE, print):  # noqa: PT012
         theirs.append(Lease(THERE, said.append))
-        time.sleep(30)  # is interrupted
+        time.sleep(patience(30))  # until the loss of the lease interrupts it
     theirs[0].release()
     (sentence,) = said
     assert "still writes to s3://bucket/data/128k/s: after 0 s" in sentence

@@ -33,6 +33,7 @@ from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
 from levelproof.pipeline.store.layout import WRITER_LOCK
 from levelproof.pipeline.store.leases import is_leased
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
+from tests.pace import patience
 from tests.pipeline.command import ROOT, assert_refused
 from tests.pipeline.command import here as command
 from tests.pipeline.made import made_job, made_split, played_split
@@ -55,7 +56,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Small pieces, a cache of its own, little patience, and nothing known of any store."""
     monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(remote, "PIECE", PIECE)
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=2))
+    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=patience(2)))
     monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
     monkeypatch.setattr(hub, "PAUSE", 0.005)
     for name in [name for name in os.environ if name.startswith(("AWS_", "HF_", "GOOGLE_"))]:
@@ -226,7 +227,7 @@ def test_a_store_that_dies_is_one_sentence_in_bounded_time(bucket: Bucket, monke
     start = time.monotonic()
     with pytest.raises(StoreFailure, match=r"Cannot read s3://bucket/data/s/.* \(503 Service Unavailable\)"):
         read_rows(S3, rows)
-    assert time.monotonic() - start < 15
+    assert time.monotonic() - start < patience(15)
 
 
 @pytest.mark.parametrize(
@@ -441,7 +442,9 @@ def test_a_forked_process_is_told_how_to_start(tmp_path: Path) -> None:
         "except Exception as error:\n    print(error, flush=True)\n    os._exit(1)\n"
     )
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=patience(60)
+    )
     assert "multiprocessing_context='forkserver'" in done.stdout
     assert not done.stderr
 

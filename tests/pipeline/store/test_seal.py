@@ -37,7 +37,8 @@ from levelproof.pipeline.store.manifest import (
 )
 from levelproof.pipeline.store.seal import CROWD, Piece, due, plan, seal
 from levelproof.pipeline.store.shard import Shard
-from tests.pipeline.command import PATIENCE
+from tests.pace import patience
+from tests.pipeline.command import COMMAND_SECONDS
 from tests.pipeline.made import commit_copy, made_job, made_result, made_split
 
 UNITS = 6  # of two levels each, one of them solved
@@ -164,7 +165,7 @@ WRITES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 def killed(split: Path, step: int) -> bool:
     """Whether who cleans and seals is killed before it has changed the files of a split so many times."""
     if child := os.fork():
-        status, end = None, time.monotonic() + PATIENCE
+        status, end = None, time.monotonic() + patience(COMMAND_SECONDS)
         while status is None:
             ended, how = os.waitpid(child, os.WNOHANG)
             status = how if ended else None

@@ -12,6 +12,7 @@ import pytest
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.dataset.batches import Batches
 from levelproof.pipeline.read.dataset.dataset import Dataset
+from tests.pace import patience, wait_until
 
 PLAIN: dict[str, Any] = {"observation": None, "seed": 3}
 
@@ -86,10 +87,7 @@ def test_threads_end_when_nobody_wants_batches_any_more(data: Dataset) -> None:
     assert readers()
     del batches
     gc.collect()
-    deadline = time.monotonic() + 10
-    while readers() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not readers()
+    wait_until(lambda: not readers(), 10, "threads still read")
 
 
 def test_so_many_are_read_ahead_and_no_more() -> None:
@@ -97,13 +95,14 @@ def test_so_many_are_read_ahead_and_no_more() -> None:
 
     def load(position: int):
         asked.append(position)
-        go.wait(10)
+        go.wait(patience(10))
         return position
 
     batches = Batches(load, None, {}, 3, None)  # type: ignore[arg-type]
     go.set()
     assert next(batches) == 0
-    time.sleep(0.1)
+    wait_until(lambda: len(asked) >= 4, 10, asked)
+    time.sleep(0.1)  # in which no more are asked for
     assert sorted(asked) == [0, 1, 2, 3]
     batches.close()
     with pytest.raises(StopIteration):
