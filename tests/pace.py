@@ -13,12 +13,15 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeVar
 
 import numpy as np
 
 SLOWNESS = "LEVELPROOF_TEST_SLOWNESS"
 MAX_SLOWNESS = 20.0  # beyond this a hang would block the suite for hours
 POLL = 0.02  # s between two checks of a condition
+
+T = TypeVar("T")
 
 
 def patience(seconds: float) -> float:
@@ -78,9 +81,10 @@ def write_files() -> None:
 JOBS = {compute: 0.15, start_process: 0.25, write_files: 0.1}
 
 
-def wait_until(condition: Callable[[], object], seconds: float, failure: object = "") -> None:
-    """Poll a condition until it holds; raise AssertionError when `patience(seconds)` are over."""
+def wait_until(condition: Callable[[], T], seconds: float, failure: object = "") -> T:
+    """Poll a condition until it holds, and return its value; raise AssertionError when `patience(seconds)` are over."""
     end = time.monotonic() + patience(seconds)
-    while not condition():
+    while not (value := condition()):
         assert time.monotonic() < end, f"nothing happened within {patience(seconds):.0f} s: {failure}"
         time.sleep(POLL)
+    return value

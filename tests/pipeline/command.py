@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from unittest.mock import patch
 
 from levelproof.pipeline.cli.main import main
@@ -17,6 +17,8 @@ from tests.pace import patience, wait_until
 ROOT = Path(__file__).parents[2]
 COMMAND_SECONDS = 600  # limit of a whole command; workers are niced, so any other load makes them wait
 TINY = ("levels=4", "unit=1", "budget=5k")  # four real units with two updates each
+
+T = TypeVar("T")
 
 
 def start(
@@ -65,16 +67,15 @@ def heed_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
-    """Wait until the condition holds; fail if the process ends before."""
+def until(condition: Callable[[], T], process: subprocess.Popen[str]) -> T:
+    """Wait until the condition holds, and return its value; fail if the process ends before."""
 
-    def met() -> bool:
-        if condition():
-            return True
-        assert process.poll() is None, f"the command ended early: {process.communicate()}"
-        return False
+    def value() -> T:
+        found = condition()
+        assert found or process.poll() is None, f"the command ended early: {process.communicate()}"
+        return found
 
-    wait_until(met, COMMAND_SECONDS, process.args)
+    return wait_until(value, COMMAND_SECONDS, process.args)
 
 
 def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:

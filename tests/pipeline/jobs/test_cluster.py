@@ -293,8 +293,8 @@ def test_a_worker_that_stalls_is_given_up_and_another_does_its_levels(tmp_path: 
     process = start([str(LEVELS), str(patience(STALLED)), *command], tmp_path, module="tests.pipeline.fragile")
     split, at_work = tmp_path / "data/1M/s", "ray::Fragile.work"
     working = lambda: [pid for pid in descendants(process.pid) if title(pid).startswith(at_work)]
-    until(lambda: fragment_paths(split) and working(), process)
-    os.kill(working()[0], signal.SIGSTOP)
+    worker, *_ = until(lambda: fragment_paths(split) and working(), process)
+    os.kill(worker, signal.SIGSTOP)
     _, err = process.communicate(timeout=patience(COMMAND_SECONDS))
     assert process.returncode == 0, err
     assert "was silent for" in err

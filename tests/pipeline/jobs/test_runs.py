@@ -117,8 +117,7 @@ def test_kill_9_of_a_worker_then_stopped_and_again(undisturbed: Path, tmp_path: 
     places = listening(descendants(process.pid))
     assert places
     assert not {place: who for place, who in places.items() if not place.startswith(LOOPBACK)}
-    until(lambda: workers(process), process)
-    (worker,) = workers(process)
+    (worker,) = until(lambda: workers(process), process)
     os.kill(worker, signal.SIGKILL)
     before = len(fragment_paths(tmp_path / SPLIT))
     until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before, process)
