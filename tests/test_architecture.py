@@ -39,7 +39,7 @@ MAY_IMPORT = {
 RAY_IN = {"pipeline/jobs/cluster.py"}
 HYDRA_IN = {"configs/compose.py"}
 LONGEST = 400  # lines of a file
-FOLDERS = {*PRODUCT, *OUTSIDE, "manifests", "docs", ".ci"}
+FOLDERS = {*PRODUCT, *OUTSIDE, "manifests", "docs", ".ci", ".github"}
 
 
 def python_files(*folders: str) -> list[Path]:

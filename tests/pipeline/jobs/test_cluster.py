@@ -123,7 +123,9 @@ def test_a_worker_that_starts_late_commits_for_its_own_driver_only(tmp_path: Pat
     split = tmp_path / SPLIT
     split.mkdir(parents=True)
     program = [sys.executable, "-c", CUT_OFF, str(split)]
-    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=patience(COMMAND_SECONDS), check=False)
+    done = subprocess.run(
+        program, cwd=ROOT, capture_output=True, text=True, timeout=patience(COMMAND_SECONDS), check=False
+    )
     assert "Another command has taken over" in done.stderr, done.stderr
     assert not fragment_paths(split)
 

@@ -41,8 +41,8 @@ def test_status_calls_no_committed_level_given_up(tmp_path: Path, capsys: pytest
     give_up(split, range(2), "Failed 3 times")
     give_up(split, range(2, 6), "Failed 3 times")
     os.mkfifo(quarantine_path(split, unit_name(0, 7)))
-    status(split, False)
+    status(split, False, print)
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Given up")]
     assert lines == [f"Given up: levels 4 to 5, for the reason in {quarantine_path(split, unit_name(2, 5))}"]
-    status(split, True)
+    status(split, True, print)
     assert '"quarantined": [\n    "000000000002-000000000005.txt"\n  ]' in capsys.readouterr().out

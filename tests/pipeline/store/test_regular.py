@@ -18,7 +18,8 @@ from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.locks import committing, only_writer
 from levelproof.pipeline.store.pieces import PieceCache
 from levelproof.pipeline.store.remote import INDEX
-from tests.pipeline.command import PATIENCE, assert_refused, here
+from tests.pace import patience
+from tests.pipeline.command import COMMAND_SECONDS, assert_refused, here
 from tests.pipeline.made import made_split
 
 MINE = b"export PATH"
@@ -32,7 +33,7 @@ def _no_hang() -> Iterator[None]:
         raise TimeoutError("it hangs")
 
     before = signal.signal(signal.SIGALRM, expire)
-    signal.alarm(PATIENCE)
+    signal.alarm(int(patience(COMMAND_SECONDS)))
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)

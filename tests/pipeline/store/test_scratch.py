@@ -15,7 +15,8 @@ import pytest
 from levelproof.pipeline.read.created import new_folder
 from levelproof.pipeline.store import scratch as module
 from levelproof.pipeline.store.scratch import FILES, LOCK, PREFIX, scratch
-from tests.pipeline.command import PATIENCE, ROOT
+from tests.pace import patience
+from tests.pipeline.command import COMMAND_SECONDS, ROOT
 
 PUBLISH = """
 from pathlib import Path
@@ -76,7 +77,7 @@ def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_scratch_removes_the_folders_of_killed_processes_alone(parent: Path) -> None:
     with process(PUBLISH, parent) as (killed, gone), process(PUBLISH, parent) as (_, alive):
         killed.kill()
-        killed.wait(PATIENCE)
+        killed.wait(patience(COMMAND_SECONDS))
         assert (gone / "shard").exists()
         with scratch() as folder:
             assert not gone.parent.exists()
@@ -89,7 +90,7 @@ def test_new_folder_removes_what_a_killed_export_left(parent: Path) -> None:
     out = parent / "levels"
     with process(EXPORT, parent, str(out)) as (killed, gone):
         killed.kill()
-        killed.wait(PATIENCE)
+        killed.wait(patience(COMMAND_SECONDS))
         assert (gone / "part").exists()
     with new_folder(out) as folder:
         (folder / "part").touch()
