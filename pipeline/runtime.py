@@ -32,6 +32,16 @@ GRACE = 20.0  # s that workers have, when a job is to end, to commit what they c
 LAST = 28.0  # s after which it has ended; batch systems kill after 30
 CLAIMING = 2.0  # s of trying to get a core
 CLAIMS: list[socket.socket] = []  # of this process
+# Settings of JAX that change results or refuse the code, by a user's environment variables or configuration
+SETTLED = {
+    "jax_enable_x64": False,
+    "jax_default_matmul_precision": None,
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_numpy_rank_promotion": "allow",
+    "jax_disable_jit": False,
+    "jax_debug_nans": False,  # worlds that break down have NaNs
+    "jax_debug_infs": False,
+}
 MIN_COMPILE_SECONDS = 0.2  # what compiles faster is not worth a file
 
 
@@ -66,7 +76,8 @@ def prepare_jax(core: int | None = None) -> None:
 
     programs = own_folder(cache_folder() / "jax", "delete it")
     remove_damaged(programs)
-    jax.config.update("jax_enable_x64", False)
+    for name, value in SETTLED.items():
+        jax.config.update(name, value)
     jax.config.update("jax_compilation_cache_dir", str(programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

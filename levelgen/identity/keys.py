@@ -4,17 +4,43 @@ Every random stream has a name here and a key of its own, derived from the level
 a level depends on its neighbours, its work unit or its worker.
 """
 
+from collections.abc import Callable
 from enum import IntEnum
+from functools import wraps
+from typing import Any
 
 import jax
 import numpy as np
+from jax.extend.random import define_prng_impl, threefry_prng_impl
 from jaxtyping import Array, Int, Key
 from numpy.typing import ArrayLike
 
 SAMPLER_VERSION = 1  # raise it when the same id would give another level, or other random streams
-GENERATOR = "threefry2x32"  # named, not JAX's default: the same numbers everywhere
-ROOT_SEED = 0
+ROOT_KEY = (0, 0)  # as words, not as a seed: `jax_random_seed_offset` is added to every seed
 MAX_LEVEL_ID = 2**31 - 1  # so that an id fits into 32 bits, with a sign and without
+
+
+def _pinned(draw: Callable[..., Any]) -> Callable[..., Any]:
+    """Run a function of JAX's generator as if `jax_threefry_partitionable` were True, the default since JAX 0.5."""
+
+    @wraps(draw)
+    def drawn(*arguments: Any) -> Any:
+        with jax.threefry_partitionable(True):
+            return draw(*arguments)
+
+    return drawn
+
+
+# Keys carry their generator along, so every draw from one is pinned, also in a caller's own `jax.jit`
+GENERATOR = define_prng_impl(
+    key_shape=threefry_prng_impl.key_shape,
+    seed=_pinned(threefry_prng_impl.seed),
+    split=_pinned(threefry_prng_impl.split),
+    random_bits=_pinned(threefry_prng_impl.random_bits),
+    fold_in=_pinned(threefry_prng_impl.fold_in),
+    name="threefry2x32_partitionable",
+    tag="fry",
+)
 
 
 class Stream(IntEnum):
@@ -47,6 +73,6 @@ def key_for(level_id: Int[Array, ""] | int, stream: Stream) -> Key[Array, ""]:
 
     `level_id` is 0 .. MAX_LEVEL_ID; it may be traced, and mapped with `jax.vmap`.
     """
-    root = jax.random.key(ROOT_SEED, impl=GENERATOR)
+    root = jax.random.wrap_key_data(np.array(ROOT_KEY, np.uint32), impl=GENERATOR)
     level_key = jax.random.fold_in(jax.random.fold_in(root, SAMPLER_VERSION), level_id)
     return jax.random.fold_in(level_key, int(stream))

@@ -125,3 +125,19 @@ def test_every_worker_of_a_machine_has_its_own_core(tmp_path: Path) -> None:
         assert again.stdout
         assert again.stdout.readline().strip() == "5"
         again.kill()
+
+
+def test_settings_of_the_user_that_change_results_are_overruled(tmp_path: Path) -> None:
+    program = (
+        "from levelproof.pipeline.runtime import prepare_jax, SETTLED; prepare_jax(); import jax; "
+        "print(all(getattr(jax.config, name) == value for name, value in SETTLED.items()))"
+    )
+    theirs = {
+        "JAX_ENABLE_X64": "1",
+        "JAX_DEFAULT_MATMUL_PRECISION": "BF16_BF16_F32",
+        "JAX_NUMPY_DTYPE_PROMOTION": "strict",
+        "JAX_NUMPY_RANK_PROMOTION": "raise",
+        "JAX_DISABLE_JIT": "1",
+        "JAX_DEBUG_NANS": "1",
+    }
+    assert python(program, tmp_path, **theirs).strip() == "True"

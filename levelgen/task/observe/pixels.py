@@ -148,7 +148,8 @@ def _spoke(centre: Float[Array, "2"], angle: Float[Array, ""]) -> Interval:
     back = jnp.array([jnp.sin(angle), -jnp.cos(angle)])
     side = jnp.array([-back[1], back[0]])
     normals = jnp.stack([back, side, -side])
-    return _columns(normals[:, 0], normals[:, 1], normals @ centre + jnp.array([0.0, 1.0, 1.0]))
+    bound = jnp.matmul(normals, centre, precision="highest")  # whatever `jax_default_matmul_precision` is
+    return _columns(normals[:, 0], normals[:, 1], bound + jnp.array([0.0, 1.0, 1.0]))
 
 
 def _columns(dx: Float[Array, " plane"], dy: Float[Array, " plane"], bound: Float[Array, " plane"]) -> Interval:
