@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from levelproof.physics.block import Block, Given, Scratch
 from levelproof.physics.buffers import buffers_like, buffers_of
 from levelproof.physics.codegen.buffers import LANES, Buffer
-from levelproof.physics.codegen.compile import register, write
+from levelproof.physics.codegen.compile import COMPILING, register, write
 from levelproof.physics.codegen.kept import kept_while_sources_stay
 from levelproof.physics.engine import STAGES, Stage, step_block
 from levelproof.physics.pairs import table_of
@@ -42,10 +42,12 @@ def step(
 
     Returns:
         The worlds after the step, and the contacts found at its start: a Manifold, or None if they are not `seen`.
+
+    Raises:
+        ValueError: an array has another shape than its annotation says for the model's size.
+        TypeError: an array has another dtype.
     """
     given = Given(model, state, motor, thrust)
-    lanes = max(x.shape[-1] for x in jax.tree.leaves(given))
-    given = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], lanes)), given)
     if state.position.dtype != jnp.float32:
         return on_all_lanes(given, params, seen)
     if jax.default_backend() == "cpu":
@@ -56,7 +58,8 @@ def step(
 
 def on_all_lanes(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
     """The step as XLA's own operations, all lanes as one block: slow on a CPU, but anywhere and in any precision."""
-    size, lanes, dtype = given.model.size, given.before.rotation.shape[-1], given.before.position.dtype
+    size, dtype = given.model.size, jax.dtypes.canonicalize_dtype(given.before.position.dtype)
+    given, lanes = as_annotated(given, str(dtype))
 
     def empty(buffer: Buffer):
         array = buffer.array(lanes)
@@ -76,8 +79,9 @@ def as_machine_code(given: Given, params: Params, seen: bool, stages: tuple[Stag
 
     With fewer `stages`, it takes less time and fills in less: to measure what each costs.
     """
-    lanes = given.before.rotation.shape[-1]
-    name, filled, scratch_bytes = _compiled(given.model.size, params, seen, buffers_like(given), stages)
+    given, lanes = as_annotated(given)  # the kernel reads and writes as far as the annotations say, unchecked
+    with COMPILING:
+        name, filled, scratch_bytes = _compiled(given.model.size, params, seen, buffers_like(given), stages)
     missing = -lanes % LANES
     fill = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge")
     given = jax.tree.map(fill, given) if missing else given
@@ -86,6 +90,35 @@ def as_machine_code(given: Given, params: Params, seen: bool, stages: tuple[Stag
     *results, _ = call(*jax.tree.leaves(given), *table_of(given.model.size, params.faithful_padding))
     results = [x[..., :lanes] for x in results] if missing else results
     return jax.tree.unflatten(jax.tree.structure(filled), results)
+
+
+def as_annotated(given: Given, number: str = "float32") -> tuple[Given, int]:
+    """Check each array's shape and dtype against its annotation; return them with equal lanes, and the lane count.
+
+    Args:
+        given: what a step reads; one lane broadcasts.
+        number: dtype of the arrays that are annotated as Float.
+
+    Raises:
+        ValueError: an array has another shape.
+        TypeError: an array has another dtype.
+    """
+    size = given.model.size
+    lanes = max(x.shape[-1] if x.shape else 1 for x in jax.tree.leaves(given))
+
+    def fitted(path: Any, x: Any, buffer: Buffer) -> Any:
+        name, shape = jax.tree_util.keystr(path).lstrip("."), (*buffer.shape, lanes)
+        if x.shape[:-1] != buffer.shape or not x.shape or x.shape[-1] not in (1, lanes):
+            raise ValueError(
+                f"{name} has shape {x.shape}, but must be {shape} in worlds of {size}: give arrays of one size, "
+                "with the lanes last"
+            )
+        wanted = number if buffer.dtype == "float32" else buffer.dtype
+        if (dtype := str(jax.dtypes.canonicalize_dtype(x.dtype))) != wanted:
+            raise TypeError(f"{name} is {dtype}, but must be {wanted}: convert it")
+        return jnp.broadcast_to(x, shape)
+
+    return jax.tree_util.tree_map_with_path(fitted, given, buffers_of(Given, size)), lanes
 
 
 @cache

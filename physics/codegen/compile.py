@@ -2,6 +2,7 @@
 
 import ctypes
 import hashlib
+import threading
 from collections.abc import Sequence
 from functools import cache
 
@@ -16,6 +17,7 @@ from levelproof.physics.codegen.kept import kept
 from levelproof.physics.codegen.lower import Memory, lower
 from levelproof.physics.codegen.values import INDEX
 
+COMPILING = threading.RLock()  # held while a kernel is made: LLVM and XLA take a name only once in a process
 _libraries: dict[str, binding.ResourceTracker] = {}  # machine code must outlive every executable that calls it
 
 
@@ -43,12 +45,13 @@ def write(
 def register(text: str) -> str:
     """Compile what `write` gave, and make it known to XLA; the name by which `jax.ffi.ffi_call` finds it."""
     name = "levelproof_" + hashlib.sha256(text.encode()).hexdigest()[:16]
-    if name not in _libraries:
-        builder = binding.JITLibraryBuilder().add_object_img(_object_code(text))
-        library = builder.export_symbol("handler").link(_jit(), name)
-        handler = jax.ffi.pycapsule(ctypes.c_void_p(library["handler"]))
-        jax.ffi.register_ffi_target(name, handler, platform="cpu")
-        _libraries[name] = library
+    with COMPILING:
+        if name not in _libraries:
+            builder = binding.JITLibraryBuilder().add_object_img(_object_code(text))
+            library = builder.export_symbol("handler").link(_jit(), name)
+            handler = jax.ffi.pycapsule(ctypes.c_void_p(library["handler"]))
+            jax.ffi.register_ffi_target(name, handler, platform="cpu")
+            _libraries[name] = library
     return name
 
 

@@ -1,0 +1,43 @@
+"""Threads that take their first steps at once share one kernel."""
+
+import os
+import subprocess
+import sys
+
+import jax
+
+from tests.golden.load import HERE
+
+# Starts with no kernel in the process; the barrier lets all threads ask for it together
+PROGRAM = """
+import threading
+import numpy as np
+from levelproof.physics.step import step
+from tests.physics.worlds import idle, room
+given, barrier, found = (*room(), *idle()), threading.Barrier(6), {}
+
+def first(thread):
+    barrier.wait()
+    try:
+        after = step(*given, seen=False)[0]
+        found[thread] = np.asarray(after.position).tobytes()
+    except Exception as error:
+        found[thread] = repr(error)
+
+threads = [threading.Thread(target=first, args=[thread]) for thread in range(6)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+for thread in range(6):
+    assert isinstance(found[thread], bytes), found[thread]
+assert len(set(found.values())) == 1
+"""
+
+
+def test_first_steps_of_six_threads_succeed() -> None:
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    environment = os.environ | ({"JAX_COMPILATION_CACHE_DIR": folder} if folder else {})
+    command = [sys.executable, "-c", PROGRAM]
+    ran = subprocess.run(command, cwd=HERE.parents[1], env=environment, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
