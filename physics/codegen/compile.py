@@ -95,6 +95,10 @@ def _initialize() -> None:
 
 @cache
 def _jit() -> binding.LLJIT:
-    """LLVM's just-in-time linker (ORC), one for the process."""
+    """LLVM's just-in-time linker (ORC), one for the process.
+
+    JITLink, the only one that LLVM maintains for AArch64 and macOS; on x86-64 too, so that what the tests run there is
+    what runs elsewhere. RuntimeDyld, llvmlite's default, corrupts memory on AArch64 (llvmlite's issue 1000).
+    """
     _initialize()
-    return binding.create_lljit_compiler()
+    return binding.create_lljit_compiler(use_jit_link=True)
