@@ -13,6 +13,7 @@ from typing import Any
 from llvmlite import ir
 
 from levelproof.physics.codegen.buffers import LANES, Buffer
+from levelproof.physics.codegen.rounding import settle
 from levelproof.physics.codegen.values import INDEX, STORED, Operand
 
 VERSION_MAJOR, VERSION_MINOR = 0, 3
@@ -66,10 +67,30 @@ def add_handler(
 
     For each block of lanes of the buffers, of which `compile.write` tells.
     """
+    blocks = _add_blocks(module, block, arguments, results, scratch)
     function = ir.Function(module, ir.FunctionType(POINTER, [POINTER]), "handler")
     (frame,) = function.args
     b = ir.IRBuilder(function.append_basic_block("entry"))
     _answer_query(b, frame)
+    restore = settle(b)
+    b.call(blocks, [frame])
+    restore()
+    b.ret(NULL)  # success
+
+
+def _add_blocks(
+    module: ir.Module,
+    block: ir.Function,
+    arguments: Sequence[Buffer],
+    results: Sequence[Buffer],
+    scratch: Sequence[Buffer],
+) -> ir.Function:
+    """Add `blocks(frame)`, which steps all blocks. Never inlined: no arithmetic moves to where the mode is another."""
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER]), "blocks")
+    function.linkage = "internal"
+    function.attributes.add("noinline")
+    (frame,) = function.args
+    b = ir.IRBuilder(function.append_basic_block("entry"))
     handed = _load(b, frame, _offset(CallFrame, "args", "args"))
     filled = _load(b, frame, _offset(CallFrame, "rets", "rets"))
     buffer = lambda array, i: _load(b, array, ctypes.sizeof(c_void_p) * i)
@@ -85,7 +106,8 @@ def add_handler(
         workspace.append(b.gep(memory, [INDEX(offset)], source_etype=BYTE))
         offset += part.bytes
     _each_block(b, lanes, block, list(zip([*arguments, *results], outside, strict=True)), workspace)
-    b.ret(NULL)  # success
+    b.ret_void()
+    return function
 
 
 def _answer_query(b: ir.IRBuilder, frame: Operand) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import llvmlite
 import numpy as np
+from llvmlite import binding
 
 SOURCES = Path(__file__).parents[1]  # of all that a kernel says, and of what writes it down
 BEGAN = time.time() - 5  # s: modules are imported one after another
@@ -47,9 +48,8 @@ def kept_while_sources_stay(asked: str, make: Callable[[], bytes]) -> bytes:
     if changed >= BEGAN:
         return make()
     x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-    return kept(
-        "\n".join([sources, sys.version, jax.__version__, np.__version__, llvmlite.__version__, str(x64), asked]), make
-    )
+    versions = [sys.version, jax.__version__, np.__version__, llvmlite.__version__]
+    return kept("\n".join([sources, *versions, binding.get_default_triple(), str(x64), asked]), make)
 
 
 @cache

@@ -1,0 +1,57 @@
+"""How a processor rounds while a kernel runs: to nearest, with subnormal numbers as zeros.
+
+XLA sets the same mode on the threads that it computes on; a kernel does not rely on that. Subnormal operands and
+results count as zeros of their sign. What the mode was before is set again afterwards.
+"""
+
+from collections.abc import Callable
+
+from llvmlite import ir
+
+from levelproof.physics.codegen.values import INDEX, Operand
+
+POINTER, WORD = ir.PointerType(), ir.IntType(32)
+MXCSR = 0x9FC0  # x86: no exceptions, to nearest; flush to zero (bit 15), denormals are zeros (bit 6)
+FPCR = 1 << 24  # AArch64: no exceptions, to nearest; flush to zero
+
+Restore = Callable[[], None]
+
+
+def settle(b: ir.IRBuilder) -> Restore:
+    """Emit instructions that set the mode; the function returned emits those that undo it.
+
+    Raises:
+        NotImplementedError: the module is for another processor than x86-64 or AArch64.
+    """
+    processor = b.module.triple.split("-")[0]
+    if processor not in SETTLED:
+        raise NotImplementedError(f"kernels run on x86-64 and AArch64, not on {processor}")
+    return SETTLED[processor](b)
+
+
+def _x86(b: ir.IRBuilder) -> Restore:
+    load, store = (_declared(b, f"llvm.x86.sse.{name}", ir.VoidType(), POINTER) for name in ("ldmxcsr", "stmxcsr"))
+    before, during = b.alloca(WORD), b.alloca(WORD)
+    b.call(store, [before])
+    b.store(WORD(MXCSR), during)
+    b.call(load, [during])
+    return lambda: b.call(load, [before])
+
+
+def _aarch64(b: ir.IRBuilder) -> Restore:
+    get = _declared(b, "llvm.aarch64.get.fpcr", INDEX)
+    put = _declared(b, "llvm.aarch64.set.fpcr", ir.VoidType(), INDEX)
+    before = b.call(get, [])
+    b.call(put, [INDEX(FPCR)])
+    return lambda: b.call(put, [before])
+
+
+def _declared(b: ir.IRBuilder, name: str, result: ir.Type, *arguments: ir.Type) -> Operand:
+    return ir.Function(b.module, ir.FunctionType(result, arguments), name)
+
+
+SETTLED: dict[str, Callable[[ir.IRBuilder], Restore]] = {
+    "x86_64": _x86,
+    "aarch64": _aarch64,
+    "arm64": _aarch64,  # as macOS says it
+}
