@@ -10,6 +10,7 @@ from functools import wraps
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.random import define_prng_impl, threefry_prng_impl
 from jaxtyping import Array, Int, Key
@@ -73,6 +74,6 @@ def key_for(level_id: Int[Array, ""] | int, stream: Stream) -> Key[Array, ""]:
 
     `level_id` is 0 .. MAX_LEVEL_ID; it may be traced, and mapped with `jax.vmap`.
     """
-    root = jax.random.wrap_key_data(np.array(ROOT_KEY, np.uint32), impl=GENERATOR)
+    root = jax.random.wrap_key_data(jnp.array(ROOT_KEY, jnp.uint32), impl=GENERATOR)
     level_key = jax.random.fold_in(jax.random.fold_in(root, SAMPLER_VERSION), level_id)
     return jax.random.fold_in(level_key, int(stream))

@@ -14,7 +14,7 @@ POINTER, WORD = ir.PointerType(), ir.IntType(32)
 MXCSR = 0x9FC0  # x86: no exceptions, to nearest; flush to zero (bit 15), denormals are zeros (bit 6)
 FPCR = 1 << 24  # AArch64: no exceptions, to nearest; flush to zero
 
-Restore = Callable[[], None]
+Restore = Callable[[], Operand]
 
 
 def settle(b: ir.IRBuilder) -> Restore:

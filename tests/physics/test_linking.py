@@ -19,7 +19,7 @@ JIT: list[binding.LLJIT] = []  # until the process ends, as what it linked
 
 
 def after(seed: int = 1) -> list[Any]:
-    return [np.asarray(x) for x in jax.tree.leaves(step(*scattered(ROOM, 64, seed)))]
+    return [np.asarray(x) for x in jax.tree.leaves(step(*scattered(ROOM, 64, seed)))]  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.skipif(

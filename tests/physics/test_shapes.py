@@ -62,11 +62,11 @@ def test_step_refuses_an_array_of_another_dtype(way: Callable[..., Any]) -> None
 def test_public_step_refuses_what_its_kernel_would() -> None:
     given = WRONG["before.contact_active"](world())
     with pytest.raises(ValueError, match=r"^before\.contact_active has shape \(1, 3\)"):
-        step(*given)
+        step(*given)  # pyright: ignore[reportArgumentType]
 
 
 def test_arrays_of_one_lane_broadcast() -> None:
     given = world()
     one = given._replace(model=jax.tree.map(lambda x: x[..., :1], given.model))
-    after, _ = jax.eval_shape(lambda: step(*one))
+    after, _ = jax.eval_shape(lambda: step(*one))  # pyright: ignore[reportArgumentType]
     assert after.rotation.shape == (BODIES, LANES)
