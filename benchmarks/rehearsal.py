@@ -23,12 +23,10 @@ from rich.console import Console
 from benchmarks.report import Report, Table
 from levelproof.configs.compose import compose_job
 from levelproof.configs.numbers import parse_count
-from levelproof.experts.steps import EnvSteps
+from levelproof.experts.steps import EnvSteps, Seconds
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.jobs.cluster import REPORTS
 from levelproof.pipeline.jobs.plan import costs_of, measured
 from levelproof.pipeline.jobs.schedule import (
-    ROUND,
     Cut,
     Order,
     Round,
@@ -36,10 +34,12 @@ from levelproof.pipeline.jobs.schedule import (
     Summary,
     UnitOutcome,
     WorkUnit,
-    plan_units,
+    schedule,
+    until_report,
 )
+from levelproof.pipeline.jobs.sizing import MOST
 
-UNIT, SLOTS = 32, 4  # levels of a unit, experts side by side: of size s on a core
+UNTIMED, SLOTS = 32, 4  # levels of a unit that nobody has timed, experts side by side: of size s on a core
 HEARING = 1e-3  # s of the driver for a report beside the scheduler's: Ray's call and its answer; assumed
 PUTS = 3500  # a second to one prefix of S3, as its documentation says
 REQUESTS = 13  # to write for a unit of density full: a shard of 11 files, its mark, its fragment
@@ -62,6 +62,7 @@ class Scene:
     crashes: float = 7 * 24 * 3600.0  # s of a worker on average, until its process dies
     slow: float = 0.01  # share of workers
     slower: float = 5.0  # times
+    unit: int | None = None  # levels per work unit; None: by the rule of `generate`
 
 
 @dataclass
@@ -70,6 +71,7 @@ class Counts:
 
     seconds: float = 0.0  # by the simulated clock
     levels: int = 0
+    there: float = 0.0  # s of workers, from when they join to when they go
     useful: float = 0.0  # s of workers, on what was committed
     lost: float = 0.0  # s of workers, on what was not
     reports: int = 0
@@ -103,6 +105,7 @@ class SimulatedWorker:
     machine: int
     speed: float
     slots: int
+    joined: float  # when
     units: deque[tuple[WorkUnit, float]] = field(default_factory=deque)
     into: float = 0.0  # s of work on the first of them
     since: float = 0.0  # when it began with what it does
@@ -134,7 +137,7 @@ class SimulatedWorker:
             unit, seconds = self.units.popleft()
             self.into -= seconds
             useful += seconds
-            outcomes.append(committed(unit))
+            outcomes.append(committed(unit, seconds / self.speed))
         waiting = max(0, sum(len(unit.level_ids) for unit, _ in self.units) - self.decided - self.slots)
         cuts, self.cuts = self.cuts, []
         return Round(outcomes, {}, max(0, self.slots - waiting), waiting, cuts), useful
@@ -146,9 +149,10 @@ class SimulatedWorker:
         for unit, seconds in self.units:
             kept, back = (unit.only(part) for part in (unit.level_ids[:done], unit.level_ids[done:]))
             round.cuts.append(Cut(unit, kept, back))
-            round.outcomes.extend([committed(kept)] if kept else [])
-            useful += seconds * done / len(unit.level_ids)
-            self.into -= seconds * done / len(unit.level_ids)
+            took = seconds * done / len(unit.level_ids)
+            round.outcomes.extend([committed(kept, took / self.speed)] if kept else [])
+            useful += took
+            self.into -= took
             done = 0
         return Round(round.outcomes, {}, 0, cuts=round.cuts, leaves=True), useful
 
@@ -169,8 +173,9 @@ class SimulatedWorker:
                 del self.units[i]
 
 
-def committed(unit: WorkUnit) -> UnitOutcome:
-    return UnitOutcome(unit, Summary(len(unit.level_ids), 0, EnvSteps()))
+def committed(unit: WorkUnit, seconds: float) -> UnitOutcome:
+    """The outcome of a unit that took its worker so long."""
+    return UnitOutcome(unit, Summary(len(unit.level_ids), 0, EnvSteps(), Seconds(training=seconds)))
 
 
 class Rehearsal:
@@ -179,8 +184,7 @@ class Rehearsal:
     def __init__(self, scene: Scene, seconds: Float[np.ndarray, " level"], seed: int = 0) -> None:
         self.scene, self.counts = scene, Counts()
         self._work, self._rng = Work(seconds * scene.stretch), np.random.default_rng(seed)
-        units = plan_units(range(scene.levels), (), UNIT)
-        self._scheduler = Scheduler(units, scene.levels, UNIT)
+        self._scheduler = scheduler_of(scene)
         self._events: list[tuple[float, int, str, Any]] = []
         self._number, self._driver_free, self._idle = count(), 0.0, set[SimulatedWorker]()
         self._machines: dict[int, list[SimulatedWorker]] = {}
@@ -196,6 +200,8 @@ class Rehearsal:
                 self._goes(*what, notice=kind == "preempted")
             else:
                 handle[kind](what)
+        left = (worker for workers in self._machines.values() for worker in workers)
+        self.counts.there += sum(self.counts.seconds - worker.joined for worker in left)
         self.counts.quarantined = len(self._scheduler.quarantined)
         return self.counts
 
@@ -214,7 +220,7 @@ class Rehearsal:
         count = min(scene.a_machine, scene.workers - machine * scene.a_machine)
         speeds = scene.speed / np.where(self._rng.random(count) < scene.slow, scene.slower, 1.0)
         slots = max(SLOTS, round(SLOTS * scene.speed))
-        self._machines[machine] = [SimulatedWorker(machine, float(speed), slots) for speed in speeds]
+        self._machines[machine] = [SimulatedWorker(machine, float(speed), slots, now) for speed in speeds]
         for worker in self._machines[machine]:
             self._scheduled(self._scheduler.join, worker, now)
             self._at(now + self._rng.exponential(scene.crashes), "crash", worker)
@@ -233,7 +239,7 @@ class Rehearsal:
         self._driver_free = now
         self.counts.hearing += HEARING
         self._idle.discard(worker)
-        seconds = max(ROUND, len(self._scheduler.workers) / REPORTS)
+        seconds = until_report(order, len(self._scheduler.workers))
         self._at(worker.begin(order, now, seconds, self._work), "report", (worker, worker.until))
 
     def _report(self, what: tuple[SimulatedWorker, float]) -> None:
@@ -266,7 +272,7 @@ class Rehearsal:
         self._remove(worker)
         for outcome in self._scheduled(self._scheduler.lost, worker, "crashed"):
             self._scheduled(self._scheduler.failed, outcome.unit)
-        other = SimulatedWorker(worker.machine, worker.speed, worker.slots)
+        other = SimulatedWorker(worker.machine, worker.speed, worker.slots, self.counts.seconds)
         self._machines[worker.machine].append(other)
         self._scheduled(self._scheduler.join, other, self.counts.seconds)
         self._at(self.counts.seconds + self._rng.exponential(self.scene.crashes), "crash", other)
@@ -290,14 +296,20 @@ class Rehearsal:
         worker.alive = False
         self._idle.discard(worker)
         self._machines[worker.machine].remove(worker)
+        self.counts.there += self.counts.seconds - worker.joined
         done = (self.counts.seconds - worker.since) * worker.speed if worker.units else 0.0
         self.counts.lost += max(worker.into + done, 0.0)
+
+
+def scheduler_of(scene: Scene) -> Scheduler:
+    """The scheduler of `generate`, with all levels of a scene to do."""
+    return schedule(range(scene.levels), (), scene.levels, scene.unit or UNTIMED, scene.unit is None)
 
 
 def state_bytes(scene: Scene) -> int:
     """Memory that the driver's plan and scheduler take until every worker is busy, at most."""
     tracemalloc.start()
-    scheduler = Scheduler(plan_units(range(scene.levels), (), UNIT), scene.levels, UNIT)
+    scheduler = scheduler_of(scene)
     for worker in range(scene.workers):
         scheduler.join(worker, 0.0)
         scheduler.order(worker, 0.0)
@@ -309,12 +321,17 @@ def state_bytes(scene: Scene) -> int:
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("settings", nargs="*", default=["size=s", "budget=64k"], help="of the levels that are measured")
     parser.add_argument("--split", type=Path, help="a split whose rows tell seconds (default: some levels are made)")
+    parser.add_argument(
+        "--mean", type=float, metavar="S", help="s that a level takes on average (default: as measured)"
+    )
     parser.add_argument("--levels", default="11.5M", help="of the rehearsed job (default: 11.5M)")
     parser.add_argument("--workers", type=int, default=10_000, metavar="N", help="cores; GPUs are a tenth of them")
 
 
 def run(given: argparse.Namespace) -> Report:
-    seconds, levels = _measured(given), parse_count(given.levels, "levels")
+    found, levels = _measured(given), parse_count(given.levels, "levels")
+    seconds = found * (given.mean / found.mean()) if given.mean else found
+    scaled = ", scaled to that average" if given.mean else ""
     gpus = max(1, given.workers // 10)
     scenes = [
         Scene(f"{given.workers:,} cores", levels, given.workers, 64),
@@ -328,6 +345,7 @@ def run(given: argparse.Namespace) -> Report:
         "",
         "hours",
         "levels/s",
+        "levels a unit",
         "busy",
         "lost",
         "machines gone",
@@ -342,15 +360,18 @@ def run(given: argparse.Namespace) -> Report:
         results=[*results, {"state_bytes": most}],
         tables=[Table(head, [row(of) for of in results])],
         notes=[
-            f"{levels:,} levels in units of {UNIT}, by the scheduler of `generate` under a simulated clock; a level "
-            f"takes what one of {len(seconds):,} measured ones did, {seconds.mean():.3g} core-seconds on average. "
-            f"Machines of 64 cores or 8 GPUs are taken away with notice after a day, or as said, and die without after "
-            f"30 days, on average, and another comes {AWAY / 60:.0f} minutes later; processes crash once a week; 1% of "
-            "workers are five times slower. That a GPU is worth 20 cores is assumed, not measured.",
-            "*busy*: share of the workers' time that went into what was committed; *lost*: into what was not. "
+            f"{levels:,} levels, by the scheduler of `generate` under a simulated clock, in units of its default size: "
+            f"20 to 60 s of a worker, at most {MOST * UNTIMED} levels and a quarter of a worker's share; a "
+            f"level takes what one of {len(seconds):,} measured ones did, {seconds.mean():.3g} core-seconds on average"
+            f"{scaled}. Machines of 64 cores or 8 GPUs are taken away with notice after a day, or as said, and die "
+            f"without after 30 days, on average, and another comes {AWAY / 60:.0f} minutes later; processes crash once "
+            "a week; 1% of workers are five times slower. That a GPU is worth 20 cores is assumed, not measured.",
+            "*levels a unit*: on average. *busy*: share of the workers' time, from when they join to when they go, "
+            "that went into what was committed; *lost*: into what was not. "
             "*scheduler*: microseconds of this machine for each report; *driver*: share of its time, with "
             f"{HEARING * 1e3:.0f} ms for Ray's part of a report, which is assumed. *writes/s*: requests to an object "
-            f"store, {REQUESTS} a unit; S3 promises {PUTS:,} a second to a prefix. *first*: what would give out first.",
+            f"store, {REQUESTS} a unit; S3 promises {PUTS:,} a second to a prefix. *first*: the most loaded of store, "
+            "driver and workers, and its load; above 100% it does not keep up, and the job takes longer than shown.",
             f"The plan and the scheduler take {most / 2**20:.0f} MB of the driver's memory with all workers busy.",
         ],
     )
@@ -372,13 +393,14 @@ def rehearsed(scene: Scene, seconds: Float[np.ndarray, " level"]) -> dict[str, A
     loads = {
         "driver": (of.hearing + of.scheduling) / of.seconds,
         "store": writes / PUTS,
-        "workers": of.useful / (of.seconds * scene.workers * scene.speed),
+        "workers": of.useful / (of.there * scene.speed),
     }
     return {
         "scene": scene.name,
         "hours": of.seconds / 3600,
         "levels": of.levels,
         "levels_per_second": of.levels / of.seconds,
+        "levels_per_unit": of.levels / of.commits,
         "busy": loads["workers"],
         "lost": of.lost / (of.useful + of.lost),
         "machines_gone": of.gone,
@@ -387,7 +409,8 @@ def rehearsed(scene: Scene, seconds: Float[np.ndarray, " level"]) -> dict[str, A
         "scheduler_us": of.scheduling / max(of.reports, 1) * 1e6,
         "driver": loads["driver"],
         "writes_per_second": writes,
-        "first": max(loads, key=lambda name: loads[name]),
+        "first": (first := max(loads, key=lambda name: loads[name])),
+        "load": loads[first],
     }
 
 
@@ -396,6 +419,7 @@ def row(of: Mapping[str, Any]) -> Sequence[str]:
         of["scene"],
         f"{of['hours']:.2f}",
         f"{of['levels_per_second']:,.0f}",
+        f"{of['levels_per_unit']:,.0f}",
         f"{of['busy']:.0%}",
         f"{of['lost']:.2%}",
         f"{of['machines_gone']:,}",
@@ -403,5 +427,5 @@ def row(of: Mapping[str, Any]) -> Sequence[str]:
         f"{of['scheduler_us']:.0f} µs",
         f"{of['driver']:.0%}",
         f"{of['writes_per_second']:,.0f}",
-        of["first"],
+        f"{of['first']}, {of['load']:.0%}",
     ]

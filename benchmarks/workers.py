@@ -26,7 +26,7 @@ from benchmarks.report import Report, Table
 from levelproof.configs.compose import compose_job
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs.progress import Board, Tally
-from levelproof.pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, UnitOutcome, WorkUnit, plan_units
+from levelproof.pipeline.jobs.schedule import ROUND, STRETCH, Order, Round, Scheduler, UnitOutcome, WorkUnit, plan_units
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 from levelproof.pipeline.store.split import writing
 
@@ -128,7 +128,7 @@ def work(words: Sequence[str], told: Any) -> None:
     job = compose_job(words)
     count = len(job.level_ids)
     with writing(job, print) as (split, _), Path("/dev/null").open("w") as nowhere:
-        scheduler = Timed(plan_units(job.level_ids, [], job.levels_per_unit), count, job.levels_per_unit)
+        scheduler = Timed(plan_units(job.level_ids, [], STRETCH), count, job.levels_per_unit, timed=True)
         board = Board(Tally(count, 0, 0), Console(file=nowhere))
 
         def settle(outcomes: Sequence[UnitOutcome]) -> None:

@@ -25,7 +25,7 @@ KEY_EVERY = 32  # env steps between key frames, by default
 KEYS_EVERY = tuple(2**i for i in range(1, 9))  # what they may be: they divide a record
 MOST_FRAME_SKIP = 64  # where records are simulated again by those who read them
 MOST_BODIES = 48  # the most that was tried; compiling takes minutes from there
-# Levels per work unit by the number of bodies: about as long to train, and multiples of the experts side by side
+# Levels of an untimed work unit by the number of bodies: about as long to train, multiples of the experts side by side
 UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MOST_BODIES, 4))
 
 # Where, how many and by whom: these change neither a level nor its expert, so one split may mix them.
@@ -61,7 +61,7 @@ class JobConfig:
     level_files: str = ""  # a level file, or a folder of them, to label instead of random levels; empty: random levels
     budget: str = "128k"  # environment steps an expert may use; names the folder
     out: str = "data"  # folder, or URL of an object store; the split is written to {out}/{budget}/{size}
-    unit: int | None = None  # levels per work unit, lost when its worker dies; null: 32 to 4, the larger the fewer
+    unit: int | None = None  # levels per work unit, lost when its worker dies; null: 20 to 60 s of a worker, as timed
     executor: Literal["ray", "inline"] = "ray"  # ray: a worker per core or GPU; inline: this process, for debugging
     workers: int = 0  # at most so many; 0: one per core, or one per GPU where JAX can use them
     checkpoint: str = ""  # how often experts under way are kept, as in 10min, to go on with; empty: never
@@ -108,6 +108,7 @@ class JobConfig:
 
     @property
     def levels_per_unit(self) -> int:
+        """Levels of a work unit; if `unit` is null, while nobody knows what a level takes."""
         if self.unit is not None:
             return self.unit
         bodies = size_of(self.size).bodies

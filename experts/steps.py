@@ -30,5 +30,10 @@ class Seconds(NamedTuple):
     writing: float = 0.0  # of shards, experts and rows; not of the fragment itself
     compiling: float = 0.0  # or reading what was compiled before
 
+    @property
+    def working(self) -> float:
+        """Seconds that grow with the number of levels: all but those idle or compiling."""
+        return self.sampling + self.search + self.training + self.evaluation + self.replay + self.writing
+
 
 NO_SECONDS = Seconds()

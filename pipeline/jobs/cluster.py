@@ -33,7 +33,7 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs.address import existing, no_cluster, require_reachable
 from levelproof.pipeline.jobs.likeness import Program, program_of, unlike
 from levelproof.pipeline.jobs.progress import STOPPING, Board, Tally
-from levelproof.pipeline.jobs.schedule import ROUND, Order, Round, Scheduler, Settle, UnitOutcome, levels_text
+from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, UnitOutcome, levels_text, until_report
 from levelproof.pipeline.runtime import GRACE, own_core, own_cores, prepare_jax, stoppable
 from levelproof.pipeline.store.leases import serve, served
 from levelproof.pipeline.store.remote import absolute, as_typed
@@ -44,7 +44,6 @@ POLL = 0.25  # s after which people see progress, whether a worker has reported 
 RESCAN = 5.0  # s between looks at which machines a cluster has
 PATIENCE = 60.0  # s without any worker after which people are told why
 STARTS = 3  # times in a row that a worker does not start, after which its place is given up
-REPORTS = 100.0  # a second that the driver takes: of more workers each reports less often
 MOST_SILENT = 1800.0  # s without a word after which a worker is given up; a large program compiles for minutes
 
 
@@ -201,12 +200,11 @@ class Crew:
     def order(self) -> None:
         """Give units to the workers that have reported, and let them go on."""
         self._scheduler.share()
-        seconds = max(ROUND, len(self._handles) / REPORTS)
         for handle in self._handles:
             if handle.free:
                 order = self._scheduler.order(handle, time.monotonic())
                 if self._scheduler.workers[handle].units:
-                    handle.answer = handle.actor.work.remote(order, seconds)
+                    handle.answer = handle.actor.work.remote(order, until_report(order, len(self._handles)))
 
     def wait(self) -> list[UnitOutcome]:
         """Outcomes of the rounds that are over, if any ends in a moment."""

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from levelproof.pipeline.jobs.sizing import unit_levels
 from levelproof.pipeline.store.merge import FILE_BYTES
 from levelproof.pipeline.store.seal import ROWS
 from levelproof.pipeline.words import number
@@ -62,6 +63,8 @@ class Forecast:
 
     levels: int
     workers: int
+    unit: int  # levels of a work unit
+    unit_seconds: float  # s of a worker that it takes, lost when the worker dies
     wall: Guess  # s
     hours: Guess  # of all workers
     seconds_per_solved: Guess | None  # None: the sample has none
@@ -73,8 +76,11 @@ class Forecast:
         return asdict(self)
 
 
-def forecast(sample: Sample, levels: int, workers: int) -> Forecast:
-    """What so many levels would take so many workers like those of the sample."""
+def forecast(sample: Sample, levels: int, workers: int, untimed: int, unit: int | None = None) -> Forecast:
+    """What so many levels would take so many workers like those of the sample.
+
+    `untimed` are levels of a work unit while nobody knows what a level takes; `unit` of any, if it is given.
+    """
     rng = np.random.default_rng(0)
     count = len(sample.busy)
     drawn = rng.integers(count, size=(DRAWS, count))
@@ -86,6 +92,7 @@ def forecast(sample: Sample, levels: int, workers: int) -> Forecast:
     solved = np.clip(total(sample.solved.astype(float)), 0, levels)
     witnessed = np.clip(total(sample.witnessed.astype(float)), 0, levels)
     seconds, busy = total(sample.busy), sample.busy.mean() * levels
+    unit = unit or unit_levels(sample.busy.mean(), levels, workers, untimed)
     wall = _guess(seconds / workers + sample.once, busy / workers + sample.once)
     hours = Guess(*(value * workers / 3600 for value in (wall.expected, wall.low, wall.high)))
     any_solved = sample.solved.any()
@@ -98,6 +105,8 @@ def forecast(sample: Sample, levels: int, workers: int) -> Forecast:
     return Forecast(
         levels,
         workers,
+        unit,
+        float(unit * sample.busy.mean()),
         wall,
         hours,
         each if any_solved else None,

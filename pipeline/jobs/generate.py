@@ -16,7 +16,7 @@ from levelproof.pipeline.errors import Exit, Failure
 from levelproof.pipeline.jobs.events import Events, telling
 from levelproof.pipeline.jobs.log import logged, require_library
 from levelproof.pipeline.jobs.progress import Board, Tally, say
-from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, plan_units
+from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, schedule
 from levelproof.pipeline.jobs.seal import Sealer, sealing
 from levelproof.pipeline.runtime import cache_folder
 from levelproof.pipeline.store import quarantine
@@ -59,8 +59,8 @@ def generate(
         is_done = np.isin(manifest.level_ids, wanted)
         done = manifest.level_ids[is_done]
         require_same_levels(split, origins or {}, done)
-        units = plan_units(asked, done, job.levels_per_unit, origins)
-        scheduler = Scheduler(units, len(wanted) - len(done), job.levels_per_unit)
+        left = len(wanted) - len(done)
+        scheduler = schedule(asked, done, left, job.levels_per_unit, job.unit is None, origins)
         quarantine.drop_notes(split, manifest.level_ids)
         prune_paused(split, manifest.level_ids, partial(say, console))
         if not repaired:

@@ -35,7 +35,6 @@ SECONDS = 60.0  # of making levels, about
 MOST = 4096  # levels
 STORED = 256  # witnesses that are written in every density
 UNITS = (3600.0, "hours"), (60.0, "minutes"), (1.0, "seconds")  # s, the first that is short enough
-NEITHER = ("idle", "compiling")  # of `Seconds`: not a level's, however many there are
 
 
 def plan(job: JobConfig, as_json: bool, console: Console) -> None:
@@ -48,7 +47,7 @@ def plan(job: JobConfig, as_json: bool, console: Console) -> None:
     if job.level_files:
         raise UserError("plan is for random levels: of level files, `generate` labels a few, and `inspect` tells more.")
     sample = measured(job, console)
-    found = forecast(sample, len(job.level_ids), job.workers or sample.workers)
+    found = forecast(sample, len(job.level_ids), job.workers or sample.workers, job.levels_per_unit, job.unit)
     if as_json:
         of = {"levels": len(sample.busy), "workers": sample.workers, "wall": sample.wall, "once": sample.once}
         print(json.dumps(found.as_json() | {"device": sample.device, "sample": of, "likely": LIKELY}, indent=2))
@@ -62,6 +61,7 @@ def told(job: JobConfig, sample: Sample, of: Forecast) -> list[str]:
     lines = {
         "wall time": f"{of.wall.told(scale)} {unit} with {many(of.workers, 'worker')}",
         f"{sample.device}-hours": of.hours.told(),
+        "levels a work unit": f"{of.unit:,}, {duration(of.unit_seconds)} of a worker",
         "solved levels": of.solved.told(tell="{:,.0f}".format),
         f"{sample.device}-seconds a solved level": of.seconds_per_solved.told() if of.seconds_per_solved else "unknown",
         **{
@@ -132,8 +132,8 @@ def costs_of(split: Path) -> tuple[pa.Table, np.ndarray, np.ndarray]:
     if not table.num_rows:
         raise Failure("None of the levels could be made here: `levelproof generate` with the same words says why.")
     column = table.column("seconds")
-    of = {stage: pc.struct_field(column, stage).to_numpy().astype(float) for stage in Seconds._fields}  # pyright: ignore[reportAttributeAccessIssue]
-    return table, np.sum([of[stage] for stage in of if stage not in NEITHER], axis=0), of["compiling"]
+    of = Seconds(*(pc.struct_field(column, stage).to_numpy().astype(float) for stage in Seconds._fields))  # pyright: ignore[reportAttributeAccessIssue]
+    return table, np.asarray(of.working), np.asarray(of.compiling)
 
 
 def _row_bytes(table: pa.Table) -> float:

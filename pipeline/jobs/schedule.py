@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
+from levelproof.pipeline.jobs.sizing import UnitSize
 from levelproof.pipeline.store.layout import unit_name
 from levelproof.pipeline.store.origins import Origin
 from levelproof.pipeline.store.runs import ascending, runs, told_levels, without
@@ -21,7 +22,10 @@ from levelproof.pipeline.store.runs import ascending, runs, told_levels, without
 # fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.
 COMPANY = (64, 8, 1)
 ROUND = 1.0  # s that a worker trains between reports; a step that is compiled takes longer
+REPORTS = 100.0  # a second that the driver takes: of more workers each reports less often
+STRETCH = 2**13  # levels that are planned together, of which units are cut once their size is known
 PARTS = 8  # of a unit, below which it is not cut where there are too few for all workers
+TIMED_PARTS = 4  # the same where times decide its size: every worker comes for parts, so each is to take 10 s
 JAX_NOTE = "\n--------------------\n"  # begins what JAX adds to an error about tracebacks
 LEAST_SHARE = 2  # levels that a worker has not begun, below which it is not asked to share them
 
@@ -42,6 +46,11 @@ class WorkUnit:
         at = [i for i, level_id in enumerate(self.level_ids) if level_id in level_ids]
         ids, origins = tuple(self.level_ids[i] for i in at), tuple(self.origins[i] for i in at if self.origins)
         return WorkUnit(ids, origins) if ids else None
+
+    def split(self, count: int) -> "tuple[WorkUnit, WorkUnit | None]":
+        """Its first `count` levels, and the others, if there are any. Of a range both are ranges."""
+        first, rest = (WorkUnit(self.level_ids[of], self.origins[of]) for of in (slice(count), slice(count, None)))
+        return first, rest if rest.level_ids else None
 
 
 def plan_units(
@@ -141,6 +150,7 @@ class Assignment:
     spare: int = 0  # levels that it has not begun, as it last said
     asked: int = 0  # levels to give back
     heard: float = 0.0  # s, when it was last told something, or reported
+    slowness: float | None = None  # how many times as long as on others its levels take; None: it has ended no unit
 
 
 class Scheduler:
@@ -150,15 +160,21 @@ class Scheduler:
     Towards the end units are cut to a worker's share of what is left, and who has nothing gets what others have not
     begun. A level's result does not depend on its unit, so neither changes any.
 
+    Where it is to find the size of units, it cuts them from stretches of levels, by what the latest ones have taken.
+
     Its memory and time depend on how many workers there are and how many units have failed, not on how many wait.
     """
 
-    def __init__(self, units: Iterable[WorkUnit], levels: int, unit: int = 1) -> None:
-        """Of units, ascending, that have so many levels together; whole ones have `unit`."""
+    def __init__(self, units: Iterable[WorkUnit], levels: int, unit: int = 1, timed: bool = False) -> None:
+        """Of units, ascending, that have so many levels together; whole ones have `unit`.
+
+        If `timed`, they are stretches, and `unit` is the size of a unit while nobody knows what a level takes.
+        """
         self._fresh = iter(units)
         self._next = next(self._fresh, None)
         self._again: list[deque[WorkUnit]] = [deque() for _ in COMPANY]  # by failed attempts; first: parts of units
-        self.waiting, self._smallest = levels, max(1, unit // PARTS)  # levels
+        self.waiting, self._unit = levels, unit  # levels
+        self._size = UnitSize(levels, unit) if timed else None  # None: units have the size that they came with
         self.attempts: dict[WorkUnit, int] = {}  # that failed
         self.quarantined: list[WorkUnit] = []
         self.workers: dict[Any, Assignment] = {}  # by whatever tells them apart
@@ -202,6 +218,9 @@ class Scheduler:
             self._put_back(back)
         for outcome in round.outcomes:
             del mine.units[outcome.unit]
+            if self._size and outcome.summary:
+                of = outcome.summary
+                mine.slowness = self._size.note(of.levels, of.seconds.working, mine.slowness)
         mine.wants, mine.spare, mine.asked, mine.heard = round.wants, round.spare, 0, now
         if not mine.units:
             self._idle.add(worker)
@@ -216,12 +235,20 @@ class Scheduler:
         return [UnitOutcome(unit, reason=reason) for unit in self._remove(worker)]
 
     def failed(self, unit: WorkUnit) -> bool:
-        """Note a failed attempt; the unit waits again, or True when it is now quarantined."""
+        """Note a failed attempt; the unit waits again, or True when it is now quarantined.
+
+        It waits whole, so that an attempt finds what an earlier one has committed. But the last attempt is at parts no
+        larger than untimed units: one level that always fails takes few others into quarantine.
+        """
         self.attempts[unit] = attempts = self.attempts.get(unit, 0) + 1
         if attempts == len(COMPANY):
             self.quarantined.append(unit)
             return True
-        self._put_back(unit)
+        rest, last = unit, attempts == len(COMPANY) - 1
+        while rest:
+            part, rest = rest.split(self._unit) if self._size and last else (rest, None)
+            self.attempts[part] = attempts
+            self._put_back(part)
         return False
 
     def share(self) -> None:
@@ -229,7 +256,9 @@ class Scheduler:
         if self.waiting or not self._idle:
             return
         untried = lambda of: self.attempts.keys().isdisjoint(of.units)
-        can = (of for of in self.workers.values() if of.spare >= LEAST_SHARE and untried(of))
+        part = self._size.now(len(self.workers), 1.0) // TIMED_PARTS if self._size else 1
+        least = lambda of: max(LEAST_SHARE, 2 * part / (of.slowness or 1.0))
+        can = (of for of in self.workers.values() if of.spare >= least(of) and untried(of))
         for of in nlargest(len(self._idle), can, key=lambda of: of.spare):
             of.asked = -(-of.spare // 2)
 
@@ -246,25 +275,30 @@ class Scheduler:
             return None
         for attempts in failures or range(len(COMPANY)):
             if self._again[attempts]:
-                return self._part(self._again[attempts].popleft())
+                return self._part(self._again[attempts].popleft(), mine.slowness)
             if not attempts and self._next:
                 unit, self._next = self._next, next(self._fresh, None)
-                return self._part(unit)
+                return self._part(unit, mine.slowness)
         return None
 
-    def _part(self, unit: WorkUnit) -> WorkUnit:
-        """The unit, or its beginning: a worker's share of all that waits. What has failed stays whole."""
-        count = size = len(unit.level_ids)
+    def _part(self, unit: WorkUnit, slowness: float | None) -> WorkUnit:
+        """The unit, or its beginning: at most the levels of a unit of this worker now, and its share of all that waits.
+
+        What has failed stays whole.
+        """
+        count = len(unit.level_ids)
         self.waiting -= count
         if unit in self.attempts:
             return unit
-        while size > self._smallest and size * len(self.workers) > self.waiting + count:
+        whole = self._size.now(len(self.workers), slowness) if self._size else self._unit
+        size, least = (min(count, whole), whole // TIMED_PARTS) if self._size else (count, whole // PARTS)
+        shares = len(self.workers) * (slowness or 1.0)
+        while size // 2 >= max(1, least) and size * shares > self.waiting + count:
             size = -(-size // 2)
-        part, rest = (unit.only(ids) for ids in (unit.level_ids[:size], unit.level_ids[size:]))
-        if not (part and rest):
-            return unit
-        self._again[0].appendleft(rest)
-        self.waiting += count - size
+        part, rest = unit.split(size)
+        if rest:
+            self._again[0].appendleft(rest)
+            self.waiting += count - size
         return part
 
     def _put_back(self, unit: WorkUnit | None) -> None:
@@ -275,6 +309,23 @@ class Scheduler:
     def _remove(self, worker: Any) -> list[WorkUnit]:
         self._idle.discard(worker)
         return list(self.workers.pop(worker).units)
+
+
+def until_report(order: Order, workers: int) -> float:
+    """s after which a worker with this order reports, one of so many, if none of its units ends before."""
+    return ROUND if order.give else max(ROUND, workers / REPORTS)
+
+
+def schedule(
+    wanted: Sequence[int] | np.ndarray,
+    done: Collection[int] | np.ndarray,
+    levels: int,
+    unit: int,
+    timed: bool,
+    origins: Mapping[int, Origin] | None = None,
+) -> Scheduler:
+    """A scheduler of what is wanted and not done, so many levels; `unit` and `timed` are those of `Scheduler`."""
+    return Scheduler(plan_units(wanted, done, STRETCH if timed else unit, origins), levels, unit, timed)
 
 
 def levels_text(units: Iterable[WorkUnit]) -> str:

@@ -53,3 +53,12 @@ def test_the_scheduler_s_memory_does_not_grow_with_levels() -> None:
     small, large = state_bytes(replace(CALM, levels=20_000)), state_bytes(replace(CALM, levels=2_000_000))
     assert abs(large - small) < 100_000
     assert rehearsed(CALM, SECONDS)["first"] == "workers"
+
+
+def test_ten_thousand_workers_are_busy_with_units_of_the_default_size() -> None:
+    """With units of 32 levels, of 0.25 s each, workers would wait for the driver a fifth of their time."""
+    scene = replace(CALM, levels=16_000_000, workers=10_000, a_machine=64)
+    found = rehearsed(scene, SECONDS * (0.25 / SECONDS.mean()))
+    assert found["busy"] >= 0.85
+    assert found["driver"] < 0.5
+    assert found["levels_per_unit"] > 80

@@ -9,6 +9,7 @@ from rich.console import Console
 from levelproof.experts.labels import Label
 from levelproof.pipeline.jobs.forecast import PerWitness, Sample, forecast
 from levelproof.pipeline.jobs.seal import seal_split
+from levelproof.pipeline.jobs.sizing import unit_levels
 from levelproof.pipeline.store.merge import FILE_BYTES
 from levelproof.pipeline.store.seal import ROWS
 from levelproof.pipeline.store.shard import stored_bytes
@@ -25,7 +26,7 @@ def test_nine_intervals_of_ten_hold_what_comes() -> None:
     rng, held = np.random.default_rng(0), 0
     for _ in range(50):
         seconds = rng.gamma(0.4, 2.0, 4256)
-        of = forecast(sample(seconds[:256], seconds[:256] < 1), 4000, 2)
+        of = forecast(sample(seconds[:256], seconds[:256] < 1), 4000, 2, 32)
         truth = seconds[256:].sum() / 2 + 5
         held += of.wall.low <= truth <= of.wall.high
     assert 38 <= held <= 50
@@ -33,7 +34,7 @@ def test_nine_intervals_of_ten_hold_what_comes() -> None:
 
 def test_numbers_follow_levels_and_workers() -> None:
     seconds = np.tile([0.5, 1.5], 100)
-    of = forecast(sample(seconds, seconds < 1), 6_000_000, 64)
+    of = forecast(sample(seconds, seconds < 1), 6_000_000, 64, 32)
     assert of.wall.expected == pytest.approx(6_000_000 / 64 + 5)
     assert of.hours.expected == pytest.approx(of.wall.expected * 64 / 3600)
     assert of.solved.expected == 3_000_000
@@ -43,7 +44,15 @@ def test_numbers_follow_levels_and_workers() -> None:
     rows = ROWS // 2
     assert of.files["full"] == 60 * (1 + 1 + 5 * (1 + -(-rows // 8192))) + 2
     assert FILE_BYTES / 10_000 <= 8192
-    assert forecast(sample(seconds, np.zeros(200, bool)), 100, 2).seconds_per_solved is None
+    assert forecast(sample(seconds, np.zeros(200, bool)), 100, 2, 32).seconds_per_solved is None
+
+
+def test_unit_is_that_of_the_scheduler_unless_it_is_given() -> None:
+    half = sample(np.full(50, 0.5), np.ones(50, bool))
+    for levels, workers in (6_000_000, 64), (1000, 8), (3, 2):
+        assert forecast(half, levels, workers, 32).unit == unit_levels(0.5, levels, workers, 32)
+    of = forecast(half, 6_000_000, 64, 32, 7)
+    assert (of.unit, of.unit_seconds) == (7, 3.5)
 
 
 def test_files_are_those_that_sealing_makes(tmp_path: Path) -> None:
@@ -52,6 +61,6 @@ def test_files_are_those_that_sealing_makes(tmp_path: Path) -> None:
     (shard,) = (split / "shards").iterdir()
     stored = PerWitness(stored_bytes(shard) / 4, sum(entry.is_dir() for entry in shard.iterdir()))
     solved = np.tile([True, False], 4)
-    of = forecast(sample(np.ones(8), solved, stored={"full": stored}), 8, 2)
+    of = forecast(sample(np.ones(8), solved, stored={"full": stored}), 8, 2, 32)
     files = [path for path in split.rglob("[!.]*") if path.is_file()]
     assert of.files["full"] == len(files), files

@@ -1,20 +1,23 @@
 """What is left to do: everything wanted and not done, once; attempts and quarantine."""
 
 import tracemalloc
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from levelproof.experts.steps import EnvSteps, Seconds
 from levelproof.pipeline.jobs.schedule import (
     COMPANY,
     Cut,
     Round,
     Scheduler,
+    Summary,
     UnitOutcome,
     WorkUnit,
     levels_text,
     plan_units,
+    schedule,
 )
 
 
@@ -172,6 +175,78 @@ def test_the_driver_does_not_grow_with_what_waits() -> None:
     tracemalloc.stop()
     assert before < 2**20 // 8, "bytes"
     assert scheduler.waiting == 2**20
+
+
+def timed(units: Iterable[WorkUnit], each: float, wants: int = 0) -> Round:
+    """A report of units that are committed, whose levels took `each` s."""
+    took = lambda unit: Summary(len(unit.level_ids), 0, EnvSteps(), Seconds(training=each * len(unit.level_ids)))
+    return Round([UnitOutcome(unit, took(unit)) for unit in units], {}, wants)
+
+
+def run_through(scheduler: Scheduler, each: Sequence[float]) -> list[WorkUnit]:
+    """All units of a job, committed by one worker for each of these times that its levels take, s."""
+    units: list[WorkUnit] = []
+    for worker in range(len(each)):
+        scheduler.join(worker, 0.0)
+    while not scheduler.over:
+        for worker, seconds in enumerate(each):
+            units += (new := scheduler.order(worker, 0.0).units)
+            scheduler.report(worker, timed(new, seconds), 0.0)
+    return units
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.integers(7000, 10_000),  # around the end of a stretch
+    st.integers(1, 3000),
+    st.sets(st.integers(7000, 13_000), max_size=20),
+    st.lists(st.floats(0.01, 100.0), min_size=1, max_size=3),
+)
+def test_timed_units_cover_what_is_left_once_under_names_of_their_own(
+    first: int, count: int, done: set[int], each: list[float]
+) -> None:
+    wanted = range(first, first + count)
+    done &= set(wanted)
+    units = run_through(schedule(wanted, done, count - len(done), 32, timed=True), each)
+    assert sorted(level_id for unit in units for level_id in unit.level_ids) == sorted(set(wanted) - done)
+    assert len({unit.name for unit in units}) == len(units)
+    most = max(1, (count - len(done)) // (4 * len(each)))
+    assert max((len(unit.level_ids) for unit in units), default=0) <= most
+
+
+def test_timed_job_goes_on_with_units_of_other_sizes_after_a_kill() -> None:
+    before = run_through(schedule(range(2000), [], 2000, 32, timed=True), [0.5, 0.5])
+    done = [level_id for unit in before[: len(before) // 2] for level_id in unit.level_ids]
+    after = run_through(schedule(range(2000), done, 2000 - len(done), 32, timed=True), [5.0])
+    assert sorted([*done, *(level_id for unit in after for level_id in unit.level_ids)]) == list(range(2000))
+    assert not {unit.name for unit in after} & {unit.name for unit in before[: len(before) // 2]}
+
+
+def test_timed_units_take_20_to_60_seconds_and_given_ones_keep_their_size() -> None:
+    sizes = [len(unit.level_ids) for unit in run_through(schedule(range(8192), [], 8192, 32, timed=True), [0.5])]
+    assert sizes[:3] == [32, 80, 80]
+    given = [len(unit.level_ids) for unit in run_through(schedule(range(8192), [], 8192, 64, timed=False), [0.5])]
+    assert given[:3] == [64, 64, 64]
+
+
+def test_range_stays_a_range_in_every_timed_unit() -> None:
+    units = run_through(schedule(range(20_000), [], 20_000, 32, timed=True), [0.05])
+    assert all(isinstance(unit.level_ids, range) for unit in units)
+
+
+def test_level_that_always_fails_takes_no_more_than_an_untimed_unit_into_quarantine() -> None:
+    scheduler, bad = schedule(range(8192), [], 8192, 32, timed=True), 5000
+    scheduler.join(0, 0.0)
+    while not scheduler.over:
+        units = scheduler.order(0, 0.0).units
+        failed = [unit for unit in units if bad in unit.level_ids]
+        done = timed([unit for unit in units if unit not in failed], 0.1).outcomes
+        scheduler.report(0, Round([*done, *(UnitOutcome(unit, reason="bad") for unit in failed)], {}, 0), 0.0)
+        for unit in failed:
+            scheduler.failed(unit)
+    (unit,) = scheduler.quarantined
+    assert bad in unit.level_ids
+    assert len(unit.level_ids) <= 32
 
 
 def test_levels_are_told_in_runs() -> None:
