@@ -8,9 +8,8 @@ counted: levels, work that was lost, reports, requests to the store, what the dr
 import argparse
 import time
 import tracemalloc
-from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import count
 from pathlib import Path
@@ -21,22 +20,12 @@ from jaxtyping import Float
 from rich.console import Console
 
 from benchmarks.report import Report, Table
+from benchmarks.simulated import SimulatedWorker, Work
 from levelproof.configs.compose import compose_job
 from levelproof.configs.numbers import parse_count
-from levelproof.experts.steps import EnvSteps, Seconds
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.plan import costs_of, measured
-from levelproof.pipeline.jobs.schedule import (
-    Cut,
-    Order,
-    Round,
-    Scheduler,
-    Summary,
-    UnitOutcome,
-    WorkUnit,
-    schedule,
-    until_report,
-)
+from levelproof.pipeline.jobs.schedule import Round, Scheduler, schedule, until_report
 from levelproof.pipeline.jobs.sizing import MOST
 
 UNTIMED, SLOTS = 32, 4  # levels of a unit that nobody has timed, experts side by side: of size s on a core
@@ -80,102 +69,6 @@ class Counts:
     hearing: float = 0.0  # s of the simulated driver
     quarantined: int = 0
     gone: int = 0  # machines
-
-
-class Work:
-    """What levels take: always the same for a level, whoever makes it."""
-
-    def __init__(self, seconds: Float[np.ndarray, " level"]) -> None:
-        drawn = np.random.default_rng(0).choice(seconds, 2**20)
-        self._sums = np.concatenate([[0.0], np.cumsum(drawn)])
-
-    def of(self, unit: WorkUnit) -> float:
-        ids, period = unit.level_ids, len(self._sums) - 1
-        if isinstance(ids, range):
-            first, end = ids[0] % period, ids[-1] % period + 1
-            return float(self._sums[end] - self._sums[first] + (self._sums[-1] if end <= first else 0.0))
-        at = np.array(ids) % period
-        return float((self._sums[at + 1] - self._sums[at]).sum())
-
-
-@dataclass(eq=False)
-class SimulatedWorker:
-    """Does its units one after another; as the real one, it reports when one ends, or when it is time."""
-
-    machine: int
-    speed: float
-    slots: int
-    joined: float  # when
-    units: deque[tuple[WorkUnit, float]] = field(default_factory=deque)
-    into: float = 0.0  # s of work on the first of them
-    since: float = 0.0  # when it began with what it does
-    until: float = 0.0  # when it reports
-    cuts: list[Cut] = field(default_factory=list)
-    alive: bool = True
-
-    def begin(self, order: Order, now: float, seconds: float, work: Work) -> float:
-        """Take what is ordered; when it will report."""
-        self.into = self.into if self.units else 0.0
-        self._give(order.give, work)
-        self.units.extend((unit, work.of(unit)) for unit in order.units)
-        first = (self.units[0][1] - self.into) / self.speed if self.units else seconds
-        self.since, self.until = now, now + min(seconds, max(first, 0.0))
-        return self.until
-
-    @property
-    def decided(self) -> int:
-        """Levels of its first unit."""
-        unit, seconds = self.units[0] if self.units else (None, 0.0)
-        return min(int(self.into / seconds * len(unit.level_ids)), len(unit.level_ids)) if unit and seconds else 0
-
-    def report(self, now: float) -> tuple[Round, float]:
-        """What it has done by now, and how much work it was."""
-        self.into += (now - self.since) * self.speed if self.units else 0.0
-        self.since = now
-        outcomes, useful = [], 0.0
-        while self.units and self.into >= self.units[0][1] - 1e-9:
-            unit, seconds = self.units.popleft()
-            self.into -= seconds
-            useful += seconds
-            outcomes.append(committed(unit, seconds / self.speed))
-        waiting = max(0, sum(len(unit.level_ids) for unit, _ in self.units) - self.decided - self.slots)
-        cuts, self.cuts = self.cuts, []
-        return Round(outcomes, {}, max(0, self.slots - waiting), waiting, cuts), useful
-
-    def leave(self, now: float) -> tuple[Round, float]:
-        """As far as it has come: levels that are decided are committed, the others given back."""
-        round, useful = self.report(now)
-        done = self.decided
-        for unit, seconds in self.units:
-            kept, back = (unit.only(part) for part in (unit.level_ids[:done], unit.level_ids[done:]))
-            round.cuts.append(Cut(unit, kept, back))
-            took = seconds * done / len(unit.level_ids)
-            round.outcomes.extend([committed(kept, took / self.speed)] if kept else [])
-            useful += took
-            self.into -= took
-            done = 0
-        return Round(round.outcomes, {}, 0, cuts=round.cuts, leaves=True), useful
-
-    def _give(self, levels: int, work: Work) -> None:
-        """Levels that have not begun, of the latest units first."""
-        left = levels
-        for i in range(len(self.units) - 1, -1, -1):
-            unit = self.units[i][0]
-            some = min(left, len(unit.level_ids) - (0 if i else self.decided + self.slots))
-            if some <= 0:
-                return
-            kept, back = (unit.only(part) for part in (unit.level_ids[:-some], unit.level_ids[-some:]))
-            self.cuts.append(Cut(unit, kept, back))
-            left -= some
-            if kept:
-                self.units[i] = kept, work.of(kept)
-            else:
-                del self.units[i]
-
-
-def committed(unit: WorkUnit, seconds: float) -> UnitOutcome:
-    """The outcome of a unit that took its worker so long."""
-    return UnitOutcome(unit, Summary(len(unit.level_ids), 0, EnvSteps(), Seconds(training=seconds)))
 
 
 class Rehearsal:
