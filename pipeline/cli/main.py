@@ -4,7 +4,6 @@ Imports nothing heavy before it knows the command: `levelproof --help` has to an
 """
 
 import argparse
-import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from pathlib import Path
 from levelproof.configs.errors import ConfigError, readable
 from levelproof.pipeline.cli.command import EXITS
 from levelproof.pipeline.errors import Exit, LevelproofError, UserError
+from levelproof.pipeline.outlet import outlets
 from levelproof.pipeline.urls import require_here, require_known
 from levelproof.pipeline.version import __version__
 
@@ -26,16 +26,21 @@ COMMANDS = [import_module(f"levelproof.pipeline.cli.{name}") for name in NAMES.s
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; its exit code."""
+    """Run one command; its exit code, whoever reads what it prints."""
+    with outlets():
+        return _run(argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
     arguments, unknown = _parser().parse_known_args(argv)
     warnings.showwarning = lambda message, *_: print(f"Warning: {message}", file=sys.stderr)
-    code = int(Exit.DONE)
     try:
         if unknown:
             raise UserError(_no_option(unknown[0], takes_settings=bool({"settings", "words"} & vars(arguments).keys())))
         _look_at_paths(arguments)
         code = int(arguments.run(arguments) or Exit.DONE)
-        sys.stdout.flush()  # here, where a pipe that is closed is no error
+        if sys.stdout:
+            sys.stdout.flush()  # here, where a full disk is an error
         return code
     except (LevelproofError, ConfigError) as error:
         if arguments.debug:
@@ -43,9 +48,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(str(error), getattr(error, "exit_code", Exit.INPUT))
     except KeyboardInterrupt:
         return Exit.INTERRUPTED
-    except BrokenPipeError:  # `levelproof inspect ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return code
     except Exception as error:
         if arguments.debug:
             raise

@@ -15,6 +15,7 @@ from rich.table import Table
 from levelproof.configs.errors import readable
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.status import look
+from levelproof.pipeline.outlet import has_reader
 from levelproof.pipeline.store.events import events_of, runs_in
 from levelproof.pipeline.store.layout import EVENTS
 from levelproof.pipeline.store.locks import is_written
@@ -29,7 +30,8 @@ FAILURE = {"unit", "cause"}
 
 
 def watch(split: Path, as_json: bool, console: Console, every: float = EVERY) -> None:
-    """Show how far a job is, again and again until no run is at work; with `as_json`, an object a line.
+    """Show how far a job is, again and again until no run is at work or nobody reads it; with `as_json`, an object a
+    line.
 
     Raises:
         UserError: there is no split, or no run has told anything.
@@ -46,7 +48,7 @@ def _follow(split: Path, every: float, show: Callable[[dict[str, Any]], None]) -
     while True:
         facts = now(split)
         show(facts)
-        if not facts["running"]:
+        if not facts["running"] or not has_reader():
             return
         time.sleep(every)
 

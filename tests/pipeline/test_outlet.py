@@ -1,0 +1,75 @@
+"""Commands whose reader leaves: they finish their work, and the exit code says what came of it. Real pipes."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from levelproof.experts.labels import Label
+from levelproof.pipeline.store.events import new_run, tell
+from levelproof.pipeline.store.locks import only_writer
+from tests.pipeline.command import PATIENCE, ROOT
+from tests.pipeline.made import made_split
+
+
+@pytest.fixture
+def unread() -> Iterator[int]:
+    """The end to write to of a pipe whose reader has left."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    yield writer
+    os.close(writer)
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    """Random bits, so `verify` finds much to report."""
+    return made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]])
+
+
+def levelproof(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[str]:
+    """Each print is a write of its own, as a report is that does not fit into the buffer."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-m", "levelproof", *arguments]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | streams
+    return subprocess.run(command, env=environment, text=True, timeout=PATIENCE, check=False, **streams)
+
+
+def test_verify_fails_on_a_damaged_split_although_its_reader_left(split: Path, unread: int) -> None:
+    done = levelproof("verify", str(split), stdout=unread)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "Error" not in done.stderr
+
+
+def test_an_error_that_nobody_reads_keeps_its_exit_code(tmp_path: Path, unread: int) -> None:
+    assert levelproof("status", str(tmp_path / "nowhere"), stderr=unread).returncode == 2
+
+
+def test_a_closed_stdout_is_no_error(split: Path) -> None:
+    command = f"{sys.executable} -m levelproof status {split} >&-"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_full_disk_below_stdout_is_an_error(split: Path) -> None:
+    with open("/dev/full", "w") as full:
+        done = levelproof("status", str(split), stdout=full)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: OSError")
+
+
+def test_a_watch_ends_when_its_reader_leaves(split: Path, unread: int) -> None:
+    """Although the run that it watches goes on."""
+    workers = {"a machine": {"count": 2, "silent": 1.5}}
+    numbers = dict.fromkeys(("levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined"), 1)
+    tell(new_run(split), [{"time": time.time(), "event": "progress", "workers": workers, **numbers}])
+    with only_writer(split, print):
+        done = levelproof("status", str(split), "--watch", "--json", stdout=unread)
+    assert (done.returncode, done.stderr) == (0, "")
