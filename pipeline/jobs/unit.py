@@ -31,7 +31,7 @@ from levelproof.pipeline.errors import Failure, StoreFailure
 from levelproof.pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
 from levelproof.pipeline.read.level_files import LevelUnseen, levels_at
 from levelproof.pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
-from levelproof.pipeline.store.disk import REFUSALS
+from levelproof.pipeline.store.disk import refusal
 from levelproof.pipeline.store.fields import arrays_of, unlike_fields
 from levelproof.pipeline.store.layout import Attempt, new_attempt
 from levelproof.pipeline.store.leases import LeaseLost
@@ -88,9 +88,8 @@ def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     reason, fatal = "".join(traceback.format_exception(error)), ""
     if isinstance(error, (LockRefused, SourceUnseen, LevelUnseen, LeaseLost, StoreFailure, CheckpointUnread)):
         fatal = str(error)
-    elif isinstance(error, OSError) and (what := REFUSALS.get(error.errno or 0)):
-        where = gettempdir() if is_remote(split) else split
-        fatal = f"Cannot write to {where}, {what}, then run the same command again."
+    elif isinstance(error, OSError) and (sentence := refusal(error, Path(gettempdir()) if is_remote(split) else split)):
+        fatal = f"{sentence}."
     return UnitOutcome(unit, reason=reason, fatal=fatal)
 
 

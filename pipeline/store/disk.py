@@ -4,7 +4,7 @@ import errno
 import fcntl
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -79,11 +79,19 @@ def told_of(split: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if not (reason := (REFUSALS | FAILS).get(error.errno or 0)):
+        if not (sentence := refusal(error, split, REFUSALS | FAILS)):
             raise
-        raise Failure(
-            f"Cannot write to {split}, {reason}, then run the same command again; nothing is lost."
-        ) from error
+        raise Failure(f"{sentence}; nothing is lost.") from error
+
+
+def refusal(error: OSError, folder: Path, reasons: Mapping[int, str] = REFUSALS) -> str:
+    """What the disk refuses and what to do, in a sentence without its end; empty: none of the `reasons`.
+
+    The sentence names the file of the error, which may lie on another disk than `folder`; `folder` if it has none.
+    """
+    reason, file = reasons.get(error.errno or 0), error.filename
+    where = os.fsdecode(file) if isinstance(file, str | bytes | os.PathLike) else folder
+    return f"Cannot write to {where}, {reason}, then run the same command again" if reason else ""
 
 
 def flush(path: Path) -> None:

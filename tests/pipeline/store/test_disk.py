@@ -3,7 +3,9 @@
 import errno
 import fcntl
 import os
+import re
 import subprocess
+import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -20,6 +22,7 @@ from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.store.checkpoints import save_experts
 from levelproof.pipeline.store.disk import flush_entry, told_of
 from levelproof.pipeline.store.fields import arrays_of
@@ -62,6 +65,17 @@ def test_what_the_disk_refuses_is_said_in_a_sentence(tmp_path: Path, code: int, 
         raise OSError(code, "refused")
     with pytest.raises(FileNotFoundError), told_of(tmp_path):
         (tmp_path / "gone").read_bytes()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a file that even root cannot write to")
+def test_the_file_that_cannot_be_written_is_named_and_not_the_split(tmp_path: Path) -> None:
+    elsewhere = Path("/proc/sys/kernel/version")
+    words = f"^Cannot write to {elsewhere}, writing is not permitted.* same command again"
+    with pytest.raises(Failure, match=words), told_of(tmp_path):
+        elsewhere.write_bytes(b"")
+    with pytest.raises(OSError, match="version") as refused:
+        elsewhere.write_bytes(b"")
+    assert re.match(words, failure(tmp_path, WorkUnit((0,)), refused.value).fatal)
 
 
 @pytest.mark.slow
