@@ -28,6 +28,7 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import ROUND, STRETCH, Order, Round, Scheduler, UnitOutcome, WorkUnit, plan_units
 from levelproof.pipeline.runtime import own_cores, prepare_jax
+from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.split import writing
 
 UNIT = 32  # levels
@@ -127,7 +128,7 @@ def work(words: Sequence[str], told: Any) -> None:
 
     job = compose_job(words)
     count = len(job.level_ids)
-    with writing(job, print) as (split, _), Path("/dev/null").open("w") as nowhere:
+    with stoppable() as stop, writing(job, print) as (split, _), Path("/dev/null").open("w") as nowhere:
         scheduler = Timed(plan_units(job.level_ids, [], STRETCH), count, job.levels_per_unit, timed=True)
         board = Board(Tally(count, 0, 0), Console(file=nowhere))
 
@@ -136,7 +137,7 @@ def work(words: Sequence[str], told: Any) -> None:
             for outcome in outcomes:
                 board.ended(outcome.unit, outcome.summary)
 
-        cluster.run(job, split, scheduler, settle, board)
+        cluster.run(job, split, scheduler, settle, board, stop)
         told.put(time.monotonic() - scheduler.began)
 
 

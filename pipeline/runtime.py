@@ -4,19 +4,14 @@ Called before JAX starts its backend; changes nothing after that.
 """
 
 import os
-import signal
 import socket
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from loky import cpu_count
 
 from levelproof.pipeline.compiled import remove_damaged
-from levelproof.pipeline.errors import Exit
 from levelproof.pipeline.owned import own_folder
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
@@ -28,8 +23,6 @@ XLA_FLAGS = (
 )
 # NPROC and PJRT_NPROC size XLA's pool; the others are those of numpy's libraries.
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-GRACE = 20.0  # s that workers have, when a job is to end, to commit what they can
-LAST = 28.0  # s after which it has ended; batch systems kill after 30
 CLAIMING = 2.0  # s of trying to get a core
 CLAIMS: list[socket.socket] = []  # of this process
 # Settings of JAX that change results or refuse the code, by a user's environment variables or configuration
@@ -81,43 +74,6 @@ def prepare_jax(core: int | None = None) -> None:
     jax.config.update("jax_compilation_cache_dir", str(programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """SIGTERM (a batch system's time limit) stops a job as Ctrl-C does."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextmanager
-def stoppable() -> Iterator[threading.Event]:
-    """Whether SIGTERM or Ctrl-C asked for the end. Asked twice, it comes at once; and after `LAST` s, come what may:
-    what is compiled hears of no signal."""
-    asked = threading.Event()
-    clock = threading.Timer(LAST, os._exit, [Exit.INTERRUPTED])
-    clock.daemon = True
-
-    def stop(*_: object) -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
-        asked.set()
-        clock.start()
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield asked
-    finally:
-        clock.cancel()
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def own_cores() -> list[int]:

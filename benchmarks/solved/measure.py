@@ -23,7 +23,8 @@ from levelproof.experts.labels import Label, Verdict
 from levelproof.pipeline.errors import Failure, LevelproofError, UserError
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Summary, WorkUnit, plan_units
-from levelproof.pipeline.runtime import cache_folder, interruptible, own_cores, prepare_jax
+from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
+from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.provenance import device, versions
 
 UNIT = 32  # levels, as in a job
@@ -113,7 +114,7 @@ def train_all(
     for task in (*units, *[None] * len(processes)):
         tasks.put(task)
     try:
-        with interruptible(), board.shown():
+        with stoppable(), board.shown():
             for process in processes:
                 process.start()
             follow(len(units), told, processes, board, scratch)

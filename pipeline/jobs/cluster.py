@@ -7,12 +7,11 @@ import io
 import logging
 import os
 import signal
-import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +30,13 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs.address import existing, no_cluster, require_reachable
-from levelproof.pipeline.jobs.likeness import Program, program_of, unlike
+from levelproof.pipeline.jobs.likeness import Program, program_of, seen_from_elsewhere, unlike
 from levelproof.pipeline.jobs.progress import STOPPING, Board, Tally
 from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, UnitOutcome, levels_text, until_report
-from levelproof.pipeline.runtime import GRACE, own_core, own_cores, prepare_jax, stoppable
+from levelproof.pipeline.runtime import own_core, own_cores, prepare_jax
+from levelproof.pipeline.stopping import Stop
 from levelproof.pipeline.store.leases import serve, served
-from levelproof.pipeline.store.remote import absolute, as_typed
+from levelproof.pipeline.store.remote import absolute
 from levelproof.pipeline.words import duration
 
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
@@ -59,19 +59,24 @@ class WorkerActor:
         from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
         serve(split, writer)
-        self._worker, self._at_work = Worker(job, split), False
+        self._worker, self._at_work, self._rounds = Worker(job, split), False, 0
         self._before = signal.signal(signal.SIGTERM, self._asked_to_go)
         return ""
 
     def work(self, order: Order, seconds: float) -> Round:
+        """A round, which ends early when the driver cancels it: nothing else reaches a worker in the middle of one."""
         self._at_work = True
         try:
-            return self._worker.work(order, seconds)
+            self._latest = self._worker.work(order, seconds, ray.get_runtime_context().is_canceled)
+            self._rounds += 1
+            return self._latest
         finally:
             self._at_work = False
 
-    def leave(self) -> Round:
-        return self._worker.leave()
+    def leave(self, heard: int) -> list[Round]:
+        """Commit what is decided, and leave. The latest round comes first if the driver, which has heard of so many
+        rounds, has not heard of it."""
+        return [*([self._latest] if self._rounds > heard else []), self._worker.leave()]
 
     def _asked_to_go(self, number: int, frame: Any) -> None:
         """SIGTERM: with units under way, leave after the step that is under way; else at once."""
@@ -89,6 +94,7 @@ class WorkerHandle:
     actor: Any = None
     answer: Any = None  # reference to what it will answer: to `begin`, then to `work`
     up: bool = False  # it has begun
+    heard: int = 0  # rounds that it has reported
     out_of_reach: bool = False  # it is asked whether it is there
     failed_starts: int = 0  # in a row
     why: str = ""  # of the last of them
@@ -113,7 +119,7 @@ class WorkerHandle:
         """It dies, if it is not dead; its place is free for another."""
         if self.actor is not None:
             ray.kill(self.actor)
-        self.actor, self.answer, self.up, self.out_of_reach = None, None, False, False
+        self.actor, self.answer, self.up, self.heard, self.out_of_reach = None, None, False, 0, False
 
 
 def _told(error: RayError) -> str:
@@ -124,32 +130,26 @@ def _told(error: RayError) -> str:
     return f"The worker died: {lines[0].rstrip('.')}"
 
 
-def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board) -> None:
-    """Work until nothing is left to do.
+def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
+    """Work until nothing is left to do; `stop` is heeded.
 
     Raises:
         UserError: the cluster of RAY_ADDRESS cannot be reached.
         Failure: no worker can start.
         KeyboardInterrupt: somebody asked for the end; what could be kept is committed.
     """
-    with connected() as stop:
-        crew = Crew(_seen_from_elsewhere(job), absolute(split), scheduler, board, served(split))
+    with connected(), stop.heeded():  # in this order: Ray sets a handler of its own when it starts
+        crew = Crew(seen_from_elsewhere(job), absolute(split), scheduler, board, served(split))
         while not scheduler.over:
             crew.follow_cluster()
             crew.start_workers()
             crew.order()
             settle(crew.wait())
             board.refresh()
-            if stop.is_set():
+            if stop.asked.is_set():
                 board.say(STOPPING)
-                settle(crew.leave())
+                settle(crew.leave(stop.grace))
                 raise KeyboardInterrupt
-
-
-def _seen_from_elsewhere(job: JobConfig) -> JobConfig:
-    """The job as a worker in another folder has to read it: no path is relative."""
-    known = lambda path: path and as_typed(absolute(Path(path)))
-    return replace(job, out=known(job.out), continue_from=known(job.continue_from))
 
 
 class Crew:
@@ -213,30 +213,34 @@ class Crew:
         if not asked:
             time.sleep(POLL)
             return []
-        ray.wait([*asked], timeout=POLL)  # for the first
-        ready, _ = ray.wait([*asked], num_returns=len(asked), timeout=0)
-        outcomes: list[UnitOutcome] = []
-        for handle in (asked[reference] for reference in ready):
-            if handle.answer is not None:  # else it has ended: one beside it was refused, and with it its machine
-                outcomes += self._hear(handle)
+        outcomes = self._heard(asked, POLL)
         for handle in self._scheduler.silent(time.monotonic() - MOST_SILENT):
             outcomes += self._lose(handle, f"The worker on {handle.host} was silent for {duration(MOST_SILENT)}")
         self._give_up()
         return outcomes
 
-    def leave(self) -> list[UnitOutcome]:
-        """Outcomes of what all workers could still commit, within GRACE."""
+    def leave(self, seconds: float) -> list[UnitOutcome]:
+        """Outcomes of what all workers could still commit within so many seconds. Rounds, which are long where there
+        are thousands of workers, end now."""
+        end = time.monotonic() + seconds
+        for handle in self._handles:
+            if handle.up:
+                if handle.answer is not None:
+                    ray.cancel(handle.answer)
+                handle.answer = handle.actor.leave.remote(handle.heard)
         outcomes: list[UnitOutcome] = []
-        end = time.monotonic() + GRACE
-        last = {handle.actor.leave.remote(): handle for handle in self._handles if handle.up}
-        while last and (left := end - time.monotonic()) > 0:
-            ready, _ = ray.wait([*last], timeout=left)
-            for reference in ready:
-                handle = last.pop(reference)
-                outcomes += self._hear(handle) if handle.answer is not None else []
-                if handle.up:
-                    handle.answer = reference
-                    outcomes += self._hear(handle)
+        while (last := {handle.answer: handle for handle in self._handles if handle.up}) and time.monotonic() < end:
+            outcomes += self._heard(last, max(0.0, end - time.monotonic()))
+        return outcomes
+
+    def _heard(self, asked: Mapping[Any, WorkerHandle], seconds: float) -> list[UnitOutcome]:
+        """Outcomes that the answers of these workers tell of, if any answers within so many seconds."""
+        ray.wait([*asked], timeout=seconds)  # for the first
+        ready, _ = ray.wait([*asked], num_returns=len(asked), timeout=0)
+        outcomes: list[UnitOutcome] = []
+        for handle in (asked[reference] for reference in ready):
+            if handle.answer is not None:  # else it has ended: one beside it was refused, and with it its machine
+                outcomes += self._hear(handle)
         return outcomes
 
     def _hear(self, handle: WorkerHandle) -> Sequence[UnitOutcome]:
@@ -258,7 +262,12 @@ class Crew:
             handle.up, handle.failed_starts = True, 0
             self._scheduler.join(handle, time.monotonic())
             return []
-        round: Round = answer
+        rounds = answer if isinstance(answer, list) else [answer]  # none follows the one with which it has left
+        return [outcome for round in rounds if handle.up for outcome in self._report(handle, round)]
+
+    def _report(self, handle: WorkerHandle, round: Round) -> Sequence[UnitOutcome]:
+        """A round's outcomes; what else it tells goes to those whom it concerns."""
+        handle.heard += 1
         self._scheduler.report(handle, round, time.monotonic())
         self._board.tally.follow(round)
         if round.leaves:
@@ -340,9 +349,8 @@ class Meters:
 
 
 @contextmanager
-def connected() -> Iterator[threading.Event]:
-    """The cluster of RAY_ADDRESS, or one on this machine that lives as long as this block and this process; and whether
-    somebody asked for the end.
+def connected() -> Iterator[None]:
+    """The cluster of RAY_ADDRESS, or one on this machine that lives as long as this block and this process.
 
     Raises:
         UserError: there is none at RAY_ADDRESS.
@@ -359,11 +367,10 @@ def connected() -> Iterator[threading.Event]:
             ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
         except ConnectionError as error:
             raise no_cluster(str(error).strip().splitlines()[0]) from error
-        with stoppable() as stop:  # only now: Ray sets a handler of its own when it starts
-            try:
-                yield stop
-            finally:
-                ray.shutdown()
+        try:
+            yield
+        finally:
+            ray.shutdown()
 
 
 def _on_gpus() -> bool:

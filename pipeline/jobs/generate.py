@@ -19,6 +19,7 @@ from levelproof.pipeline.jobs.progress import Board, Tally, say
 from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, schedule
 from levelproof.pipeline.jobs.seal import Sealer, sealing
 from levelproof.pipeline.runtime import cache_folder
+from levelproof.pipeline.stopping import Stop, stoppable
 from levelproof.pipeline.store import quarantine
 from levelproof.pipeline.store.checkpoints import require_same_experts
 from levelproof.pipeline.store.job_note import note_job
@@ -53,7 +54,7 @@ def generate(
     require_library(job.log)
     cache_folder()  # where workers refuse it, Ray makes many lines of the sentence
     require_same_experts(job)
-    with writing(job, partial(say, console), repaired) as (split, manifest):
+    with stoppable() as stop, writing(job, partial(say, console), repaired) as (split, manifest):
         asked = [*origins] if origins else (job.level_ids if level_ids is None else level_ids)
         wanted = ascending(np.fromiter(asked, np.int64, len(asked)))
         is_done = np.isin(manifest.level_ids, wanted)
@@ -78,7 +79,7 @@ def generate(
                     sealing(split, manifest.counting, board.say) as sealer,
                     telling(split, board, scheduler, shlex.join(command), log) as events,
                 ):
-                    _work(job, split, scheduler, board, sealer, events)
+                    _work(job, split, scheduler, board, sealer, events, stop)
             except KeyboardInterrupt:
                 done = f"{board.tally.done:,} of {many(len(wanted), 'level')} committed"
                 board.say(f"Stopped: {done}; the same command goes on.")
@@ -94,7 +95,9 @@ def generate(
     return Exit.QUARANTINED if scheduler.quarantined else Exit.DONE
 
 
-def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, sealer: Sealer, events: Events) -> None:
+def _work(
+    job: JobConfig, split: Path, scheduler: Scheduler, board: Board, sealer: Sealer, events: Events, stop: Stop
+) -> None:
     """Have every unit done or given up, by workers or in this process."""
 
     def settle(outcomes: Sequence[UnitOutcome]) -> None:
@@ -125,7 +128,7 @@ def _work(job: JobConfig, split: Path, scheduler: Scheduler, board: Board, seale
         from levelproof.pipeline.jobs.inline import run
     else:
         from levelproof.pipeline.jobs.cluster import run
-    run(job, split, scheduler, settle, board)
+    run(job, split, scheduler, settle, board, stop)
 
 
 def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:

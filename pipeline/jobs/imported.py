@@ -27,7 +27,8 @@ from levelproof.pipeline.jobs.unit import commit
 from levelproof.pipeline.read.kinetix.folder import Folder, open_folder, read_trajectories
 from levelproof.pipeline.read.kinetix.records import dtype_of
 from levelproof.pipeline.read.kinetix.zarr2 import FormatError, StoredArray
-from levelproof.pipeline.runtime import interruptible, prepare_jax
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.manifest import Manifest, read_manifest
 from levelproof.pipeline.store.origins import Origin, RecordPlace, can_be_noted
@@ -48,6 +49,7 @@ class UnitOfRows(NamedTuple):
     unit: WorkUnit  # the ids of its rows, whatever becomes of them
 
 
+@stoppable()
 def import_folder(folder: Path, out: Path, console: Console) -> Exit:
     """Make the split `out` of the trajectories in `folder`, or go on with it.
 
@@ -78,7 +80,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
         shown = track(left, "units of trajectories", console=console, transient=True, disable=not console.is_terminal)
         firsts = [*(part.unit.level_ids[0] for part in left[1:]), None]  # of what is to come after each
         try:
-            with interruptible(), sealing(split, manifest.counting, partial(say, console)) as sealer:
+            with sealing(split, manifest.counting, partial(say, console)) as sealer:
                 for part, first in zip(shown, firsts, strict=False):
                     out_of.update(_import(job, split, found, part, shlex.join(command), console, sum(out_of.values())))
                     sealer.committed(part.unit)

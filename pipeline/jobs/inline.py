@@ -6,21 +6,22 @@ from pathlib import Path
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.jobs.progress import STOPPING, Board
 from levelproof.pipeline.jobs.schedule import ROUND, Scheduler, Settle
-from levelproof.pipeline.runtime import prepare_jax, stoppable
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.stopping import Stop
 
 HERE = "this process"
 
 
-def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board) -> None:
-    """Work until nothing is left to do."""
+def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
+    """Work until nothing is left to do; `stop` is heeded."""
     prepare_jax()
     from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
-    with stoppable() as stop:
+    with stop.heeded():
         worker = Worker(job, split)
         scheduler.join(HERE, time.monotonic())
         while not scheduler.over:
-            if stop.is_set():
+            if stop.asked.is_set():
                 board.say(STOPPING)
                 worker.stopping = True
             order = scheduler.order(HERE, time.monotonic())

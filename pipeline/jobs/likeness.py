@@ -2,11 +2,13 @@
 
 import hashlib
 import socket
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.store.provenance import versions
+from levelproof.pipeline.store.remote import absolute, as_typed
 
 Program = dict[str, str]  # versions by name
 SAME = ("levelproof", "jax", "jaxlib", "sampler")  # of `provenance.versions`
@@ -29,6 +31,12 @@ def unlike(program: Program, job: JobConfig) -> str:
                 f"{there}: install the same levelproof there, start its Ray again, and run the same command."
             )
     return ""
+
+
+def seen_from_elsewhere(job: JobConfig) -> JobConfig:
+    """The job as a worker in another folder has to read it: no path is relative."""
+    known = lambda path: path and as_typed(absolute(Path(path)))
+    return replace(job, out=known(job.out), continue_from=known(job.continue_from))
 
 
 @cache

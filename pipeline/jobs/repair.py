@@ -18,6 +18,7 @@ from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.read.findings import Findings
+from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job, sound_note
 from levelproof.pipeline.store.layout import EXPERTS, data_paths
 from levelproof.pipeline.store.locks import nobody_commits
@@ -28,6 +29,7 @@ from levelproof.pipeline.store.split import locked, taken
 SETTINGS = ("executor", "workers", "unit")  # of `generate`, that a repair may have
 
 
+@stoppable()
 def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
     """Verify a split, and make again what is wrong with it. Killed at any moment, it goes on where it was.
 
@@ -71,7 +73,13 @@ def _examined(split: Path, inline: bool) -> Findings:
     if inline:
         return _examine(split)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        return process.submit(_examine, split).result()
+        found = process.submit(_examine, split)
+        try:
+            return found.result()
+        except KeyboardInterrupt:  # SIGTERM reaches this process alone
+            for child in multiprocessing.active_children():
+                child.terminate()
+            raise
 
 
 def _examine(split: Path) -> Findings:

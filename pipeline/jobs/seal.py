@@ -16,6 +16,7 @@ from levelproof.pipeline.errors import LevelproofError, UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store import seal as store
 from levelproof.pipeline.store.disk import told_of
 from levelproof.pipeline.store.job_note import note_density
@@ -27,6 +28,7 @@ from levelproof.pipeline.store.split import taken
 from levelproof.pipeline.words import many
 
 
+@stoppable()
 def seal_split(
     split: Path, rows: int | None, console: Console, density: Density | None = None, key_every: int = KEY_EVERY
 ) -> None:
@@ -37,6 +39,7 @@ def seal_split(
     Raises:
         UserError: there is no split, it cannot be written, or somebody writes to it.
         Failure: it is damaged, or the disk refuses. What is sealed by then stays so; nothing is lost.
+        KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; the same holds.
     """
     if rows is not None and rows < 1:
         raise UserError(f"A sealed fragment cannot have {rows} rows: give --rows a number from 1.")

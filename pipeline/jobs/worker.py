@@ -5,7 +5,7 @@ The same in this process and in a Ray worker. Knows nothing of either.
 
 import contextlib
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
@@ -26,15 +26,16 @@ class Worker:
         self._keep_at = time.monotonic() + job.checkpoint_seconds
         self.stopping = False  # set by whoever wants it to leave soon
 
-    def work(self, order: Order, seconds: float) -> Round:
-        """Give levels back and begin units as ordered, then train for so many seconds, or until a unit ends.
+    def work(self, order: Order, seconds: float, ended: Callable[[], bool] = lambda: False) -> Round:
+        """Give levels back and begin units as ordered, then train for so many seconds, or until a unit ends or the
+        round has `ended`.
 
         A failure of one unit is that unit's outcome. One of the step that all share is the outcome of each.
         """
         until = time.monotonic() + seconds
         cuts = self._give(order.give)
         outcomes = [outcome for unit in order.units if (outcome := self._begin(unit))]
-        while self._runs and not outcomes and not self.stopping and time.monotonic() < until:
+        while self._runs and not (outcomes or self.stopping or ended()) and time.monotonic() < until:
             outcomes = self._step()
         if self._job.checkpoint and time.monotonic() >= self._keep_at:
             self._keep()

@@ -44,7 +44,8 @@ def merge_shards(
     Args:
         path: of the new shard.
         places: at least one; all of shards that hold the same fields in the same way.
-        moved: called with the bytes of each chunk that was copied; what it raises ends this.
+        moved: called before each shard is opened, and with the bytes of each chunk that was copied; what it raises
+            ends this.
         rows_a_file: rows of each file; default: as few as FILE_BYTES allow, a power of two.
 
     Raises:
@@ -52,7 +53,7 @@ def merge_shards(
         FileExistsError: `path` is there already.
         OSError: the disk refuses.
     """
-    documents, sources = _opened(dict.fromkeys(place.shard for place in places))
+    documents, sources = _opened(dict.fromkeys(place.shard for place in places), moved)
     for shard, row, level_id in places:
         if sources[shard].level_ids[row : row + 1] != [level_id]:
             raise damaged(shard, ContentsError(f"its row {row} is not level {level_id}, as the manifest says"))
@@ -79,13 +80,14 @@ def merge_shards(
     flush(path)
 
 
-def _opened(paths: Iterable[Path]) -> tuple[dict[str, Any], dict[Path, _Source]]:
+def _opened(paths: Iterable[Path], moved: Callable[[int], None]) -> tuple[dict[str, Any], dict[Path, _Source]]:
     """The sources, and the metadata that they share, by array (the group's without a name).
 
     What depends on the number of levels is zero in it.
     """
     first, shared, sources = None, {}, {}
     for path in paths:
+        moved(0)
         shard, arrays = Shard(path), {}
         try:
             files = {"": "zarr.json"} | {name: f"{name}/zarr.json" for name in shard.arrays}

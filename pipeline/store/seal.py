@@ -103,8 +103,8 @@ def seal(
     """Merge these fragments, and their shards of each density. Only the writer of a split may.
 
     Kept experts stay where they are, unread: their digests are carried over. `moved` and `rows_a_file` are those of
-    `merge_shards`; `moved` is called before each fragment is read, too. With a `density` and its `key_every`, all
-    shards get that one; `converted` is called with how many levels have.
+    `merge_shards`; `moved` is called before each fragment or shard is opened and before each is removed, too. With a
+    `density` and its `key_every`, all shards get that one; `converted` is called with how many levels have.
 
     Returns:
         The sealed fragment.
@@ -123,7 +123,7 @@ def seal(
     replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
     digests = {name: files for of, _ in parts for name, files in of.digests.items()}
     _require_committed(shards, digests)
-    places, between = _places(table, shards), list[Path]()
+    places, between = _places(table, shards, moved), list[Path]()
     densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(of.densities for of, _ in parts))
     first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
     unit, count = unit_name(first, last), 1 if density else len(places)
@@ -139,8 +139,10 @@ def seal(
         write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, digests)
     sealed = fragment_path(split, unit)
     for path in paths - {sealed}:
+        moved(0)
         remove(path)
     for shard in replaced:
+        moved(0)
         drop(shard)
     return Piece(sealed, table.num_rows, True)
 
@@ -171,9 +173,12 @@ def _require_committed(shards: Mapping[str, Path], digests: Mapping[str, Mapping
             raise damaged(path, ContentsError(f"its {wrong[0]} is not what was committed"))
 
 
-def _places(table: pa.Table, shards: Mapping[str, Path]) -> dict[Encoding, list[Place]]:
+def _places(table: pa.Table, shards: Mapping[str, Path], moved: Callable[[int], None]) -> dict[Encoding, list[Place]]:
     """Where the trajectories of these rows lie, by how they are stored."""
-    encodings = {name: Shard(path).encoding for name, path in shards.items()}
+    encodings = {}
+    for name, path in shards.items():
+        moved(0)
+        encodings[name] = Shard(path).encoding
     found: dict[Encoding, list[Place]] = {}
     for name, row, level_id in zip(*(table.column(of).to_pylist() for of in ("shard", "row", "level_id")), strict=True):
         if name:

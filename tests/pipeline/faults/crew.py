@@ -22,6 +22,7 @@ from levelproof.experts.train import UnitResult
 from levelproof.pipeline.jobs.progress import Board
 from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, Summary, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.unit import commit, failure
+from levelproof.pipeline.stopping import Stop
 from levelproof.pipeline.store.leases import serve, served
 from tests.pipeline.made import made_level, made_record, made_verdict
 
@@ -40,7 +41,7 @@ def result_of(level_ids: tuple[int, ...], experts: bool) -> UnitResult:
     return UnitResult(np.array(level_ids), level, record, verdicts, EnvSteps(), kept)
 
 
-def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board) -> None:
+def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
     """As an executor does: work until nothing is left to do; who dies is replaced."""
     worker: Connection | None = None
     while not scheduler.over:

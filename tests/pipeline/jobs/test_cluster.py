@@ -17,7 +17,7 @@ from rich.console import Console
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs import cluster
 from levelproof.pipeline.jobs.address import require_reachable
-from levelproof.pipeline.jobs.likeness import program_of, unlike
+from levelproof.pipeline.jobs.likeness import program_of, seen_from_elsewhere, unlike
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import COMPANY, Scheduler, WorkUnit
 from levelproof.pipeline.store.layout import JOB
@@ -132,10 +132,10 @@ def test_a_worker_that_starts_late_commits_for_its_own_driver_only(tmp_path: Pat
 
 def test_workers_read_no_relative_path() -> None:
     """They run in another folder than the command."""
-    job = cluster._seen_from_elsewhere(made_job("data", "continue_from=data/5k/s"))
+    job = seen_from_elsewhere(made_job("data", "continue_from=data/5k/s"))
     assert job.out == str(Path("data").absolute())
     assert job.continue_from == str(Path("data/5k/s").absolute())
-    assert cluster._seen_from_elsewhere(made_job()).continue_from == ""
+    assert seen_from_elsewhere(made_job()).continue_from == ""
 
 
 def test_there_are_as_many_workers_as_machines_have_room_for_now(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,78 @@
+"""SIGTERM and Ctrl-C end a command in time, whatever it does then. Real signals."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from levelproof.pipeline.stopping import GRACE, stoppable
+from levelproof.pipeline.store.manifest import fragment_paths
+from tests.pipeline.command import PATIENCE, descendants, start, title, until
+from tests.pipeline.slow_seal import HUNG
+
+BOTH = (signal.SIGTERM, signal.SIGINT)
+
+
+def asked(number: signal.Signals) -> None:
+    os.kill(os.getpid(), number)
+
+
+@pytest.mark.parametrize("beside", ["1", "0"])
+def test_sigterm_ends_a_job_while_its_seal_hangs(tmp_path: Path, beside: str) -> None:
+    process = start([str(tmp_path), "1", beside], tmp_path, module="tests.pipeline.slow_seal")
+    assert process.stdout
+    assert process.stdout.readline() == f"{HUNG}\n", process.communicate()
+    process.terminate()
+    try:
+        _, err = process.communicate(timeout=PATIENCE / 10)
+    finally:
+        process.kill()
+    assert process.returncode == 130, err
+
+
+@pytest.mark.parametrize("number", BOTH)
+def test_a_signal_interrupts_what_does_not_heed_it(number: signal.Signals) -> None:
+    before = [signal.getsignal(each) for each in BOTH]
+    with pytest.raises(KeyboardInterrupt), stoppable() as stop:
+        asked(number)
+    assert stop.asked.is_set()
+    assert [signal.getsignal(each) for each in BOTH] == before
+    stop.clock.join(PATIENCE)
+    assert not stop.clock.is_alive(), "it would end this process"
+
+
+@pytest.mark.parametrize("number", BOTH)
+def test_the_first_signal_leaves_time_to_what_heeds_it(number: signal.Signals) -> None:
+    heeded = False
+    with pytest.raises(KeyboardInterrupt), stoppable() as stop:  # noqa: PT012
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as Ray sets a handler of its own
+        with stop.heeded():
+            asked(number)
+            assert stop.asked.is_set()
+            assert 0 < stop.grace <= GRACE
+            heeded = True
+        pytest.fail("it goes on as if nobody had asked")
+    assert heeded
+
+
+def test_the_second_signal_interrupts_what_heeds_the_first() -> None:
+    with pytest.raises(KeyboardInterrupt), stoppable() as stop, stop.heeded():  # noqa: PT012
+        asked(signal.SIGTERM)
+        asked(signal.SIGINT)
+        pytest.fail("the second was ignored")
+
+
+@pytest.mark.slow
+def test_workers_keep_their_experts_although_their_round_is_long(tmp_path: Path) -> None:
+    """The driver ends the round: a worker hears of nothing else before its end."""
+    alone = ("scout.rounds=0", "search.env_steps=0", "stop.rule=budget")  # so that experts train long
+    command = ["generate", "levels=8", "unit=1", "budget=1M", "workers=1", "checkpoint=1h", *alone]
+    process = start(command, tmp_path, module="tests.pipeline.long_rounds")
+    split, at_work = tmp_path / "data/1M/s", "ray::WorkerActor.work"
+    working = lambda: any(title(pid).startswith(at_work) for pid in descendants(process.pid))
+    until(lambda: fragment_paths(split) and working(), process)
+    process.terminate()
+    _, err = process.communicate(timeout=PATIENCE / 10)
+    assert process.returncode == 130, err
+    assert list(split.glob("checkpoints/[0-9]*.npz")), err
