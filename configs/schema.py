@@ -37,6 +37,7 @@ WITHOUT_EFFECT = frozenset(
         "out",
         "unit",
         "executor",
+        "device",
         "workers",
         "checkpoint",
         "keep_experts",
@@ -63,7 +64,8 @@ class JobConfig:
     out: str = "data"  # folder, or URL of an object store; the split is written to {out}/{budget}/{size}
     unit: int | None = None  # levels per work unit, lost when its worker dies; null: 20 to 60 s of a worker, as timed
     executor: Literal["ray", "inline"] = "ray"  # ray: a worker per core or GPU; inline: this process, for debugging
-    workers: int = 0  # at most so many; 0: one per core, or one per GPU where JAX can use them
+    device: Literal["cpu", "gpu"] = "cpu"  # a core, or a GPU, for each worker; gpu: if one is free and JAX can use it
+    workers: int = 0  # maximum number; 0: one per core that memory allows, or with device=gpu one per GPU
     checkpoint: str = ""  # how often experts under way are kept, as in 10min, to go on with; empty: never
     keep_experts: bool = False  # keep experts, too, so that a larger budget can go on with them
     density: Density = "full"  # what is stored of a record: full (all), resume (states), witness (actions, key frames)

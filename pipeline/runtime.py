@@ -8,6 +8,7 @@ import socket
 import sys
 import time
 from pathlib import Path
+from typing import Literal
 
 from loky import cpu_count
 
@@ -23,6 +24,7 @@ XLA_FLAGS = (
 )
 # NPROC and PJRT_NPROC size XLA's pool; the others are those of numpy's libraries.
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+NO_GPU = "JAX cannot use one here, as it can with levelproof's extra `gpu`"
 CLAIMING = 2.0  # s of trying to get a core
 CLAIMS: list[socket.socket] = []  # of this process
 # Settings of JAX that change results or refuse the code, by a user's environment variables or configuration
@@ -53,8 +55,11 @@ def cache_folder() -> Path:
     return own_folder(path, f"delete it, or have {CACHE_VARIABLE} name a folder of your own")
 
 
-def prepare_jax(core: int | None = None) -> None:
+def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = None) -> None:
     """Set this process up to run work units, on one CPU core or, with None, where the system likes.
+
+    JAX computes on the CPU and leaves GPUs alone, or with `device="gpu"` on a GPU if it can use one. Without a `device`
+    JAX_PLATFORMS decides, and if it is not set, the CPU.
 
     Raises:
         UserError: as `cache_folder`.
@@ -69,11 +74,19 @@ def prepare_jax(core: int | None = None) -> None:
 
     programs = own_folder(cache_folder() / "jax", "delete it")
     remove_damaged(programs)
+    asked = os.environ.get("JAX_PLATFORMS")
+    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": asked, None: asked or "cpu"}[device])
     for name, value in SETTLED.items():
         jax.config.update(name, value)
     jax.config.update("jax_compilation_cache_dir", str(programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def jax_sees_a_gpu() -> bool:
+    import jax
+
+    return jax.default_backend() == "gpu"
 
 
 def own_cores() -> list[int]:

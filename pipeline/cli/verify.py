@@ -19,8 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--repair",
         nargs="*",
         metavar="NAME=VALUE",
-        help="make again what is damaged or missing, and nothing else; settings: executor, workers and unit, as for "
-        "generate",
+        help="make again what is damaged or missing, and nothing else; settings: executor, workers, unit and "
+        "device, as for generate",
     )
 
 

@@ -9,9 +9,9 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +25,19 @@ import ray
 from ray._private import ray_constants
 from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 from ray.util.metrics import Gauge
-from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+from ray.util.placement_group import placement_group, remove_placement_group
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy, PlacementGroupSchedulingStrategy
 
 from levelproof.configs.schema import JobConfig
+from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs.address import existing, no_cluster, require_reachable
 from levelproof.pipeline.jobs.likeness import Program, program_of, seen_from_elsewhere, unlike
-from levelproof.pipeline.jobs.progress import STOPPING, Board, Tally
+from levelproof.pipeline.jobs.meters import Meters
+from levelproof.pipeline.jobs.places import bytes_of_worker, places, share_of_memory, shortage
+from levelproof.pipeline.jobs.progress import STOPPING, Board
 from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, UnitOutcome, levels_text, until_report
-from levelproof.pipeline.runtime import own_core, own_cores, prepare_jax
+from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_core, own_cores, prepare_jax
 from levelproof.pipeline.stopping import Stop
 from levelproof.pipeline.store.leases import serve, served
 from levelproof.pipeline.store.remote import absolute
@@ -42,6 +46,7 @@ from levelproof.pipeline.words import duration
 OBJECT_STORE = 80 * 2**20  # bytes; next to nothing travels
 POLL = 0.25  # s after which people see progress, whether a worker has reported or not
 RESCAN = 5.0  # s between looks at which machines a cluster has
+GPU_PATIENCE = 10.0  # s of waiting for a GPU that is free, after which workers do without
 PATIENCE = 60.0  # s without any worker after which people are told why
 STARTS = 3  # times in a row that a worker does not start, after which its place is given up
 MOST_SILENT = 1800.0  # s without a word after which a worker is given up; a large program compiles for minutes
@@ -55,7 +60,7 @@ class WorkerActor:
         `leases.serve`."""
         if refusal := unlike(program, job):
             return refusal
-        prepare_jax(own_core(neighbours))
+        prepare_jax(own_core(neighbours), job.device)
         from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
         serve(split, writer)
@@ -91,6 +96,7 @@ class WorkerHandle:
 
     node: str  # Ray's id of its machine
     host: str
+    memory: int = 0  # bytes that Ray reserves for it
     actor: Any = None
     answer: Any = None  # reference to what it will answer: to `begin`, then to `work`
     up: bool = False  # it has begun
@@ -111,7 +117,8 @@ class WorkerHandle:
     def start(self, name: str, gpus: int, *begin: Any) -> None:
         """Ask for a worker. It gets no unit before it answers: its machine may have no room for it now, or ever."""
         here = NodeAffinitySchedulingStrategy(self.node, soft=False)
-        options = {"num_cpus": 1, "num_gpus": gpus, "max_restarts": 0, "scheduling_strategy": here}
+        resources = {"num_cpus": 1, "num_gpus": gpus, "memory": self.memory}
+        options = {"max_restarts": 0, "scheduling_strategy": here, **resources}
         self.actor = ray.remote(WorkerActor).options(name=f"{name} on {self.host}", **options).remote()
         self.answer = self.actor.begin.remote(*begin)
 
@@ -157,15 +164,20 @@ class Crew:
 
     def __init__(self, job: JobConfig, split: Path, scheduler: Scheduler, board: Board, writer: str = "") -> None:
         """`writer` is the name under which the driver has the split; workers that get none commit beside no writer."""
-        self._job, self._split, self._scheduler, self._board, self._writer = job, split, scheduler, board, writer
+        if why := _why_no_gpu() if job.device == "gpu" else "":
+            board.say(f"Workers use CPU cores, not GPUs: {why}.")
+        self._gpus = job.device == "gpu" and not why
+        self._job = replace(job, device="gpu" if self._gpus else "cpu")
+        self._split, self._scheduler, self._board, self._writer = split, scheduler, board, writer
         units = -(-scheduler.waiting // job.levels_per_unit)
         self._most = max(1, min(job.workers or units, units))
-        self._gpus = _on_gpus()
+        self._kind, self._memory = "GPU" if self._gpus else "CPU", bytes_of_worker(size_of(job.size))
         self._handles: list[WorkerHandle] = []
         self._refused: set[str] = set()  # machines
+        self._short: set[str] = set()  # machines whose lack of memory people know of
         self._given_up: Counter[str] = Counter()  # workers that cannot start, by machine
         self._started = 0
-        self._meters = Meters(split) if existing() else None
+        self._meters = Meters(split, Gauge) if existing() else None
         self._rescan_at = 0.0
         self._notice_at = time.monotonic() + PATIENCE
 
@@ -176,14 +188,19 @@ class Crew:
         self._rescan_at = time.monotonic() + RESCAN if existing() else float("inf")
         if self._meters:
             self._meters.show(self._board.tally)
-        room = _room(self._gpus, self._most, self._refused)
+        machines = {node: of for node, of in _machines().items() if node not in self._refused}
+        room = places(machines, self._kind, self._most, self._memory)
         for handle in [handle for handle in self._handles if not handle.up]:
-            if sum(of.node == handle.node for of in self._handles) > len(room.get(handle.node, ())):
+            if sum(of.node == handle.node for of in self._handles) > room[handle.node]:
                 handle.end()
                 self._handles.remove(handle)
-        for node, places in room.items():
+        for node, count in room.items():
             there = sum(handle.node == node for handle in self._handles) + self._given_up[node]
-            self._handles += places[there:]
+            host, memory = machines[node]["NodeManagerHostname"], share_of_memory(machines[node], self._memory)
+            self._handles += [WorkerHandle(node, host, memory) for _ in range(count - there)]
+            if node not in self._short and (why := shortage(machines[node], self._kind, self._most, self._memory)):
+                self._short.add(node)
+                self._board.say(why)
         del self._handles[self._most :]
 
     def start_workers(self) -> None:
@@ -335,19 +352,6 @@ class Crew:
             self._notice_at = float("inf")
 
 
-class Meters:
-    """A job's progress, as Prometheus gets it from Ray."""
-
-    def __init__(self, split: Path) -> None:
-        self._split = {"split": "/".join(split.parts[-2:])}
-        about = {"levels": "levels committed", "solved": "of them solved", "env_steps": "env steps of this run"}
-        self._gauges = {name: Gauge(f"levelproof_{name}", what, ("split",)) for name, what in about.items()}
-
-    def show(self, tally: Tally) -> None:
-        for name, value in {"levels": tally.done, "solved": tally.solved, "env_steps": tally.steps}.items():
-            self._gauges[name].set(value, self._split)
-
-
 @contextmanager
 def connected() -> Iterator[None]:
     """The cluster of RAY_ADDRESS, or one on this machine that lives as long as this block and this process.
@@ -367,37 +371,29 @@ def connected() -> Iterator[None]:
             ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
         except ConnectionError as error:
             raise no_cluster(str(error).strip().splitlines()[0]) from error
+        except OSError as error:
+            raise Failure(f"Ray cannot start ({error}): mend that, or have RAY_TMPDIR name another folder.") from error
         try:
             yield
         finally:
             ray.shutdown()
 
 
-def _on_gpus() -> bool:
-    """Whether each worker gets a GPU: where there are some, and JAX can use them."""
+def _why_no_gpu() -> str:
+    """Why workers cannot have GPUs; empty: the cluster has one that is free, and JAX can use it."""
     if not ray.cluster_resources().get("GPU"):
-        return False
-    return ray.get(ray.remote(num_gpus=1, max_calls=1)(_jax_sees_a_gpu).remote())
-
-
-def _room(gpus: bool, most: int, refused: Collection[str]) -> dict[str, list[WorkerHandle]]:
-    """A place for each worker that there is room for now, at most so many, by machine: one for each GPU or core."""
-    nodes = {name: node for name, node in _machines().items() if name not in refused}
-    count = {name: int(node["Resources"].get("GPU" if gpus else "CPU", 0)) for name, node in nodes.items()}
-    turns = sorted((turn, name) for name, number in count.items() for turn in range(number))  # one on each, then more
-    host = lambda name: nodes[name]["NodeManagerHostname"]
-    return {
-        name: [WorkerHandle(name, host(name)) for _ in range(number)]
-        for name, number in Counter(name for _, name in turns[:most]).items()
-    }
+        return "the cluster has none"
+    group = placement_group([{"GPU": 1}])
+    try:
+        if not group.wait(GPU_PATIENCE):
+            return f"after {duration(GPU_PATIENCE)} of waiting, others still hold all of them"
+        there = PlacementGroupSchedulingStrategy(group)
+        probe = ray.remote(num_cpus=0, num_gpus=1, max_calls=1, scheduling_strategy=there)(jax_sees_a_gpu)
+        return "" if ray.get(probe.remote()) else NO_GPU
+    finally:
+        remove_placement_group(group)
 
 
 def _machines() -> dict[str, dict[str, Any]]:
     """The machines that the cluster has now, by Ray's ids."""
     return {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}
-
-
-def _jax_sees_a_gpu() -> bool:
-    import jax
-
-    return jax.default_backend() == "gpu"

@@ -6,7 +6,7 @@ from pathlib import Path
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.jobs.progress import STOPPING, Board
 from levelproof.pipeline.jobs.schedule import ROUND, Scheduler, Settle
-from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, prepare_jax
 from levelproof.pipeline.stopping import Stop
 
 HERE = "this process"
@@ -14,7 +14,9 @@ HERE = "this process"
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
     """Work until nothing is left to do; `stop` is heeded."""
-    prepare_jax()
+    prepare_jax(device=job.device)
+    if job.device == "gpu" and not jax_sees_a_gpu():
+        board.say(f"This process uses a CPU core, not a GPU: {NO_GPU}.")
     from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
 
     with stop.heeded():

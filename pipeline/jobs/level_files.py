@@ -27,7 +27,7 @@ def generate_from_files(job: JobConfig, command: Sequence[str], console: Console
     """
     folder = Path(job.level_files).expanduser()
     if job.executor == "inline":
-        prepare_jax()
+        prepare_jax(device=job.device)
         listing = levels_below(folder, job)
     else:
         listing = _listed_elsewhere(folder, job)
@@ -46,13 +46,5 @@ def generate_from_files(job: JobConfig, command: Sequence[str], console: Console
 
 def _listed_elsewhere(folder: Path, job: JobConfig) -> Listing:
     """`levels_below`, read by a process of its own: Ray forks this one, which must not have started JAX by then."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _stay_off_gpus) as process:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), prepare_jax, (None, "cpu")) as process:
         return process.submit(levels_below, folder, job).result()
-
-
-def _stay_off_gpus() -> None:
-    """GPUs are for workers."""
-    import jax
-
-    prepare_jax()
-    jax.config.update("jax_platforms", "cpu")

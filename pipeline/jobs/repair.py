@@ -26,7 +26,7 @@ from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.store.runs import merged, runs, told_levels
 from levelproof.pipeline.store.split import locked, taken
 
-SETTINGS = ("executor", "workers", "unit")  # of `generate`, that a repair may have
+SETTINGS = ("executor", "workers", "unit", "device")  # of `generate`, that a repair may have
 
 
 @stoppable()

@@ -108,6 +108,7 @@ def test_the_hash_follows_results_and_nothing_else() -> None:
         "unit=2",
         "executor=inline",
         "workers=1",
+        "device=gpu",
         "budget=128000",
         "log=wandb",
     ):

@@ -69,6 +69,12 @@ def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a folder in which even root can make nothing")
+def test_a_folder_of_ray_s_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_TMPDIR", "/proc/sys/ray")
+    assert_refused(run(SETTINGS, tmp_path), 1, "Ray cannot start", "/proc/sys/ray", "RAY_TMPDIR")
+
+
 @pytest.mark.parametrize("address", ["127.0.0.1:99999", "a..b:6379"])
 def test_an_address_that_cannot_be_one_is_named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", address)

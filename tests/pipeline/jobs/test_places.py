@@ -1,0 +1,85 @@
+"""How many workers a machine gets, and of what: as its cores, GPUs and memory allow. Some on real Ray."""
+
+import os
+import subprocess
+import sys
+
+from levelproof.levelgen.level import size_of
+from levelproof.pipeline.jobs.places import GB, Machine, bytes_of_worker, places, share_of_memory, shortage
+from tests.pipeline.command import PATIENCE, ROOT
+
+NEED = 2 * GB
+
+# A machine with a GPU that an actor holds, and memory for one worker on its two cores
+HELD = """
+import ray
+from levelproof.configs.compose import compose_job
+from pathlib import Path
+from rich.console import Console
+from levelproof.pipeline.jobs import cluster
+from levelproof.pipeline.jobs.progress import Board, Tally
+from levelproof.pipeline.jobs.schedule import Scheduler
+from levelproof.pipeline.runtime import NO_GPU
+
+ray.init(address="local", include_dashboard=False, num_cpus=2, num_gpus=1, _memory=2 * 10**9, log_to_driver=False)
+Holder = ray.remote(num_cpus=0, num_gpus=1)(type("Holder", (), {"there": lambda self: True}))
+holder = Holder.remote()
+ray.get(holder.there.remote())
+said = []
+board = Board(Tally(8, 0, 0), Console())
+board.say = said.append
+cluster.GPU_PATIENCE = 1.0
+crew = cluster.Crew(compose_job(["device=gpu", "unit=1"]), Path("data"), Scheduler([], 8), board)
+assert not crew._gpus and crew._job.device == "cpu", said
+crew.follow_cluster()
+assert len(crew._handles) == 1, crew._handles
+gpu, memory = said
+assert gpu == "Workers use CPU cores, not GPUs: after 1 s of waiting, others still hold all of them.", gpu
+assert memory.endswith("has 2.0 GB of memory free, and a worker of this size needs 1.5 GB: it gets 1 of 2 workers.")
+cluster.GPU_PATIENCE = 600.0
+ray.kill(holder)
+assert cluster._why_no_gpu() == NO_GPU  # it is free, and none that JAX can use
+ray.get(Holder.remote().there.remote(), timeout=600.0)  # nor does the probe keep it
+"""
+
+
+def machine(cores: int, memory: float | None = None, gpus: int = 0) -> Machine:
+    resources = {"CPU": cores, "GPU": gpus} | ({} if memory is None else {"memory": memory})
+    return {"NodeManagerHostname": "a", "Resources": resources}
+
+
+def test_workers_are_as_many_as_there_are_cores_and_memory_for() -> None:
+    machines = {"a": machine(8, 8.5 * GB), "b": machine(2, 100 * GB), "c": machine(4)}
+    assert places(machines, "CPU", 100, NEED) == {"a": 4, "b": 2, "c": 4}
+    assert places(machines, "CPU", 4, NEED) == {"a": 2, "b": 1, "c": 1}
+    assert places({"a": machine(8, 100 * GB, gpus=2)}, "GPU", 100, NEED) == {"a": 2}
+
+
+def test_a_machine_with_little_memory_gets_one_worker_which_reserves_all_of_it() -> None:
+    small = machine(2, 1 * GB)
+    assert places({"a": small}, "CPU", 100, NEED) == {"a": 1}
+    assert share_of_memory(small, NEED) == 1 * GB
+    assert share_of_memory(machine(2, 9 * GB), NEED) == share_of_memory(machine(2), NEED) == NEED
+    assert places({"head": machine(0, 9 * GB)}, "CPU", 100, NEED) == {}
+
+
+def test_a_shortage_is_told_where_it_leaves_a_core_without_a_worker() -> None:
+    sentence = "a has 4.5 GB of memory free, and a worker of this size needs 2.0 GB: it gets 2 of 4 workers."
+    assert shortage(machine(4, 4.5 * GB), "CPU", 100, NEED) == sentence
+    assert shortage(machine(4, 4.5 * GB), "CPU", 2, NEED) == ""
+    assert shortage(machine(4, 8 * GB), "CPU", 100, NEED) == ""
+    assert shortage(machine(4), "CPU", 100, NEED) == ""
+
+
+def test_larger_sizes_need_more_memory() -> None:
+    needs = [bytes_of_worker(size_of(size)) for size in ("s", "m", "l", "20-28-8-4")]
+    assert needs == sorted(needs)
+    assert needs[0] < needs[-1]
+
+
+def test_a_gpu_that_others_hold_is_not_waited_for() -> None:
+    command = [sys.executable, "-c", HELD]
+    environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
+    environment |= {"PYTHONPATH": str(ROOT), "RAY_USAGE_STATS_ENABLED": "0"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert done.returncode == 0, done.stderr
