@@ -313,3 +313,25 @@ def test_a_full_disk_changes_nothing(split: Path, made: Path, monkeypatch: pytes
             with pytest.raises(OSError, match="No space left"):
                 seal(split, pieces(split))
         assert sorted(split.rglob("*")) == before
+
+
+class Stopped(Exception):
+    """The seal is asked to end."""
+
+
+def test_a_seal_that_is_stopped_while_it_opens_or_removes_files_loses_nothing(split: Path, made: Path) -> None:
+    fragment = fragment_path(split, unit_name(0, 2 * UNITS - 1))
+    for committed in (False, True):
+        asked = [0]
+
+        def moved(count: int, committed: bool = committed, asked: list[int] = asked) -> None:
+            asked[0] += not count  # before a file is opened or removed, no chunk has moved
+            if fragment.exists() if committed else asked[0] > UNITS:  # it has read all fragments by then
+                raise Stopped
+
+        with pytest.raises(Stopped):
+            seal(split, pieces(split), moved)
+        assert whole(split) == whole(made)
+        clean(split, print)
+        assert_tidy(split, 1 if committed else UNITS)
+    assert whole(split) == whole(made)
