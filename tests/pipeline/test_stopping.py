@@ -1,6 +1,7 @@
 """SIGTERM and Ctrl-C end a command in time, whatever it does then. Real signals."""
 
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -64,15 +65,18 @@ def test_the_second_signal_interrupts_what_heeds_the_first() -> None:
 
 
 @pytest.mark.slow
-def test_workers_keep_their_experts_although_their_round_is_long(tmp_path: Path) -> None:
-    """The driver ends the round: a worker hears of nothing else before its end."""
+def test_the_driver_ends_rounds_to_stop(tmp_path: Path) -> None:
+    """A worker hears of nothing else before the end of its round."""
     alone = ("scout.rounds=0", "search.env_steps=0", "stop.rule=budget")  # so that experts train long
-    command = ["generate", "levels=8", "unit=1", "budget=1M", "workers=1", "checkpoint=1h", *alone]
+    command = ["generate", "levels=8", "unit=1", "budget=100M", "workers=1", *alone]
     process = start(command, tmp_path, module="tests.pipeline.long_rounds")
-    split, at_work = tmp_path / "data/1M/s", "ray::WorkerActor.work"
+    split, at_work = tmp_path / "data/100M/s", "ray::WorkerActor.work"
     working = lambda: any(title(pid).startswith(at_work) for pid in descendants(process.pid))
     until(lambda: fragment_paths(split) and working(), process)
     process.terminate()
-    _, err = process.communicate(timeout=PATIENCE / 10)
+    try:
+        _, err = process.communicate(timeout=PATIENCE / 4)
+    finally:
+        process.kill()
     assert process.returncode == 130, err
-    assert list(split.glob("checkpoints/[0-9]*.npz")), err
+    assert re.search(r"Stopped: [1-8] of 8 levels committed", err), err

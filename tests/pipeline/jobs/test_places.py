@@ -80,6 +80,10 @@ def test_larger_sizes_need_more_memory() -> None:
 def test_a_gpu_that_others_hold_is_not_waited_for() -> None:
     command = [sys.executable, "-c", HELD]
     environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
-    environment |= {"PYTHONPATH": str(ROOT), "RAY_USAGE_STATS_ENABLED": "0"}
+    environment |= {
+        "PYTHONPATH": str(ROOT),
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_raylet_start_wait_time_s": str(PATIENCE),
+    }
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert done.returncode == 0, done.stderr
