@@ -13,7 +13,8 @@ import pytest
 from levelproof.experts.labels import Label
 from levelproof.pipeline.store.events import new_run, tell
 from levelproof.pipeline.store.locks import only_writer
-from tests.pipeline.command import PATIENCE, ROOT
+from tests.pace import patience
+from tests.pipeline.command import COMMAND_SECONDS, ROOT
 from tests.pipeline.made import made_split
 
 
@@ -37,7 +38,9 @@ def levelproof(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[s
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     command = [sys.executable, "-m", "levelproof", *arguments]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | streams
-    return subprocess.run(command, env=environment, text=True, timeout=PATIENCE, check=False, **streams)
+    return subprocess.run(
+        command, env=environment, text=True, timeout=patience(COMMAND_SECONDS), check=False, **streams
+    )
 
 
 def test_verify_fails_on_a_damaged_split_although_its_reader_left(split: Path, unread: int) -> None:

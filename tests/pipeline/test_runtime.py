@@ -146,7 +146,8 @@ def test_settings_of_the_user_that_change_results_are_overruled(tmp_path: Path) 
 @pytest.mark.parametrize("device", ["'cpu'", "None", "'gpu'"])
 def test_jax_leaves_gpus_alone_unless_they_are_asked_for(tmp_path: Path, device: str) -> None:
     program = (
-        f"from levelproof.pipeline.runtime import prepare_jax; prepare_jax(); prepare_jax(device={device}); import jax; "
+        "from levelproof.pipeline.runtime import prepare_jax; import jax; "
+        f"prepare_jax(); prepare_jax(device={device}); "
         "print(jax.config.jax_platforms); jax.config.jax_platforms and print(jax.default_backend())"
     )
     unset = python(program, tmp_path, JAX_PLATFORMS="").split()

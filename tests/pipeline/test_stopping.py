@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from levelproof.pipeline.stopping import GRACE, stoppable
-from tests.pipeline.command import PATIENCE, descendants, start, title, until
+from tests.pace import patience
+from tests.pipeline.command import COMMAND_SECONDS, descendants, start, title, until
 from tests.pipeline.slow_seal import HUNG
 
 BOTH = (signal.SIGTERM, signal.SIGINT)
@@ -25,7 +26,7 @@ def test_sigterm_ends_a_job_while_its_seal_hangs(tmp_path: Path, beside: str) ->
     assert process.stdout.readline() == f"{HUNG}\n", process.communicate()
     process.terminate()
     try:
-        _, err = process.communicate(timeout=PATIENCE / 10)
+        _, err = process.communicate(timeout=patience(COMMAND_SECONDS / 10))
     finally:
         process.kill()
     assert process.returncode == 130, err
@@ -38,7 +39,7 @@ def test_a_signal_interrupts_what_does_not_heed_it(number: signal.Signals) -> No
         asked(number)
     assert stop.asked.is_set()
     assert [signal.getsignal(each) for each in BOTH] == before
-    stop.clock.join(PATIENCE)
+    stop.clock.join(patience(COMMAND_SECONDS))
     assert not stop.clock.is_alive(), "it would end this process"
 
 
@@ -73,7 +74,7 @@ def test_the_driver_ends_rounds_to_stop(tmp_path: Path) -> None:
     until(lambda: any(title(pid).startswith(at_work) for pid in descendants(process.pid)), process)
     process.terminate()
     try:
-        _, err = process.communicate(timeout=PATIENCE / 4)
+        _, err = process.communicate(timeout=patience(COMMAND_SECONDS / 4))
     finally:
         process.kill()
     assert process.returncode == 130, err

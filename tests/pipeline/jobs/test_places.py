@@ -6,7 +6,8 @@ import sys
 
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.jobs.places import GB, Machine, bytes_of_worker, places, share_of_memory, shortage
-from tests.pipeline.command import PATIENCE, ROOT
+from tests.pace import patience
+from tests.pipeline.command import COMMAND_SECONDS, ROOT
 
 NEED = 2 * GB
 
@@ -83,7 +84,9 @@ def test_a_gpu_that_others_hold_is_not_waited_for() -> None:
     environment |= {
         "PYTHONPATH": str(ROOT),
         "RAY_USAGE_STATS_ENABLED": "0",
-        "RAY_raylet_start_wait_time_s": str(PATIENCE),
+        "RAY_raylet_start_wait_time_s": str(int(patience(COMMAND_SECONDS))),
     }
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=patience(COMMAND_SECONDS), check=False
+    )
     assert done.returncode == 0, done.stderr
