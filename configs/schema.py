@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from levelproof.configs.convert import plain
+from levelproof.configs.convert import flat, plain
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count, parse_duration
 from levelproof.experts.config import ExpertConfig, ScoutConfig, StopConfig, check_budget
@@ -28,7 +28,7 @@ MOST_BODIES = 48  # the most that was tried; compiling takes minutes from there
 # Levels of an untimed work unit by the number of bodies: about as long to train, multiples of the experts side by side
 UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MOST_BODIES, 4))
 
-# Where, how many and by whom: these change neither a level nor its expert, so one split may mix them.
+# Where, how many, by whom and on what machine: these change neither a level nor its expert, so one split may mix them.
 WITHOUT_EFFECT = frozenset(
     {
         "levels",
@@ -45,8 +45,11 @@ WITHOUT_EFFECT = frozenset(
         "density",
         "key_every",
         "log",
+        "expert.slots",
+        "search.rounds",
     }
 )
+RENAMED: Mapping[str, str] = {}  # names of settings in earlier versions, with a dot: those of today
 # In the results of levels that no id makes, where those of random levels have their distribution
 FROM_FILES, FROM_RECORDS = "files", "import"
 OF_RECORDS = ("size", "budget", "task", "sampler_version")  # what decides results where nobody searches or trains
@@ -143,7 +146,7 @@ class JobConfig:
     @property
     def results(self) -> dict[str, Any]:
         """Everything that decides a level's results, as JSON's types."""
-        kept = {f.name: plain(getattr(self, f.name)) for f in fields(self) if f.name not in WITHOUT_EFFECT}
+        kept = decisive({f.name: plain(getattr(self, f.name)) for f in fields(self)})
         if self.level_files:
             kept["distribution"] = FROM_FILES
         return kept | {"budget": self.env_steps, "sampler_version": SAMPLER_VERSION}
@@ -172,6 +175,32 @@ class ImportConfig(JobConfig):
 def from_files(results: Mapping[str, Any]) -> bool:
     """Whether a job with these `JobConfig.results` labels levels that no id makes: level files, or imported ones."""
     return results.get("distribution") in (FROM_FILES, FROM_RECORDS)
+
+
+def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) -> dict[str, Any]:
+    """Keep the settings that decide results, under today's names, whichever version wrote them down.
+
+    Splits record the `JobConfig.results` of the version that made them. Readers compare what this returns of them, so
+    a setting that loses its effect or takes another name leaves a split the same.
+
+    Args:
+        settings: nested, as JSON has them.
+        renamed: today's names by earlier ones, all with dots.
+
+    Raises:
+        ValueError: a setting lies below a value.
+    """
+    kept: dict[str, Any] = {}
+    for name, value in flat(settings).items():
+        if (now := renamed.get(name, name)) not in WITHOUT_EFFECT:
+            *groups, last = now.split(".")
+            group = kept
+            for part in groups:
+                group = group.setdefault(part, {})
+                if not isinstance(group, dict):
+                    raise ValueError(f"{now} lies below a value")
+            group[last] = value
+    return kept
 
 
 def hash_of(results: dict[str, Any]) -> str:

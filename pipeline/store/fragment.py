@@ -9,8 +9,9 @@ from typing import Any, get_args
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
-from levelproof.configs.schema import KEYS_EVERY, Density, hash_of, stored_as
+from levelproof.configs.schema import KEYS_EVERY, Density, decisive, hash_of, stored_as
 from levelproof.experts.labels import Label, Source
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.level import size_of
@@ -32,8 +33,8 @@ class Fragment:
     """What one fragment says, without its rows."""
 
     path: Path
-    config_hash: str
-    config: dict[str, Any]  # the settings that decide results
+    config_hash: str  # of `config`
+    config: dict[str, Any]  # the settings that decide results, under today's names
     digests: dict[str, dict[str, str]]  # of the files of each shard and checkpoint that its rows name
     rows: int
     sealed: bool
@@ -62,16 +63,15 @@ def read_fragment(
                     f"The fragment {path} has manifest version {version[:9]}, this program reads {MANIFEST_VERSION}: "
                     "use the levelproof that wrote it."
                 )
-            config, true_hash = _config_in(metadata[CONFIG_KEY])
-            if true_hash != metadata[HASH_KEY].decode():
-                raise ValueError("its footer has another configuration than was written")
+            written = metadata[HASH_KEY].decode()
+            config, config_hash = _config_in(metadata[CONFIG_KEY], written)
             digests, densities = _digests_in(metadata), _densities_in(metadata)
-            fragment = Fragment(path, true_hash, config, digests, file.rows, SEALED_KEY in metadata, densities)
+            fragment = Fragment(path, config_hash, config, digests, file.rows, SEALED_KEY in metadata, densities)
             wanted = COLUMNS.names if columns is None else columns
             found = file.read(
                 [name for name in wanted if name in VERSIONS[version]], VERSIONS[version], level_ids, compact
             )
-            table = completed(found, wanted)
+            table = _with_hash(completed(found, wanted), written, config_hash)
             if "level_id" in table.column_names:
                 _require_own_levels(table.column("level_id").to_numpy(), path)
             _require_known(table)
@@ -118,9 +118,25 @@ def _digests_in(metadata: Mapping[bytes, bytes]) -> dict[str, dict[str, str]]:
 
 
 @lru_cache(maxsize=8)
-def _config_in(text: bytes) -> tuple[dict[str, Any], str]:
-    """A configuration and its hash: nearly always those of the fragment before."""
+def _config_in(text: bytes, written: str) -> tuple[dict[str, Any], str]:
+    """A configuration as this version has it, and its hash: nearly always those of the fragment before.
+
+    `written` is the hash beside it, by the version that wrote both.
+    """
     config = json.loads(text)
     if not isinstance(config, dict) or text.count(b"[") + text.count(b"{") > MOST_BRACKETS:
         raise ValueError("its settings are none")
+    if hash_of(config) != written:
+        raise ValueError("its footer has another configuration than was written")
+    config = decisive(config)
     return config, hash_of(config)
+
+
+def _with_hash(table: pa.Table, written: str, config_hash: str) -> pa.Table:
+    """Rows that name their configuration as this version does."""
+    if written == config_hash or "config_hash" not in table.column_names:
+        return table
+    at = table.schema.get_field_index("config_hash")
+    column = table.column(at).cast(pa.string())
+    renewed = pc.if_else(pc.equal(column, written), config_hash, column)  # pyright: ignore[reportAttributeAccessIssue]
+    return table.set_column(at, table.schema.field(at), renewed.cast(table.schema.field(at).type))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from levelproof.configs.schema import JobConfig, hash_of
+from levelproof.configs.schema import JobConfig, decisive, hash_of
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.objects import get
@@ -30,7 +30,7 @@ class JobNote:
 
     command: str  # the last one
     level_ids: np.ndarray  # (run, 2): first and last of each run of ids, ascending
-    config: dict[str, Any] | None  # the settings that decide results, as in every fragment
+    config: dict[str, Any] | None  # the settings that decide results, under today's names
     intact: bool  # every byte is as it was written
 
 
@@ -72,11 +72,12 @@ def read_note(split: Path) -> JobNote:
         if not isinstance(command, str) or (runs[:, 0] > runs[:, 1]).any():
             raise ValueError
         known = isinstance(config, dict) and hash_of(config) == note["config_hash"]
+        config = decisive(config) if known else None
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise NoteError(type(error).__name__) from None
     said = {name: value for name, value in note.items() if name != DIGEST}
     command = "".join(c if c.isprintable() else "?" for c in command)  # no terminal obeys it
-    return JobNote(command, runs, config if known else None, text == _text(said))
+    return JobNote(command, runs, config, text == _text(said))
 
 
 def _bytes(path: Path) -> bytes:

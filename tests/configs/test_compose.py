@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from levelproof.configs.compose import FOLDERS, again, chosen, compose_job, distributions, identified, presets
+from levelproof.configs.convert import flat, plain
 from levelproof.configs.errors import ConfigError
-from levelproof.configs.schema import WITHOUT_EFFECT
+from levelproof.configs.meanings import every_setting
+from levelproof.configs.schema import WITHOUT_EFFECT, decisive
 from levelproof.experts.config import ExpertConfig
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.task.rules import TaskParams
@@ -111,6 +113,8 @@ def test_the_hash_follows_results_and_nothing_else() -> None:
         "device=gpu",
         "budget=128000",
         "log=wandb",
+        "expert.slots=3",
+        "search.rounds=5",
     ):
         assert compose_job([same]).hash == job.hash, same
     for other in (
@@ -126,9 +130,25 @@ def test_the_hash_follows_results_and_nothing_else() -> None:
 
 def test_every_setting_that_decides_results_is_hashed() -> None:
     job = compose_job([])
-    names = {field.name for field in dataclasses.fields(job)}
-    assert names - set(job.results) == WITHOUT_EFFECT
-    assert "stop" in job.results
+    names = set(flat(plain(job)))
+    assert names - set(flat(job.results)) == WITHOUT_EFFECT
+    assert "stop.rule" in names - WITHOUT_EFFECT
+
+
+def test_settings_of_the_machine_are_not_hashed() -> None:
+    """`test_the_number_of_slots_changes_no_result` and `test_rounds_between_syncs_change_no_result` hold these two."""
+    machine = {setting.name for setting in every_setting() if setting.group.endswith(": machine")}
+    assert machine == {name for name in WITHOUT_EFFECT if "." in name} == {"expert.slots", "search.rounds"}
+
+
+def test_settings_of_an_earlier_version_take_the_names_of_today() -> None:
+    old = {"size": "s", "budget": 128_000, "expert": {"slots": 4, "units": 64}, "scout": {"tries": 3}}
+    renamed = {"expert.units": "expert.width", "scout.tries": "search.tries", "rooms": "expert.slots"}
+    now = decisive(old | {"rooms": 2}, renamed)
+    assert now == {"size": "s", "budget": 128_000, "expert": {"width": 64}, "search": {"tries": 3}}
+    assert decisive(now) == now
+    with pytest.raises(ValueError, match="below a value"):
+        decisive({"a": 1, "a.b": 2})
 
 
 @pytest.mark.parametrize(

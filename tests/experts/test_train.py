@@ -1,5 +1,7 @@
 """Experts on real levels: verdicts, witnesses, and independence of neighbours."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,6 +70,12 @@ def test_a_result_depends_on_the_level_alone(levels: Level, result: UnitResult) 
     for i, verdict in zip(at, some.verdicts, strict=True):
         np.testing.assert_equal(vars(verdict), vars(result.verdicts[i]))
     same(some.record, jax.tree.map(lambda x: x[..., at], result.record))
+
+
+def test_the_number_of_slots_changes_no_result(levels: Level, result: UnitResult) -> None:
+    other = label(levels, IDS, BUDGET, untouched(WHOLE, replace(CONFIG, slots=3)))
+    np.testing.assert_equal([vars(verdict) for verdict in other.verdicts], [vars(one) for one in result.verdicts])
+    same(other.record, result.record)
 
 
 def test_progress_is_reported(reports: list[tuple[int, float, int]], result: UnitResult) -> None:

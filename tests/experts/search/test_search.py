@@ -190,6 +190,10 @@ def test_when_a_search_ends_is_no_part_of_its_programs() -> None:
     assert programs() == before
 
 
+def test_rounds_between_syncs_change_no_result() -> None:
+    same(search(levels(), IDS, replace(CONFIG, rounds=3), DEFAULT_RULES), found())
+
+
 def test_a_level_that_comes_no_nearer_leaves() -> None:
     config = replace(CONFIG, patience=65_536, per_cell=0)
     now = begun()

@@ -1,11 +1,14 @@
 """What the last command wanted: read again as it was written, and no byte of it changes unseen."""
 
+import json
 import os
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from levelproof.configs.convert import plain
+from levelproof.configs.schema import hash_of
 from levelproof.pipeline.store.job_note import NoteError, note_density, note_job, read_note
 from levelproof.pipeline.store.layout import JOB
 from tests.pipeline.made import made_job
@@ -83,3 +86,13 @@ def test_what_may_never_end(split: Path) -> None:
 def test_a_terminal_does_not_obey_it(split: Path) -> None:
     note_job(split, made_job(), ["\x1b[2J"], [])
     assert read_note(split).command == "'?[2J'"
+
+
+def test_the_settings_of_an_earlier_version_take_their_form_of_today(tmp_path: Path) -> None:
+    job = made_job()
+    before = job.results | {"expert": plain(job.expert) | {"slots": 8}}
+    note = {"command": "levelproof generate", "level_ids": [[0, 7]], "config_hash": hash_of(before), "config": before}
+    (tmp_path / JOB).write_text(json.dumps(note))
+    assert read_note(tmp_path).config == job.results
+    (tmp_path / JOB).write_text(json.dumps(note | {"config_hash": job.hash}))
+    assert read_note(tmp_path).config is None

@@ -4,13 +4,21 @@ from pathlib import Path
 
 import pytest
 
-from levelproof.configs.schema import JobConfig
+from levelproof.configs.convert import plain
+from levelproof.configs.schema import JobConfig, hash_of
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
-from levelproof.pipeline.store.layout import FOLDERS
+from levelproof.pipeline.store.layout import FOLDERS, new_attempt
 from levelproof.pipeline.store.locks import is_written
+from levelproof.pipeline.store.manifest import (
+    begin_fragment,
+    fragment_paths,
+    read_fragment,
+    read_manifest,
+    write_fragment,
+)
 from levelproof.pipeline.store.split import writing
 from tests.pipeline.made import made_job, made_result
 
@@ -59,6 +67,29 @@ def test_more_levels_are_no_other_configuration(tmp_path: Path, job: JobConfig) 
         committed(job, split)
     with writing(made_job(str(tmp_path / "data"), "levels=128", "unit=7", "workers=1"), print) as (_, manifest):
         assert len(manifest.level_ids) == 2
+
+
+def test_a_split_with_the_hash_of_an_earlier_version_goes_on(tmp_path: Path, job: JobConfig) -> None:
+    """Hashes covered how many experts train side by side, and how often the host looks at a search."""
+    before = job.results | {"expert": plain(job.expert) | {"slots": 8}, "search": plain(job.search)}
+    assert hash_of(before) != job.hash
+    with writing(job, print) as (split, _):
+        committed(job, split)
+    (path,) = fragment_paths(split)
+    rows = [row | {"config_hash": hash_of(before)} for row in read_fragment(path)[1].to_pylist()]
+    attempt = new_attempt(split, path.stem)
+    begin_fragment(attempt)
+    write_fragment(attempt, rows, hash_of(before), before)
+    other = made_job(job.out, "expert.width=64")
+    with pytest.raises(UserError, match=r"\(expert.width was 32, now 64\)"), writing(other, print):
+        pass
+    with writing(made_job(job.out, "expert.slots=3"), print) as (_, manifest):
+        assert manifest.config == job.results
+        commit(job, split, WorkUnit((2, 3)), made_result([2, 3], [Label.UNSOLVED, Label.UNSOLVED]))
+    for compact in (False, True):
+        manifest = read_manifest(split, compact=compact)
+        assert manifest.level_ids.tolist() == [0, 1, 2, 3]
+        assert set(manifest.table.column("config_hash").to_pylist()) == {job.hash} == {manifest.config_hash}
 
 
 @pytest.mark.parametrize("place", ["data", "data/128k", "data/128k/s"])
