@@ -134,7 +134,7 @@ class _Now(NamedTuple):
     done: Bool[Array, "time environment"]
     goal: Bool[Array, "time environment"]
     timestep: Int[Array, "time environment"]
-    rehearsing: Bool[Array, " environment"]
+    own: Bool[Array, " environment"]  # as `Manner.own`
 
 
 def _split(
@@ -164,7 +164,7 @@ def _split(
         by_slot(seen.done),
         by_slot(seen.goal),
         by_slot(seen.timestep),
-        manner.rehearsing.reshape(-1, config.environments),
+        manner.own.reshape(-1, config.environments),
     )
 
 
@@ -187,7 +187,7 @@ def _learn(
 ) -> tuple[Slot, Float[Array, ""]]:
     """One update, and whether an evaluation comes next."""
     training = slot.training
-    totals, share = progress.follow(training.progress, now.reward, now.done, now.goal, ~now.rehearsing)
+    totals, share = progress.follow(training.progress, now.reward, now.done, now.goal, now.own)
     recent = jnp.concatenate([training.recent, now.action])
     success = remember(training.success, find(recent, now.goal, now.timestep))
     shuffling = jax.random.fold_in(now.key, config.horizon)  # the rollout used 0 .. horizon - 1

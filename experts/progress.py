@@ -37,7 +37,7 @@ def follow(
 
     Returns:
         The totals, and the share of its finished episodes that reached the goal, of the environments in which the
-        expert chose its own actions (NaN: none finished).
+        expert alone chose the actions (NaN: none finished).
     """
     steps, environments = reward.shape
 

@@ -34,6 +34,11 @@ class Manner(NamedTuple):
     rehearsing: Bool[Array, " lane"]  # what `rehearsal` has for the episode's env step
     rehearsal: Int[Array, "256 6 level"]
 
+    @property
+    def own(self) -> Bool[Array, " lane"]:
+        """Lanes in which the expert alone chooses every action."""
+        return ~self.rehearsing & (self.stickiness == 0)
+
 
 class Trajectory(NamedTuple):
     """What happened, time first."""

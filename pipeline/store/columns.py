@@ -119,7 +119,11 @@ DESCRIBED = (
         f"{NO_WITNESS}, or `expert.replays=0`",
     ),
     ManifestColumn(
-        "steps_to_first_success", pa.int64(), "Training steps until the first success", "env steps", "never"
+        "steps_to_first_success",
+        pa.int64(),
+        "Training steps until the expert's first success of its own, so in no environment that repeats actions",
+        "env steps",
+        "never",
     ),
     ManifestColumn("env_steps", pa.int64(), "Training steps that were used, at most the budget", "env steps"),
     ManifestColumn("evaluation_steps", pa.int64(), "Spent on the expert's evaluations", "env steps"),
@@ -134,7 +138,8 @@ DESCRIBED = (
     ManifestColumn(
         "learning_curve",
         pa.list_(pa.float32()),
-        "Success rate of training for each update; an entry is null where no episode ended",
+        "Success rate of training for each update, of environments in which the expert alone chooses actions; an entry "
+        "is null where no episode ended",
         "share",
     ),
     ManifestColumn(

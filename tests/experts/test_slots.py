@@ -15,6 +15,7 @@ from levelproof.experts.found import Looking
 from levelproof.experts.judge import Trained
 from levelproof.experts.labels import Label, Source
 from levelproof.experts.pool import Pool, Submission, capacity_of
+from levelproof.experts.progress import NEVER
 from levelproof.experts.queue import empty_queue, enter
 from levelproof.experts.search.search import Searching
 from levelproof.experts.slots import LevelQueue, Mode, empty_slots
@@ -182,6 +183,16 @@ def test_a_success_before_training_is_rehearsed_from_the_first_update(levels: Le
         assert np.array_equal(of.evaluations[-1].success.action, found.success.action[i]) or not found.success.length[i]
         if not found.success.length[i]:
             same(of.curve, whole[i].curve[:2])
+
+
+def test_a_success_of_a_lane_that_repeats_its_actions_is_not_the_experts_own() -> None:
+    """Such a lane mostly ignores what the expert draws, as a lane that rehearses does."""
+    ids = np.arange(100, 164)
+    trained, _ = train(jax.tree.map(np.asarray, sample_levels(ids, SIZES["s"])), ids, 1, CONFIG, WHOLE)
+    last = [(of.evaluations[-1], of.curve[0]) for of in trained]
+    forced = [share for shown, share in last if shown.success.length and shown.progress.first_success == NEVER]
+    assert forced, "in some of these levels no other lane reaches the goal"
+    assert all(np.isnan(share) or share == 0 for share in forced)
 
 
 def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level, whole: list[Trained]) -> None:
