@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.experts import ppo, progress, stop
 from levelproof.experts.config import ExpertConfig
+from levelproof.experts.labels import Cause
 from levelproof.experts.policy import ActorCritic, network_of
 from levelproof.experts.ppo import LevelConstants, Samples
 from levelproof.experts.rollout import Acting, Manner, Trajectory, rollout, start
@@ -107,7 +108,7 @@ def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
         choose = lambda new, old: jnp.where(takes.reshape(-1, *[1] * (old.ndim - 1)), new, old)
         put = lambda new, old: jax.tree.map(choose, new, old)
         due, final, deadline = jax.tree.map(lambda x: x[index], queue.pending)
-        final, trial = final | begun.training.course.over, slots.slot.trial
+        final, trial = final | (begun.training.course.over != Cause.NONE), slots.slot.trial
         slot = slots.slot._replace(
             mode=put(jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), slots.slot.mode),
             queue_index=put(index, slots.slot.queue_index),

@@ -5,10 +5,19 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Array, Bool, Int
 
 from levelproof.experts.config import RECORD_STEPS, Choice, ExpertConfig
-from levelproof.experts.labels import UNTRAINED, Label, Source, Verdict, solved_reason, unsolved_reason, untrained
+from levelproof.experts.labels import (
+    UNTRAINED,
+    Cause,
+    Label,
+    Source,
+    Verdict,
+    solved_reason,
+    unsolved_reason,
+    untrained,
+)
 from levelproof.experts.progress import NEVER, Progress
 from levelproof.experts.slots import Begun
 from levelproof.experts.success import Success
@@ -25,6 +34,7 @@ class Evaluation(NamedTuple):
     goal: Bool[np.ndarray, "256 environment"]
     progress: Progress  # of training until then
     success: Success  # the first: a scout's or a search's, else training's
+    over: int | Int[np.ndarray, ""] | Int[Array, ""]  # the Cause for which training stopped for good
 
 
 class Kept(NamedTuple):
@@ -57,21 +67,20 @@ def judge(
     trained: Sequence[Trained],
     chosen: Sequence[Witness | None],
     record: Record,
-    updates: int,
     config: ExpertConfig,
     failed_by_noop: Bool[np.ndarray, " level"],
 ) -> list[Verdict]:
     """Verdicts. A witness counts only if its record, by replay, shows what the evaluation showed.
 
-    `chosen` are the witnesses, not yet replayed; `updates` are those that the budget paid for.
+    `chosen` are the witnesses, not yet replayed.
     """
     replays, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
     verdicts = []
     for i, (of, choice) in enumerate(zip(trained, chosen, strict=True)):
         counts = choice is not None and replays[i] and steps[i] == choice.steps
         witness = choice if counts else None
-        episodes, halted = int(record.done[:, i].sum()), len(of.curve) < updates
-        verdicts.append(verdict_of(of, witness, episodes, halted, config, bool(failed_by_noop[i])))
+        episodes = int(record.done[:, i].sum())
+        verdicts.append(verdict_of(of, witness, episodes, config, bool(failed_by_noop[i])))
     return verdicts
 
 
@@ -129,11 +138,10 @@ def verdict_of(
     trained: Trained,
     witness: Witness | None,
     episodes: int,
-    halted: bool,
     config: ExpertConfig,
     failed_by_noop: bool,
 ) -> Verdict:
-    """A level's verdict: `episodes` are those of its record, `halted` tells that it left before its budget ended."""
+    """A level's verdict: `episodes` are those of its record."""
     if not trained.evaluations:
         if witness is None:
             return untrained(Label.UNSOLVED, UNTRAINED, failed_by_noop)
@@ -142,11 +150,11 @@ def verdict_of(
         return untrained(Label.SOLVED, reason, failed_by_noop, source, steps, portability)
     last = trained.evaluations[-1]
     attempts, sticky, moved = shares(last, config)
-    first, diverged = (int(x) for x in (last.progress.first_success, last.progress.diverged))
+    first, env_steps = (int(x) for x in (last.progress.first_success, last.progress.env_steps))
     if witness is not None:
         reason = solved_reason(witness.source, episodes)
     else:
-        reason = unsolved_reason(config.attempts, first != NEVER, halted, None if diverged == NEVER else diverged)
+        reason = unsolved_reason(config.attempts, first != NEVER, Cause(int(last.over)), env_steps)
     return Verdict(
         label=Label.UNSOLVED if witness is None else Label.SOLVED,
         label_reason=reason,
@@ -158,7 +166,7 @@ def verdict_of(
         moved_success_rate=moved,
         steps_to_goal=None if witness is None else witness.steps,
         steps_to_first_success=None if first == NEVER else first,
-        env_steps=int(last.progress.env_steps),
+        env_steps=env_steps,
         portability=None if witness is None else witness.portability,
         evaluation_steps=trained.evaluation_steps,
         learning_curve=trained.curve,

@@ -1,7 +1,7 @@
 """Labels, each with its reason and the evidence for it."""
 
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 from math import inf, nan
 
 from levelproof.levelgen.proofs import Proof
@@ -26,6 +26,15 @@ class Source(StrEnum):
     SEARCH = "search"  # exploration from archived states, before training, or around another witness
     NOTHING = "nothing"  # a trivial level's
     IMPORT = "import"  # of another program's data
+
+
+class Cause(IntEnum):
+    """Why an expert stopped training for good."""
+
+    NONE = 0  # it did not: more budget would continue it
+    RUNG = 1  # the best return had not grown; in experts kept by earlier versions, any cause
+    FRUITLESS = 2  # no success of its own after `stop.fruitless` env steps
+    DIVERGED = 3  # its parameters were no longer finite
 
 
 MADE_BY = {
@@ -75,12 +84,22 @@ def solved_reason(source: Source, episodes: int) -> str:
     return f"the witness, {how}, reaches the goal in all {episodes} of its finished episodes"
 
 
-def unsolved_reason(attempts: int, training_successes: bool, halted: bool, diverged: int | None) -> str:
-    """Why a level is unsolved: `diverged` are the env steps after which its expert was of no more use."""
-    before = "the goal was reached in training" if training_successes else "the goal was never reached in training"
-    why = ", and at a rung the best return had not grown" if halted else ""
-    if diverged is not None:
-        why = f", and its network's numbers {DIVERGED} after {diverged} env steps"
+def unsolved_reason(attempts: int, reached: bool, over: Cause, env_steps: int) -> str:
+    """Say why a level is unsolved.
+
+    Args:
+        attempts: of the last evaluation.
+        reached: whether the expert itself reached the goal in training.
+        over: why its training stopped, if that was for good.
+        env_steps: of its training.
+    """
+    before = "the expert reached the goal in training" if reached else "the expert never reached the goal in training"
+    why = {
+        Cause.NONE: "",
+        Cause.RUNG: ", and at a rung the best return had not grown",
+        Cause.FRUITLESS: f", so it left after {env_steps} env steps",
+        Cause.DIVERGED: f", and its network's numbers {DIVERGED} after {env_steps} env steps",
+    }[over]
     return f"{before}{why}; none of the {attempts} attempts of the last evaluation is a witness"
 
 

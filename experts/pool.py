@@ -328,11 +328,12 @@ def expert_of(slots: Slots, slot: int, config: ExpertConfig) -> Begun:
 
 def evaluation_of(slots: Slots, slot: int) -> Evaluation:
     """What the evaluation that has just ended in a slot showed."""
-    shown = slots.slot.trial, slots.slot.training.progress, slots.slot.training.success
-    trial, progress, success = jax.device_get(_row(shown, slot))
+    training = slots.slot.training
+    shown = slots.slot.trial, training.progress, training.success, training.course.over
+    trial, progress, success, over = jax.device_get(_row(shown, slot))
     record = slice(0, RECORD_STEPS)
     done, goal = trial.done[record], trial.goal[record]
-    return Evaluation(trial.action[record].astype(np.int32), done, goal, progress, success)
+    return Evaluation(trial.action[record].astype(np.int32), done, goal, progress, success, over)
 
 
 @jax.jit

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.experts.config import MOST_DOUBLINGS, RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from levelproof.experts.labels import Cause
 from levelproof.experts.progress import NEVER, Progress
 
 LAST = np.int32(2**31 - 1)  # update, that nobody reaches
@@ -51,11 +52,12 @@ class Course(NamedTuple):
     failed: Int[Array, ""]  # evaluations after which it trained on
     solved: Bool[Array, ""]  # by an evaluation
     rung_return: Float[Array, ""]  # the best return at the last rung
-    over: Bool[Array, ""]  # for good: more budget would change nothing
+    over: Int[Array, ""]  # the Cause for which training stopped for good: more budget would change nothing
 
 
 def begin() -> Course:
-    return Course(jnp.int32(0), jnp.int32(0), jnp.int32(0), jnp.bool_(False), jnp.float32(-jnp.inf), jnp.bool_(False))
+    zero = jnp.int32(0)
+    return Course(zero, zero, zero, jnp.bool_(False), jnp.float32(-jnp.inf), jnp.int8(Cause.NONE))
 
 
 def after_update(
@@ -86,10 +88,11 @@ def after_update(
     reached = progress.first_success != NEVER
     moves = usable | reached | (progress.best_return >= course.rung_return + rules.gain)
     fruitless = rules.halves & ~reached & (updates >= rules.fruitless)
-    over = (progress.diverged != NEVER) | (at_rung & ~moves) | fruitless
+    stopped = [progress.diverged != NEVER, at_rung & ~moves, fruitless]
+    over = jnp.select(stopped, [jnp.int8(x) for x in (Cause.DIVERGED, Cause.RUNG, Cause.FRUITLESS)], jnp.int8(0))
     rung_return = jnp.where(at_rung, progress.best_return, course.rung_return)
     course = course._replace(updates=updates, rung_return=rung_return, over=over)
-    return course, evaluate, over | (updates >= deadline)
+    return course, evaluate, (over != Cause.NONE) | (updates >= deadline)
 
 
 def after_evaluation(

@@ -176,7 +176,7 @@ class TrainingRun:
                 actions[..., i] = witness.action
         record = replay(levels, actions, rules)
         witnesses = [chosen[i] for i in left]
-        judged = judge(trained, witnesses, take(record, left), self.pool.updates, config, failed[left])
+        judged = judge(trained, witnesses, take(record, left), config, failed[left])
         verdicts = {
             i: with_looks(verdict, found, at, int(reworked[i]))
             for i, verdict, at in zip(left.tolist(), judged, asked.tolist(), strict=True)

@@ -22,7 +22,7 @@ from benchmarks.solved.measure import Progress, Trained, row_of
 from benchmarks.solved.results import Header
 from benchmarks.solved.variants import Variant
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig
-from levelproof.experts.labels import Label, Source, Verdict
+from levelproof.experts.labels import Cause, Label, Source, Verdict
 from levelproof.experts.steps import EnvSteps
 from levelproof.levelgen.level import Level
 from levelproof.pipeline.errors import LevelproofError
@@ -172,11 +172,13 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
         diverged=jnp.int32(progress.NEVER),
     )
     nothing = jax.tree.map(lambda x: x[0], no_success(1))
-    evaluation = judge.Evaluation(np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, nothing)
+    evaluation = judge.Evaluation(
+        np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, nothing, Cause.NONE
+    )
     witness = next(iter(judge.candidates_of([evaluation], Source.EXPLORATION, config)), None)
     of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))
     episodes = int(seen["done"][:, of_witness].sum())
-    return judge.verdict_of(judge.Trained([], [evaluation]), witness, episodes, False, config, failed_by_noop)
+    return judge.verdict_of(judge.Trained([], [evaluation]), witness, episodes, config, failed_by_noop)
 
 
 def first_success(goal: Bool[np.ndarray, "step environment"]) -> int:

@@ -97,9 +97,10 @@ def unstacked(arrays: Mapping[str, np.ndarray], path: str, like: T, count: int) 
     """So many trees such as `like`, out of their stacked arrays. Raises ValueError or KeyError if they are none."""
     leaves = []
     for name, one in arrays_of(like, path).items():
-        if (arrays[name].shape, arrays[name].dtype) != ((count, *one.shape), one.dtype):
+        known = arrays[name]
+        if known.shape != (count, *one.shape) or not np.can_cast(known.dtype, one.dtype):  # a cause was a bit once
             raise ValueError(f"{name} has another shape or type")
-        leaves.append(arrays[name])
+        leaves.append(known.astype(one.dtype, copy=False))
     return [jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves]) for i in range(count)]
 
 

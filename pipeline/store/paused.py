@@ -255,11 +255,12 @@ def _experts(arrays: dict[str, np.ndarray], job: JobConfig) -> Iterator[tuple[in
     """Raises ValueError or KeyError where arrays are none of such experts."""
     level_ids, of = arrays["level_id"], arrays.get("evaluated", np.zeros(0, int))
     begun = begun_like(job)
+    training = begun.training
     like = begun, Pending(np.bool_(0), np.bool_(0), np.int32(0)), np.int64(0), nothing_found(1)._replace(source=())
     environments, attempts = job.expert.environments, job.expert.attempts
     flags = np.zeros((RECORD_STEPS, environments), bool)
-    action = np.zeros((RECORD_STEPS, begun.training.recent.shape[1], attempts), np.int32)
-    shown = Evaluation(action, flags, flags, begun.training.progress, begun.training.success)
+    action = np.zeros((RECORD_STEPS, training.recent.shape[1], attempts), np.int32)
+    shown = Evaluation(action, flags, flags, training.progress, training.success, training.course.over)
     rows = unstacked(arrays, "paused/", like, len(level_ids))
     evaluations = unstacked(arrays, "evaluation/", shown, len(of)) if len(of) else []
     for i, (level_id, row) in enumerate(zip(level_ids.tolist(), rows, strict=True)):

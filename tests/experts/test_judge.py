@@ -15,7 +15,7 @@ from levelproof.experts.judge import (
     shares,
     successful_episodes,
 )
-from levelproof.experts.labels import Source
+from levelproof.experts.labels import Cause, Source
 from levelproof.experts.success import Success
 
 CONFIG = ExpertConfig(environments=8, rehearsals=2, attempts=3, sticky_attempts=2, moved_attempts=2)
@@ -29,7 +29,7 @@ def evaluation(*episodes: list[tuple[int, bool]], success: int = 0, config: Expe
             done[end, environment], goal[end, environment] = True, reached
     action = np.arange(RECORD_STEPS)[:, None, None] + 1000 * np.arange(config.attempts) + np.zeros((1, 6, 1), int)
     played = Success(np.full((RECORD_STEPS, 6), 7, np.int8), np.int32(success))
-    return Evaluation(action, done, goal, progress.start(config.environments), played)
+    return Evaluation(action, done, goal, progress.start(config.environments), played, np.int8(Cause.NONE))
 
 
 def best_of(evaluations: list[Evaluation], source: Source, config: ExpertConfig) -> Witness | None:

@@ -133,6 +133,20 @@ def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) ->
     assert all("at a rung the best return had not grown" in reasons[i] for i in never)
 
 
+def test_a_fruitless_expert_says_why_it_left(levels: Level, whole: list[Trained]) -> None:
+    never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
+    stopping = replace(HALVED, first_rung=UPDATES * 512, fruitless=5 * 512)
+    verdicts = label(levels, IDS, UPDATES * 512, untouched(stopping)).verdicts
+    assert never
+    for i in never:
+        assert verdicts[i].env_steps == 5 * 512
+        if verdicts[i].label is Label.UNSOLVED:
+            assert verdicts[i].label_reason.startswith(
+                "the expert never reached the goal in training, so it left after 2560 env steps; none of the 4 attempts"
+            )
+    assert Label.UNSOLVED in {verdicts[i].label for i in never}
+
+
 def test_a_success_of_training_is_a_witness_where_evaluation_has_none(levels: Level) -> None:
     """Which level that is depends on the machine's rounding, so several budgets are looked at."""
     found = set()

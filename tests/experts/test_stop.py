@@ -8,6 +8,7 @@ import pytest
 
 from levelproof.experts import progress, stop
 from levelproof.experts.config import ExpertConfig, Rule, StopConfig, check_budget
+from levelproof.experts.labels import Cause
 from levelproof.experts.stop import rules_of
 
 CONFIG = ExpertConfig(
@@ -50,7 +51,7 @@ def test_an_expert_that_diverged_leaves(stopping: StopConfig) -> None:
         jnp.int32(100),
         rules_of(stopping, CONFIG),
     )
-    assert (bool(final), bool(course.over)) == (True, True)
+    assert (bool(final), int(course.over)) == (True, Cause.DIVERGED)
 
 
 def test_a_level_that_its_last_update_brings_to_a_rung_is_over_with_any_budget() -> None:
@@ -58,7 +59,7 @@ def test_a_level_that_its_last_update_brings_to_a_rung_is_over_with_any_budget()
     course, _, final = stop.after_update(
         course, totals, jnp.bool_(False), jnp.float32(0.0), jnp.int32(8), rules_of(HALVING, CONFIG)
     )
-    assert (bool(final), bool(course.over)) == (True, True)
+    assert (bool(final), int(course.over)) == (True, Cause.RUNG)
 
 
 def test_at_a_rung_learning_has_to_move() -> None:
@@ -92,7 +93,7 @@ def test_an_expert_that_never_reaches_the_goal_leaves(
     course, _, final = stop.after_update(
         course, totals, given, jnp.float32(0.0), jnp.int32(100), rules_of(stopping, CONFIG)
     )
-    assert (bool(final), bool(course.over)) == (leaves, leaves)
+    assert (bool(final), int(course.over)) == (leaves, Cause.FRUITLESS if leaves else Cause.NONE)
 
 
 def test_rungs() -> None:

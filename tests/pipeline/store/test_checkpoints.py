@@ -10,11 +10,12 @@ import pytest
 
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.judge import Kept
-from levelproof.experts.labels import Label, Source
+from levelproof.experts.labels import Cause, Label, Source
 from levelproof.experts.slots import begin
 from levelproof.experts.success import no_success
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store import checkpoints, manifest
 from levelproof.pipeline.store.checkpoints import SourceUnseen, experts_for, load_experts, save_experts
 from levelproof.pipeline.store.manifest import read_fragment
@@ -45,6 +46,23 @@ def test_each_unit_s_experts_come_back_bit_for_bit(tmp_path: Path) -> None:
         back = load_experts(tmp_path / f"{i}.npz", job)[i].begun
         pairs = zip(jax.tree.leaves(kept[i].begun), jax.tree.leaves(back), strict=True)
         assert all(np.asarray(before).tobytes() == np.asarray(after).tobytes() for before, after in pairs)
+
+
+@pytest.mark.parametrize("over", [False, True])
+def test_experts_from_before_there_were_causes_come_back(tmp_path: Path, over: bool) -> None:
+    """Whether training stopped for good was a bit; larger types than today's are refused."""
+    job, kept = made_job("data", *SETTINGS), some_experts(made_job("data", *SETTINGS))[0]
+
+    def saved(value: np.generic) -> Path:
+        training = kept.begun.training
+        training = training._replace(course=training.course._replace(over=value))
+        save_experts(tmp_path / "0.npz", {0: kept._replace(begun=kept.begun._replace(training=training))})
+        return tmp_path / "0.npz"
+
+    back = load_experts(saved(np.bool_(over)), job)[0].begun.training.course.over
+    assert (back.dtype, back) == (np.int8, Cause.RUNG if over else Cause.NONE)
+    with pytest.raises(Failure, match="over has another shape or type"):
+        load_experts(saved(np.int32(over)), job)
 
 
 @pytest.mark.parametrize("source", [Source.SEARCH, Source.SAMPLED])

@@ -36,7 +36,7 @@ def kept() -> dict[int, Paused]:
     like = begun_like(JOB)
     action = np.zeros((RECORD_STEPS, like.training.recent.shape[1], JOB.expert.attempts), np.int32)
     flags = np.zeros((RECORD_STEPS, JOB.expert.environments), bool)
-    shown = Evaluation(action, flags, flags, like.training.progress, like.training.success)
+    shown = Evaluation(action, flags, flags, like.training.progress, like.training.success, like.training.course.over)
     filled = lambda tree: jax.tree.map(lambda x: rng.integers(0, 2, x.shape).astype(x.dtype), tree)
 
     def one(updates: int, evaluations: int) -> Paused:
