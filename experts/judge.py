@@ -18,6 +18,7 @@ from levelproof.experts.labels import (
     unsolved_reason,
     untrained,
 )
+from levelproof.experts.policy import Params
 from levelproof.experts.progress import NEVER, Progress
 from levelproof.experts.slots import Begun
 from levelproof.experts.success import Success
@@ -61,6 +62,7 @@ class Trained(NamedTuple):
     expert: Kept | None = None  # if it is kept
     candidates: Sequence[Witness] = ()  # for its witness, the shortest first; some have been replayed
     evaluation_steps: int = 0  # env steps
+    policy: Params | None = None  # of the expert that left; None: there was none
 
 
 def judge(

@@ -59,8 +59,8 @@ class Verdict:
     label_reason: str
     failed_by_noop: bool  # doing nothing lets green touch red
     witness: Source | None = None
+    success_rate: float = nan  # of sampled attempts after training, first episodes; NaN: no expert made any
     # of the last evaluation; NaN: there were no such attempts
-    success_rate: float = nan  # of sampled attempts, first episodes
     most_probable_succeeds: bool = False  # every episode of the attempt that takes the most probable actions
     sticky_success_rate: float = nan  # of attempts where an action is sometimes repeated, first episodes
     moved_success_rate: float = nan  # of attempts that start with slightly other velocities, first episodes

@@ -21,6 +21,7 @@ from levelproof.experts.found import Found, nothing_found, row_of
 from levelproof.experts.judge import Evaluation, Kept, Trained, Witness, candidates_of, shortest_first, witnesses_in
 from levelproof.experts.ledger import Lap, Ledger, Steps, lap
 from levelproof.experts.paused import Paused
+from levelproof.experts.policy import Params
 from levelproof.experts.portability import PORTABLE, choose
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.queue import GROUP, empty_queue, enter
@@ -65,6 +66,7 @@ class Submission:
         self.evaluations = [list(paused[i].evaluations) if i in paused else [] for i in range(count)]
         self.experts: list[Kept | None] = [None] * count
         self.candidates: list[list[Witness]] = [[] for _ in range(count)]
+        self.policies: list[Params | None] = [None] * count
         self.under_way = set(range(count))
         self.solved = 0
         self.trained_rollouts = self.idle_rollouts = 0
@@ -75,7 +77,7 @@ class Submission:
 
     def trained(self, config: ExpertConfig) -> list[Trained]:
         evaluated = (self.evaluated_rollouts * config.steps_per_update).tolist()
-        of = self.curves, self.evaluations, self.experts, self.candidates, evaluated
+        of = self.curves, self.evaluations, self.experts, self.candidates, evaluated, self.policies
         return [Trained(*level) for level in zip(*of, strict=True)]
 
 
@@ -276,6 +278,7 @@ class Pool:
                 continue
             if submission.keep:
                 submission.experts[i] = Kept(expert_of(self._slots, slot, self.config), submission.curves[i])
+            submission.policies[i] = jax.device_get(_row(self._slots.slot.training.train_state.params, slot))
             submission.solved += bool(submission.candidates[i])
             del self._at[int(seen.queue_index[slot])]
             submission.under_way.remove(i)

@@ -7,12 +7,13 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
+from levelproof.experts.afresh import attempt
 from levelproof.experts.before import decide
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig, Rule
 from levelproof.experts.found import Found, Looking, joined
 from levelproof.experts.judge import Kept, Trained, Witness, judge, repeating
 from levelproof.experts.labels import WITNESSED, Source, Verdict
-from levelproof.experts.ledger import Ledger, lap
+from levelproof.experts.ledger import Lap, Ledger, lap
 from levelproof.experts.paused import Paused
 from levelproof.experts.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Submission, Totals
 from levelproof.experts.portability import choose
@@ -144,8 +145,10 @@ class TrainingRun:
         """Choose witnesses and give verdicts, once the submission has finished; of all levels that are not left out."""
         submission = self.submission
         assert submission is not None
+        trained = submission.trained(self.pool.config) if len(submission.level_ids) else as_found(submission.found)
+        attempted = self._attempted(trained)
         with lap() as took:
-            result = self._judged(submission)
+            result = self._judged(submission, trained, attempted)
         looks = np.zeros(len(self.level_ids), np.int64)
         looks[self.left] = submission.found.scout_steps + submission.found.search_steps
         self.ledger.share("search", looks)
@@ -155,7 +158,24 @@ class TrainingRun:
         ledger.add("replay", took)
         return replace(result, ledger=ledger)
 
-    def _judged(self, submission: Submission) -> UnitResult:
+    def _attempted(self, trained: Sequence[Trained]) -> dict[int, tuple[float, int]]:
+        """Success rates of experts, and the env steps that these took, by index among `left`."""
+        policies = {
+            i: of.policy
+            for i, (level, of) in enumerate(zip(self.left, trained, strict=True))
+            if of.policy is not None and int(self.level_ids[level]) not in self._gone
+        }
+        with lap() as took:
+            at = self.left[list(policies)]
+            found = attempt(*self._some(at), list(policies.values()), self.pool.config, self.pool.rules)
+        self.ledger.add("evaluation", Lap(0.0, took.compiling))
+        for level in at:
+            self.ledger.put("evaluation", level, took.seconds / len(at))
+        return dict(zip(policies, zip(*(x.tolist() for x in found), strict=True), strict=True))
+
+    def _judged(
+        self, submission: Submission, trained: list[Trained], attempted: Mapping[int, tuple[float, int]]
+    ) -> UnitResult:
         config, rules = self.pool.config, self.pool.rules
         kept = np.flatnonzero(~np.isin(self.level_ids, list(self._gone)))
         levels, level_ids = self._some(kept)
@@ -163,7 +183,6 @@ class TrainingRun:
         found = submission.found
         asked = np.flatnonzero(np.isin(self.left, kept))  # of those that came to the submission
         left = np.searchsorted(kept, self.left[asked])
-        trained = submission.trained(config) if len(submission.level_ids) else as_found(found)
         trained = [trained[i] for i in asked]
         actions = np.zeros((RECORD_STEPS, ACTIONS, len(kept)), np.int32)  # doing nothing, if none are found
         candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
@@ -178,7 +197,7 @@ class TrainingRun:
         witnesses = [chosen[i] for i in left]
         judged = judge(trained, witnesses, take(record, left), config, failed[left])
         verdicts = {
-            i: with_looks(verdict, found, at, int(reworked[i]))
+            i: with_looks(with_attempts(verdict, attempted.get(at)), found, at, int(reworked[i]))
             for i, verdict, at in zip(left.tolist(), judged, asked.tolist(), strict=True)
         }
         shares = [None if witness is None else witness.portability for witness in chosen]
@@ -194,6 +213,14 @@ class TrainingRun:
 
     def _some(self, indices: Int[np.ndarray, " index"]) -> tuple[Level, Int[np.ndarray, " index"]]:
         return take(self.levels, indices), self.level_ids[indices]
+
+
+def with_attempts(verdict: Verdict, attempted: tuple[float, int] | None) -> Verdict:
+    """The verdict with what the expert's last attempts gave, and their env steps, if it made any."""
+    if attempted is None:
+        return verdict
+    rate, env_steps = attempted
+    return replace(verdict, success_rate=rate, evaluation_steps=verdict.evaluation_steps + env_steps)
 
 
 def with_looks(verdict: Verdict, found: Found, index: int, reworked: int) -> Verdict:

@@ -31,7 +31,8 @@ SCHEMA = pa.schema(
         ("scout_steps", pa.int64()),
         ("search_steps", pa.int64()),
         ("witness", WORD),  # where it comes from; null: there is none, or it was not noted
-        ("success_rate", pa.float64()),  # of the last evaluation's sampled episodes; null: none ended
+        # of sampled first episodes: in attempts after training, in older rows in the last evaluation; null: none ended
+        ("success_rate", pa.float64()),
         ("most_probable_succeeds", pa.bool_()),  # in the last evaluation; null: it was not noted
         ("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: no witness
         ("core_seconds", pa.float64()),  # without compiling, and without slots and rows that are empty at the end

@@ -53,6 +53,7 @@ class Stream(IntEnum):
     SCOUT = 3  # random play before training
     SEARCH = 4  # exploration of a search
     PORTABILITY = 5  # the moved starts that witnesses are replayed from
+    SUCCESS_RATE = 6  # attempts of an expert whose training has ended
 
 
 def level_id_array(level_ids: ArrayLike) -> Int[np.ndarray, " level"]:

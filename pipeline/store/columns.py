@@ -87,7 +87,8 @@ DESCRIBED = (
     ManifestColumn(
         "success_rate",
         pa.float32(),
-        "How many of the last evaluation's first episodes reach the goal, with sampled actions",
+        "How many first episodes of the expert reach the goal with sampled actions, in attempts after its training "
+        "that decide nothing",
         "share",
         NO_ATTEMPTS,
     ),
@@ -99,14 +100,15 @@ DESCRIBED = (
     ManifestColumn(
         "sticky_success_rate",
         pa.float32(),
-        "As success_rate, where an action is sometimes repeated against the expert's will",
+        "How many of the last evaluation's first episodes reach the goal, where an action is sometimes repeated "
+        "against the expert's will",
         "share",
         NO_ATTEMPTS,
     ),
     ManifestColumn(
         "moved_success_rate",
         pa.float32(),
-        "As success_rate, from starts with slightly other velocities",
+        "How many of the last evaluation's first episodes reach the goal from starts with slightly other velocities",
         "share",
         NO_ATTEMPTS,
     ),
@@ -126,7 +128,12 @@ DESCRIBED = (
         "never",
     ),
     ManifestColumn("env_steps", pa.int64(), "Training steps that were used, at most the budget", "env steps"),
-    ManifestColumn("evaluation_steps", pa.int64(), "Spent on the expert's evaluations", "env steps"),
+    ManifestColumn(
+        "evaluation_steps",
+        pa.int64(),
+        "Spent on the expert's evaluations, and on the attempts of success_rate",
+        "env steps",
+    ),
     ManifestColumn("scout_steps", pa.int64(), "Spent on random play before training", "env steps"),
     ManifestColumn(
         "search_steps", pa.int64(), "Spent on the search before training and around the witness", "env steps"
