@@ -44,9 +44,7 @@ class Params:
 
     dt: float = 1 / 60  # s; larger: faster and less stable
     slop: float = 0.01  # m of penetration left alone; larger: visible overlap, smaller: jitter
-    contact_bias: float = (
-        0.2  # share of the penetration beyond the slop undone per step; near 1: bodies are thrown apart
-    )
+    contact_bias: float = 0.2  # share of the penetration beyond the slop undone per step; near 1: bodies jump apart
     joint_bias_velocity: float = 2.0  # 1/s; pull of a joint's ends towards each other; larger: stiffer, then unstable
     joint_bias_position: float = 0.7  # share of the gap closed per solver iteration; above 1: overshoots
     fixed_joint_bias: float = 2.0  # 1/s; pull of a fixed joint to its angle
