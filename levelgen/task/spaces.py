@@ -17,9 +17,22 @@ class Box:
         self.low, self.high, self.shape, self.dtype = low, high, shape, dtype
 
     def sample(self, key: Key[Array, ""]) -> Array:
+        """A random element: uniform between the bounds; without them, normal or exponential as in Gymnasium."""
         if jnp.issubdtype(self.dtype, jnp.floating):
-            return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
+            return self._sample_floats(key)
         return jax.random.randint(key, self.shape, self.low, self.high + 1).astype(self.dtype)
+
+    def _sample_floats(self, key: Key[Array, ""]) -> Array:
+        low, high = (np.broadcast_to(np.asarray(x, self.dtype), self.shape) for x in (self.low, self.high))
+        below, above = np.isfinite(low), np.isfinite(high)
+        bounded = below & above
+        if bounded.all():
+            return jax.random.uniform(key, self.shape, self.dtype, low, high)
+        between = jax.random.uniform(key, self.shape, self.dtype, np.where(bounded, low, 0), np.where(bounded, high, 1))
+        beyond = jax.random.exponential(key, self.shape, self.dtype)
+        one_sided = jnp.where(below, low + beyond, high - beyond)
+        free = jax.random.normal(key, self.shape, self.dtype)
+        return jnp.where(bounded, between, jnp.where(below | above, one_sided, free))
 
     def contains(self, x: Any) -> Bool[Array, ""]:
         x = jnp.asarray(x)
