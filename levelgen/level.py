@@ -4,10 +4,13 @@ Batches of levels have the level axis LAST, like everything else (a batch of lev
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.physics.types import Model, Size, State
@@ -40,6 +43,8 @@ class Level:
     """An immutable initial world, or many: the level axis is the last of every array (`lane`).
 
     `model` (what is constant) and `state` (what evolves) are the engine's, the rest is what the task adds.
+    `len(levels)` counts levels; `levels[0]`, `levels[10:20]` and `levels[mask]` choose some. What they give has a level
+    axis too, so that every function of levels takes it. `concatenate_levels` joins.
     """
 
     model: Model
@@ -54,15 +59,44 @@ class Level:
     def size(self) -> Size:
         return self.model.size
 
+    def __len__(self) -> int:
+        lanes = {x.shape[-1] for x in jax.tree.leaves(self)}
+        return 0 if 0 in lanes else max(lanes)
 
-def size_of(name: str) -> Size:
-    """The size with this name: one of SIZES, or four numbers as in `8-8-8-4`.
+    def __getitem__(self, index: Any) -> "Level":
+        """Levels by index (negative ones count from the end), slice, list of indices or mask, as numpy arrays.
+
+        Raises:
+            IndexError: there is no such level.
+        """
+        chosen = np.atleast_1d(np.arange(len(self))[index])
+        of_each = lambda x: np.broadcast_to(x, (*x.shape[:-1], len(self)))  # in numpy: JAX would compile each shape
+        return jax.tree.map(lambda x: of_each(np.asarray(x))[..., chosen], self)
+
+
+def concatenate_levels(parts: Sequence[Level]) -> Level:
+    """Join levels of one size, such as those of several calls, in their order, as numpy arrays.
+
+    Raises:
+        ValueError: there are none, or sizes differ.
+    """
+    sizes = list(dict.fromkeys(part.size for part in parts))
+    if len(sizes) != 1:
+        names = ", ".join(map(name_of, sizes))
+        raise ValueError(f"levels of the sizes {names} cannot be joined" if sizes else "there are no levels to join")
+    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *(part[:] for part in parts))
+
+
+def size_of(name: str | Size) -> Size:
+    """The size with this name: one of SIZES, or four numbers as in `8-8-8-4`. A Size is returned as it is.
 
     The numbers count polygons (the scenery's four included), circles, joints and thrusters.
 
     Raises:
         ValueError: it is no name of a size, or not its only one; the message starts with `size`.
     """
+    if isinstance(name, Size):
+        return name
     if name in SIZES:
         return SIZES[name]
     if not re.fullmatch(r"(0|[1-9][0-9]{0,3})(-(0|[1-9][0-9]{0,3})){3}", name):

@@ -18,11 +18,13 @@ if not os.path.isdir(os.path.join(__path__[0], "physics")):
 if TYPE_CHECKING:
     from levelproof.experts.witness import Record as Record
     from levelproof.experts.witness import replay as replay
+    from levelproof.levelgen.files.entries import LevelFileError as LevelFileError
     from levelproof.levelgen.files.level_file import LevelFile as LevelFile
     from levelproof.levelgen.files.level_file import read_level_file as read_level_file
     from levelproof.levelgen.files.level_file import write_level_file as write_level_file
     from levelproof.levelgen.level import SIZES as SIZES
     from levelproof.levelgen.level import Level as Level
+    from levelproof.levelgen.level import concatenate_levels as concatenate_levels
     from levelproof.levelgen.pictures.raster import draw as draw
     from levelproof.levelgen.sampling.distribution import Distribution as Distribution
     from levelproof.levelgen.sampling.sampler import sample_levels as sample_levels
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
     from levelproof.levelgen.task.environment import starts as starts
     from levelproof.levelgen.task.rules import TaskParams as TaskParams
     from levelproof.physics.types import Size as Size
+    from levelproof.pipeline.errors import Failure as Failure
+    from levelproof.pipeline.errors import LevelproofError as LevelproofError
+    from levelproof.pipeline.errors import StoreFailure as StoreFailure
+    from levelproof.pipeline.errors import UserError as UserError
     from levelproof.pipeline.read.columns import levels_from as levels_from
     from levelproof.pipeline.read.dataset.batch import Batch as Batch
     from levelproof.pipeline.read.dataset.dataset import Dataset as Dataset
@@ -40,6 +46,12 @@ if TYPE_CHECKING:
     from levelproof.pipeline.version import __version__ as __version__
 
 HOME = {
+    "concatenate_levels": "levelproof.levelgen.level",
+    "LevelproofError": "levelproof.pipeline.errors",
+    "UserError": "levelproof.pipeline.errors",
+    "Failure": "levelproof.pipeline.errors",
+    "StoreFailure": "levelproof.pipeline.errors",
+    "LevelFileError": "levelproof.levelgen.files.entries",
     "Batch": "levelproof.pipeline.read.dataset.batch",
     "Dataset": "levelproof.pipeline.read.dataset.dataset",
     "SIZES": "levelproof.levelgen.level",

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Int
 from numpy.typing import ArrayLike
 
 from levelproof.levelgen.identity.keys import Stream, key_for, level_id_array
-from levelproof.levelgen.level import Level, Role, name_of
+from levelproof.levelgen.level import Level, Role, name_of, size_of
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.draws import at, deal, pick
 from levelproof.levelgen.sampling.moves import ThrusterDraws, add_thruster, propose_connected, propose_free
@@ -64,7 +64,7 @@ class Plan(NamedTuple):
     may_be_fixed: Flag
 
 
-def sample_levels(level_ids: ArrayLike, size: Size, distribution: Distribution = DEFAULT) -> Level:
+def sample_levels(level_ids: ArrayLike, size: Size | str, distribution: Distribution = DEFAULT) -> Level:
     """The levels with these ids, as float32 and int32 arrays in SI units, level axis last.
 
     A level depends on its id, the size, `SAMPLER_VERSION` and the distribution alone: whatever the number
@@ -72,14 +72,15 @@ def sample_levels(level_ids: ArrayLike, size: Size, distribution: Distribution =
 
     Args:
         level_ids: whole numbers from 0 to MAX_LEVEL_ID, in any order.
-        size: how many things a level has room for: one of SIZES, or a Size of your own.
+        size: room in a level: the name of one of SIZES such as "s", four numbers as in "8-8-8-4", or a Size.
         distribution: what random levels are like.
 
     Raises:
-        ValueError: the size has no room for the scenery, a green and a blue body; an id is not 0 .. MAX_LEVEL_ID; or
-            `jax_enable_x64` is on.
+        ValueError: there is no size of this name, or it has no room for the scenery, a green and a blue body; an id is
+            not 0 .. MAX_LEVEL_ID; or `jax_enable_x64` is on.
     """
     require_32_bits()
+    size = size_of(size)
     check_size(size)
     ids = level_id_array(level_ids)
     padded = np.resize(ids, (max(1, -(-len(ids) // CHUNK)), CHUNK))

@@ -1,10 +1,16 @@
-"""Sizes and their names."""
+"""Sizes and their names; levels by number, and joined."""
 
+from dataclasses import replace
+
+import jax
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from levelproof.levelgen.level import MOST_THINGS, SIZES, name_of, size_of
+from levelproof.levelgen.level import MOST_THINGS, SIZES, Level, concatenate_levels, name_of, size_of
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.physics.types import Size
 
 
@@ -39,3 +45,48 @@ def test_a_size_that_cannot_be_is_refused(name: str, sentence: str) -> None:
     with pytest.raises(ValueError, match="size") as refused:
         size_of(name)
     assert str(refused.value) == sentence
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return sample_levels(np.arange(12), "s")
+
+
+def assert_same(left: Level, right: Level) -> None:
+    jax.tree.map(np.testing.assert_array_equal, left, right)
+
+
+def test_levels_have_a_length_and_are_chosen_by_index(levels: Level) -> None:
+    assert len(levels) == 12
+    assert len(levels[0]) == len(levels[-1]) == 1
+    assert_same(levels[-1], levels[11])
+    assert_same(levels[3:7], sample_levels(np.arange(3, 7), "s"))
+    assert_same(levels[[5, 0]], sample_levels(np.array([5, 0]), SIZES["s"]))
+    assert_same(levels[np.arange(12) > 9], levels[10:])
+    assert len(levels[5:5]) == 0
+    assert [len(level) for level in levels] == [1] * 12
+    for wrong in 12, -13, [0, 12]:
+        with pytest.raises(IndexError):
+            levels[wrong]
+
+
+def test_an_array_of_one_lane_counts_for_every_level(levels: Level) -> None:
+    shared = replace(levels, model=replace(levels.model, gravity=levels.model.gravity[:, :1]))
+    assert len(shared) == 12
+    assert shared[2:5].model.gravity.shape == (2, 3)
+    assert concatenate_levels([shared, shared[:1]]).model.gravity.shape == (2, 13)
+
+
+def test_levels_of_several_calls_are_joined(levels: Level) -> None:
+    assert_same(concatenate_levels([levels[:5], levels[5:6], levels[6:]]), levels)
+    with pytest.raises(ValueError, match="levels of the sizes s, 6-0-1-0 cannot be joined"):
+        concatenate_levels([levels, empty_level(Size(6, 0, 1, 0), 2)])
+    with pytest.raises(ValueError, match="there are no levels to join"):
+        concatenate_levels([])
+
+
+def test_a_size_is_given_by_its_name_wherever_one_is_asked_for() -> None:
+    assert size_of(SIZES["s"]) == SIZES["s"]
+    assert_same(sample_levels([0], "s"), sample_levels([0], SIZES["s"]))
+    with pytest.raises(ValueError, match="size is 'xl': choose one of s, m, l"):
+        sample_levels([0], "xl")

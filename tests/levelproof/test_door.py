@@ -52,3 +52,15 @@ def test_importing_it_imports_nothing_heavy() -> None:
     program = "import sys, levelproof; print({'jax', 'numpy', 'ray', 'zarr'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", program], cwd=SOURCE.parents[1], capture_output=True, text=True)
     assert done.stdout.strip() == "set()", done.stderr
+
+
+def test_type_checkers_are_told_that_it_has_types() -> None:
+    assert SOURCE.with_name("py.typed").is_file()
+
+
+def test_what_is_raised_can_be_caught_by_its_name_at_the_door(tmp_path: Path) -> None:
+    with pytest.raises(levelproof.UserError, match="There is no split"):
+        levelproof.open(tmp_path / "none")
+    with pytest.raises(levelproof.LevelFileError):
+        levelproof.read_level_file(tmp_path / "none.json")
+    assert issubclass(levelproof.Failure, levelproof.LevelproofError)
