@@ -3,6 +3,9 @@
 `env.reset(key, params)` and `env.step(key, state, action, params)` are functions of ONE environment, to be mapped
 with `jax.vmap`; the mapped axis becomes the engine's lanes (`levelgen.task.vmapped`). After an end, a step resets: to a
 level drawn from `params.levels`, or to `override_reset_state`.
+
+Which level a reset draws depends on its key, on the number of the episode, and on a tag of its own. So code that hands
+one key to `reset`, to `step` and to the sampling of actions, or the same key to every step, still meets every level.
 Facts: `kinetix.environment.env` and `spaces` 3.0.2.
 """
 
@@ -14,6 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.levelgen.level import ACTIONS, Level
@@ -34,6 +38,8 @@ from levelproof.levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete, 
 from levelproof.levelgen.task.vmapped import single
 from levelproof.physics.bounds import require_32_bits
 from levelproof.physics.types import Size
+
+LEVEL_DRAW = 0x6C76_0000  # folded, with the number of the episode, into the key that chooses a level
 
 
 class ActionType(StrEnum):
@@ -67,22 +73,28 @@ class EnvState:
     """One environment, without an axis of lanes: its level, and the episode under way."""
 
     level: Level  # its world as it is now
-    timestep: Int[Array, ""]
-    last_distance: Float[Array, ""]
+    timestep: Int[Array, ""]  # env steps taken in this episode
+    last_distance: Float[Array, ""]  # m, between green and blue; NO_DISTANCE at the start
+    level_index: Int[Array, ""]  # which of `params.levels`; else which of the levels that the state was made from
+    episode: Int[Array, ""]  # automatic resets since `reset`
 
     @property
     def now(self) -> TaskState:
         return TaskState(self.level.state, self.timestep, self.last_distance)
 
-    @staticmethod
-    def at(level: Level, now: TaskState) -> "EnvState":
-        """A level in an episode."""
-        return EnvState(replace(level, state=now.state), now.timestep, now.last_distance)
+    def moved(self, now: TaskState) -> "EnvState":
+        """The same episode at another state of its world."""
+        return replace(self, level=replace(self.level, state=now.state), timestep=now.timestep,
+                       last_distance=now.last_distance)  # fmt: skip
 
     @staticmethod
-    def start(level: Level) -> "EnvState":
-        """An episode's beginning."""
-        return EnvState.at(level, task.reset(level))
+    def start(
+        level: Level, level_index: Int[Array, " lane"] | int = 0, episode: Int[Array, " lane"] | int = 0
+    ) -> "EnvState":
+        """The beginning of an episode."""
+        now = task.reset(level)
+        count = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.int32), now.timestep.shape)
+        return EnvState(level, now.timestep, now.last_distance, count(level_index), count(episode))
 
 
 Step = tuple[Any, EnvState, Float[Array, ""], Bool[Array, ""], dict[str, Array]]
@@ -105,6 +117,7 @@ def make(
     observation_type: str = ObservationType.SYMBOLIC_FLAT,
     rules: TaskParams = task.DEFAULT_RULES,
     auto_reset: bool = True,
+    final_observation: bool = False,
 ) -> tuple["Environment", EnvParams]:
     """An environment and its default parameters.
 
@@ -114,6 +127,7 @@ def make(
         observation_type: one of ObservationType.
         rules: of the task.
         auto_reset: whether a step that ends an episode gives the first state of the next one.
+        final_observation: whether `info["final_observation"]` has the observation before an automatic reset, too.
 
     Raises:
         ValueError: no such type, no level, or `jax_enable_x64` is on.
@@ -122,17 +136,22 @@ def make(
     for kinds, given in (ActionType, action_type), (ObservationType, observation_type):
         if given not in [*kinds]:
             raise ValueError(f"there is no {kinds.__name__} {given!r}: choose one of {', '.join(kinds)}")
-    count = max(x.shape[-1] for x in jax.tree.leaves(levels))
-    if not levels.role.shape[-1]:
+    if not len(levels):
         raise ValueError("there are no levels to reset to: give at least one")
-    levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], count)), levels)
-    env = Environment(levels, ActionType(action_type), ObservationType(observation_type), rules, auto_reset)
+    levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], len(levels))), levels)
+    env = Environment(
+        levels, ActionType(action_type), ObservationType(observation_type), rules, auto_reset, final_observation
+    )
     return env, env.default_params
 
 
 def starts(levels: Level) -> EnvState:
-    """The first state of every level, level axis FIRST: what `vmap` maps over, and `override_reset_state` takes."""
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), EnvState.start(levels))
+    """The first state of every level, level axis FIRST: what `vmap` maps over, and `override_reset_state` takes.
+
+    `level_index` of each says which of these levels it is.
+    """
+    states = EnvState.start(levels, jnp.arange(levels.state.rotation.shape[-1], dtype=jnp.int32))
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +163,8 @@ class Environment:
     observation_type: ObservationType
     rules: TaskParams
     auto_reset: bool
+    final_observation: bool = False
+    level_ids: Int[np.ndarray, " level"] | None = None  # of `levels`, where they are those of a split
 
     @property
     def default_params(self) -> EnvParams:
@@ -167,7 +188,7 @@ class Environment:
         self, key: Key[Array, ""], params: EnvParams | None = None, override_reset_state: EnvState | None = None
     ) -> tuple[Any, EnvState]:
         """The observation and the state at the start of an episode."""
-        return single(self._reset_lanes)(*self._restart(key, params, override_reset_state))
+        return single(self._reset_lanes)(*self._restart(key, params, override_reset_state, 0))
 
     @partial(jax.jit, static_argnums=0)
     def step(
@@ -178,16 +199,23 @@ class Environment:
         params: EnvParams | None = None,
         override_reset_state: EnvState | None = None,
     ) -> Step:
-        """One env step: observation, state, reward, done, info.
+        """Take one env step: return observation, state, reward, done, info.
 
-        Where the episode ended and the environment resets itself, the observation and the state are those of the
-        next episode's start; the reward is always that of the step. `info` has the reference's entries: GoalR
-        (green touched blue) and distance (of green and blue at the end of the step, m).
+        If the episode ended and the environment resets itself, the observation and the state are those of the
+        next episode's start; reward and info are always those of the step.
+
+        Entries of `info`:
+            GoalR: whether green touched blue.
+            distance: of green and blue at the end of the step, m.
+            terminated: the task ended the episode, so that nothing follows: a value function learns 0 there.
+            truncated: the time limit ended it: a value function bootstraps from the final observation.
+            level_index: which of `params.levels` the step was taken in (as `EnvState.level_index`).
+            final_observation: what is seen at the end of the step, before any reset; if `make` was asked for it.
         """
         self._check(action)
         if not self.auto_reset:
             return self.step_env(key, state, action, params)
-        table, index, override = self._restart(key, params, override_reset_state)
+        table, index, override = self._restart(key, params, override_reset_state, state.episode + 1)
         return single(self._step_lanes)(table, index, (override, *_detached(state, action)))
 
     def step_env(self, key: Key[Array, ""], state: EnvState, action: Array, params: EnvParams | None = None) -> Step:
@@ -227,28 +255,33 @@ class Environment:
             return Dict({"image": Box(0.0, 1.0, (SIDE, SIDE, 3)), "global_info": Box(-jnp.inf, jnp.inf, (1,))})
         return _space_of_entities(jax.eval_shape(lambda: self.reset(jax.random.key(0))[0]), self.size)
 
-    def _restart(self, key, params: EnvParams | None, override: EnvState | None) -> tuple[Any, Array | int, Any]:
+    def _restart(
+        self, key: Key[Array, ""], params: EnvParams | None, override: EnvState | None, episode: Int[Array, ""] | int
+    ) -> tuple[Any, Array | int, Any]:
         """(levels to draw from, the one drawn, a state instead of them): what a reset in lanes needs."""
         if override is not None:
             return (), 0, override
         levels = (params or self.default_params).levels
-        count = levels.state.rotation.shape[-1]
-        return levels, jax.random.randint(key, (), 0, count) if count > 1 else 0, None
+        return levels, _drawn(key, episode, levels.state.rotation.shape[-1]), None
 
     def _reset_lanes(self, levels: Any, index: Int[Array, " lane"], override: EnvState | None) -> tuple[Any, EnvState]:
-        state = _first_state(levels, index, override)
+        state = _first_state(levels, index, 0, override)
         return self._look(state), state
 
     def _step_lanes(self, levels: Any, index: Int[Array, " lane"], given: tuple[Any, EnvState, Array]) -> Step:
         """(what `_restart` gives, with the state and the action) to a step; without levels or a state, no reset."""
         override, state, action = given
         driven = CONTROLS[self.action_type](state.level, action)
-        now, result, distance, _ = task.advance_driven(state.level, state.now, driven, self.rules)
-        after = EnvState.at(state.level, now)
-        if levels or override:
-            restart = _first_state(levels, index, override)
+        now, result, closing, _ = task.advance_driven(state.level, state.now, driven, self.rules)
+        after = state.moved(now)
+        info = {"GoalR": result.goal, "distance": closing.distance, "terminated": closing.terminated}
+        info |= {"truncated": result.done & ~closing.terminated, "level_index": state.level_index}
+        if self.final_observation:
+            info["final_observation"] = self._look(after)
+        if override is not None or isinstance(levels, Level):
+            restart = _first_state(levels, index, state.episode + 1, override)
             after = jax.tree.map(lambda fresh, x: jnp.where(result.done, fresh, x), restart, after)
-        return self._look(after), after, result.reward, result.done, {"GoalR": result.goal, "distance": distance}
+        return self._look(after), after, result.reward, result.done, info
 
     def _look(self, state: EnvState) -> Any:
         return LOOKS[self.observation_type](state.level, state.level.state)
@@ -259,10 +292,20 @@ def _detached(*given: Any) -> Any:
     return jax.tree.map(jax.lax.stop_gradient, given)
 
 
-def _first_state(levels: Any, index: Int[Array, " lane"], override: EnvState | None) -> EnvState:
+def _drawn(key: Key[Array, ""], episode: Int[Array, ""] | int, count: int) -> Int[Array, ""] | int:
+    """The index of the level that an episode plays. Its key is used for nothing else: see the module's docstring."""
+    if count == 1:
+        return 0
+    bits = jax.random.bits(jax.random.fold_in(key, LEVEL_DRAW + episode))
+    return (bits % count).astype(jnp.int32)  # uneven by less than count / 2**32
+
+
+def _first_state(
+    levels: Any, index: Int[Array, " lane"], episode: Int[Array, " lane"] | int, override: EnvState | None
+) -> EnvState:
     if override is not None:
         return override
-    return EnvState.start(jax.tree.map(lambda x: x[..., index], levels))
+    return EnvState.start(jax.tree.map(lambda x: x[..., index], levels), index, episode)
 
 
 def _space_of_entities(seen: Any, size: Size) -> Dict:

@@ -57,6 +57,13 @@ class StepResult(NamedTuple):
     goal: Bool[Array, " lane"]  # ended because green touched blue
 
 
+class Closing(NamedTuple):
+    """How things stood at the end of an env step, before any reset."""
+
+    distance: Float[Array, " lane"]  # of green and blue, m
+    terminated: Bool[Array, " lane"]  # the task ended the episode, not the time limit alone: no value lies beyond
+
+
 def reset(level: Level) -> TaskState:
     """The first state of an episode in every lane."""
     lanes = level.state.rotation.shape[-1]
@@ -106,10 +113,10 @@ def advance(
 
 def advance_driven(
     level: Level, now: TaskState, driven: Controls, params: TaskParams, seen: bool = False
-) -> tuple[TaskState, StepResult, Float[Array, " lane"], Any]:
+) -> tuple[TaskState, StepResult, Closing, Any]:
     """The same under controls, whatever kind of action they come from.
 
-    Also returns the distance of the goal at the end, m, and the contacts of the last physics step, if `seen`.
+    Also returns how it stood at the end, and the contacts of the last physics step, if `seen`.
     """
     motor, thrust = driven
 
@@ -126,13 +133,19 @@ def advance_driven(
     goal = select(goals, first)
     distance = at_end(distances)
     timestep = now.timestep + 1
-    done = ended.any(0) | (timestep >= params.max_timesteps) | has_nan(state)
+    terminated = ended.any(0) | has_nan(state)
+    done = terminated | (timestep >= params.max_timesteps)
 
     closer = jnp.nan_to_num(now.last_distance - distance, nan=0.0, posinf=0.0, neginf=0.0)
     shaping = jnp.where(now.last_distance == NO_DISTANCE, 0.0, params.dense_reward_scale * closer)
     reward = goal.astype(jnp.float32) - select(fails, first).astype(jnp.float32) + shaping
     after = TaskState(state, timestep, jnp.where(done, NO_DISTANCE, distance))
-    return after, StepResult(reward, done, goal), distance, jax.tree.map(lambda x: x[-1], manifolds)
+    return (
+        after,
+        StepResult(reward, done, goal),
+        Closing(distance, terminated),
+        jax.tree.map(lambda x: x[-1], manifolds),
+    )
 
 
 def has_nan(state: State) -> Bool[Array, " lane"]:

@@ -145,12 +145,34 @@ def test_resets_draw_from_all_levels(levels: Level, made) -> None:
     assert drawn.any(0).all()
 
 
+def test_one_key_for_everything_still_meets_every_level(levels: Level) -> None:
+    """Code that never splits its keys: each goes to reset, to the sampling of actions and to every step."""
+    eleven = jax.tree.map(lambda x: x[..., :11], levels)  # as many as there are discrete actions
+    env, params = make(eleven, ActionType.DISCRETE, rules=task.TaskParams(max_timesteps=1))
+    keys = jax.random.split(jax.random.PRNGKey(0), 256)
+    state = jax.jit(jax.vmap(env.reset, (0, None)))(keys, params)[1]
+    action = jax.vmap(env.action_space(params).sample)(keys)
+    step, drawn = jax.jit(jax.vmap(env.step, (0, 0, 0, None))), [action, state.level_index]
+    for episode in range(1, 4):
+        _, state, _, done, info = step(keys, state, action, params)
+        assert done.all()
+        np.testing.assert_array_equal(info["level_index"], drawn[-1])
+        assert (np.asarray(state.episode) == episode).all()
+        drawn.append(state.level_index)
+    drawn = np.array(drawn)
+    assert all(set(row.tolist()) == set(range(11)) for row in drawn)
+    same = (drawn[:, None] == drawn).mean(-1)[np.triu_indices(len(drawn), 1)]
+    assert (same < 0.2).all(), same  # 1 in 11 by chance
+
+
 def test_an_end_resets(levels: Level, keys) -> None:
     env, params = make(levels, rules=task.TaskParams(max_timesteps=1))
     stop, own = jnp.zeros((LEVELS, 6), jnp.int32), starts(levels)
     seen, state, _, done, info = jax.jit(jax.vmap(env.step, (0, 0, 0, None, 0)))(keys, own, stop, params, own)
     assert done.all()
-    assert set(info) == {"GoalR", "distance"}
+    assert set(info) == {"GoalR", "distance", "terminated", "truncated", "level_index"}
+    assert info["truncated"].sum() > LEVELS / 2  # the rest reached the goal or failed in that step
+    np.testing.assert_array_equal(info["level_index"], np.arange(LEVELS))
     assert (np.asarray(info["distance"]) > 0).all()
     assert_same(state, own)  # the given state, and what is seen of it
     np.testing.assert_array_equal(seen, jax.jit(jax.vmap(env.get_obs))(own))
@@ -158,6 +180,34 @@ def test_an_end_resets(levels: Level, keys) -> None:
     assert done.all()
     assert (np.asarray(drawn.now.timestep) == 0).all()
     assert not np.array_equal(drawn.level.model.inverse_mass, own.level.model.inverse_mass)  # other levels
+
+
+def test_info_tells_what_value_functions_and_curricula_need(levels: Level, keys, actions) -> None:
+    """Played beside an environment that does not reset: which shows how an episode ended, and what was seen then."""
+    limit = 8
+    env, params = make(levels, rules=task.TaskParams(max_timesteps=limit), final_observation=True)
+    bare, _ = make(levels, rules=env.rules, auto_reset=False)
+    step, alone = (jax.jit(jax.vmap(e.step, (0, 0, 0, None))) for e in (env, bare))
+    state, ends = starts(levels), np.zeros(2, int)
+    for number in range(2 * limit):
+        played = np.asarray(state.level_index)
+        seen, final, reward, done, _ = alone(keys, state, actions[number % STEPS], params)
+        seen_next, after, reward_next, done_next, info = step(keys, state, actions[number % STEPS], params)
+        assert_same((reward, done), (reward_next, done_next))
+        assert_same(info["final_observation"], seen)
+        assert_same(info["level_index"], played)
+        assert_same(info["terminated"] | info["truncated"], done)
+        assert not (info["terminated"] & info["truncated"]).any()
+        assert not (np.asarray(info["truncated"]) & (np.asarray(final.timestep) < limit)).any()
+        assert not (np.asarray(info["GoalR"]) & ~np.asarray(info["terminated"])).any()
+        start = np.asarray(levels.state.position)[..., np.asarray(after.level_index)]
+        fresh = np.asarray(done)
+        np.testing.assert_array_equal(np.moveaxis(np.asarray(after.level.state.position), 0, -1)[..., fresh],
+                                      start[..., fresh])  # fmt: skip
+        assert_same(seen_next[~fresh], seen[~fresh])
+        ends += np.asarray(info["terminated"]).sum(), np.asarray(info["truncated"]).sum()
+        state = after
+    assert (ends > 0).all(), ends
 
 
 def test_parameters_are_those_of_make_where_none_are_given(levels: Level, made) -> None:
@@ -215,6 +265,14 @@ def test_spaces_know_what_is_not_in_them() -> None:
     assert not Discrete(11).contains(11)
     assert not MultiDiscrete(CHOICES).contains(jnp.array([0, 0, 0, 0, 2, 0]))
     assert not Box(-1.0, 1.0, (6,)).contains(jnp.full(6, 1.1))
+
+
+def test_spaces_without_bounds_sample_finite_elements(levels: Level) -> None:
+    env, params = make(levels, observation_type=ObservationType.PIXELS)
+    for space in env.observation_space(params), Box(0.0, jnp.inf, (50,)), Box(-jnp.inf, np.array([0.0, 9.0]), (2,)):
+        drawn = jax.jit(space.sample)(jax.random.key(0))
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(drawn))
+        assert space.contains(drawn)
 
 
 def test_unknown_types_are_refused(levels: Level) -> None:
