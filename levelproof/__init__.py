@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from levelproof.levelgen.pictures.raster import draw as draw
     from levelproof.levelgen.sampling.distribution import Distribution as Distribution
     from levelproof.levelgen.sampling.sampler import sample_levels as sample_levels
-    from levelproof.levelgen.task.environment import make as make
     from levelproof.levelgen.task.environment import starts as starts
     from levelproof.levelgen.task.rules import TaskParams as TaskParams
     from levelproof.physics.types import Size as Size
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from levelproof.pipeline.read.dataset.batch import Batch as Batch
     from levelproof.pipeline.read.dataset.dataset import Dataset as Dataset
     from levelproof.pipeline.read.dataset.dataset import open as open
+    from levelproof.pipeline.read.environment import make as make
     from levelproof.pipeline.store.manifest import read_manifest as read_manifest
     from levelproof.pipeline.store.shard import EngineDiffers as EngineDiffers
     from levelproof.pipeline.store.shard import Shard as Shard
@@ -66,7 +66,7 @@ HOME = {
     "__version__": "levelproof.pipeline.version",
     "draw": "levelproof.levelgen.pictures.raster",
     "levels_from": "levelproof.pipeline.read.columns",
-    "make": "levelproof.levelgen.task.environment",
+    "make": "levelproof.pipeline.read.environment",
     "open": "levelproof.pipeline.read.dataset.dataset",
     "read_level_file": "levelproof.levelgen.files.level_file",
     "read_manifest": "levelproof.pipeline.store.manifest",

@@ -1,0 +1,72 @@
+"""The environment on levels at hand, or on those of a split."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task import environment
+from levelproof.levelgen.task.environment import ActionType, Environment, EnvParams, ObservationType
+from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
+from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.manifest import require_manifest
+
+
+def make(
+    levels: Level | None = None,
+    action_type: str = ActionType.MULTI_DISCRETE,
+    observation_type: str = ObservationType.SYMBOLIC_FLAT,
+    rules: TaskParams | None = None,
+    auto_reset: bool = True,
+    final_observation: bool = False,
+    *,
+    split: str | os.PathLike[str] | None = None,
+    where: str | None = None,
+) -> tuple[Environment, EnvParams]:
+    """Make an environment and its default parameters, from levels or from a split.
+
+    Args:
+        levels: what resets draw from, with equal chances; level axis last.
+        action_type: `discrete`, `multi_discrete` or `continuous`.
+        observation_type: `symbolic_flat`, `symbolic_flat_padded`, `symbolic_entity` or `pixels`.
+        rules: of the task; None: those of the split, or the defaults.
+        auto_reset: whether a step that ends an episode gives the first state of the next one.
+        final_observation: whether `info["final_observation"]` has the observation before an automatic reset, too.
+        split: path or URL of a split, such as `data/128k/s`, instead of `levels`: all its levels, in the order of their
+            ids (`env.level_ids`), whether they have a witness or not.
+        where: an SQL condition on the manifest's columns, such as `label = 'solved' AND steps_to_goal < 64`.
+
+    Raises:
+        UserError: neither or both of levels and split are given, there is no such split, or no level fits.
+        Failure: the split is damaged.
+        ValueError: no such type, no level, or `jax_enable_x64` is on.
+    """
+    if (levels is None) == (split is None):
+        raise UserError("make takes either levels or split=, the path of a split: give one of them.")
+    if split is None or levels is not None:
+        if where is not None:
+            raise UserError("where= is a condition on the levels of a split: give split= with it, not levels.")
+        assert levels is not None
+        return environment.make(
+            levels, action_type, observation_type, rules or DEFAULT_RULES, auto_reset, final_observation
+        )
+    manifest = require_manifest(Path(split), ["level_id", *COLUMNS, *columns_in(where)])
+    rows = select(manifest.table, where)
+    if not rows.num_rows:
+        raise UserError(
+            f"The split {split} has no level for which {where}: `levelproof inspect {split}` shows its levels."
+        )
+    jax.devices()  # JAX starts as the caller has set it up, not as `levels_of` would: for a worker of one thread
+    env, params = environment.make(
+        levels_of(manifest, rows),
+        action_type,
+        observation_type,
+        rules or rules_of(manifest),
+        auto_reset,
+        final_observation,
+    )
+    return replace(env, level_ids=rows["level_id"].to_numpy()), params

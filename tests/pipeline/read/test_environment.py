@@ -1,0 +1,50 @@
+"""The environment on a split's levels."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import levelproof
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.store.manifest import read_manifest
+from tests.pipeline.made import played_split
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return played_split(tmp_path_factory.mktemp("environment"))
+
+
+def test_it_plays_every_level_of_a_split_by_the_splits_rules(split: Path) -> None:
+    env, params = levelproof.make(split=split, auto_reset=False)
+    table = read_manifest(split).table
+    ids = table["level_id"].to_numpy()
+    np.testing.assert_array_equal(env.level_ids, ids)
+    assert not table["shard"].is_valid().to_numpy().all(), "the split has no level without a witness: choose another"
+    jax.tree.map(np.testing.assert_array_equal, params.levels, levelproof.sample_levels(ids, "s"))
+    assert env.rules == levelproof.open(split).rules
+
+
+def test_a_condition_chooses_levels(split: Path) -> None:
+    env, params = levelproof.make(split=str(split), where="shard IS NOT NULL", action_type="discrete")
+    data = levelproof.open(split)
+    np.testing.assert_array_equal(env.level_ids, data.manifest["level_id"])
+    jax.tree.map(np.testing.assert_array_equal, params.levels, data.levels(np.arange(len(data))))
+    _, state = jax.eval_shape(env.reset, jax.random.key(0), params)
+    assert state.level_index.shape == ()
+
+
+def test_what_cannot_be_made_is_a_sentence(split: Path, tmp_path: Path) -> None:
+    levels = levelproof.sample_levels(np.arange(2), "s")
+    assert levelproof.make(levels)[0].rules == DEFAULT_RULES
+    for given in {}, {"levels": levels, "split": split}:
+        with pytest.raises(levelproof.UserError, match="make takes either levels or split="):
+            levelproof.make(**given)
+    with pytest.raises(levelproof.UserError, match="where= is a condition on the levels of a split"):
+        levelproof.make(levels, where="label = 'solved'")
+    with pytest.raises(levelproof.UserError, match="has no level for which level_id < 0"):
+        levelproof.make(split=split, where="level_id < 0")
+    with pytest.raises(levelproof.UserError, match="There is no split at"):
+        levelproof.make(split=tmp_path / "none")
