@@ -171,7 +171,7 @@ Trajectories, with {_link("levelproof", wishes.code)}:
 import levelproof
 
 data = levelproof.open("data/{split.path}", where="steps_to_goal < 64")
-for batch in data.batches(64, seed=0, part="train"):  # (B, T, ...)
+for batch in data.batches(64, seed=0, subset="train"):  # (B, T, ...)
     batch.observation, batch.action, batch.action_mask, batch.reward, batch.done, batch.mask
 ```
 

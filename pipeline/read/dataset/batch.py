@@ -36,6 +36,8 @@ class Batch:
     action_mask: Bool[np.ndarray, "batch time 6"]  # which entries of an action can have an effect
     reward: Float[np.ndarray, "batch time"]
     done: Bool[np.ndarray, "batch time"]  # the step ended its episode
+    terminated: Bool[np.ndarray, "batch time"]  # by the task: nothing follows, and the value there is 0
+    truncated: Bool[np.ndarray, "batch time"]  # by the time limit: the value there is that of the state reached
     goal: Bool[np.ndarray, "batch time"]  # by reaching the goal
     fields: dict[str, np.ndarray]  # the others that were asked for, by their names
 

@@ -10,16 +10,18 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.dataset.batch import Batch
 from levelproof.pipeline.runtime import own_cores
 
+RENAMED = {"batch": "batch_size", "part": "subset"}  # in positions of the version before
+
 
 class Batches(Iterator[Batch]):
     """Made by `Dataset.batches`. Its threads end with it: when it is used up, closed or forgotten."""
 
     def __init__(
-        self, load: Callable[[int], Batch], count: int | None, of: Mapping[str, Any], ahead: int, start: Any
+        self, load: Callable[[int], Batch], count: int | None, of: Mapping[str, Any], prefetch: int, start: Any
     ) -> None:
         """Batch `position` is `load(position)`, for all below `count` (None: no end).
 
-        `of` tells these batches from others, `ahead` is how many are read before they are asked for, and `start` is
+        `of` tells these batches from others, `prefetch` is how many are read before they are asked for, and `start` is
         None or what `state` gave.
 
         Raises:
@@ -29,7 +31,7 @@ class Batches(Iterator[Batch]):
         self._position = 0 if start is None else _position_in(start, self._of)
         self._pool = ThreadPoolExecutor(len(own_cores()), "levelproof-reader")
         self._ahead: deque[Future[Batch]] = deque()
-        self._most = max(ahead, 0) + 1
+        self._most = max(prefetch, 0) + 1
         self._end = weakref.finalize(self, self._pool.shutdown, wait=False, cancel_futures=True)
 
     def __next__(self) -> Batch:
@@ -61,9 +63,10 @@ class Batches(Iterator[Batch]):
 
 def _position_in(start: Any, of: Mapping[str, Any]) -> int:
     try:
-        position, others = start["position"], start["of"]
+        position = start["position"]
+        others = {RENAMED.get(name, name): value for name, value in dict(start["of"]).items()}
         differing = [name for name in of if others[name] != of[name]]
-    except (KeyError, TypeError):
+    except (KeyError, TypeError, ValueError):
         raise UserError("The start is no position of batches: give what their state() returned.") from None
     if differing or type(position) is not int or position < 0:
         told = ", ".join(f"{name} was {others[name]}, now {of[name]}" for name in differing)

@@ -1,4 +1,4 @@
-"""A split opened for training: its trajectories by number, in batches, and as starts for the environment."""
+"""A split opened for training: its trajectories by index, in batches, and as starts for the environment."""
 
 import hashlib
 import os
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from numpy.typing import ArrayLike
 
 from levelproof.experts.config import RECORD_STEPS
@@ -28,8 +28,9 @@ from levelproof.pipeline.read.dataset.batch import Batch, named
 from levelproof.pipeline.read.dataset.batches import Batches
 from levelproof.pipeline.read.dataset.observations import kind_of, observed
 from levelproof.pipeline.read.dataset.order import EpochOrder
-from levelproof.pipeline.read.dataset.parts import check_share, in_part
+from levelproof.pipeline.read.dataset.renamed import renamed
 from levelproof.pipeline.read.dataset.sources import TrajectorySource
+from levelproof.pipeline.read.dataset.subsets import check_share, in_subset
 from levelproof.pipeline.read.dataset.windows import Windows
 from levelproof.pipeline.read.levels import rules_of
 from levelproof.pipeline.read.rows import COLUMNS, moved_rows, read_placed, same_places
@@ -55,7 +56,7 @@ def open(
         path: of the split, such as `data/1M/s`, or its URL (docs/remote.md).
         where: an SQL condition on the manifest's columns, such as `label = 'solved' AND steps_to_goal < 64`.
         columns: of the manifest, to have in `Dataset.manifest` beside those that are always read.
-        validation: share of all levels that is kept for `part="validation"`.
+        validation: share of all levels that is kept for `subset="validation"`.
 
     Raises:
         UserError: there is no split, no trajectory in it that fits, or a condition or column that is none.
@@ -65,7 +66,7 @@ def open(
 
 
 class Dataset:
-    """Made by `levelproof.open`. Trajectories are numbered from 0 in the order of their level ids."""
+    """Made by `levelproof.open`. Trajectories have indices from 0 in the order of their level ids."""
 
     def __init__(self, split: Path, where: str | None, columns: Sequence[str], validation: float) -> None:
         self.split, self._opened_with = split, (split, where, columns, validation)
@@ -93,20 +94,21 @@ class Dataset:
     def __len__(self) -> int:
         return self._manifest.num_rows
 
-    def __getitem__(self, number: int) -> Batch:
+    def __getitem__(self, index: int) -> Batch:
         """One trajectory, [time, ...], with every field, and seen as symbolic_flat.
 
         Raises:
-            IndexError: there is none of this number.
+            IndexError: there is none with this index.
         """
-        if not -len(self) <= number < len(self):
-            raise IndexError(f"There is no trajectory {number}: {self.split} has {len(self)} of these.")
-        batch = self.read([number % len(self)], fields=["level", "record"])
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"There is no trajectory {index}: {self.split} has {len(self)} of these.")
+        batch = self.read([index % len(self)], fields=["level", "record"])
         return jax.tree.map(lambda x: x[0], batch)
 
+    @renamed(numbers="indices")
     def read(
         self,
-        numbers: ArrayLike,
+        indices: ArrayLike,
         length: int | None = None,
         first: ArrayLike = 0,
         fields: Iterable[str] = (),
@@ -115,7 +117,7 @@ class Dataset:
         """These trajectories, or a window of each.
 
         Args:
-            numbers: of trajectories, one after another; one alone is as a list of one.
+            indices: of trajectories, in any order; one alone is as a list of one.
             length: steps of a window; None: whole records.
             first: step at which each window starts.
             fields: names of other fields, or what they are below, such as `record/state`.
@@ -126,15 +128,17 @@ class Dataset:
             Failure: the data is damaged.
         """
         windows, kind, chosen = Windows.of(length), kind_of(observation), named(fields, self.size)
-        numbers = np.atleast_1d(np.asarray(numbers, np.int64))
-        starts = np.broadcast_to(np.asarray(first, np.int64), numbers.shape)
+        indices = np.atleast_1d(np.asarray(indices, np.int64))
+        starts = np.broadcast_to(np.asarray(first, np.int64), indices.shape)
         _require_steps(starts)
         needed = [*chosen, *ALWAYS, *named(["level", *(["record/state"] if kind else [])], self.size)]
-        arrays = windows.cut(self._arrays(numbers, needed), starts)
+        whole = self._arrays(indices, needed)
+        timed_out = _timed_out(whole["record/done"], whole["record/goal"], self.rules.max_timesteps)
+        arrays = windows.cut(whole | {"record/truncated": timed_out}, starts)
         level, mask = tree_of(Level, arrays, "level/"), windows.mask(starts)
         live = action_mask(jax.tree.map(lambda x: np.moveaxis(x, 0, -1), level)).T[:, None]
         return Batch(
-            level_id=self._manifest["level_id"].take(pa.array(numbers)).to_numpy(),
+            level_id=self._manifest["level_id"].take(pa.array(indices)).to_numpy(),
             first=starts,
             mask=mask,
             observation=observed(kind, level, tree_of(State, arrays, "record/state/")) if kind else None,
@@ -142,22 +146,25 @@ class Dataset:
             action_mask=np.broadcast_to(live, arrays["record/action"].shape),
             reward=arrays["record/reward"],
             done=arrays["record/done"],
+            terminated=arrays["record/done"] & ~arrays["record/truncated"],
+            truncated=arrays["record/truncated"],
             goal=arrays["record/goal"],
             fields={name: arrays[name] for name in chosen},
         )
 
+    @renamed(batch="batch_size", part="subset", ahead="prefetch")
     def batches(
         self,
-        batch: int,
+        batch_size: int,
         seed: int | None = None,
-        part: str | None = None,
+        subset: str | None = None,
         length: int | None = None,
         fields: Iterable[str] = (),
         observation: str | None = ObservationType.SYMBOLIC_FLAT,
         epochs: int | None = 1,
         process_index: int = 0,
         process_count: int = 1,
-        ahead: int | None = None,
+        prefetch: int | None = None,
         start: dict[str, Any] | None = None,
     ) -> Batches:
         """Batches of trajectories, or of all their windows, read ahead by threads.
@@ -166,71 +173,78 @@ class Dataset:
         shape and every host as many.
 
         Args:
-            batch: trajectories or windows of a batch on this host.
+            batch_size: trajectories or windows of a batch on this host.
             seed: of the order, which is another one in each epoch; None: by level id and step.
-            part: `train` or `validation`; None: both.
+            subset: `train` or `validation`, told apart by what levels consist of; None: both.
             length: steps of a window; None: whole records.
             fields: names of other fields, or what they are below, such as `record/state`.
             observation: one of the environment's, or None.
             epochs: how many; None: no end.
             process_index: of this host.
             process_count: hosts that share the batches; each calls this with the same words, but for its index.
-            ahead: batches that are read before they are asked for; default: two for each core.
+            prefetch: batches that are read before they are asked for; default: two for each core.
             start: what `Batches.state` gave, to go on from there; it may come from another host.
 
         Raises:
-            UserError: any of these is wrong, or the part is empty.
+            UserError: any of these is wrong, or the subset is empty.
         """
-        windows, numbers, fields = Windows.of(length), self._part(part), tuple(named(fields, self.size))
+        windows, indices, fields = Windows.of(length), self._subset(subset), tuple(named(fields, self.size))
         kind_of(observation)
-        order = EpochOrder(len(numbers) * windows.each, batch, seed, process_index, process_count)
+        order = EpochOrder(len(indices) * windows.each, batch_size, seed, process_index, process_count)
 
         def load(position: int) -> Batch:
             items, new = order.items(position)
             which, first = windows.at(items)
-            found = self.read(numbers[which], length, first, fields, observation)
+            found = self.read(indices[which], length, first, fields, observation)
             return replace(found, mask=found.mask & new[:, None])
 
-        of = {"trajectories": self.fingerprint, "part": part, "validation": self._opened_with[-1], "length": length}
-        of |= {"batch": batch, "seed": seed, "process_count": process_count}
+        of = {"trajectories": self.fingerprint, "subset": subset, "validation": self._opened_with[-1], "length": length}
+        of |= {"batch_size": batch_size, "seed": seed, "process_count": process_count}
         count = None if epochs is None else epochs * order.batches
-        return Batches(load, count, of, 2 * len(own_cores()) if ahead is None else ahead, start)
+        return Batches(load, count, of, 2 * len(own_cores()) if prefetch is None else prefetch, start)
 
+    @renamed(part="subset")
     def grain(
         self,
-        part: str | None = None,
+        subset: str | None = None,
         length: int | None = None,
         fields: Iterable[str] = (),
         observation: str | None = ObservationType.SYMBOLIC_FLAT,
     ) -> TrajectorySource:
         """Trajectories or windows one by one, as a data source for grain and a data set for a torch DataLoader.
 
-        The words are those of `batches`; elements are dictionaries of numpy arrays [time, ...].
+        The arguments are those of `batches`; elements are dictionaries of numpy arrays [time, ...].
         """
-        return TrajectorySource(self, self._part(part), part, length, named(fields, self.size), kind_of(observation))
+        chosen = named(fields, self.size)
+        return TrajectorySource(self, self._subset(subset), subset, length, chosen, kind_of(observation))
 
     torch = grain
 
-    def levels(self, numbers: ArrayLike) -> Level:
+    @renamed(numbers="indices")
+    def levels(self, indices: ArrayLike) -> Level:
         """The levels of these trajectories as `levelproof.make` takes them, level axis last."""
-        arrays = self._arrays(np.atleast_1d(np.asarray(numbers, np.int64)), named(["level"], self.size))
+        arrays = self._arrays(np.atleast_1d(np.asarray(indices, np.int64)), named(["level"], self.size))
         return jax.tree.map(lambda x: np.ascontiguousarray(np.moveaxis(x, 0, -1)), tree_of(Level, arrays, "level/"))
 
-    def state(self, number: ArrayLike, step: ArrayLike = 0) -> EnvState:
+    @renamed(number="index")
+    def state(self, index: ArrayLike, step: ArrayLike = 0) -> EnvState:
         """The environment's state before a step of a trajectory; of several, with an axis for them in front.
+
+        Its `level_index` is the trajectory's index.
 
         What is played from there by the split's `rules` and the stored actions is the stored future, bit for bit, on
         the stack that made it.
         """
-        numbers, steps = np.broadcast_arrays(np.asarray(number, np.int64), np.asarray(step, np.int64))
+        indices, steps = np.broadcast_arrays(np.asarray(index, np.int64), np.asarray(step, np.int64))
         _require_steps(steps)
         fields = named(["level", "record/state", "record/timestep", "record/last_distance"], self.size)
-        arrays = self._arrays(numbers.ravel(), fields)
-        rows = np.arange(numbers.size)
+        arrays = self._arrays(indices.ravel(), fields)
+        rows = np.arange(indices.size)
         arrays |= {name: x[rows, steps.ravel()] for name, x in arrays.items() if name.startswith("record/")}
         level = replace(tree_of(Level, arrays, "level/"), state=tree_of(State, arrays, "record/state/"))
-        given = level, arrays["record/timestep"], arrays["record/last_distance"]
-        return EnvState(*jax.tree.map(lambda x: jnp.asarray(x.reshape((*numbers.shape, *x.shape[1:]))), given))
+        counts = indices.ravel().astype(np.int32), np.zeros(indices.size, np.int32)
+        given = level, arrays["record/timestep"], arrays["record/last_distance"], *counts
+        return EnvState(*jax.tree.map(lambda x: jnp.asarray(x.reshape((*indices.shape, *x.shape[1:]))), given))
 
     @cached_property
     def fingerprint(self) -> str:
@@ -244,23 +258,23 @@ class Dataset:
     def __repr__(self) -> str:
         return f"levelproof.open({', '.join(map(repr, self._opened_with))}) of {many(len(self), 'trajectory')}"
 
-    def _part(self, part: str | None) -> Int[np.ndarray, " number"]:
+    def _subset(self, subset: str | None) -> Int[np.ndarray, " index"]:
         share = self._opened_with[-1]
-        numbers = np.flatnonzero(in_part(self._manifest["content_hash"].to_pylist(), part, share))
-        if not len(numbers):
+        indices = np.flatnonzero(in_subset(self._manifest["content_hash"].to_pylist(), subset, share))
+        if not len(indices):
             raise UserError(
-                f"None of the {len(self)} trajectories is in the part {part}: open with another validation=."
+                f"None of the {len(self)} trajectories is in the subset {subset}: open with another validation=."
             )
-        return numbers
+        return indices
 
-    def _arrays(self, numbers: Int[np.ndarray, " batch"], fields: Sequence[str]) -> dict[str, np.ndarray]:
+    def _arrays(self, indices: Int[np.ndarray, " batch"], fields: Sequence[str]) -> dict[str, np.ndarray]:
         """Named arrays of trajectories, level axis first; looked for again where a seal has moved them."""
-        if not numbers.size or numbers.min() < 0 or numbers.max() >= len(self):
-            raise UserError(f"There are no trajectories {numbers.tolist()}: give some from 0 to {len(self) - 1}.")
+        if not indices.size or indices.min() < 0 or indices.max() >= len(self):
+            raise UserError(f"There are no trajectories {indices.tolist()}: give some from 0 to {len(self) - 1}.")
         while True:
             manifest = self._manifest
             try:
-                return read_placed(self.split, manifest.select(COLUMNS).take(pa.array(numbers)), fields, self._shard)
+                return read_placed(self.split, manifest.select(COLUMNS).take(pa.array(indices)), fields, self._shard)
             except Failure:
                 if not self._found_again(manifest):
                     raise
@@ -282,6 +296,16 @@ class Dataset:
 def _require_steps(steps: np.ndarray) -> None:
     if ((steps < 0) | (steps >= RECORD_STEPS)).any():
         raise UserError(f"There are no steps {steps.tolist()} in a record: give some from 0 to {RECORD_STEPS - 1}.")
+
+
+def _timed_out(
+    done: Bool[np.ndarray, "item time"], goal: Bool[np.ndarray, "item time"], limit: int
+) -> Bool[np.ndarray, "item time"]:
+    """Steps of whole records at which the time limit, env steps, ended an episode that had not reached its goal."""
+    steps = np.arange(done.shape[1])
+    starts = np.where(done, steps + 1, 0)[:, :-1]  # of the episode after each end
+    start = np.maximum.accumulate(np.pad(starts, [(0, 0), (1, 0)]), 1)
+    return done & ~goal & (steps - start + 1 >= limit)
 
 
 def _opened_again(opened_with: tuple, fingerprint: str) -> Dataset:

@@ -20,14 +20,14 @@ class EpochOrder:
     """The batches of all epochs, as one host has them."""
 
     count: int  # items
-    batch: int  # items of a batch on this host
+    batch_size: int  # items of a batch on this host
     seed: int | None  # None: in the order of items
     process_index: int = 0
     process_count: int = 1
 
     def __post_init__(self) -> None:
-        if not (type(self.batch) is int and self.batch > 0):
-            raise UserError(f"A batch cannot have {self.batch} items: give a number from 1.")
+        if not (type(self.batch_size) is int and self.batch_size > 0):
+            raise UserError(f"A batch cannot have {self.batch_size} items: give a number from 1.")
         if not 0 <= self.process_index < self.process_count:
             raise UserError(
                 f"There is no process {self.process_index} of {self.process_count}: "
@@ -39,7 +39,7 @@ class EpochOrder:
     @property
     def batches(self) -> int:
         """Of an epoch, on every host."""
-        return -(-self.count // (self.batch * self.process_count))
+        return -(-self.count // (self.batch_size * self.process_count))
 
     def items(self, position: int) -> tuple[Int[np.ndarray, " batch"], Bool[np.ndarray, " batch"]]:
         """The items of a batch, counted from the first epoch's first, and which of them are no repetition.
@@ -47,8 +47,8 @@ class EpochOrder:
         Every item comes once an epoch; what is missing to a last whole batch on every host is filled up.
         """
         epoch, step = divmod(position, self.batches)
-        first = (step * self.process_count + self.process_index) * self.batch
-        places = np.arange(first, first + self.batch)
+        first = (step * self.process_count + self.process_index) * self.batch_size
+        places = np.arange(first, first + self.batch_size)
         items = places % self.count
         if self.seed is not None:
             items = permuted(items, self.count, self.seed, epoch)

@@ -17,8 +17,8 @@ from levelproof.pipeline.read.dataset.windows import Windows
 class Readable(Protocol):
     """What a source needs of a `Dataset`, which makes it."""
 
-    def read(self, numbers: Any, length: Any, first: Any, fields: Any, observation: Any, /) -> Batch: ...
-    def grain(self, part: Any, length: Any, fields: Any, observation: Any, /) -> "TrajectorySource": ...
+    def read(self, indices: Any, length: Any, first: Any, fields: Any, observation: Any, /) -> Batch: ...
+    def grain(self, subset: Any, length: Any, fields: Any, observation: Any, /) -> "TrajectorySource": ...
 
 
 class TrajectorySource:
@@ -31,19 +31,19 @@ class TrajectorySource:
     def __init__(
         self,
         data: Readable,
-        numbers: Int[np.ndarray, " number"],
-        part: str | None,
+        indices: Int[np.ndarray, " index"],
+        subset: str | None,
         length: int | None,
         fields: Sequence[str],
         observation: ObservationType | None,
     ) -> None:
-        """Made by `Dataset.grain` and `Dataset.torch`; `numbers` are the trajectories of `part`."""
-        self._data, self._numbers, self._windows = data, numbers, Windows.of(length)
-        self._words = (part, length, tuple(fields), observation)
+        """Made by `Dataset.grain` and `Dataset.torch`; `indices` are the trajectories of `subset`."""
+        self._data, self._indices, self._windows = data, indices, Windows.of(length)
+        self._settings = (subset, length, tuple(fields), observation)
         self._process = os.getpid()
 
     def __len__(self) -> int:
-        return len(self._numbers) * self._windows.each
+        return len(self._indices) * self._windows.each
 
     def __getitem__(self, item: int) -> dict[str, Any]:
         """One trajectory or window: arrays [time, ...] by name."""
@@ -51,7 +51,7 @@ class TrajectorySource:
 
     def __getitems__(self, items: Sequence[int]) -> list[dict[str, Any]]:
         """Several at once, as torch asks for them if it can."""
-        _, length, fields, observation = self._words
+        _, length, fields, observation = self._settings
         if observation and os.getpid() != self._process:
             raise UserError(
                 "A forked process cannot make observations with JAX: give the DataLoader "
@@ -61,18 +61,17 @@ class TrajectorySource:
         if not ((chosen >= 0) & (chosen < len(self))).all():
             raise IndexError(f"There is no item {chosen.max()}: these are {len(self)}.")
         which, first = self._windows.at(chosen)
-        batch = self._data.read(self._numbers[which], length, first, fields, observation)
+        batch = self._data.read(self._indices[which], length, first, fields, observation)
         return [_element(batch, i) for i in range(len(chosen))]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self._data).grain, (self._data, *self._words)
+        return type(self._data).grain, (self._data, *self._settings)
 
     def __repr__(self) -> str:
-        part, length, fields, observation = self._words
-        words = (
-            f"part={part!r}, length={length}, fields={list(fields)}, observation={observation and str(observation)!r}"
-        )
-        return f"{self._data!r}.grain({words})"
+        subset, length, fields, observation = self._settings
+        seen = observation and str(observation)
+        settings = f"subset={subset!r}, length={length}, fields={list(fields)}, observation={seen!r}"
+        return f"{self._data!r}.grain({settings})"
 
 
 def _element(batch: Batch, i: int) -> dict[str, Any]:

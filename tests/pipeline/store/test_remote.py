@@ -157,7 +157,7 @@ def test_a_split_in_s3_reads_as_in_its_folder(bucket: Bucket, split: Path) -> No
 def test_a_split_in_s3_opens_as_its_folder_does(bucket: Bucket, split: Path) -> None:
     there, here = (levelproof.open(path, where="label = 'solved'", validation=0.0) for path in (S3, split))
     assert there.manifest.equals(here.manifest)
-    words: dict[str, Any] = {"batch": 3, "seed": 0, "observation": None, "fields": ["record/state/position"]}
+    words: dict[str, Any] = {"batch_size": 3, "seed": 0, "observation": None, "fields": ["record/state/position"]}
     for one, other in zip(there.batches(**words), here.batches(**words), strict=True):
         assert one.level_id.tolist() == other.level_id.tolist()
         assert same_bits(one.fields["record/state/position"], other.fields["record/state/position"]).all()

@@ -45,7 +45,7 @@ def test_epochs_have_orders_of_their_own(data: Dataset) -> None:
 
 
 def test_parts_share_nothing(data: Dataset) -> None:
-    train, validation = (seen(data.batches(8, part=part, **PLAIN)) for part in ("train", "validation"))
+    train, validation = (seen(data.batches(8, subset=subset, **PLAIN)) for subset in ("train", "validation"))
     assert len(train) > len(validation) > 0
     assert sorted(train + validation) == [(i, 0) for i in data.manifest["level_id"].to_pylist()]
 

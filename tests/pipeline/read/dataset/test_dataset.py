@@ -14,7 +14,7 @@ import levelproof
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import ObservationType, make
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.read.dataset.dataset import Dataset, open
+from levelproof.pipeline.read.dataset.dataset import Dataset, _timed_out, open
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.store.fields import arrays_of, same_bits
 from levelproof.pipeline.store.manifest import read_manifest
@@ -63,6 +63,44 @@ def test_a_batch_has_the_trajectories_in_front(data: Dataset) -> None:
     assert_same(batch.state.rotation[1], data[0].state.rotation)
     with pytest.raises(UserError, match=r"The field record/manifold/active was not read: ask for fields=\['record'\]"):
         batch.record  # noqa: B018
+
+
+def test_ends_are_of_the_task_or_of_the_time_limit(data: Dataset) -> None:
+    every = np.arange(len(data))
+    batch = data.read(every, fields=["record/timestep"], observation=None)
+    late = batch.fields["record/timestep"] + 1 >= data.rules.max_timesteps
+    assert_same(batch.truncated, batch.done & ~batch.goal & late)
+    assert_same(batch.terminated, batch.done & ~batch.truncated)
+    assert batch.terminated.any()
+    assert not (batch.goal & ~batch.terminated).any()
+    window = data.read(every, length=56, first=200, observation=None)
+    assert_same(window.truncated, batch.truncated[:, 200:])
+
+
+def test_an_episode_as_long_as_the_limit_is_truncated() -> None:
+    done, goal = np.zeros((3, 12), bool), np.zeros((3, 12), bool)
+    done[0, [3, 7, 10]] = done[1, [1, 5, 11]] = done[2, [3]] = goal[2, 3] = True
+    expected = np.zeros((3, 12), bool)
+    expected[0, [3, 7]] = expected[1, [5, 11]] = True
+    assert_same(_timed_out(done, goal, 4), expected)
+
+
+def test_arguments_of_the_version_before_still_work_and_warn(data: Dataset) -> None:
+    plain = {"seed": 1, "observation": None}
+    with pytest.warns(DeprecationWarning, match="of batches is now") as warned:
+        old = data.batches(**{"batch": 8, "part": "train", "ahead": 1} | plain)  # type: ignore[call-arg]
+    assert {Path(warning.filename).name for warning in warned} == {"test_dataset.py"}
+    new = data.batches(batch_size=8, subset="train", prefetch=1, **plain)
+    assert_same(next(old).level_id, next(new).level_id)
+    position = new.state()
+    before = position["of"] | {"batch": 8, "part": "train"}
+    del before["batch_size"], before["subset"]
+    again = data.batches(8, subset="train", start={"position": position["position"], "of": before}, **plain)
+    assert_same(next(again).level_id, next(new).level_id)
+    with pytest.warns(DeprecationWarning, match="numbers= of read is now indices="):
+        assert_same(data.read(numbers=[1], observation=None).level_id, data.read([1], observation=None).level_id)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match=r"batches got batch_size= and batch=, its old name"):
+        data.batches(batch_size=8, batch=8)  # type: ignore[call-arg]
 
 
 def test_windows_are_parts_of_trajectories(data: Dataset) -> None:
@@ -171,7 +209,7 @@ def test_its_pickle_is_small_and_notices_other_trajectories(split: Path, tmp_pat
         ({"fields": ["xyzzy"]}, "There is no field 'xyzzy'"),
         ({"observation": "flat"}, "There is no observation 'flat': choose one of symbolic_flat, "),
         ({"length": 300}, "A window cannot have 300 steps"),
-        ({"part": "test"}, "There is no part 'test'"),
+        ({"subset": "test"}, "There is no subset 'test'"),
     ],
 )
 def test_what_cannot_be_read_is_a_sentence(data: Dataset, words: dict, sentence: str) -> None:
@@ -192,8 +230,8 @@ def test_what_cannot_be_opened_is_a_sentence(split: Path, tmp_path: Path) -> Non
         open(split, columns=["lable"])
     with pytest.raises(UserError, match="The share of validation is 2"):
         open(split, validation=2)
-    with pytest.raises(UserError, match="trajectories is in the part validation: open with another validation="):
-        open(split, validation=0).batches(8, part="validation")
+    with pytest.raises(UserError, match="trajectories is in the subset validation: open with another validation="):
+        open(split, validation=0).batches(8, subset="validation")
     for numbers in ([999], [-1, 0], []):
         with pytest.raises(UserError, match="There are no trajectories"):
             open(split).read(numbers)

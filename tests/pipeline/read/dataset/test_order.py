@@ -64,12 +64,12 @@ def test_without_a_seed_items_come_in_their_order() -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ({"batch": 0}, "A batch cannot have 0 items"),
-        ({"batch": 2.5}, r"A batch cannot have 2\.5 items"),
+        ({"batch_size": 0}, "A batch cannot have 0 items"),
+        ({"batch_size": 2.5}, r"A batch cannot have 2\.5 items"),
         ({"process_index": 2, "process_count": 2}, "There is no process 2 of 2"),
         ({"seed": -1}, "The seed is -1"),
     ],
 )
 def test_what_makes_no_order_is_refused(words: dict, sentence: str) -> None:
     with pytest.raises(UserError, match=sentence):
-        EpochOrder(**({"count": 10, "batch": 2, "seed": 0} | words))
+        EpochOrder(**({"count": 10, "batch_size": 2, "seed": 0} | words))

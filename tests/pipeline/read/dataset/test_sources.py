@@ -16,7 +16,8 @@ def test_elements_are_windows_by_name(data: Dataset) -> None:
     one, whole = source[5], data[1]
     assert {name: x.shape for name, x in one.items()} == {
         "level_id": (), "first": (), "mask": (100,), "observation": (100, 140), "action": (100, 6),
-        "action_mask": (100, 6), "reward": (100,), "done": (100,), "goal": (100,), "level/role": (7,),
+        "action_mask": (100, 6), "reward": (100,), "done": (100,), "terminated": (100,), "truncated": (100,),
+        "goal": (100,), "level/role": (7,),
     }  # fmt: skip
     assert one["mask"].sum() == 56
     assert np.array_equal(one["observation"][:56], whole.observation[200:])
@@ -25,7 +26,7 @@ def test_elements_are_windows_by_name(data: Dataset) -> None:
 
 
 def test_a_worker_process_gets_a_small_pickle(data: Dataset) -> None:
-    source = data.grain(part="train", length=64, observation=None)
+    source = data.grain(subset="train", length=64, observation=None)
     pickled = pickle.dumps(source)
     assert len(pickled) < 1000
     again = pickle.loads(pickled)
@@ -54,7 +55,7 @@ def test_a_forked_process_reads_but_makes_no_observations(data: Dataset) -> None
 def test_grain_shuffles_and_batches_it(data: Dataset, workers: int) -> None:
     grain = pytest.importorskip("grain")
     pytest.importorskip("absl.flags").FLAGS.mark_as_parsed()  # grain's workers look at them
-    source = data.grain(part="train", length=64, observation=None)
+    source = data.grain(subset="train", length=64, observation=None)
     loader = grain.DataLoader(
         data_source=source,
         sampler=grain.samplers.IndexSampler(len(source), shuffle=True, seed=0, num_epochs=1),
@@ -81,7 +82,7 @@ def test_grain_shuffles_and_batches_it(data: Dataset, workers: int) -> None:
 )
 def test_a_torch_loader_takes_it_as_it_is(data: Dataset, context: str | None, observation: str | None) -> None:
     torch = pytest.importorskip("torch")
-    source = data.torch(part="train", observation=observation)
+    source = data.torch(subset="train", observation=observation)
     loader = torch.utils.data.DataLoader(
         source, batch_size=8, shuffle=True, num_workers=2 if context else 0, multiprocessing_context=context
     )
