@@ -1,6 +1,11 @@
-"""What the symbolic-flat observation of every step costs beside the step: env steps/s without and with it."""
+"""What the symbolic-flat observation of every step costs, and what `levelproof.Lanes` and `vmap` keep of the speed.
+
+Four ways, measured in turns: lanes that stay on their level, without and with observations; `levelproof.Lanes`, whose
+lanes start another level at each end; and `jax.vmap` of `Environment.step`.
+"""
 
 import argparse
+import time
 from functools import partial
 from typing import Any
 
@@ -9,15 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.reference.actions import sticky_actions
-from benchmarks.reference.serve import timed
 from benchmarks.report import Report, Table
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.environment import make, starts
+from levelproof.levelgen.task.lanes import Lanes
 from levelproof.levelgen.task.observe.flat import level_features, symbolic_flat
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 
+WAYS = ("without", "with", "Lanes.step", "vmap(env.step)")
 LANES = 128  # stepped together
+LEVELS = 1024  # that lanes start
 STEPS = 64
 REPEATS = 60
 
@@ -32,34 +40,73 @@ def rollout(level, now, actions, observed: bool):
         seen = symbolic_flat(level, now.state, constant) if observed else seen
         return (now, seen), outcome.done.sum()
 
-    start = jnp.zeros((len(constant), LANES))
+    start = jnp.zeros((len(constant), actions.shape[-1]))
     return jax.lax.scan(act, (now, start), actions)
+
+
+def lanes_rollout(lanes, table, played, state, actions, coming):
+    """The same with `levelproof.Lanes`; `coming` are the levels that come next."""
+
+    def act(carry, given):
+        seen, state, played, _, done, _ = lanes.step(table, carry[2], carry[1], *given)
+        return (seen, state, played), done.sum()
+
+    return jax.lax.scan(act, (lanes.observe(state, played), state, played), (actions, coming))
+
+
+def mapped_rollout(env, params, state, actions, key):
+    """The same with `jax.vmap(env.step)`."""
+    step = jax.vmap(env.step, (0, 0, 0, None))
+
+    def act(carry, given):
+        action, key = given
+        seen, state, _, done, _ = step(jax.random.split(key, len(carry[0])), carry[1], action.T, params)
+        return (seen, state), done.sum()
+
+    return jax.lax.scan(act, (jax.vmap(env.get_obs)(state), state), (actions, jax.random.split(key, STEPS)))
 
 
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
+    parser.add_argument("--lanes", type=int, default=LANES, help=f"stepped together (default: {LANES})")
+    parser.add_argument("--repeats", type=int, default=REPEATS, help=f"of which the best counts (default: {REPEATS})")
 
 
 def run(given: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
-    results = [measured(size) for size in given.size]
-    rows = [
-        [of["size"], f"{of['without']:,.0f}", f"{of['with']:,.0f}", f"{1 - of['with'] / of['without']:.0%}"]
-        for of in results
-    ]
-    table = Table(("size", "without", "with", "slower by"), rows, "Env steps/s of one core")
+    results = [measured(size, given.lanes, given.repeats) for size in given.size]
+    rows = [[of["size"], *(f"{of[way]:,.0f}" for way in WAYS), *_shares(of)] for of in results]
+    header = ("size", *WAYS, "observation slower by", "Lanes", "vmap")
+    table = Table(header, rows, "Env steps/s of one core; Lanes and vmap also as a share of `with`")
     return Report("The symbolic-flat observation", results, [table])
 
 
-def measured(size: str) -> dict[str, Any]:
-    """Env steps/s, the best of REPEATS in turns."""
-    level = jax.tree.map(jnp.asarray, sample_levels(np.arange(LANES), SIZES[size]))
-    given = level, task.reset(level), jnp.asarray(sticky_actions(STEPS, LANES))
-    ways = {seen: jax.jit(partial(rollout, observed=seen)).lower(*given).compile() for seen in (False, True)}
-    best = dict.fromkeys(ways, np.inf)
-    for _ in range(REPEATS):
-        for seen, compiled in ways.items():
-            seconds, _ = timed(lambda compiled=compiled: jax.block_until_ready(compiled(*given)))
-            best[seen] = min(best[seen], seconds)
-    rate = {seen: STEPS * LANES / seconds for seen, seconds in best.items()}
-    return {"size": size, "unit": "env steps/s of one core", "without": rate[False], "with": rate[True]}
+def _shares(of: dict[str, Any]) -> list[str]:
+    return [f"{share:.0%}" for share in (1 - of["with"] / of["without"], *(of[way] / of["with"] for way in WAYS[2:]))]
+
+
+def measured(size: str, lanes: int, repeats: int) -> dict[str, Any]:
+    """Env steps/s, the best of the repeats in turns."""
+    levels = jax.tree.map(jnp.asarray, sample_levels(np.arange(LEVELS), size))
+    level, action = jax.tree.map(lambda x: x[..., :lanes], levels), jnp.asarray(sticky_actions(STEPS, lanes))
+    env, params = make(levels)
+    ours = Lanes(env)
+    table = jax.jit(ours.table)(params)
+    _, state, played = jax.jit(ours.reset)(table, jnp.arange(lanes))
+    coming = jax.random.randint(jax.random.key(0), (STEPS, lanes), 0, LEVELS)
+    fixed, programs = (level, task.reset(level), action), {}
+    for way, program, given in (
+        ("without", partial(rollout, observed=False), fixed),
+        ("with", partial(rollout, observed=True), fixed),
+        ("Lanes.step", partial(lanes_rollout, ours), (table, played, state, action, coming)),
+        ("vmap(env.step)", partial(mapped_rollout, env), (params, starts(level), action, jax.random.key(0))),
+    ):
+        programs[way] = jax.jit(program).lower(*given).compile(), given
+    best = dict.fromkeys(programs, np.inf)
+    for _ in range(repeats):
+        for way, (compiled, given) in programs.items():
+            begin = time.process_time()  # of this process alone: its neighbours on the machine count less
+            jax.block_until_ready(compiled(*given))
+            best[way] = min(best[way], time.process_time() - begin)
+    rates = {way: STEPS * lanes / seconds for way, seconds in best.items()}
+    return {"size": size, "lanes": lanes, "unit": "env steps/s of one core", **rates}

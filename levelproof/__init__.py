@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from levelproof.levelgen.sampling.distribution import Distribution as Distribution
     from levelproof.levelgen.sampling.sampler import sample_levels as sample_levels
     from levelproof.levelgen.task.environment import starts as starts
+    from levelproof.levelgen.task.lanes import Lanes as Lanes
     from levelproof.levelgen.task.rules import TaskParams as TaskParams
+    from levelproof.levelgen.task.to_gymnax import to_gymnax as to_gymnax
     from levelproof.physics.types import Size as Size
     from levelproof.pipeline.errors import Failure as Failure
     from levelproof.pipeline.errors import LevelproofError as LevelproofError
@@ -57,6 +59,7 @@ HOME = {
     "SIZES": "levelproof.levelgen.level",
     "EngineDiffers": "levelproof.pipeline.store.shard",
     "Distribution": "levelproof.levelgen.sampling.distribution",
+    "Lanes": "levelproof.levelgen.task.lanes",
     "Level": "levelproof.levelgen.level",
     "LevelFile": "levelproof.levelgen.files.level_file",
     "Record": "levelproof.experts.witness",
@@ -73,6 +76,7 @@ HOME = {
     "replay": "levelproof.experts.witness",
     "sample_levels": "levelproof.levelgen.sampling.sampler",
     "starts": "levelproof.levelgen.task.environment",
+    "to_gymnax": "levelproof.levelgen.task.to_gymnax",
     "write_level_file": "levelproof.levelgen.files.level_file",
 }
 __all__ = list(HOME)  # pyright: ignore[reportUnsupportedDunderAll]

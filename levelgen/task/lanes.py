@@ -1,0 +1,125 @@
+"""The environment for learners that step many lanes: batch axis last, levels by index into a table.
+
+`jax.vmap(env.step)` carries every lane's level through every step. Here a lane's state is the episode alone, and the
+index of its level; what the level consists of is copied from the table when a lane starts an episode, and only then.
+The learner says which level comes next in each lane, so a step takes no key and draws nothing.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.environment import CONTROLS, LOOKS, Environment, EnvParams, ObservationType
+from levelproof.levelgen.task.observe.flat import level_features, symbolic_flat
+from levelproof.levelgen.task.rules import TaskState
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LevelTable:
+    """Levels as lanes take them, level axis last."""
+
+    level: Level
+    start: TaskState  # of an episode in each level
+    features: Float[Array, "feature level"]  # what is constant in the symbolic-flat observation; else no rows
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LaneState:
+    """The episodes under way, without what is constant in their levels."""
+
+    now: TaskState
+    level_index: Int[Array, " lane"]  # into the table
+
+
+LaneStep = tuple[Any, LaneState, LevelTable, Float[Array, " lane"], Bool[Array, " lane"], dict[str, Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Lanes:
+    """An environment (`levelproof.make`) stepped in lanes: its rules, actions and observations, batch axis last.
+
+    `table` is made once from parameters. `reset` starts episodes, and gives `played`: each lane's own columns of the
+    table, which every `step` takes and returns. `take` gives them for any state.
+    """
+
+    env: Environment
+
+    def table(self, params: EnvParams | None = None) -> LevelTable:
+        """The levels of `params`, and what is computed once from each."""
+        level = (params or self.env.default_params).levels
+        flat = self.env.observation_type == ObservationType.SYMBOLIC_FLAT
+        features = level_features(level) if flat else jnp.zeros((0, len(level)))
+        return LevelTable(level, task.reset(level), features)
+
+    def take(self, table: LevelTable, level_index: Int[Array, " lane"]) -> LevelTable:
+        """Columns of the table, one for each lane."""
+        return jax.tree.map(lambda x: x[..., level_index], table)
+
+    def reset(self, table: LevelTable, level_index: Int[Array, " lane"]) -> tuple[Any, LaneState, LevelTable]:
+        """Start an episode in every lane: (observation, state, played)."""
+        played = self.take(table, level_index)
+        state = LaneState(played.start, level_index)
+        return self.observe(state, played), state, played
+
+    def step(
+        self, table: LevelTable, played: LevelTable, state: LaneState, action: Array, next_index: Int[Array, " lane"]
+    ) -> LaneStep:
+        """Take one env step in every lane: (observation, state, played, reward, done, info).
+
+        Args:
+            table: all levels.
+            played: each lane's level, as `reset` or the step before gave it.
+            state: the episodes under way.
+            action: of the environment's kind, lanes last: int [lane], int [6, lane] or float [6, lane].
+            next_index: into the table: the level that a lane starts if this step ends its episode.
+
+        `info` has the entries of `Environment.step`, lanes last. Nothing is differentiated through the world.
+        """
+        env, level = self.env, played.level
+        state, action = jax.lax.stop_gradient((state, action))
+        driven = CONTROLS[env.action_type](level, action)
+        now, result, closing, _ = task.advance_driven(level, state.now, driven, env.rules)
+        info = {"GoalR": result.goal, "distance": closing.distance, "terminated": closing.terminated}
+        info |= {"truncated": result.done & ~closing.terminated, "level_index": state.level_index}
+        after = replace(state, now=now)
+        if env.final_observation:
+            info["final_observation"] = self.observe(after, played)
+        if env.auto_reset:
+            after = LaneState(now, jnp.where(result.done, next_index.astype(jnp.int32), state.level_index))
+            after, played = _started(table, played, after, result.done)
+        return self.observe(after, played), after, played, result.reward, result.done, info
+
+    def observe(self, state: LaneState, played: LevelTable) -> Any:
+        """What is seen of states, lanes last."""
+        if self.env.observation_type == ObservationType.SYMBOLIC_FLAT:
+            return symbolic_flat(played.level, state.now.state, played.features)
+        world = state.now.state
+        return LOOKS[self.env.observation_type](replace(played.level, state=world), world)
+
+
+def _started(
+    table: LevelTable, played: LevelTable, state: LaneState, done: Bool[Array, " lane"]
+) -> tuple[LaneState, LevelTable]:
+    """Copy the table's columns into the lanes that start an episode, lane by lane: few do in any one step.
+
+    Selecting among all lanes would read and write every level in every step, which takes as long as the step itself.
+    """
+
+    def start_one(carry: tuple) -> tuple:
+        waiting, now, played = carry
+        lane = jnp.argmax(waiting)
+        column = lambda x: jax.lax.dynamic_slice_in_dim(x, state.level_index[lane], 1, -1)
+        into = lambda x, one: jax.lax.dynamic_update_slice_in_dim(x, one, lane, -1)
+        chosen = jax.tree.map(column, table)
+        now, played = jax.tree.map(into, (now, played), (chosen.start, chosen))
+        return waiting.at[lane].set(False), now, played
+
+    _, now, played = jax.lax.while_loop(lambda carry: carry[0].any(), start_one, (done, state.now, played))
+    return replace(state, now=now), played

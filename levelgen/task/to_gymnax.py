@@ -1,0 +1,103 @@
+"""The environment as one of gymnax's: an instance of its class, with its spaces. Needs gymnax installed.
+
+Before version 1.0, gymnax's `step` returns (observation, state, reward, done, info); since then, (observation, state,
+reward, terminated, truncated, info). What comes out here is what the installed version returns.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Key
+
+from levelproof.levelgen.task.environment import Environment, EnvParams, EnvState
+from levelproof.levelgen.task.spaces import Dict, Discrete, MultiDiscrete, Space
+
+
+def to_gymnax(env: Environment) -> Any:
+    """Wrap an environment in gymnax's own classes, for code that checks for them.
+
+    The result is a `gymnax.environments.environment.Environment`. Its parameters are those of `levelproof.make`, and
+    `override_reset_state` may be given to `reset` and `step`, too. Actions of six entries are a gymnax `Tuple`; `step`
+    takes them as a tuple or as an array. A state alone does not say whether its episode has ended, so there is no
+    `is_terminal` and no `discount`: `step` and `info` tell.
+
+    Raises:
+        ImportError: gymnax is not installed.
+    """
+    from gymnax.environments.environment import Environment as GymnaxBase
+
+    splits_done = hasattr(GymnaxBase, "is_truncated")  # since 1.0
+    inner = replace(env, final_observation=True) if splits_done else env  # 1.0 always has it in info
+
+    def as_gymnax(result: tuple) -> tuple:
+        observation, state, reward, done, info = result
+        return (
+            observation,
+            state,
+            reward,
+            *((info["terminated"], info["truncated"]) if splits_done else (done,)),
+            info,
+        )
+
+    class GymnaxEnvironment(GymnaxBase):
+        @property
+        def default_params(self) -> EnvParams:  # pyright: ignore[reportIncompatibleVariableOverride]
+            return inner.default_params
+
+        @property
+        def name(self) -> str:
+            return inner.name
+
+        @property
+        def num_actions(self) -> int:
+            return inner.num_actions
+
+        def reset(self, key: Key[Array, ""], params: EnvParams | None = None, override_reset_state=None) -> tuple:
+            return inner.reset(key, params, override_reset_state)
+
+        def step(
+            self, key: Key[Array, ""], state: EnvState, action: Any, params: EnvParams | None = None,
+            override_reset_state: EnvState | None = None,
+        ) -> tuple:  # fmt: skip
+            return as_gymnax(inner.step(key, state, _array(action), params, override_reset_state))
+
+        def reset_env(self, key: Key[Array, ""], params: EnvParams | None = None) -> tuple:
+            return inner.reset_env(key, params)
+
+        def step_env(self, key: Key[Array, ""], state: EnvState, action: Any, params: EnvParams | None = None) -> tuple:
+            """One env step without reset; as gymnax has it, the fourth is `terminated` since 1.0, before it `done`."""
+            observation, state, reward, done, info = inner.step_env(key, state, _array(action), params)
+            return observation, state, reward, info["terminated"] if splits_done else done, info
+
+        def get_obs(self, state: EnvState, params: EnvParams | None = None, key: Key[Array, ""] | None = None) -> Any:
+            return inner.get_obs(state)
+
+        def is_truncated(self, state: EnvState, params: EnvParams | None = None) -> Bool[Array, ""]:
+            return state.timestep >= inner.rules.max_timesteps
+
+        def action_space(self, params: EnvParams | None = None) -> Any:
+            return _converted(inner.action_space(params))
+
+        def observation_space(self, params: EnvParams | None = None) -> Any:
+            return _converted(inner.observation_space(params))
+
+    return GymnaxEnvironment()
+
+
+def _array(action: Any) -> Array:
+    return jnp.stack(action) if isinstance(action, tuple) else action
+
+
+def _converted(space: Space) -> Any:
+    from gymnax.environments import spaces
+
+    if isinstance(space, Dict):
+        return spaces.Dict({name: _converted(one) for name, one in space.spaces.items()})
+    if isinstance(space, MultiDiscrete):
+        return spaces.Tuple([spaces.Discrete(int(n)) for n in space.number_of_dims_per_distribution])
+    if isinstance(space, Discrete):
+        return spaces.Discrete(space.n)
+    box = spaces.Box(space.low, space.high, space.shape, space.dtype)
+    box.sample = space.sample  # gymnax's own gives NaN where there are no bounds
+    return box

@@ -1,0 +1,66 @@
+"""Lanes beside the environment of one: the same worlds, rewards, ends and observations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.environment import ObservationType, make, starts
+from levelproof.levelgen.task.lanes import Lanes
+
+COUNT, STEPS = 24, 12
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return sample_levels(np.arange(COUNT), "s")
+
+
+def lanes_last(tree):
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
+
+
+def test_lanes_step_as_mapped_environments_do(levels: Level) -> None:
+    env, params = make(levels, rules=task.TaskParams(max_timesteps=5), final_observation=True)
+    lanes = Lanes(env)
+    actions = np.random.default_rng(0).integers(0, np.array(CHOICES), (STEPS, COUNT, 6)).astype(np.int32)
+    keys, one, fresh = jax.random.split(jax.random.key(0), COUNT), starts(levels), starts(levels)
+    table = lanes.table(params)
+    seen, state, played = jax.jit(lanes.reset)(table, jnp.arange(COUNT)[::-1])
+    mapped, step = jax.jit(jax.vmap(env.step, (0, 0, 0, None, 0))), jax.jit(lanes.step)
+    one = jax.tree.map(lambda x: x[::-1], one)
+    ended = 0
+    for number in range(STEPS):
+        chosen = np.roll(np.arange(COUNT), number)  # the levels that lanes start next
+        given = jax.tree.map(lambda x, chosen=chosen: x[chosen], fresh)
+        expected, one, reward, done, told = mapped(keys, one, actions[number], params, given)
+        seen, state, played, *rest, info = step(table, played, state, actions[number].T, chosen)
+        jax.tree.map(np.testing.assert_array_equal, rest, [reward, done])
+        jax.tree.map(np.testing.assert_array_equal, state.now, lanes_last(one.now))
+        np.testing.assert_array_equal(state.level_index, one.level_index)
+        np.testing.assert_allclose(seen, expected.T, rtol=1e-6)
+        np.testing.assert_allclose(info.pop("final_observation"), told.pop("final_observation").T, rtol=1e-6)
+        jax.tree.map(np.testing.assert_array_equal, info, told)
+        ended += int(done.sum())
+    assert ended > 2 * COUNT
+    jax.tree.map(np.testing.assert_array_equal, played, jax.jit(lanes.take)(table, state.level_index))
+
+
+def test_a_lane_state_has_nothing_of_the_levels(levels: Level) -> None:
+    env, params = make(levels)
+    _, state, _ = jax.eval_shape(lambda: Lanes(env).reset(Lanes(env).table(params), jnp.arange(3)))
+    assert {x.shape[-1] for x in jax.tree.leaves(state)} == {3}
+    assert sum(x.size for x in jax.tree.leaves(state)) < sum(x.size for x in jax.tree.leaves(levels[:3]))
+
+
+@pytest.mark.parametrize("kind", list(ObservationType))
+def test_every_observation_is_that_of_the_environment(levels: Level, kind: str) -> None:
+    env, params = make(levels[:2], observation_type=kind)
+    lanes = Lanes(env)
+    shown = jax.eval_shape(lambda: lanes.reset(lanes.table(params), jnp.arange(2))[0])
+    single = jax.eval_shape(lambda: env.reset(jax.random.key(0))[0])
+    assert jax.tree.map(lambda x: (*x.shape, 2), single) == jax.tree.map(lambda x: x.shape, shown)
