@@ -24,8 +24,8 @@ from levelproof.levelgen.task.rules import TaskState
 class LevelTable:
     """Levels as lanes take them, level axis last."""
 
-    level: Level
-    start: TaskState  # of an episode in each level
+    level: Level  # what is constant: its `state` is None
+    start: TaskState | None  # of an episode in each level; None in what lanes play
     features: Float[Array, "feature level"]  # what is constant in the symbolic-flat observation; else no rows
 
 
@@ -56,16 +56,16 @@ class Lanes:
         level = (params or self.env.default_params).levels
         flat = self.env.observation_type == ObservationType.SYMBOLIC_FLAT
         features = level_features(level) if flat else jnp.zeros((0, len(level)))
-        return LevelTable(level, task.reset(level), features)
+        return LevelTable(_constant(level), task.reset(level), features)
 
     def take(self, table: LevelTable, level_index: Int[Array, " lane"]) -> LevelTable:
         """Columns of the table, one for each lane."""
-        return jax.tree.map(lambda x: x[..., level_index], table)
+        return jax.tree.map(lambda x: x[..., level_index], replace(table, start=None))
 
     def reset(self, table: LevelTable, level_index: Int[Array, " lane"]) -> tuple[Any, LaneState, LevelTable]:
         """Start an episode in every lane: (observation, state, played)."""
         played = self.take(table, level_index)
-        state = LaneState(played.start, level_index)
+        state = LaneState(jax.tree.map(lambda x: x[..., level_index], table.start), level_index)
         return self.observe(state, played), state, played
 
     def step(
@@ -104,6 +104,10 @@ class Lanes:
         return LOOKS[self.env.observation_type](replace(played.level, state=world), world)
 
 
+def _constant(level: Level) -> Level:
+    return replace(level, state=None)  # pyright: ignore[reportArgumentType]
+
+
 def _started(
     table: LevelTable, played: LevelTable, state: LaneState, done: Bool[Array, " lane"]
 ) -> tuple[LaneState, LevelTable]:
@@ -118,7 +122,7 @@ def _started(
         column = lambda x: jax.lax.dynamic_slice_in_dim(x, state.level_index[lane], 1, -1)
         into = lambda x, one: jax.lax.dynamic_update_slice_in_dim(x, one, lane, -1)
         chosen = jax.tree.map(column, table)
-        now, played = jax.tree.map(into, (now, played), (chosen.start, chosen))
+        now, played = jax.tree.map(into, (now, played), (chosen.start, replace(chosen, start=None)))
         return waiting.at[lane].set(False), now, played
 
     _, now, played = jax.lax.while_loop(lambda carry: carry[0].any(), start_one, (done, state.now, played))
