@@ -5,6 +5,7 @@ reward, terminated, truncated, info). What comes out here is what the installed 
 """
 
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ def to_gymnax(env: Environment) -> Any:
     Raises:
         ImportError: gymnax is not installed.
     """
-    from gymnax.environments.environment import Environment as GymnaxBase
+    GymnaxBase: Any = import_module("gymnax.environments.environment").Environment  # noqa: N806
 
     splits_done = hasattr(GymnaxBase, "is_truncated")  # since 1.0
     inner = replace(env, final_observation=True) if splits_done else env  # 1.0 always has it in info
@@ -42,7 +43,7 @@ def to_gymnax(env: Environment) -> Any:
 
     class GymnaxEnvironment(GymnaxBase):
         @property
-        def default_params(self) -> EnvParams:  # pyright: ignore[reportIncompatibleVariableOverride]
+        def default_params(self) -> EnvParams:
             return inner.default_params
 
         @property
@@ -90,8 +91,7 @@ def _array(action: Any) -> Array:
 
 
 def _converted(space: Space) -> Any:
-    from gymnax.environments import spaces
-
+    spaces: Any = import_module("gymnax.environments.spaces")
     if isinstance(space, Dict):
         return spaces.Dict({name: _converted(one) for name, one in space.spaces.items()})
     if isinstance(space, MultiDiscrete):
