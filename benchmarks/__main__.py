@@ -26,6 +26,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "floor": ("benchmarks.floor", "what each stage of a physics step costs, and the floor of its arithmetic"),
     "scaling": ("benchmarks.scaling", "env steps/s against active contacts, and against bodies"),
     "observation": ("benchmarks.observation", "what the symbolic-flat observation costs beside the step"),
+    "cores": ("benchmarks.cores", "how much faster one process steps on all cores than on one"),
     "families": ("benchmarks.families", "how many levels of each distribution need no expert, and a sheet of each"),
     "portability": ("benchmarks.portability", "how many witnesses reach the goal in the reference"),
     "polish": ("benchmarks.polish", "how short search around a witness makes it, and how far masters are from that"),

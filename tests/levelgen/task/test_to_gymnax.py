@@ -68,4 +68,3 @@ def test_spaces_are_those_of_gymnax(action_type: str, kind: str) -> None:
     seen = wrapped.observation_space(params)
     assert type(seen) is spaces.Dict
     assert all(np.isfinite(x).all() for x in seen.sample(jax.random.key(0)).values())
-    spaces.gymnax_space_to_gym_space(space)
