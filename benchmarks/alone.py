@@ -5,11 +5,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from levelproof.experts.judge import Kept
 from levelproof.experts.labels import Label
-from levelproof.experts.pool import NOTHING_BEGUN, Pool
+from levelproof.experts.pool.pool import NOTHING_BEGUN, Pool
+from levelproof.experts.pool.run import TrainingRun, UnitResult
 from levelproof.experts.procedure import Procedure
-from levelproof.experts.train import TrainingRun, UnitResult
+from levelproof.experts.verdict.judge import Kept
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from levelproof.experts.advance import advance
 from levelproof.experts.config import ExpertConfig, Rule, StopConfig
-from levelproof.experts.queue import GROUP, empty_queue, enter
-from levelproof.experts.slots import LevelQueue, Report, Slots
-from levelproof.experts.stop import rules_of
-from levelproof.experts.success import no_success
-from levelproof.experts.witness import take
+from levelproof.experts.pool.queue import GROUP, empty_queue, enter
+from levelproof.experts.training.advance import advance
+from levelproof.experts.training.slots import LevelQueue, Report, Slots
+from levelproof.experts.training.stop import rules_of
+from levelproof.experts.witness.success import no_success
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.report import Report, Table
 from levelproof.configs.compose import compose_job, distributions
-from levelproof.experts.before import facts_of
+from levelproof.experts.verdict.before import facts_of
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.pictures.raster import write_png
 from levelproof.levelgen.proofs import Proof

@@ -19,7 +19,7 @@ from benchmarks import oracle
 from benchmarks.reference.level_statistics import statistics
 from benchmarks.report import Report, Table
 from benchmarks.statistics import holm
-from levelproof.experts.before import facts_of
+from levelproof.experts.verdict.before import facts_of
 from levelproof.levelgen.files.kinetix import level_from_kinetix, state_to_kinetix
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.proofs import Proof

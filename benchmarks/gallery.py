@@ -21,9 +21,10 @@ from levelproof.configs.compose import compose_job
 from levelproof.configs.numbers import parse_count
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import Label, Source, Verdict
+from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.steps import EnvSteps
-from levelproof.experts.train import UnitResult
-from levelproof.experts.witness import replay, steps_to_goal, succeeds, take
+from levelproof.experts.witness.witness import replay, steps_to_goal, succeeds
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import ACTIONS, size_of
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.jobs.schedule import WorkUnit

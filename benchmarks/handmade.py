@@ -26,8 +26,8 @@ from levelproof.configs.compose import compose_job
 from levelproof.configs.numbers import parse_count
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import WITNESSED, Verdict
-from levelproof.experts.train import UnitResult
-from levelproof.experts.witness import blocks
+from levelproof.experts.pool.run import UnitResult
+from levelproof.levelgen.batching import blocks
 from levelproof.levelgen.pictures.raster import draw, sheet
 from levelproof.levelgen.pictures.words import Caption
 from levelproof.pipeline.errors import UserError

@@ -16,7 +16,7 @@ from benchmarks.report import Report, Table
 from levelproof.experts.config import ExpertConfig, Network
 from levelproof.experts.networks.entity import KINDS
 from levelproof.experts.networks.layers import LOGITS
-from levelproof.experts.slots import empty_slots
+from levelproof.experts.training.slots import empty_slots
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.observe.flat import DYNAMIC_ROWS

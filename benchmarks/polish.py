@@ -12,12 +12,12 @@ from benchmarks.alone import label
 from benchmarks.oracle import tell
 from benchmarks.report import Report, Table
 from levelproof.configs.compose import compose_job
-from levelproof.experts.judge import Witness
 from levelproof.experts.labels import BY_EXPERT, Label
+from levelproof.experts.pool.rework import rework
+from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.procedure import Procedure
-from levelproof.experts.rework import rework
-from levelproof.experts.train import UnitResult
-from levelproof.experts.witness import take
+from levelproof.experts.verdict.judge import Witness
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES

@@ -19,13 +19,13 @@ from benchmarks import oracle
 from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig
-from levelproof.experts.judge import Witness, candidates_of
 from levelproof.experts.labels import Label
-from levelproof.experts.pool import Pool
-from levelproof.experts.portability import survival
+from levelproof.experts.pool.pool import Pool
+from levelproof.experts.pool.run import TrainingRun
 from levelproof.experts.procedure import Procedure
-from levelproof.experts.train import TrainingRun
-from levelproof.experts.witness import take
+from levelproof.experts.verdict.judge import Witness, candidates_of
+from levelproof.experts.verdict.portability import survival
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.files.level_file import LevelFile, write_level_file
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels

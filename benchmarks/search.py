@@ -22,12 +22,13 @@ from benchmarks.oracle import tell
 from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
 from levelproof.configs.numbers import parse_count
-from levelproof.experts.before import decide
 from levelproof.experts.config import MOST_COUNTED
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.search.explore import Search, begin, explore, success_of
 from levelproof.experts.search.search import side_by_side
-from levelproof.experts.witness import blocks, replay, take
+from levelproof.experts.verdict.before import decide
+from levelproof.experts.witness.witness import replay
+from levelproof.levelgen.batching import blocks, take
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES

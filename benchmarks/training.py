@@ -15,14 +15,14 @@ import numpy as np
 
 from benchmarks.endless import endless_queue, go_on
 from benchmarks.report import Report, Table
-from levelproof.experts import ppo
 from levelproof.experts.config import ExpertConfig
 from levelproof.experts.policy import network_of
-from levelproof.experts.pool import slot_count
-from levelproof.experts.ppo import LevelConstants, Samples
-from levelproof.experts.rollout import Manner, rollout, start
-from levelproof.experts.slots import empty_slots
-from levelproof.experts.witness import repeat
+from levelproof.experts.pool.pool import slot_count
+from levelproof.experts.training import ppo
+from levelproof.experts.training.ppo import LevelConstants, Samples
+from levelproof.experts.training.rollout import Manner, rollout, start
+from levelproof.experts.training.slots import empty_slots
+from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.actions import CHOICES, action_mask

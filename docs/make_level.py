@@ -15,7 +15,7 @@ from levelproof.levelgen.pictures.shapes import Part, Point, line, text
 from levelproof.levelgen.pictures.style import INK
 from levelproof.levelgen.pictures.svg import svg_of
 from levelproof.levelgen.pictures.words import Caption
-from levelproof.pipeline.look.play.session import empty_file
+from levelproof.pipeline.play.session import empty_file
 from levelproof.pipeline.runtime import prepare_jax
 
 DRAWING = Path(__file__).with_name("concepts-level.svg")

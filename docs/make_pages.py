@@ -10,8 +10,8 @@ from pathlib import Path
 
 from benchmarks.browser import browser
 from levelproof.experts.procedure import Procedure
-from levelproof.pipeline.look.play.open import level_to_play
-from levelproof.pipeline.look.play.server import HOST, serving
+from levelproof.pipeline.play.open import level_to_play
+from levelproof.pipeline.play.server import HOST, serving
 from levelproof.pipeline.runtime import prepare_jax
 
 VIEW = {"width": 1180, "height": 700}

@@ -16,8 +16,8 @@ if not os.path.isdir(os.path.join(__path__[0], "physics")):
     )
 
 if TYPE_CHECKING:
-    from levelproof.experts.witness import Record as Record
-    from levelproof.experts.witness import replay as replay
+    from levelproof.experts.witness.witness import Record as Record
+    from levelproof.experts.witness.witness import replay as replay
     from levelproof.levelgen.files.entries import LevelFileError as LevelFileError
     from levelproof.levelgen.files.level_file import LevelFile as LevelFile
     from levelproof.levelgen.files.level_file import read_level_file as read_level_file
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
     from levelproof.levelgen.task.rules import TaskParams as TaskParams
     from levelproof.levelgen.task.to_gymnax import to_gymnax as to_gymnax
     from levelproof.physics.types import Size as Size
+    from levelproof.pipeline.dataset.batch import Batch as Batch
+    from levelproof.pipeline.dataset.dataset import Dataset as Dataset
+    from levelproof.pipeline.dataset.dataset import open as open
+    from levelproof.pipeline.dataset.environment import make as make
     from levelproof.pipeline.errors import Failure as Failure
     from levelproof.pipeline.errors import LevelproofError as LevelproofError
     from levelproof.pipeline.errors import StoreFailure as StoreFailure
     from levelproof.pipeline.errors import UserError as UserError
-    from levelproof.pipeline.read.columns import levels_from as levels_from
-    from levelproof.pipeline.read.dataset.batch import Batch as Batch
-    from levelproof.pipeline.read.dataset.dataset import Dataset as Dataset
-    from levelproof.pipeline.read.dataset.dataset import open as open
-    from levelproof.pipeline.read.environment import make as make
+    from levelproof.pipeline.exchange.tables import levels_from as levels_from
     from levelproof.pipeline.store.manifest import read_manifest as read_manifest
     from levelproof.pipeline.store.shard import EngineDiffers as EngineDiffers
     from levelproof.pipeline.store.shard import Shard as Shard
@@ -54,26 +54,26 @@ HOME = {
     "Failure": "levelproof.pipeline.errors",
     "StoreFailure": "levelproof.pipeline.errors",
     "LevelFileError": "levelproof.levelgen.files.entries",
-    "Batch": "levelproof.pipeline.read.dataset.batch",
-    "Dataset": "levelproof.pipeline.read.dataset.dataset",
+    "Batch": "levelproof.pipeline.dataset.batch",
+    "Dataset": "levelproof.pipeline.dataset.dataset",
     "SIZES": "levelproof.levelgen.level",
     "EngineDiffers": "levelproof.pipeline.store.shard",
     "Distribution": "levelproof.levelgen.sampling.distribution",
     "Lanes": "levelproof.levelgen.task.lanes",
     "Level": "levelproof.levelgen.level",
     "LevelFile": "levelproof.levelgen.files.level_file",
-    "Record": "levelproof.experts.witness",
+    "Record": "levelproof.experts.witness.witness",
     "Shard": "levelproof.pipeline.store.shard",
     "Size": "levelproof.physics.types",
     "TaskParams": "levelproof.levelgen.task.rules",
     "__version__": "levelproof.pipeline.version",
     "draw": "levelproof.levelgen.pictures.raster",
-    "levels_from": "levelproof.pipeline.read.columns",
-    "make": "levelproof.pipeline.read.environment",
-    "open": "levelproof.pipeline.read.dataset.dataset",
+    "levels_from": "levelproof.pipeline.exchange.tables",
+    "make": "levelproof.pipeline.dataset.environment",
+    "open": "levelproof.pipeline.dataset.dataset",
     "read_level_file": "levelproof.levelgen.files.level_file",
     "read_manifest": "levelproof.pipeline.store.manifest",
-    "replay": "levelproof.experts.witness",
+    "replay": "levelproof.experts.witness.witness",
     "sample_levels": "levelproof.levelgen.sampling.sampler",
     "starts": "levelproof.levelgen.task.environment",
     "to_gymnax": "levelproof.levelgen.task.to_gymnax",

@@ -14,10 +14,21 @@ ROOT = Path(__file__).parent.parent
 ROOMS = ("physics", "levelgen", "experts", "configs", "pipeline")  # imported as levelproof.physics, and so on
 PRODUCT = (*ROOMS, "levelproof")
 OUTSIDE = ("benchmarks", "tests")  # the product imports neither
+BELOW = ("experts", "levelgen", "physics")
+EXPERTS = (
+    "experts.pool",
+    "experts.verdict",
+    "experts.training",
+    "experts.search",
+    "experts.witness",
+    "experts.networks",
+)
+PIPELINE_BELOW = ("configs", *EXPERTS, *BELOW)
 # A room and the others that it may import: a folder with what lies below it, or one file
 MAY_IMPORT = {
     "physics.codegen": (),
     "physics": ("physics.codegen",),
+    "levelgen.batching": (),
     "levelgen.frames": ("physics",),
     "levelgen.level": ("physics",),
     "levelgen.identity": ("levelgen.level", "physics"),
@@ -26,15 +37,35 @@ MAY_IMPORT = {
     "levelgen.files": ("levelgen.sampling", "levelgen.task", "levelgen.frames", "levelgen.level", "physics"),
     "levelgen.pictures": ("levelgen.frames", "levelgen.level", "physics"),
     "levelgen": ("levelgen", "physics"),
-    "experts": ("levelgen", "physics"),
-    "configs": ("experts", "levelgen", "physics"),
-    "pipeline": ("configs",),  # errors, owned, runtime, version
-    "pipeline.store": ("pipeline", "configs", "experts", "levelgen", "physics"),
-    "pipeline.read": ("pipeline.store", "pipeline", "configs", "experts", "levelgen", "physics"),
-    "pipeline.look": ("pipeline.read", "pipeline.store", "pipeline", "configs", "experts", "levelgen", "physics"),
-    "pipeline.jobs": ("pipeline.read", "pipeline.store", "pipeline", "configs", "experts", "levelgen", "physics"),
-    "pipeline.cli": ("pipeline.jobs", "pipeline.look", "pipeline.read", "pipeline.store", "pipeline", "configs"),
-    "levelproof": ("pipeline", "configs", "experts", "levelgen", "physics"),
+    # "experts" and "pipeline" alone mean the files beside their rooms
+    "experts": ("experts.networks", "experts.search", "levelgen", "physics"),
+    "experts.networks": ("experts", "levelgen", "physics"),
+    "experts.witness": ("experts", "levelgen", "physics"),
+    "experts.training": ("experts.witness", "experts", "levelgen", "physics"),
+    "experts.search": ("experts.witness", "experts", "levelgen", "physics"),
+    "experts.verdict": ("experts.training", "experts.search", "experts.witness", "experts", "levelgen", "physics"),
+    "experts.pool": ("experts.verdict", "experts.training", "experts.search", "experts.witness", *BELOW),
+    "configs": ("experts", "experts.search", "levelgen", "physics"),
+    "pipeline": ("configs",),
+    "pipeline.store": ("pipeline", *PIPELINE_BELOW),
+    "pipeline.read": ("pipeline.store", "pipeline", *PIPELINE_BELOW),
+    "pipeline.dataset": ("pipeline.read", "pipeline.store", "pipeline", *PIPELINE_BELOW),
+    "pipeline.exchange": ("pipeline.read", "pipeline.store", "pipeline", *PIPELINE_BELOW),
+    "pipeline.verify": ("pipeline.read", "pipeline.store", "pipeline", *PIPELINE_BELOW),
+    "pipeline.look": ("pipeline.read", "pipeline.store", "pipeline", *PIPELINE_BELOW),
+    "pipeline.play": ("pipeline.look", "pipeline.read", "pipeline.store", "pipeline", *PIPELINE_BELOW),
+    "pipeline.jobs": ("pipeline.verify", "pipeline.read", "pipeline.store", "pipeline", *PIPELINE_BELOW),
+    "pipeline.cli": (
+        "pipeline.jobs",
+        "pipeline.look",
+        "pipeline.play",
+        "pipeline.verify",
+        "pipeline.exchange",
+        "pipeline.store",
+        "pipeline",
+        "configs",
+    ),
+    "levelproof": (),  # opens every room
 }
 RAY_IN = {"pipeline/jobs/cluster.py"}
 HYDRA_IN = {"configs/compose.py"}
@@ -77,8 +108,11 @@ def room(module: str) -> str | None:
 def allowed(inner: str, outer: str) -> bool:
     if inner == outer:
         return True
-    # "pipeline" alone means the files beside its rooms; any other name all that is in it
-    return any(outer == name or (name != "pipeline" and outer.startswith(f"{name}.")) for name in MAY_IMPORT[inner])
+    # "experts" and "pipeline" alone mean the files beside their rooms; any other name means all that is in it
+    return any(
+        outer == name or (name not in ("experts", "pipeline") and outer.startswith(f"{name}."))
+        for name in MAY_IMPORT[inner]
+    )
 
 
 def test_there_is_something_to_look_at() -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 import levelproof
+from levelproof.pipeline.exchange.level_json import export
+from levelproof.pipeline.exchange.parquet import export_parquet
 from levelproof.pipeline.look.gallery.gallery import SITE
-from levelproof.pipeline.read.export import export
-from levelproof.pipeline.read.parquet import export_parquet
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import played_split
 

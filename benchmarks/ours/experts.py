@@ -26,9 +26,9 @@ def main() -> None:
     from benchmarks.endless import endless_queue, go_on
     from benchmarks.levels import load_levels
     from benchmarks.solved.variants import REFERENCE
-    from levelproof.experts.pool import slot_count
-    from levelproof.experts.slots import LevelQueue, Training, empty_slots
-    from levelproof.experts.witness import take
+    from levelproof.experts.pool.pool import slot_count
+    from levelproof.experts.training.slots import LevelQueue, Training, empty_slots
+    from levelproof.levelgen.batching import take
     from levelproof.levelgen.task.rules import TaskParams
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured

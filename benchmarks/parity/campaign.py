@@ -18,7 +18,7 @@ from benchmarks.parity.progress import Board
 from benchmarks.parity.scenes import SCENES
 from benchmarks.parity.worlds import BLOCK, joined, lanes_of
 from benchmarks.reference.actions import sticky_actions
-from levelproof.experts.witness import blocks
+from levelproof.levelgen.batching import blocks
 from levelproof.levelgen.level import SIZES, Level, Role, name_of, size_of
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import UserError

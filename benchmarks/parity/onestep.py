@@ -12,7 +12,7 @@ from benchmarks.parity.causes import Step, find_cause
 from benchmarks.parity.distance import OFF, UNITS, Distances, distances
 from benchmarks.parity.engines import RULES, Stepped, step_ours
 from benchmarks.parity.worlds import BLOCK, joined, lanes_of, starting_in
-from levelproof.experts.witness import blocks
+from levelproof.levelgen.batching import blocks
 from levelproof.levelgen.level import Level
 from levelproof.physics.types import State
 

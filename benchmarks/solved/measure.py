@@ -180,8 +180,8 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
     import numpy as np
 
     from benchmarks.alone import side_by_side
-    from levelproof.experts.pool import Pool
-    from levelproof.experts.train import TrainingRun
+    from levelproof.experts.pool.pool import Pool
+    from levelproof.experts.pool.run import TrainingRun
     from levelproof.levelgen.level import Level, size_of
     from levelproof.levelgen.sampling.distribution import Distribution
     from levelproof.levelgen.sampling.sampler import sample_levels

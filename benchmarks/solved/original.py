@@ -88,8 +88,8 @@ def train(
     """
     import jax.numpy as jnp
 
-    from levelproof.experts.before import decide
-    from levelproof.experts.witness import take
+    from levelproof.experts.verdict.before import decide
+    from levelproof.levelgen.batching import take
     from levelproof.levelgen.level import size_of
     from levelproof.levelgen.sampling.sampler import sample_levels
     from levelproof.levelgen.task.rules import DEFAULT_RULES
@@ -158,9 +158,10 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
     import jax
     import jax.numpy as jnp
 
-    from levelproof.experts import judge, progress
-    from levelproof.experts.success import no_success
-    from levelproof.experts.witness import succeeds
+    from levelproof.experts.training import progress
+    from levelproof.experts.verdict import judge
+    from levelproof.experts.witness.success import no_success
+    from levelproof.experts.witness.witness import succeeds
 
     done, goal = seen["trained_done"], seen["trained_goal"]
     totals = progress.Progress(
@@ -183,7 +184,7 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
 
 def first_success(goal: Bool[np.ndarray, "step environment"]) -> int:
     """Env steps of training until then, those of all environments."""
-    from levelproof.experts.progress import NEVER
+    from levelproof.experts.training.progress import NEVER
 
     reached = goal.any(1)
     return int((np.argmax(reached) + 1) * goal.shape[1]) if reached.any() else NEVER

@@ -17,7 +17,7 @@ from levelproof.experts.search.config import Ends, SearchConfig
 from levelproof.experts.search.near import FAR, gap, goals_of
 from levelproof.experts.search.play import CODES, Arena, Walk, arena, decode, most_steps, play
 from levelproof.experts.search.rows import from_rows, to_rows
-from levelproof.experts.success import Success
+from levelproof.experts.witness.success import Success
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.rules import TaskParams

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.search.near import Goals, goals_of
-from levelproof.experts.witness import repeat
+from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import ACTIONS, Level, Role
 from levelproof.levelgen.task.actions import CHOICES, action_mask, controls
 from levelproof.levelgen.task.rules import TaskParams, has_nan, has_roles

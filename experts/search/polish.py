@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.search.play import CODES, Arena, Walk, arena, decode
 from levelproof.experts.search.shorten import Shortened, below, drawn, edited, ended, replayed
-from levelproof.experts.success import Success
+from levelproof.experts.witness.success import Success
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.actions import action_mask

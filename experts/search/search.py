@@ -17,8 +17,8 @@ from levelproof.experts.search.explore import Search, success_of
 from levelproof.experts.search.shorten import shorten
 from levelproof.experts.search.stage import Entrant, Searched, Sought, Stage
 from levelproof.experts.search.vary import Varying, nearest_of
-from levelproof.experts.success import Success
-from levelproof.experts.witness import at_once, blocks, take
+from levelproof.experts.witness.success import Success
+from levelproof.levelgen.batching import at_once, blocks, take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskParams
 

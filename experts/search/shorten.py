@@ -11,7 +11,7 @@ from jaxtyping import Array, Int, UInt32
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.search.play import Arena, Walk, act, arena, fresh_walk
-from levelproof.experts.success import Success
+from levelproof.experts.witness.success import Success
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.rules import TaskParams

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from levelproof.experts.ledger import Lap, Ledger, lap
-from levelproof.experts.success import Success
-from levelproof.experts.witness import take
+from levelproof.experts.witness.success import Success
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
 
 Rows = Any  # what a program advances: a dataclass, its `levels` with their axis last, all else level-first

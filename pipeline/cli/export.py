@@ -22,27 +22,27 @@ WHERE = (
 
 
 def _kinetix(split: Path, where: str | None, out: Path) -> None:
-    from levelproof.pipeline.read.kinetix.export import export_kinetix
+    from levelproof.pipeline.exchange.kinetix import export_kinetix
 
     export_kinetix(split, where, out)
 
 
 def _parquet(split: Path, where: str | None, out: Path) -> None:
-    from levelproof.pipeline.read.parquet import export_parquet
+    from levelproof.pipeline.exchange.parquet import export_parquet
 
     export_parquet(split, where, out)
 
 
 def _minari(split: Path, where: str | None, out: Path, actions: str = "multi_discrete") -> None:
-    from levelproof.pipeline.read.minari.episodes import ActionKind
-    from levelproof.pipeline.read.minari.export import export_minari
+    from levelproof.pipeline.exchange.minari.episodes import ActionKind
+    from levelproof.pipeline.exchange.minari.export import export_minari
 
     export_minari(split, where, out, ActionKind(actions))
 
 
 # What writes the levels of a split for which a condition holds (None: each format's own) to a new file or folder
 FORMATS: dict[str, Callable[..., None]] = {"kinetix": _kinetix, "minari": _minari, "parquet": _parquet}
-ACTIONS = ("multi_discrete", "combined", "continuous")  # pipeline.read.minari.episodes.ActionKind
+ACTIONS = ("multi_discrete", "combined", "continuous")  # of pipeline.exchange.minari.episodes.ActionKind, without importing it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
                 f"As {JSON} one level is exported: give its id, as in levelproof export {split} 7, without --where; "
                 f"--format chooses one of {', '.join(FORMATS)} for many."
             )
-        from levelproof.pipeline.read.export import export
+        from levelproof.pipeline.exchange.level_json import export
 
         export(split, level_id, out or Path("level.json"))
         return

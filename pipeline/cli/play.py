@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from levelproof.pipeline.look.play.open import play
+    from levelproof.pipeline.play.open import play
 
     play(
         arguments.source,

@@ -34,6 +34,6 @@ def run(arguments: argparse.Namespace) -> Exit:
         from levelproof.pipeline.jobs.repair import repair
 
         return repair(arguments.split, arguments.repair, Console(stderr=True))
-    from levelproof.pipeline.read.verify import verify
+    from levelproof.pipeline.verify.verify import verify
 
     return verify(arguments.split, arguments.json, Console(stderr=True))

@@ -13,11 +13,11 @@ from rich.progress import track
 
 from levelproof.configs.schema import ImportConfig
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.given import label_given
 from levelproof.experts.labels import WITNESSED
+from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.steps import EnvSteps
-from levelproof.experts.train import UnitResult
-from levelproof.experts.witness import LANES, take
+from levelproof.experts.verdict.given import label_given
+from levelproof.levelgen.batching import LANES, take
 from levelproof.levelgen.level import name_of
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.progress import say

@@ -17,7 +17,6 @@ from levelproof.configs.schema import FROM_RECORDS, JobConfig, from_files, hash_
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
-from levelproof.pipeline.read.findings import Findings
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job, sound_note
 from levelproof.pipeline.store.layout import EXPERTS, data_paths
@@ -25,6 +24,7 @@ from levelproof.pipeline.store.locks import nobody_commits
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.store.runs import merged, runs, told_levels
 from levelproof.pipeline.store.split import locked, taken
+from levelproof.pipeline.verify.findings import Findings
 
 SETTINGS = ("executor", "workers", "unit", "device")  # of `generate`, that a repair may have
 
@@ -83,7 +83,7 @@ def _examined(split: Path, inline: bool) -> Findings:
 
 
 def _examine(split: Path) -> Findings:
-    from levelproof.pipeline.read.verify import examine  # starts JAX
+    from levelproof.pipeline.verify.verify import examine  # starts JAX
 
     return examine(split, Console(stderr=True))
 

@@ -18,9 +18,10 @@ from levelproof.configs.compose import again
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import WITNESSED, Label, Verdict
 from levelproof.experts.ledger import Ledger
-from levelproof.experts.pool import Pool
-from levelproof.experts.train import TrainingRun, UnitResult
-from levelproof.experts.witness import Record, replay, succeeds, take
+from levelproof.experts.pool.pool import Pool
+from levelproof.experts.pool.run import TrainingRun, UnitResult
+from levelproof.experts.witness.witness import Record, replay, succeeds
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.identity.keys import level_id_array
 from levelproof.levelgen.identity.signature import signatures

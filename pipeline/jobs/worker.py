@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
-from levelproof.experts.train import TrainingRun
+from levelproof.experts.pool.run import TrainingRun
 from levelproof.pipeline.errors import LevelproofError
 from levelproof.pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for

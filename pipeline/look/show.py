@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.witness import Record, replay, steps_to_goal, succeeds
+from levelproof.experts.witness.witness import Record, replay, steps_to_goal, succeeds
 from levelproof.levelgen.level import ACTIONS, Level, name_of
 from levelproof.levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
 from levelproof.levelgen.pictures.scene import scene_of

@@ -13,10 +13,10 @@ from jaxtyping import Float
 
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.config import Rule
-from levelproof.experts.judge import Kept
 from levelproof.experts.labels import BY_EXPERT
-from levelproof.experts.slots import Begun, begin
-from levelproof.experts.success import no_success
+from levelproof.experts.training.slots import Begun, begin
+from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.identity.keys import level_id_array
 from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.scenery import empty_level

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.witness import Record
+from levelproof.experts.witness.witness import Record
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.level import MOST_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
 from levelproof.levelgen.sampling.scenery import empty_level

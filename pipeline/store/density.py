@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.resume import KnownStates, Moves, checksum, resume, timesteps
-from levelproof.experts.witness import take
+from levelproof.experts.witness.resume import KnownStates, Moves, checksum, resume, timesteps
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskState
 from levelproof.physics.types import State

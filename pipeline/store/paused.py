@@ -21,11 +21,11 @@ import numpy as np
 
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.found import nothing_found
-from levelproof.experts.judge import Evaluation
 from levelproof.experts.labels import Source
-from levelproof.experts.paused import Paused
-from levelproof.experts.slots import Pending
+from levelproof.experts.pool.found import nothing_found
+from levelproof.experts.pool.paused import Paused
+from levelproof.experts.training.slots import Pending
+from levelproof.experts.verdict.judge import Evaluation
 from levelproof.pipeline.errors import Failure, LevelproofError, StoreFailure
 from levelproof.pipeline.owned import require_own
 from levelproof.pipeline.store import objects

@@ -22,7 +22,7 @@ from benchmarks.parity.onestep import Pool, distinct, one_step, picked
 from benchmarks.parity.report import report_of
 from benchmarks.parity.worlds import BLOCK, contact_bodies, lanes_of, nudged
 from benchmarks.report import Report
-from levelproof.experts.witness import blocks
+from levelproof.levelgen.batching import blocks
 from levelproof.physics.types import FIXED_POLYGONS, Params
 from levelproof.pipeline.errors import Exit
 from tests.golden.load import HERE, load

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import networks, training
 from levelproof.experts.config import ExpertConfig, Network
-from levelproof.experts.slots import Mode
+from levelproof.experts.training.slots import Mode
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 

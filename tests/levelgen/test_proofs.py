@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelproof.experts.before import facts_of
-from levelproof.experts.witness import take
+from levelproof.experts.verdict.before import facts_of
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES, Level, Role
 from levelproof.levelgen.proofs import Facts, Proof
 from levelproof.levelgen.sampling.distribution import Distribution

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
-from levelproof.experts.train import UnitResult
+from levelproof.experts.pool.run import UnitResult
 from levelproof.pipeline.jobs.schedule import WorkUnit, plan_units
 from levelproof.pipeline.jobs.unit import commit
 from levelproof.pipeline.store.fields import same_bits

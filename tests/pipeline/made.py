@@ -15,13 +15,14 @@ import numpy as np
 
 from levelproof.configs.compose import compose_job
 from levelproof.configs.schema import JobConfig
-from levelproof.experts.before import decide
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.judge import Kept
 from levelproof.experts.labels import WITNESSED, Label, Source, Verdict
+from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.steps import EnvSteps
-from levelproof.experts.train import UnitResult
-from levelproof.experts.witness import Record, replay, steps_to_goal, succeeds, take
+from levelproof.experts.verdict.before import decide
+from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.witness.witness import Record, replay, steps_to_goal, succeeds
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import ACTIONS, SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.physics.pairs import pairs_of

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from levelproof.experts.witness import steps_to_goal, succeeds
+from levelproof.experts.witness.witness import steps_to_goal, succeeds
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.pictures.palette import palette_css
 from levelproof.pipeline.errors import Failure, UserError
@@ -26,10 +26,10 @@ from levelproof.pipeline.look.gallery.columns import NOTHING, PAGE, columns_of, 
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, states_of, text_of, world_of
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.look.things import THINGS, things_of
-from levelproof.pipeline.read.created import new_folder
 from levelproof.pipeline.read.levels import levels_of, rules_of
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.shown import shown

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.witness import Record
+from levelproof.experts.witness.witness import Record
 from levelproof.levelgen.files.kinetix import (
     BODIES,
     MANIFOLD,

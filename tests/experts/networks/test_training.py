@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from levelproof.experts.config import Network
-from levelproof.experts.judge import Trained
-from levelproof.experts.witness import take
+from levelproof.experts.verdict.judge import Trained
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from tests.experts.small import CONFIG

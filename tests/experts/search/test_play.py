@@ -8,7 +8,7 @@ import numpy as np
 
 from levelproof.experts.search.play import Arena, Walk, arena, decode, encode, fresh_walk, play
 from levelproof.experts.search.rows import from_rows, to_rows
-from levelproof.experts.witness import take
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.rules import DEFAULT_RULES

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 
 from levelproof.experts.config import ExpertConfig
-from levelproof.experts.judge import repeating
 from levelproof.experts.labels import Source
+from levelproof.experts.pool.rework import IN_CACHE, rework
 from levelproof.experts.procedure import Procedure
-from levelproof.experts.rework import IN_CACHE, rework
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.search.polish import LANES, polish
 from levelproof.experts.search.shorten import Shortened
-from levelproof.experts.success import Success
-from levelproof.experts.witness import at_once, replay, steps_to_goal, take
+from levelproof.experts.verdict.judge import repeating
+from levelproof.experts.witness.success import Success
+from levelproof.experts.witness.witness import replay, steps_to_goal
+from levelproof.levelgen.batching import at_once, take
 from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, Level, Role
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.search.worlds import world

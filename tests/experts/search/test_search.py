@@ -12,17 +12,18 @@ from benchmarks.alone import label
 from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
 from levelproof.experts.labels import Label, Source
 from levelproof.experts.procedure import Procedure
-from levelproof.experts.scout import STEPS_PER_ROUND
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.search.explore import NEARER, Search, _explore, begin, draw, explore, under_way
 from levelproof.experts.search.near import FAR
 from levelproof.experts.search.play import arena, fresh_walk, play
+from levelproof.experts.search.scout import STEPS_PER_ROUND
 from levelproof.experts.search.search import AHEAD, Searching, side_by_side
 from levelproof.experts.search.shorten import shorten
 from levelproof.experts.search.stage import Searched
 from levelproof.experts.steps import EnvSteps
-from levelproof.experts.success import Success
-from levelproof.experts.witness import replay, take
+from levelproof.experts.witness.success import Success
+from levelproof.experts.witness.witness import replay
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.identity.keys import GENERATOR
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams

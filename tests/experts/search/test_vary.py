@@ -27,7 +27,8 @@ from levelproof.experts.search.vary import (
     varied,
     vary,
 )
-from levelproof.experts.witness import replay, take
+from levelproof.experts.witness.witness import replay
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.identity.keys import GENERATOR
 from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, Level
 from levelproof.levelgen.task.rules import DEFAULT_RULES

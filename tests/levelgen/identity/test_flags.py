@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from levelproof.experts.config import ScoutConfig
-from levelproof.experts.scout import scout
+from levelproof.experts.search.scout import scout
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import SIZES
@@ -40,7 +40,7 @@ DRAWS: dict[str, Callable[[Any], Any]] = {
     "fold_in": lambda key: jax.random.key_data(jax.random.fold_in(key, 3)),
 }
 # Sources of randomness that decide no result: shapes alone; what a page shows of an expert under way
-HARMLESS = {"levelgen/task/environment.py", "pipeline/look/play/training.py"}
+HARMLESS = {"levelgen/task/environment.py", "pipeline/play/training.py"}
 
 
 def digest(arrays: Any) -> str:

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from levelproof.configs.schema import JobConfig
-from levelproof.experts.judge import Kept
 from levelproof.experts.labels import Label
+from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.steps import EnvSteps
-from levelproof.experts.train import UnitResult
+from levelproof.experts.verdict.judge import Kept
 from levelproof.pipeline.jobs.progress import Board
 from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, Summary, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.unit import commit, failure

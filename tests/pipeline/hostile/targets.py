@@ -29,10 +29,10 @@ from levelproof.configs.convert import plain, typed
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count
 from levelproof.configs.schema import JobConfig
-from levelproof.experts.judge import Kept
 from levelproof.experts.labels import Label
-from levelproof.experts.slots import begin
-from levelproof.experts.success import no_success
+from levelproof.experts.training.slots import begin
+from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.files.level_file import (
     LevelFile,
     LevelFileError,

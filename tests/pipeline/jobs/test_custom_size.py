@@ -6,16 +6,16 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.look.inspect import inspect, survey
 from levelproof.pipeline.look.rows import Asked
 from levelproof.pipeline.look.show import show
 from levelproof.pipeline.look.status import look
-from levelproof.pipeline.read.export import export
-from levelproof.pipeline.read.verify import examine
 from levelproof.pipeline.store.columns import OF_THE_RUN
 from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.shard import Shard
+from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here
 
 SIZE = "5-3-2-2"

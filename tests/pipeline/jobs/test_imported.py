@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from benchmarks import oracle
-from levelproof.experts.witness import replay, succeeds
+from levelproof.experts.witness.witness import replay, succeeds
 from levelproof.levelgen.files.level_file import read_level_file
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.pipeline.jobs import imported as module
 from levelproof.pipeline.look.status import look
 from levelproof.pipeline.read.rows import read_rows
-from levelproof.pipeline.read.verify import examine
 from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, ours_of, trajectories_in
 

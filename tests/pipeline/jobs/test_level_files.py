@@ -23,9 +23,9 @@ from levelproof.pipeline.look.inspect import survey
 from levelproof.pipeline.look.rows import Asked
 from levelproof.pipeline.look.status import look
 from levelproof.pipeline.read.level_files import LevelUnseen, level_at, levels_below
-from levelproof.pipeline.read.verify import examine
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.origins import Origin
+from levelproof.pipeline.verify.verify import examine
 from tests.experts.search.worlds import switchback
 from tests.pipeline.command import assert_refused, here, run
 from tests.pipeline.made import lasting

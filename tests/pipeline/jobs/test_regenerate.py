@@ -11,10 +11,10 @@ from levelproof.configs.compose import compose_job
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.regenerate import kept_words, split_words
-from levelproof.pipeline.read.verify import examine
 from levelproof.pipeline.store.checkpoints import load_experts, require_same_experts
 from levelproof.pipeline.store.layout import new_attempt
 from levelproof.pipeline.store.manifest import begin_fragment, read_manifest
+from levelproof.pipeline.verify.verify import examine
 from levelproof.pipeline.words import many
 from tests.pipeline.command import here
 from tests.pipeline.made import lasting, made_job

@@ -13,7 +13,6 @@ from rich.console import Console
 
 from levelproof.pipeline.jobs import repair as repairing
 from levelproof.pipeline.jobs.seal import seal_split
-from levelproof.pipeline.read.verify import examine
 from levelproof.pipeline.store import mend
 from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.layout import JOB, WRITER_LOCK, new_attempt
@@ -25,6 +24,7 @@ from levelproof.pipeline.store.manifest import (
     write_fragment,
 )
 from levelproof.pipeline.store.shard import Shard
+from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here, run
 from tests.pipeline.made import lasting
 from tests.pipeline.read.test_damage import files_of, flip

@@ -10,8 +10,8 @@ import pytest
 from benchmarks.alone import label
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
-from levelproof.experts.train import UnitResult
-from levelproof.experts.witness import Record, replay
+from levelproof.experts.pool.run import UnitResult
+from levelproof.experts.witness.witness import Record, replay
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import Failure

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from levelproof.experts.witness import steps_to_goal
+from levelproof.experts.witness.witness import steps_to_goal
 from levelproof.pipeline.cli.gallery import MOST
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look.gallery import gallery as module

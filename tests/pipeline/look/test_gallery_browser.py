@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.browser import browser
-from levelproof.experts.witness import steps_to_goal
+from levelproof.experts.witness.witness import steps_to_goal
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.look.gallery.gallery import gallery
 from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.witness import succeeds
+from levelproof.experts.witness.witness import succeeds
 from levelproof.levelgen.files.level_file import LevelFile, write_level_file
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.pictures.raster import draw, rasterised

@@ -10,12 +10,12 @@ from rich.console import Console
 
 from levelproof.configs.schema import Density
 from levelproof.pipeline.jobs.seal import seal_split
-from levelproof.pipeline.read.findings import Findings
-from levelproof.pipeline.read.verify import examine
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.locks import nobody_commits
 from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
 from levelproof.pipeline.store.mend import take_out
+from levelproof.pipeline.verify.findings import Findings
+from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import here
 from tests.pipeline.made import honest_split
 
@@ -227,7 +227,7 @@ def test_what_is_exchanged(kind: str, copied: Callable[[Path], Path], request: p
 
 
 def _hits(levels: set[int]) -> str:
-    from levelproof.pipeline.read.findings import _levels
+    from levelproof.pipeline.verify.findings import _levels
 
     return _levels(levels)
 

@@ -12,9 +12,9 @@ import levelproof
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs.seal import seal_split
 from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectories
-from levelproof.pipeline.read.verify import examine
 from levelproof.pipeline.store.checkpoints import load_experts
 from levelproof.pipeline.store.job_note import read_note
+from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.made import made_job, played_split
 from tests.pipeline.read.kinetix.folder import GOLDEN
 

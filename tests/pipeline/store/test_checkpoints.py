@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from levelproof.configs.schema import JobConfig
-from levelproof.experts.judge import Kept
 from levelproof.experts.labels import Cause, Label, Source
-from levelproof.experts.slots import begin
-from levelproof.experts.success import no_success
+from levelproof.experts.training.slots import begin
+from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import Failure

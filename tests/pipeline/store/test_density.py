@@ -19,11 +19,10 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from levelproof.configs.compose import compose_job
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.schema import KEYS_EVERY
-from levelproof.experts import resume
-from levelproof.experts.resume import checksum, timesteps
+from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.steps import EnvSteps
-from levelproof.experts.train import UnitResult
-from levelproof.experts.witness import Record, replay
+from levelproof.experts.witness.resume import checksum, timesteps
+from levelproof.experts.witness.witness import Record, replay, resume
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.sampler import sample_levels

@@ -15,9 +15,9 @@ import jax
 import numpy as np
 import pytest
 
-from levelproof.experts.judge import Kept
-from levelproof.experts.slots import begin as begin_experts
-from levelproof.experts.success import no_success
+from levelproof.experts.training.slots import begin as begin_experts
+from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import Failure

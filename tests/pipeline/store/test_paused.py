@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.found import nothing_found
-from levelproof.experts.judge import Evaluation, Kept
 from levelproof.experts.labels import Source
-from levelproof.experts.paused import Paused
-from levelproof.experts.slots import Pending
+from levelproof.experts.pool.found import nothing_found
+from levelproof.experts.pool.paused import Paused
+from levelproof.experts.training.slots import Pending
+from levelproof.experts.verdict.judge import Evaluation, Kept
 from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.store import paused as store
 from levelproof.pipeline.store import remote

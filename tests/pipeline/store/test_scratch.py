@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from levelproof.pipeline.read.created import new_folder
 from levelproof.pipeline.store import scratch as module
+from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.scratch import FILES, LOCK, PREFIX, scratch
 from tests.pace import patience
 from tests.pipeline.command import COMMAND_SECONDS, ROOT
@@ -29,7 +29,7 @@ with publishing(Path("s3://bucket/data/128k/s")) as folder:
 EXPORT = """
 import sys
 from pathlib import Path
-from levelproof.pipeline.read.created import new_folder
+from levelproof.pipeline.store.created import new_folder
 with new_folder(Path(sys.argv[1])) as folder:
     (folder / "part").write_bytes(bytes(1000))
     print(folder, flush=True)

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.witness import Record
+from levelproof.experts.witness.witness import Record
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of

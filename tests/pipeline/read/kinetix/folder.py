@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numcodecs import get_codec
 
-from levelproof.experts.witness import Record
+from levelproof.experts.witness.witness import Record
 from levelproof.levelgen.files.kinetix import MANIFOLD, _ours, level_from_kinetix, state_from_kinetix
 from levelproof.levelgen.level import Level
 from levelproof.physics.types import Manifold

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import oracle
-from levelproof.experts.witness import Record
+from levelproof.experts.witness.witness import Record
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.task.observe.pixels import pixels
 from levelproof.pipeline.read.kinetix.records import dtype_of, trajectories_of

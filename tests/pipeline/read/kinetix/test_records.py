@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from levelproof.experts.witness import replay, succeeds
+from levelproof.experts.witness.witness import replay, succeeds
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.read.kinetix.records import dtype_of, fields_of, trajectories_of
 from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, ours_of, trajectories_in

@@ -1,0 +1,1 @@
+"""A worker's slots and the queue before them: levels in, results out."""

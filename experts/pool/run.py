@@ -1,0 +1,260 @@
+"""From levels to verdicts: they are decided without an expert, or scouted, trained and judged."""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig, Rule
+from levelproof.experts.labels import WITNESSED, Source, Verdict
+from levelproof.experts.ledger import Lap, Ledger, lap
+from levelproof.experts.pool.found import Found, Looking, joined
+from levelproof.experts.pool.paused import Paused
+from levelproof.experts.pool.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Submission, Totals
+from levelproof.experts.pool.rework import rework
+from levelproof.experts.steps import EnvSteps
+from levelproof.experts.verdict.afresh import attempt
+from levelproof.experts.verdict.before import decide
+from levelproof.experts.verdict.judge import Kept, Trained, Witness, judge, repeating
+from levelproof.experts.verdict.portability import choose
+from levelproof.experts.witness.success import Success
+from levelproof.experts.witness.witness import Record, replay
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.identity.keys import level_id_array
+from levelproof.levelgen.level import ACTIONS, Level
+
+
+@dataclass(frozen=True)
+class UnitResult:
+    """What came of some levels, on the host, in the order they were given."""
+
+    level_ids: Int[np.ndarray, " level"]
+    levels: Level
+    record: Record  # all zero where the level has no witness
+    verdicts: list[Verdict]
+    spent: EnvSteps
+    experts: dict[int, Kept] = field(default_factory=dict)  # by level id, where they are kept
+    ledger: Ledger | None = None  # None: nobody has counted
+
+
+class TrainingRun:
+    """Levels on their way to their verdicts: decided at once, looked into, then in a pool, perhaps beside others."""
+
+    def __init__(
+        self,
+        pool: Pool,
+        levels: Level,
+        level_ids: np.ndarray,
+        begun: Mapping[int, Kept] = NOTHING_BEGUN,
+        keep: bool = False,
+        ledger: Ledger | None = None,
+        paused: Mapping[int, Paused] = NONE_PAUSED,
+    ) -> None:
+        """
+        Args:
+            pool: where experts train.
+            levels: the levels, as their ids rebuild them.
+            level_ids: their ids; the seeds of all randomness.
+            begun: by level id, experts that go on with what they have left of the budget; the others begin.
+            keep: whether the result has the experts.
+            ledger: what the levels have cost before.
+            paused: by level id, experts that were under way before with this budget; nobody looks into their levels.
+        """
+        self.ledger = ledger or Ledger(len(level_ids))
+        self.pool, self.level_ids, self._begun, self._keep = pool, level_id_array(level_ids), begun, keep
+        with self.ledger.timing("sampling"):
+            self.levels: Level = jax.tree.map(np.asarray, levels)
+            self.before = decide(self.levels, pool.rules)
+        self.left = np.array([i for i, verdict in enumerate(self.before.verdicts) if verdict is None], int)
+        self._paused = {i: paused[i] for i in self.level_ids[self.left].tolist() if i in paused}
+        new = ~np.isin(self.level_ids[self.left], list(self._paused))
+        self._order = np.argsort(np.r_[np.flatnonzero(new), np.flatnonzero(~new)])  # of new ones and others, as left
+        with self.ledger.timing("search"):
+            self._looked = self.left[new]
+            self.looking = Looking(*self._some(self._looked), pool.procedure, pool.rules, pool.searching)
+        self.submission: Submission | None = None  # of those that an expert is asked for
+        self._gone: set[int] = set()  # ids of levels that others label
+        self.look()
+
+    def look(self) -> None:
+        """Let experts begin, once there is nothing left to search."""
+        if self.submission is None:
+            with self.ledger.timing("search"):
+                ended = self.looking.ended()
+            if ended:
+                self.ledger.take(self.looking.ledger, self._looked)
+                self._submit()
+
+    def _submit(self) -> None:
+        some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
+        levels, level_ids = self._some(some)
+        of = lambda known: {i: known[one] for i, one in enumerate(level_ids.tolist()) if one in known}
+        found = joined([self.looking.found, *(one.found for one in self._paused.values())], self._order)
+        self.submission = self.pool.submit(levels, level_ids, found, of(self._begun), self._keep, of(self._paused))
+        if self._gone:
+            self.leave_out(self._gone)
+
+    @property
+    def searching(self) -> int:
+        """Levels that will come to the pool."""
+        return 0 if self.submission else len(self.left) - len(self._gone)
+
+    @property
+    def unbegun(self) -> list[int]:
+        """Ids of levels that wait for their search to begin, or for their expert."""
+        if self.submission is None:
+            waiting = self.level_ids[self._looked[self.looking.waiting]]
+        else:
+            waiting = self.submission.level_ids[self.pool.waiting(self.submission)]
+        return [level_id for level_id in waiting.tolist() if level_id not in self._paused]
+
+    def paused(self, in_slots: Iterable[tuple[Submission, int, Paused]]) -> dict[int, Paused]:
+        """Its experts under way, by level id: those among these, which have a slot, and those that wait for one."""
+        undecided = set(self.undecided)
+        waiting = {level_id: of for level_id, of in self._paused.items() if level_id in undecided}
+        return waiting | {
+            int(self.level_ids[self.left[i]]): of for submission, i, of in in_slots if submission is self.submission
+        }
+
+    @property
+    def undecided(self) -> list[int]:
+        """Ids of levels that wait for an expert or have one; of all, while there is anything left to search."""
+        of = self.submission
+        return (of.level_ids[sorted(of.under_way)] if of else self.level_ids).tolist()
+
+    def leave_out(self, level_ids: Collection[int]) -> None:
+        """Have others label some of these levels: any that are `unbegun`, or all that are `undecided` at the end."""
+        self._gone.update(level_ids)
+        indices = lambda of: np.flatnonzero(np.isin(of, list(self._gone)))
+        if self.submission is None:
+            self.looking.withdraw(indices(self.level_ids[self._looked]))
+        else:
+            self.pool.withdraw(self.submission, indices(self.submission.level_ids).tolist())
+
+    def totals(self) -> Totals:
+        """How far all levels are, those that need no expert included."""
+        looked = self.looking.env_steps
+        if self.submission is None:
+            return Totals(looked, len(self.level_ids) - len(self.left), 0)
+        now, waiting = self.pool.totals(self.submission), len(self.submission.level_ids)
+        others = len(self.level_ids) - waiting - len(self._gone)
+        return now._replace(env_steps=now.env_steps + looked, levels=others + now.levels)
+
+    def finish(self) -> UnitResult:
+        """Choose witnesses and give verdicts, once the submission has finished; of all levels that are not left out."""
+        submission = self.submission
+        assert submission is not None
+        trained = submission.trained(self.pool.config) if len(submission.level_ids) else as_found(submission.found)
+        attempted = self._attempted(trained)
+        with lap() as took:
+            result = self._judged(submission, trained, attempted)
+        looks = np.zeros(len(self.level_ids), np.int64)
+        looks[self.left] = submission.found.scout_steps + submission.found.search_steps
+        self.ledger.share("search", looks)
+        if len(submission.level_ids):
+            self.ledger.take(submission.ledger, self.left)
+        ledger = self.ledger.only(np.flatnonzero(np.isin(self.level_ids, result.level_ids)))
+        ledger.add("replay", took)
+        return replace(result, ledger=ledger)
+
+    def _attempted(self, trained: Sequence[Trained]) -> dict[int, tuple[float, int]]:
+        """Success rates of experts, and the env steps that these took, by index among `left`."""
+        policies = {
+            i: of.policy
+            for i, (level, of) in enumerate(zip(self.left, trained, strict=True))
+            if of.policy is not None and int(self.level_ids[level]) not in self._gone
+        }
+        with lap() as took:
+            at = self.left[list(policies)]
+            found = attempt(*self._some(at), list(policies.values()), self.pool.config, self.pool.rules)
+        self.ledger.add("evaluation", Lap(0.0, took.compiling))
+        for level in at:
+            self.ledger.put("evaluation", level, took.seconds / len(at))
+        return dict(zip(policies, zip(*(x.tolist() for x in found), strict=True), strict=True))
+
+    def _judged(
+        self, submission: Submission, trained: list[Trained], attempted: Mapping[int, tuple[float, int]]
+    ) -> UnitResult:
+        config, rules = self.pool.config, self.pool.rules
+        kept = np.flatnonzero(~np.isin(self.level_ids, list(self._gone)))
+        levels, level_ids = self._some(kept)
+        before, failed = [self.before.verdicts[i] for i in kept], self.before.failed_by_noop[kept]
+        found = submission.found
+        asked = np.flatnonzero(np.isin(self.left, kept))  # of those that came to the submission
+        left = np.searchsorted(kept, self.left[asked])
+        trained = [trained[i] for i in asked]
+        actions = np.zeros((RECORD_STEPS, ACTIONS, len(kept)), np.int32)  # doing nothing, if none are found
+        candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
+        for i, of in zip(left, trained, strict=True):
+            candidates[i] = of.candidates
+        chosen = choose(levels, level_ids, candidates, config.replays, rules)
+        chosen, reworked = rework(levels, level_ids, chosen, self.pool.procedure, rules)
+        for i, witness in enumerate(chosen):
+            if witness is not None:
+                actions[..., i] = witness.action
+        record = replay(levels, actions, rules)
+        witnesses = [chosen[i] for i in left]
+        judged = judge(trained, witnesses, take(record, left), config, failed[left])
+        verdicts = {
+            i: with_looks(with_attempts(verdict, attempted.get(at)), found, at, int(reworked[i]))
+            for i, verdict, at in zip(left.tolist(), judged, asked.tolist(), strict=True)
+        }
+        shares = [None if witness is None else witness.portability for witness in chosen]
+        known = [
+            replace(verdict, portability=share) if verdict else verdicts[i]
+            for i, (verdict, share) in enumerate(zip(before, shares, strict=True))
+        ]
+        witnessed = np.array([verdict.label in WITNESSED for verdict in known])
+        record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
+        ended = zip(level_ids[left].tolist(), trained, strict=True)
+        experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
+        return UnitResult(level_ids, levels, record, known, spent_on(known, submission, config), experts)
+
+    def _some(self, indices: Int[np.ndarray, " index"]) -> tuple[Level, Int[np.ndarray, " index"]]:
+        return take(self.levels, indices), self.level_ids[indices]
+
+
+def with_attempts(verdict: Verdict, attempted: tuple[float, int] | None) -> Verdict:
+    """The verdict with what the expert's last attempts gave, and their env steps, if it made any."""
+    if attempted is None:
+        return verdict
+    rate, env_steps = attempted
+    return replace(verdict, success_rate=rate, evaluation_steps=verdict.evaluation_steps + env_steps)
+
+
+def with_looks(verdict: Verdict, found: Found, index: int, reworked: int) -> Verdict:
+    """The verdict with what was done before training, and the env steps of search around its witness."""
+    searched = int(found.search_steps[index])
+    return replace(
+        verdict,
+        scout_steps=int(found.scout_steps[index]),
+        search_steps=searched + reworked,
+        cells=int(found.cells[index]) if searched else None,
+        still_grew=bool(found.still_grew[index]) if searched else None,
+    )
+
+
+def as_found(found: Found) -> list[Trained]:
+    """Levels that no expert trained for: their witness is what was found before."""
+    each = zip(found.success.action, found.success.length, found.source, strict=True)
+    return [Trained([], [], candidates=repeating(Success(action, length), source)) for action, length, source in each]
+
+
+def idling(verdict: Verdict, nothing: Int[np.ndarray, "256 6"]) -> Sequence[Witness]:
+    """The witness of a level that needs no expert, if it has one: doing nothing."""
+    steps = verdict.steps_to_goal
+    return () if steps is None else (Witness(nothing, Source.NOTHING, steps),)
+
+
+def spent_on(verdicts: list[Verdict], submission: Submission, config: ExpertConfig) -> EnvSteps:
+    """What the levels of a submission took, and the slots that had none."""
+    total = lambda name: sum(getattr(verdict, name) for verdict in verdicts)
+    return EnvSteps(
+        total("scout_steps"),
+        total("search_steps"),
+        submission.trained_rollouts * config.steps_per_update,
+        total("evaluation_steps"),
+        submission.idle_rollouts * config.steps_per_update,
+    )

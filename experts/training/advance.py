@@ -1,0 +1,272 @@
+"""Continuous batching: a fixed number of slots, each with an expert in training or under evaluation.
+
+One compiled program, `advance`, takes every slot a rollout further. A level that is decided leaves its slot, and the
+next of the queue takes it, on the device. What becomes of a level depends on the level, its id and the configuration
+alone: not on its slot, its neighbours or when it came.
+
+An evaluation interrupts the training of its slot and leaves no trace in it.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.labels import Cause
+from levelproof.experts.policy import ActorCritic, network_of
+from levelproof.experts.training import ppo, progress, stop
+from levelproof.experts.training.ppo import LevelConstants, Samples
+from levelproof.experts.training.rollout import Acting, Manner, Trajectory, rollout, start
+from levelproof.experts.training.slots import LevelQueue, Mode, Report, Slot, Slots, Training, Trial, lanes_of
+from levelproof.experts.training.stop import StopRules
+from levelproof.experts.witness.success import find, remember
+from levelproof.levelgen.batching import repeat
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.rules import TaskParams
+
+STICKINESS = 0.25  # of sticky attempts (Machado et al. 2018, arXiv:1709.06009)
+MOVED = 0.1  # m/s and rad/s, the most by which velocities of moved attempts differ from the level's
+
+
+def over_slots(function: Callable, *slots: Any) -> Any:
+    """One slot after another on a CPU: its minibatch stays in a core's cache, and `cond` skips what it can."""
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda xs: function(*xs), slots)
+    return jax.vmap(function)(*slots)
+
+
+@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="slots")
+def advance(
+    slots: Slots, queue: LevelQueue, config: ExpertConfig, stopping: StopRules, rules: TaskParams
+) -> tuple[Slots, Report]:
+    """A rollout in every slot, and what follows from it: an update, a part of an evaluation, another level.
+
+    Args:
+        slots: used up.
+        queue: the levels that wait.
+        config: what an expert is.
+        stopping: when a level leaves.
+        rules: of the task; their reward trains.
+    """
+    slots = refill(slots, queue, config)
+    slot = slots.slot
+    levels = jax.tree.map(lambda x: x[..., slot.queue_index], queue.levels)
+    keys = jax.vmap(_key)(queue.level_ids[slot.queue_index], slot)
+    lanes = repeat(levels, config.environments)
+    evaluating = slot.mode == Mode.EVALUATE
+
+    trains = repeat(~evaluating, config.environments)
+    fresh = repeat(slot.trial.part == 0, config.environments)
+    trial = _where(fresh, _moved_start(lanes, keys, config), slots.trial)
+    acting = _where(trains, slots.acting, trial)
+
+    network = network_of(levels.size, config)
+    manner = _manner(slot, evaluating, config)
+    acting, trajectory, last_value = rollout(
+        network, slot.training.train_state.params, levels, acting, keys, manner, config.horizon, rules
+    )
+    now = _split(network, levels, keys, trajectory, last_value, manner, config)
+    slot, share, mode = over_slots(partial(_follow, network=network, config=config, stopping=stopping), slot, now)
+    left = (slot.mode == Mode.EMPTY) & (mode == Mode.EVALUATE)
+    evaluated = (mode == Mode.EVALUATE) & (left | slot.trial.solved)
+    after = Slots(slot, _where(trains, acting, slots.acting), acting, slots.taken)
+    early = left & slot.trial.solved & ~slot.trial.final
+    return after, Report(slot.queue_index, mode, share, evaluated, left, early, slots.taken)
+
+
+@partial(jax.jit, donate_argnames="slots")
+def train_on(slots: Slots, stays: Bool[Array, " slot"], stopping: StopRules) -> Slots:
+    """Slots (used up) in which some levels that left early stay, for a witness that more replays survive."""
+    slot = slots.slot
+    course, deadline = stop.steady_on(slot.training.course, slot.deadline, stopping)
+    keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(stays, a, b), new, old)
+    return slots._replace(
+        slot=slot._replace(
+            mode=keep(jnp.full_like(slot.mode, Mode.TRAIN), slot.mode),
+            deadline=keep(deadline, slot.deadline),
+            training=slot.training._replace(course=keep(course, slot.training.course)),
+        )
+    )
+
+
+def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
+    """Slots that are empty take the next levels of the queue. An expert that is over is only evaluated again, and so is
+    one whose evaluation was under way when it was kept."""
+    free = slots.slot.mode == Mode.EMPTY
+    number = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
+    takes, index = free & (number < queue.come), queue.order[number % queue.capacity]
+
+    def fill() -> tuple[Slot, Acting]:
+        begun = jax.tree.map(lambda x: x[index], queue.begun)
+        choose = lambda new, old: jnp.where(takes.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+        put = lambda new, old: jax.tree.map(choose, new, old)
+        due, final, deadline = jax.tree.map(lambda x: x[index], queue.pending)
+        final, trial = final | (begun.training.course.over != Cause.NONE), slots.slot.trial
+        slot = slots.slot._replace(
+            mode=put(jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), slots.slot.mode),
+            queue_index=put(index, slots.slot.queue_index),
+            deadline=put(deadline, slots.slot.deadline),
+            training=put(begun.training, slots.slot.training),
+            trial=trial._replace(
+                part=put(jnp.zeros_like(index), trial.part), due=put(due, trial.due), final=put(final, trial.final)
+            ),
+        )
+        return slot, _where(repeat(takes, config.environments), lanes_of(begun.acting), slots.acting)
+
+    slot, acting = jax.lax.cond(takes.any(), fill, lambda: (slots.slot, slots.acting))
+    return Slots(slot, acting, slots.trial, slots.taken + takes.sum(dtype=jnp.int32))
+
+
+class _Now(NamedTuple):
+    """What one slot's rollout gave."""
+
+    constants: LevelConstants
+    key: Key[Array, ""]
+    rows: Float[Array, "sample column"]
+    action: Int[Array, "time 6 environment"]
+    reward: Float[Array, "time environment"]
+    done: Bool[Array, "time environment"]
+    goal: Bool[Array, "time environment"]
+    timestep: Int[Array, "time environment"]
+    own: Bool[Array, " environment"]  # as `Manner.own`
+
+
+def _split(
+    network: ActorCritic,
+    levels: Level,
+    keys: Key[Array, " slot"],
+    trajectory: Trajectory,
+    last_value: Float[Array, "slot environment"],
+    manner: Manner,
+    config: ExpertConfig,
+) -> _Now:
+    """By slot, slots first."""
+    seen = trajectory
+    advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
+    rehearsed = jnp.broadcast_to(manner.rehearsing.reshape(seen.value.shape[1:]), seen.value.shape)
+    samples = Samples(
+        seen.moving, seen.action, seen.log_probability, seen.value, advantage, rehearsed.astype(jnp.float32)
+    )
+    rows = jax.vmap(ppo.as_rows, in_axes=-2)(samples)
+    by_slot = lambda x: jnp.moveaxis(x, -2, 0)
+    return _Now(
+        jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), LevelConstants(network.constant(levels), action_mask(levels))),
+        keys,
+        rows,
+        by_slot(seen.action.astype(jnp.int8)),
+        by_slot(seen.reward),
+        by_slot(seen.done),
+        by_slot(seen.goal),
+        by_slot(seen.timestep),
+        manner.own.reshape(-1, config.environments),
+    )
+
+
+def _follow(
+    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopRules
+) -> tuple[Slot, Float[Array, ""], Int[Array, ""]]:
+    """What follows from a slot's rollout; also the share of successes, and the mode it was in."""
+    nothing = jnp.float32(jnp.nan)
+    branches = (
+        lambda: (slot, nothing),
+        lambda: _learn(slot, now, network, config, stopping),
+        lambda: (_collect(slot, now, config, stopping), nothing),
+    )
+    after, share = jax.lax.switch(slot.mode, branches)
+    return after, share, slot.mode
+
+
+def _learn(
+    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopRules
+) -> tuple[Slot, Float[Array, ""]]:
+    """One update, and whether an evaluation comes next."""
+    training = slot.training
+    totals, share = progress.follow(training.progress, now.reward, now.done, now.goal, now.own)
+    recent = jnp.concatenate([training.recent, now.action])
+    success = remember(training.success, find(recent, now.goal, now.timestep))
+    shuffling = jax.random.fold_in(now.key, config.horizon)  # the rollout used 0 .. horizon - 1
+    train_state = ppo.update(training.train_state, shuffling, network, now.constants, now.rows, config)
+    totals = progress.watch(totals, train_state.params)
+    course, due, final = stop.after_update(training.course, totals, success.length > 0, share, slot.deadline, stopping)
+    training = Training(train_state, totals, course, success, recent[config.horizon :])
+    trial = slot.trial._replace(part=jnp.int32(0), due=due, final=final)
+    return slot._replace(mode=jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share
+
+
+def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopRules) -> Slot:
+    """A part of an evaluation; after the last, whether the level leaves."""
+    first = slot.trial.part * config.horizon
+    put = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, first, 0)
+    action = put(slot.trial.action, now.action[..., : config.attempts])
+    done, goal = put(slot.trial.done, now.done), put(slot.trial.goal, now.goal)
+    part = slot.trial.part + 1
+    hopeless = ~slot.trial.final & stop.fails(done, goal, part * config.horizon, stopping, config)
+    ended = (part == config.record_rollouts) | hopeless
+    solved = ended & ~hopeless & stop.solves(done, goal, stopping, config)
+    trial = Trial(part, slot.trial.due, slot.trial.final, solved, action, done, goal)
+    course, leaves, deadline = stop.after_evaluation(
+        slot.training.course, solved, trial.due, trial.final, slot.deadline, stopping
+    )
+    keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, old)
+    mode = jnp.where(leaves, Mode.EMPTY, Mode.TRAIN)
+    training = slot.training._replace(course=keep(course, slot.training.course))
+    return Slot(keep(mode, slot.mode), slot.queue_index, keep(deadline, slot.deadline), training, trial)
+
+
+def _key(level_id: Int[Array, ""], slot: Slot) -> Key[Array, ""]:
+    """The key of a slot's next rollout."""
+    update = slot.training.course.updates
+    learning = jax.random.fold_in(key_for(level_id, Stream.EXPERT), update + 1)
+    evaluation = jax.random.fold_in(jax.random.fold_in(key_for(level_id, Stream.EVALUATION), update), slot.trial.part)
+    return jnp.where(slot.mode == Mode.EVALUATE, evaluation, learning)
+
+
+def _manner(slot: Slot, evaluating: Bool[Array, " slot"], config: ExpertConfig) -> Manner:
+    """Evaluations: attempts, then sticky ones, then moved ones. Training: rehearsals in the last environments."""
+    number = jnp.arange(config.environments)
+    sticky = (number >= config.attempts) & (number < config.attempts + config.sticky_attempts)
+    succeeded = slot.training.success.length > 0
+    guides = number >= config.environments - config.rehearsals
+    per_lane = lambda slots, environments: (slots[:, None] & environments).reshape(-1)
+    stickiness = STICKINESS * per_lane(evaluating, sticky) + config.persistence * per_lane(
+        ~evaluating & ~succeeded, guides
+    )
+    return Manner(
+        per_lane(evaluating, number == 0),
+        stickiness,
+        per_lane(~evaluating & succeeded, guides),
+        jnp.moveaxis(slot.training.success.action, 0, -1),
+    )
+
+
+def _moved_start(lanes: Level, keys: Key[Array, " slot"], config: ExpertConfig) -> Acting:
+    """The first state of each lane's level; bodies of the moved attempts start with slightly other velocities."""
+    number = jnp.arange(config.environments)
+    first = config.attempts + config.sticky_attempts
+    moved = jnp.tile((number >= first) & (number < first + config.moved_attempts), len(keys))
+    acting = start(lanes)
+    state, movable = acting.world.state, (lanes.model.inverse_mass > 0) & lanes.model.active
+
+    def noise(key):
+        shape = (3, len(movable), config.environments)
+        return jax.random.uniform(jax.random.fold_in(key, config.horizon), shape, minval=-MOVED, maxval=MOVED)
+
+    drawn = jnp.moveaxis(jax.vmap(noise)(keys), 0, -2).reshape(3, len(movable), -1)
+    drawn = jnp.where(movable & moved, drawn, 0.0)
+    state = replace(
+        state,
+        velocity=state.velocity + jnp.moveaxis(drawn[:2], 0, 1),
+        angular_velocity=state.angular_velocity + drawn[2],
+    )
+    return acting._replace(world=replace(acting.world, state=state))
+
+
+def _where(lanes: Bool[Array, " lane"], a: Any, b: Any) -> Any:
+    return jax.tree.map(lambda x, y: jnp.where(lanes, x, y), a, b)

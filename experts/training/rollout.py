@@ -1,0 +1,120 @@
+"""Experts acting in their levels: `levels x environments` lanes, level by level.
+
+Lane `i * environments + j` is environment j of level i.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from levelproof.experts.policy import ActorCritic, forward, log_probability, most_probable, sample
+from levelproof.levelgen.batching import repeat
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.observe.flat import state_features
+from levelproof.levelgen.task.rules import TaskParams, TaskState
+
+
+class Acting(NamedTuple):
+    """Episodes under way."""
+
+    world: TaskState
+    last_action: Int[Array, "6 lane"]  # in this episode; 0 at its start
+
+
+class Manner(NamedTuple):
+    """How lanes choose their actions, where it is not by sampling."""
+
+    greedy: Bool[Array, " lane"]  # the most probable one
+    stickiness: Float[Array, " lane"]  # chance of the last one again
+    rehearsing: Bool[Array, " lane"]  # what `rehearsal` has for the episode's env step
+    rehearsal: Int[Array, "256 6 level"]
+
+    @property
+    def own(self) -> Bool[Array, " lane"]:
+        """Lanes in which the expert alone chooses every action."""
+        return ~self.rehearsing & (self.stickiness == 0)
+
+
+class Trajectory(NamedTuple):
+    """What happened, time first."""
+
+    moving: Float[Array, "time dynamic level environment"]  # the moving rows of the observation before the action
+    action: Int[Array, "time 6 level environment"]
+    log_probability: Float[Array, "time level environment"]
+    value: Float[Array, "time level environment"]
+    reward: Float[Array, "time level environment"]
+    done: Bool[Array, "time level environment"]
+    goal: Bool[Array, "time level environment"]
+    timestep: Int[Array, "time level environment"]  # env steps of the episode before this one
+
+
+def start(lanes: Level) -> Acting:
+    """The first state of every lane's level."""
+    world = task.reset(lanes)
+    return Acting(world, jnp.zeros((len(CHOICES), *world.timestep.shape), jnp.int32))
+
+
+def rollout(
+    network: ActorCritic,
+    params,
+    levels: Level,
+    acting: Acting,
+    keys: Key[Array, " level"],
+    manner: Manner,
+    steps: int,
+    rules: TaskParams,
+) -> tuple[Acting, Trajectory, Float[Array, "level environment"]]:
+    """Act for `steps` env steps, with automatic reset.
+
+    Args:
+        network: the shape of the experts' networks.
+        params: of every expert, level axis first.
+        levels: one per expert.
+        acting: episodes under way, one per lane.
+        keys: one per expert, used up.
+        manner: how actions are chosen.
+        steps: env steps in each lane.
+        rules: of the task.
+
+    Returns:
+        The episodes afterwards, the trajectory, and the value of the last observation.
+    """
+    level_count = keys.shape[0]
+    environments = len(manner.greedy) // level_count
+    level_of = jnp.arange(len(manner.greedy)) // environments
+    lanes = repeat(levels, environments)
+    constant, live = network.constant(levels), action_mask(lanes)
+    per_level = lambda x: x.reshape(*x.shape[:-1], level_count, environments)
+    flat = lambda x: x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
+    each = jax.vmap(partial(forward, network), in_axes=(0, -1, 1), out_axes=(-2, 0))
+
+    def look(world: TaskState):
+        moving = per_level(state_features(lanes, world.state))
+        logits, value = each(params, constant, moving)
+        return moving, flat(logits), value
+
+    def draw(key, t):
+        return jax.random.uniform(jax.random.fold_in(key, t), (len(CHOICES) + 1, environments))
+
+    def act(acting: Acting, t):
+        world, last = acting
+        moving, logits, value = look(world)
+        uniform = flat(jnp.moveaxis(jax.vmap(draw, in_axes=(0, None))(keys, t), 0, 1))
+        action = jnp.where(manner.greedy, most_probable(logits), sample(logits, uniform[:-1]))
+        action = jnp.where(uniform[-1] < manner.stickiness, last, action)
+        rehearsed = manner.rehearsal[world.timestep, :, level_of].T.astype(jnp.int32)
+        action = jnp.where(manner.rehearsing, rehearsed, action)
+        action = jnp.where(live, action, 0)
+        log_probs = log_probability(logits, action, live)
+        after, outcome = task.step(lanes, world, action, rules)
+        played, log_probs, reward, done, goal, timestep = map(per_level, (action, log_probs, *outcome, world.timestep))
+        seen = Trajectory(moving, played, log_probs, value, reward, done, goal, timestep)
+        return Acting(after, jnp.where(outcome.done, 0, action)), seen
+
+    acting, trajectory = jax.lax.scan(act, acting, jnp.arange(steps))
+    return acting, trajectory, look(acting.world)[2]

@@ -1,0 +1,88 @@
+"""How often an expert reaches the goal, by attempts that decide nothing.
+
+An evaluation that ends training had enough successes for that, so its own success rate is above the policy's.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from levelproof.experts.config import RECORD_STEPS, ExpertConfig
+from levelproof.experts.policy import Params, network_of
+from levelproof.experts.training.rollout import Acting, Manner, rollout, start
+from levelproof.experts.verdict.portability import IN_CACHE
+from levelproof.levelgen.batching import at_once, blocks, repeat, take
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.rules import TaskParams
+
+PART = 16  # env steps between checks whether all attempts have ended
+
+
+class Attempted(NamedTuple):
+    """First episodes under sampled actions."""
+
+    success_rate: Float[np.ndarray, " level"]  # share of attempts
+    env_steps: Int[np.ndarray, " level"]  # of all attempts
+
+
+class _Attempting(NamedTuple):
+    acting: Acting
+    part: Int[Array, ""]
+    ended: Bool[Array, "level attempt"]
+    reached: Bool[Array, "level attempt"]
+    env_steps: Int[Array, " level"]
+
+
+def attempt(
+    levels: Level,
+    level_ids: Int[np.ndarray, " level"],
+    policies: Sequence[Params],
+    config: ExpertConfig,
+    rules: TaskParams,
+) -> Attempted:
+    """Have each level's policy make `expert.attempts` attempts, of at most a record's length.
+
+    Args:
+        levels: on the host.
+        level_ids: their ids, the seeds of all randomness.
+        policies: parameters of their experts, on the host.
+        config: of the experts.
+        rules: of the task.
+    """
+    parts = [Attempted(np.zeros(0, np.float32), np.zeros(0, np.int32))]
+    for some in blocks(len(level_ids), at_once(config.attempts, IN_CACHE)):
+        params = jax.tree.map(lambda *xs: np.stack(xs), *(policies[i] for i in some))
+        parts.append(jax.device_get(_attempt(take(levels, some), level_ids[some], params, config, rules)))
+    return Attempted(*(np.concatenate(of)[: len(level_ids)] for of in zip(*parts, strict=True)))
+
+
+@partial(jax.jit, static_argnames=("config", "rules"))
+def _attempt(
+    levels: Level, level_ids: Int[Array, " level"], params: Params, config: ExpertConfig, rules: TaskParams
+) -> Attempted:
+    network, shape = network_of(levels.size, config), (len(level_ids), config.attempts)
+    no = jnp.zeros(shape, bool)
+    never, nothing = jnp.zeros(no.size), jnp.zeros((1, len(CHOICES), len(level_ids)), jnp.int8)
+    manner = Manner(no.reshape(-1), never, no.reshape(-1), nothing)
+    keys = jax.vmap(lambda level_id: key_for(level_id, Stream.SUCCESS_RATE))(level_ids)
+
+    def act(now: _Attempting) -> _Attempting:
+        key = jax.vmap(jax.random.fold_in, (0, None))(keys, now.part)
+        acting, seen, _ = rollout(network, params, levels, now.acting, key, manner, PART, rules)
+        ends, first = seen.done.any(0), jnp.argmax(seen.done, 0)
+        goal = jnp.take_along_axis(seen.goal, first[None], 0)[0]
+        steps = jnp.where(now.ended, 0, jnp.where(ends, first + 1, PART)).sum(1)
+        reached = now.reached | (~now.ended & ends & goal)
+        return _Attempting(acting, now.part + 1, now.ended | ends, reached, now.env_steps + steps)
+
+    going = lambda now: (now.part < RECORD_STEPS // PART) & ~now.ended.all()
+    begun = _Attempting(start(repeat(levels, config.attempts)), jnp.int32(0), no, no, jnp.zeros(shape[0], jnp.int32))
+    after = jax.lax.while_loop(going, act, begun)
+    return Attempted(after.reached.mean(1), after.env_steps)  # pyright: ignore[reportArgumentType]

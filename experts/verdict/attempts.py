@@ -1,0 +1,61 @@
+"""What an expert in training would do now: attempts to look at. They leave no trace in the training."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax.typing import VariableDict as Params
+from jaxtyping import Array, Bool, Float, Key
+
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.policy import network_of
+from levelproof.experts.training.rollout import Manner, rollout, start
+from levelproof.levelgen.batching import repeat
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.rules import TaskParams
+
+
+class Attempts(NamedTuple):
+    """Where bodies are after each env step, time first; an attempt that has ended rests where it did."""
+
+    position: Float[Array, "time body 2 attempt"]  # m
+    rotation: Float[Array, "time body attempt"]  # rad
+    goal: Bool[Array, " attempt"]  # it reached the goal
+
+
+@partial(jax.jit, static_argnames=("config", "rules", "count", "steps"))
+def attempts(
+    level: Level, params: Params, key: Key[Array, ""], config: ExpertConfig, rules: TaskParams, count: int, steps: int
+) -> Attempts:
+    """First episodes under sampled actions.
+
+    Args:
+        level: one level, level axis last.
+        params: of its expert.
+        key: of the samples.
+        config: of the expert.
+        rules: of the task.
+        count: how many attempts.
+        steps: env steps of each.
+    """
+    network, lanes = network_of(level.size, config), repeat(level, count)
+    no, never = jnp.zeros(count, bool), jnp.zeros(count)
+    manner = Manner(no, never, no, jnp.zeros((1, len(CHOICES), 1), jnp.int8))
+    params = jax.tree.map(lambda x: x[None], params)
+
+    def act(carry, key):
+        acting, ended, shown, reached = carry
+        acting, seen, _ = rollout(network, params, level, acting, key[None], manner, 1, rules)
+        state = acting.world.state
+        shown = jax.tree.map(lambda old, new: jnp.where(ended, old, new), shown, (state.position, state.rotation))
+        reached |= ~ended & seen.goal[0, 0]
+        return (acting, ended | seen.done[0, 0], shown, reached), shown
+
+    begun = start(lanes)
+    state = begun.world.state
+    carry, (position, rotation) = jax.lax.scan(
+        act, (begun, no, (state.position, state.rotation), no), jax.random.split(key, steps)
+    )
+    return Attempts(position, rotation, carry[-1])

@@ -1,0 +1,46 @@
+"""What needs no expert: levels that doing nothing solves, and levels that are proved unsolvable."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import Label, Source, Verdict, trivial_reason, unsolvable_reason, untrained
+from levelproof.experts.witness.witness import replay, steps_to_goal, succeeds
+from levelproof.levelgen.batching import blocks, take
+from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.proofs import Facts, Proof, examine
+from levelproof.levelgen.task.rules import TaskParams
+
+
+class Before(NamedTuple):
+    """What is known before training."""
+
+    verdicts: list[Verdict | None]  # None: an expert has to try
+    failed_by_noop: Bool[np.ndarray, " level"]
+
+
+def decide(levels: Level, rules: TaskParams) -> Before:
+    """Verdicts on levels that need no expert. Every lane on its own, in blocks of one compiled program."""
+    count = levels.role.shape[-1]
+    facts = facts_of(levels, rules)
+    verdicts: list[Verdict | None] = [None] * count
+    falls = np.flatnonzero(facts.reaches)
+    if len(falls):
+        idle = replay(take(levels, falls), np.zeros((RECORD_STEPS, ACTIONS, len(falls)), np.int32), rules)
+        for i, solved, steps in zip(falls, succeeds(idle.done, idle.goal), steps_to_goal(idle.done), strict=True):
+            if solved:
+                verdicts[i] = untrained(Label.TRIVIAL, trivial_reason(int(steps)), False, Source.NOTHING, int(steps))
+    for i in np.flatnonzero(facts.proof != Proof.NONE):
+        fails = bool(facts.fails[i])
+        verdicts[i] = untrained(Label.UNSOLVABLE, unsolvable_reason(Proof(int(facts.proof[i])), fails), fails)
+    return Before(verdicts, np.asarray(facts.fails))
+
+
+def facts_of(levels: Level, rules: TaskParams) -> Facts:
+    """`levelgen.proofs.examine` for any number of levels, on the host; it watches one record's length."""
+    count, watched = levels.role.shape[-1], min(RECORD_STEPS, rules.max_timesteps)
+    parts = [jax.device_get(examine(take(levels, lanes), rules, watched)) for lanes in blocks(count)]
+    return jax.tree.map(lambda *xs: np.concatenate(xs, -1)[:count], *parts)

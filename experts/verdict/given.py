@@ -1,0 +1,54 @@
+"""Levels whose actions somebody else found: played again here, and labelled by what comes of it."""
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from levelproof.experts.labels import Label, Source, Verdict, untrained
+from levelproof.experts.verdict.before import decide
+from levelproof.experts.verdict.judge import repeated
+from levelproof.experts.witness.witness import Record, replay, steps_to_goal, succeeds
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
+
+AGAIN = "the actions of the first imported episode, again and again, reach the goal"
+WHOLE = "the imported actions reach the goal in all {} of their finished episodes"
+MISSED = "the imported actions do not reach the goal here: {}"
+
+
+def label_given(
+    levels: Level, action: Int[np.ndarray, "256 6 level"], rules: TaskParams
+) -> tuple[Record, list[Verdict]]:
+    """What the actions do, and what that makes of the levels.
+
+    Where not every episode reaches the goal, but the first does, its actions are the witness. Levels that need no
+    expert are what they always are: the witness of a trivial one does nothing.
+    """
+    before, failed = decide(levels, rules)
+    record = replay(levels, action, rules)
+    whole, done, steps = succeeds(record.done, record.goal), np.asarray(record.done), steps_to_goal(record.done)
+    at_first = np.take_along_axis(np.asarray(record.goal), steps[None] - 1, 0)[0]
+    fails = done[steps - 1, np.arange(len(steps))]  # no episode ended otherwise
+    new = action.copy()
+    for i, verdict in enumerate(before):
+        if verdict is not None:
+            new[..., i] = 0
+        elif at_first[i] and not whole[i]:
+            new[..., i] = repeated(action[..., i], int(steps[i]))
+    changed = np.flatnonzero((new != action).any((0, 1)))
+    if len(changed):
+        again = replay(take(levels, changed), new[..., changed], rules)
+        for ours, theirs in zip(jax.tree.leaves(record), jax.tree.leaves(again), strict=True):
+            ours[..., changed] = theirs
+    solved, episodes = succeeds(record.done, record.goal), np.asarray(record.done).sum(0)
+    verdicts = []
+    for i, verdict in enumerate(before):
+        if verdict is None and solved[i]:
+            reason = WHOLE.format(episodes[i]) if whole[i] else AGAIN
+            verdict = untrained(Label.SOLVED, reason, bool(failed[i]), Source.IMPORT, int(steps[i]))
+        elif verdict is None:
+            reason = MISSED.format("the first episode ends otherwise" if fails[i] else "no episode ends")
+            verdict = untrained(Label.UNSOLVED, reason, bool(failed[i]))
+        verdicts.append(verdict)
+    return record, verdicts

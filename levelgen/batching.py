@@ -1,0 +1,43 @@
+"""Lanes in batches of few sizes: a compiled program serves one number of lanes, and compiling takes seconds.
+
+A batch that is shorter than its program's is padded with copies of its last lane.
+"""
+
+from collections.abc import Iterator
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+LANES = 64  # in a batch of replays
+BATCHES = (16, 64, 256)  # levels in a batch: a program for each of these, instead of one for each count
+LANES_ON_ACCELERATOR = 32_768  # enough to keep it busy
+
+T = TypeVar("T")
+
+
+def blocks(count: int, size: int = LANES) -> Iterator[np.ndarray]:
+    """Yield the lane indices of each batch of `size`; the last batch is padded with its last index."""
+    for first in range(0, count, size):
+        yield np.minimum(np.arange(first, first + size), count - 1)
+
+
+def block_size(count: int, most: int) -> int:
+    """Return the smallest of BATCHES and `most` that has room for `count` levels, or `most` if none has."""
+    return min((size for size in (*BATCHES, most) if count <= size <= most), default=most)
+
+
+def at_once(lanes: int, in_cache: int) -> int:
+    """Return how many items of `lanes` lanes each a program takes at once; `in_cache` lanes fit a core's cache."""
+    return max(1, (in_cache if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR) // lanes)
+
+
+def take(tree: T, lanes: np.ndarray) -> T:
+    """Return the lanes with these indices, of every array."""
+    return jax.tree.map(lambda x: x[..., lanes], tree)
+
+
+def repeat(tree: T, lanes: int) -> T:
+    """Copy each level into `lanes` neighbouring lanes."""
+    return jax.tree.map(lambda x: jnp.repeat(x, lanes, axis=-1), tree)

@@ -1,0 +1,1 @@
+"""The reader: batches of levels and records for training code."""

@@ -1,0 +1,1 @@
+"""Splits for other programs: Kinetix, Minari, tables and level files."""

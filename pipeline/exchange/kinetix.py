@@ -1,0 +1,54 @@
+"""A split as the reference has its data: a folder that `kinetix.data.TrajectoryDatasetManager` opens."""
+
+from pathlib import Path
+
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness.witness import Record
+from levelproof.levelgen.level import Level, size_of
+from levelproof.pipeline.read.kinetix.records import dtype_of, trajectories_of
+from levelproof.pipeline.read.kinetix.zarr2 import ROWS, write_array, write_chunk, write_group
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.read.select import SOLVED, witnessed
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.created import new_folder
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.store.shard import stored_bytes
+from levelproof.pipeline.store.shown import shown
+from levelproof.pipeline.words import many
+
+BLOCK = 4 * ROWS  # trajectories in memory at a time
+ARRAY = 64 * ROWS  # trajectories of an array: the reference shuffles arrays, and what they have
+
+
+def export_kinetix(split: Path, where: str | None, out: Path) -> None:
+    """Write the levels of `split` that have a witness and for which a condition holds, and say so.
+
+    Raises:
+        UserError: no split, no such level, a condition that DuckDB cannot use, or `out` is there already.
+        Failure: the split is damaged.
+    """
+    rows = witnessed(split, where or SOLVED)
+    prepare_jax()
+    count = rows.num_rows
+    with new_folder(out) as folder:
+        for first in shown(range(0, count, BLOCK), "trajectories"):
+            fields = read_rows(split, rows.slice(first, BLOCK))
+            made = trajectories_of(tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/"))
+            array, at = divmod(first, ARRAY)
+            for part in range(0, len(made), ROWS):
+                write_chunk(folder / name_of_array(array), (at + part) // ROWS, made[part : part + ROWS])
+        dtype = dtype_of(size_of(rows.column("size")[0].as_py()))
+        for first in range(0, count, ARRAY):
+            write_array(folder / name_of_array(first // ARRAY), min(ARRAY, count - first), dtype)
+        write_group(folder)
+    print(
+        f"{out}: {many(count, 'trajectory')} of {as_typed(split)}, "
+        f"{stored_bytes(out) / (count * RECORD_STEPS):.0f} bytes per transition.\n"
+        f'Next:  kinetix.data.TrajectoryDatasetManager("{out}", batch_size=64)'
+    )
+
+
+def name_of_array(number: int) -> str:
+    """Names sort as the arrays do."""
+    return f"{number:06d}"

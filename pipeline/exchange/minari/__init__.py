@@ -1,0 +1,1 @@
+"""Episodes of a split as a Minari dataset."""

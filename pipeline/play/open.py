@@ -1,0 +1,67 @@
+"""Which level a page begins with, and the time that its server is there."""
+
+import json
+import time
+import webbrowser
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from levelproof.configs.numbers import parse_count
+from levelproof.experts.config import check_budget
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.witness.witness import steps_to_goal
+from levelproof.levelgen.files.level_file import LevelFile
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.play.server import HOST, serving
+from levelproof.pipeline.play.session import empty_file, witness_in
+from levelproof.pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of
+from levelproof.pipeline.read.rows import read_row
+from levelproof.pipeline.runtime import prepare_jax
+
+
+def play(source: Path | None, level_id: int | None, size: str, budget: str, port: int, browser: bool) -> None:
+    """Serve the page until Ctrl-C; `browser`: and open it.
+
+    Raises:
+        UserError: no such level, size or budget, a file that cannot be read, or a port that is none or taken.
+        Failure: the split is damaged.
+    """
+    prepare_jax()
+    procedure, env_steps = Procedure(), parse_count(budget, "budget")
+    try:
+        check_budget(env_steps, procedure.expert, procedure.stop)
+    except ValueError as error:
+        raise UserError(f"{error}.") from None
+    file, actions = level_to_play(source, level_id, size)
+    with serving(file, actions, procedure, env_steps, port) as server:
+        address = f"http://{HOST}:{server.socket.getsockname()[1]}/"
+        print(f"Play at {address} (Ctrl-C ends it)", flush=True)
+        if browser:
+            webbrowser.open(address)
+        try:
+            while True:
+                time.sleep(3600)
+        except KeyboardInterrupt:
+            print("Done. What you saved is where your browser puts downloads.")
+
+
+def level_to_play(source: Path | None, level_id: int | None, size: str) -> tuple[LevelFile, np.ndarray | None]:
+    """A level, its rules, and the actions [step, 6] of its witness, if it has one."""
+    if source is None:
+        return empty_file(size), None
+    if is_level_file(source):
+        if level_id is not None:
+            raise UserError(f"{source} is a level file, which has one level: leave out the id {level_id}.")
+        file = level_file(source)
+        return file, witness_in(json.loads(source.read_bytes()), file)
+    if level_id is None:
+        raise UserError(f"Which level of {source}? Add its id, as `levelproof inspect {source}` shows them.")
+    manifest, row = find_level(source, level_id)
+    level = jax.tree.map(np.asarray, levels_of(manifest, manifest.table))
+    file = LevelFile(level, rules_of(manifest))
+    if not row["shard"]:
+        return file, None
+    stored = read_row(manifest.split, row, ["record/action", "record/done"])
+    return file, stored["record/action"][: int(steps_to_goal(stored["record/done"])[0]), :, 0]

@@ -1,0 +1,1 @@
+"""Whether a split is what its manifest says, byte by byte."""

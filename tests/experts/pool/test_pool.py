@@ -1,0 +1,259 @@
+"""Submissions that share a pool: each gets what it would have got alone, whenever it came."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from levelproof.experts.pool.found import nothing_found
+from levelproof.experts.pool.paused import Paused
+from levelproof.experts.pool.pool import Pool, Submission, capacity_of
+from levelproof.experts.pool.queue import GROUP, empty_queue, enter
+from levelproof.experts.training.slots import Pending, begin
+from levelproof.experts.verdict.judge import Kept, Trained, Witness
+from levelproof.experts.verdict.portability import PORTABLE, choose
+from levelproof.experts.witness.success import no_success
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from tests.experts.small import CONFIG, WHOLE, untouched
+from tests.experts.test_slots import SOLVED, same
+
+IDS = np.arange(100, 136)
+UPDATES = 6
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
+
+
+@pytest.fixture(scope="module")
+def alone(levels: Level) -> list[Trained]:
+    pool = new_pool()
+    (submission,) = finished(pool, pool.submit(levels, IDS))
+    return submission.trained(CONFIG)
+
+
+def new_pool() -> Pool:
+    return Pool(UPDATES * CONFIG.steps_per_update, untouched(SOLVED), DEFAULT_RULES)
+
+
+def part(levels: Level, at: range) -> tuple[Level, np.ndarray]:
+    return take(levels, np.array(at, int)), IDS[np.array(at, int)]
+
+
+def finished(pool: Pool, *submissions: Submission) -> list[Submission]:
+    """Those of the pool in the order in which they finish, once all of these have."""
+    done: list[Submission] = []
+    while not set(submissions) <= set(done):
+        done += pool.step()
+    return done
+
+
+def test_each_gets_what_it_would_get_alone(levels: Level, alone: list[Trained]) -> None:
+    """More levels come than the queue has room for, so its entries are used again."""
+    assert capacity_of(CONFIG) < len(IDS)
+    pool, parts = new_pool(), [range(20), range(20, 23), range(23, 36), range(0)]
+    submissions = [pool.submit(*part(levels, at)) for at in parts]
+    order = finished(pool, *submissions)
+    assert order[0] is submissions[3]  # without levels
+    assert len(order) == len(parts)
+    trained = [of for submission in submissions for of in submission.trained(CONFIG)]
+    assert len(trained) == len(IDS)
+    same(trained, alone)
+    for submission in submissions:
+        curves = sum(len(of.curve) for of in submission.trained(CONFIG))
+        assert submission.trained_rollouts == curves
+
+
+def test_levels_that_come_later_take_the_slots_that_are_empty(levels: Level) -> None:
+    """One level keeps one slot busy; others come while it trains, into the other."""
+    pool = new_pool()
+    first = pool.submit(*part(levels, range(1)))
+    assert pool.step() == []
+    second = pool.submit(*part(levels, range(1, 4)))
+    finished(pool, first, second)
+    assert first.idle_rollouts == 1  # of the first rollout alone
+
+
+def test_levels_that_wait_are_taken_out_and_change_no_other(levels: Level, alone: list[Trained]) -> None:
+    """From the queue, and from before it; another pool gives them what they would have got here."""
+    pool, other = new_pool(), new_pool()
+    first, second = pool.submit(*part(levels, range(30))), pool.submit(*part(levels, range(30, 36)))
+    for _ in range(3):
+        pool.step()
+    assert pool.waiting(first)[-1] == 29
+    assert pool.waiting(second) == list(range(6))
+    gone = pool.waiting(first)[3:]
+    pool.withdraw(first, gone)
+    assert not set(gone) & set(pool.waiting(first))
+    later = other.submit(take(levels, np.array(gone)), IDS[gone])
+    finished(pool, first, second)
+    finished(other, later)
+    trained = dict(zip(gone, later.trained(CONFIG), strict=True))
+    trained = dict(enumerate(first.trained(CONFIG))) | trained | dict(enumerate(second.trained(CONFIG), 30))
+    same([trained[i] for i in range(36)], alone)
+
+
+def test_an_expert_that_is_paused_at_any_moment_goes_on_to_the_same(levels: Level, alone: list[Trained]) -> None:
+    """In a slot of another pool, from a training step or an evaluation, and from the middle of one."""
+    pool, evaluated = new_pool(), 0
+    submission = pool.submit(*part(levels, range(4)))
+    while True:
+        now = {i: of for _, i, of in pool.paused()}
+        evaluated += sum(bool(of.pending.due or of.pending.final) for of in now.values())
+        if evaluated > 1:
+            break
+        pool.step()
+    steps = sum(len(of.expert.curve) for of in now.values())
+    assert steps, "one has begun"
+    other, at = new_pool(), np.array(sorted(now))
+    paused = {row: now[i] for row, i in enumerate(at)}
+    later = other.submit(take(levels, at), IDS[at], paused=paused)
+    finished(other, later)
+    same(later.trained(CONFIG), [alone[i] for i in at])
+    assert later.trained_rollouts == sum(len(alone[i].curve) for i in at) - steps
+    finished(pool, submission)
+    same(submission.trained(CONFIG), alone[:4])
+
+
+@pytest.fixture
+def never_portable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No witness survives enough replays."""
+    monkeypatch.setattr("levelproof.experts.pool.pool.PORTABLE", 2)
+
+
+def steadied(updates: int) -> Pool:
+    """In which levels train on for so many updates after they are solved, 10 at most in all."""
+    stopping = replace(SOLVED, steady=updates * CONFIG.steps_per_update)
+    return Pool(10 * CONFIG.steps_per_update, untouched(stopping), DEFAULT_RULES)
+
+
+def trained_by(pool: Pool, levels: Level) -> list[Trained]:
+    (submission,) = finished(pool, pool.submit(levels, IDS))
+    return submission.trained(CONFIG)
+
+
+def chosen(levels: Level, i: int, trained: Trained) -> Witness:
+    """A level's witness."""
+    level, candidates = take(levels, np.array([i])), [trained.candidates]
+    (witness,) = choose(level, IDS[[i]], candidates, CONFIG.replays, DEFAULT_RULES)
+    assert witness is not None
+    assert witness.portability is not None
+    return witness
+
+
+def test_levels_train_on_where_few_replays_survive_and_no_others_do(levels: Level) -> None:
+    at_once, waited = (trained_by(steadied(updates), levels) for updates in (0, 3))
+    left = [i for i, of in enumerate(at_once) if len(of.curve) < 10]
+    assert left
+    for i in left:
+        before, best = len(at_once[i].curve), chosen(levels, i, at_once[i])
+        stays = (best.portability or 0) < PORTABLE
+        assert len(waited[i].curve) > before if stays else len(waited[i].curve) == before
+        assert stays or [witness.steps for witness in waited[i].candidates] == [best.steps]
+
+
+@pytest.mark.usefixtures("never_portable")
+def test_a_level_trains_on_for_no_longer_than_that(levels: Level) -> None:
+    """What it was before is in what it becomes, and of the witnesses of all its evaluations the best is kept."""
+    at_once, waited = (trained_by(steadied(updates), levels) for updates in (0, 3))
+    early = [i for i, of in enumerate(at_once) if of.candidates and len(of.curve) < 10]
+    assert early
+    for i in early:
+        before, after = at_once[i], waited[i]
+        assert len(after.curve) == min(len(before.curve) + 3, 10)
+        np.testing.assert_array_equal(after.curve[: len(before.curve)], before.curve)
+        same(after.evaluations[0], before.evaluations[0])
+        best, now = chosen(levels, i, before), chosen(levels, i, after)
+        assert (now.portability or 0, -now.steps) >= (best.portability or 0, -best.steps)
+
+
+@pytest.mark.usefixtures("never_portable")
+def test_levels_that_train_on_are_the_same_in_any_company_and_after_any_pause(levels: Level) -> None:
+    alone = trained_by(steadied(3), levels)
+    assert any(len(of.evaluations) > 1 for of in alone)
+    pool = steadied(3)
+    parts = [pool.submit(*part(levels, at)) for at in (range(7), range(7, 36))]
+    finished(pool, *parts)
+    same([of for submission in parts for of in submission.trained(CONFIG)], alone)
+
+    stopped = steadied(3)
+    submission = stopped.submit(levels, IDS)
+    paused: dict[int, Paused] = {}
+    while not stopped.step():
+        for _, i, now in stopped.paused():
+            if now.evaluations and i not in paused:  # it has been solved once
+                paused[i] = now
+    same(submission.trained(CONFIG), alone)
+    assert paused
+    at, other = np.array(sorted(paused)), steadied(3)
+    later = other.submit(take(levels, at), IDS[at], paused={row: paused[i] for row, i in enumerate(at.tolist())})
+    finished(other, later)
+    told = lambda trained, at: [
+        of._replace(candidates=[chosen(levels, i, of)]) for i, of in zip(at, trained, strict=True)
+    ]
+    same(told(later.trained(CONFIG), at), told([alone[i] for i in at], at))
+
+
+def test_totals_grow_to_the_whole(levels: Level) -> None:
+    pool = new_pool()
+    submission, seen = pool.submit(*part(levels, range(5))), []
+    while not pool.step():
+        seen.append(pool.totals(submission))
+    seen.append(pool.totals(submission))
+    for numbers in zip(*seen, strict=True):
+        assert list(numbers) == sorted(numbers)
+    assert seen[-1][:2] == (submission.trained_rollouts * CONFIG.steps_per_update, 5)
+
+
+def test_a_pool_wants_levels_while_fewer_wait_than_there_are_slots(levels: Level) -> None:
+    pool = new_pool()
+    assert [pool.wants(searched) for searched in (0, 1, 5)] == [2, 1, 0]
+    pool.submit(*part(levels, range(5)))
+    assert pool.wants(0) == 0
+    wanted: list[int] = []
+    while not pool.step():
+        wanted.append(pool.wants(0))
+    assert wanted[0] == 0  # three wait
+    assert wanted == sorted(wanted)
+    assert pool.wants(0) == 2
+
+
+def test_indices_of_a_queue_are_used_again_in_any_order(levels: Level) -> None:
+    capacity = capacity_of(CONFIG)
+    queue = empty_queue(levels, capacity, CONFIG)
+    at = np.random.default_rng(0).permutation(capacity)
+    expected = np.zeros(capacity, int)
+    for first in range(0, 36, 12):
+        some, ids = part(levels, range(first, first + 12))
+        indices = [int(at[i % capacity]) for i in range(first, first + 12)]
+        queue = enter(queue, indices, some, ids, no_success(len(ids)), CONFIG, UPDATES)
+        expected[indices] = ids
+    assert int(queue.come) == 36 > capacity
+    np.testing.assert_array_equal(queue.level_ids, expected)
+    same(jax.device_get(queue.levels), take(levels, expected - IDS[0]))
+    np.testing.assert_array_equal(
+        np.asarray(queue.level_ids)[queue.order], [*IDS[capacity:], *IDS[36 - capacity : capacity]]
+    )
+
+
+def test_a_level_that_stays_long_keeps_no_slot_empty(levels: Level) -> None:
+    """More others come and go meanwhile than the queue has room for."""
+    pool = Pool(400 * CONFIG.steps_per_update, untouched(WHOLE), DEFAULT_RULES)
+    groups = np.resize(np.arange(len(IDS)), (-(-len(IDS) // GROUP), GROUP))  # for so many at once there is a program
+    begun = [jax.device_get(begin(take(levels, at), IDS[at], no_success(GROUP), CONFIG)) for at in groups]
+    experts = jax.tree.map(lambda *xs: np.concatenate(xs), *begun)
+    soon, no = np.int32(1), np.bool_(False)  # they leave after an update
+    paused = {
+        i: Paused(Kept(jax.tree.map(lambda x, i=i: x[i], experts), []), Pending(no, no, soon), 0, [], nothing_found(1))
+        for i in range(1, len(IDS))
+    }
+    submission = pool.submit(levels, IDS, paused=paused)
+    while pool.waiting(submission):
+        assert pool.step() == []
+    assert 0 in submission.under_way
+    assert submission.idle_rollouts == 0

@@ -1,0 +1,91 @@
+"""Reworked witnesses: a fragile one becomes steady, whatever is beside it, and what that takes is counted."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import numpy as np
+
+from benchmarks.alone import label
+from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.labels import Source
+from levelproof.experts.pool.rework import rework
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.search.scout import scout
+from levelproof.experts.verdict.judge import Witness, repeating
+from levelproof.experts.verdict.portability import survival
+from levelproof.experts.witness.success import Success
+from levelproof.experts.witness.witness import replay, steps_to_goal
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+
+IDS = np.array([3, 107], np.int32)  # of size s: what scouts find of the other survives next to nothing
+STEADY, FRAGILE = 0, 1
+ONCE = ScoutConfig(rounds=1)
+PROCEDURE = Procedure(ONCE, SearchConfig(env_steps=0), ExpertConfig(), StopConfig(rule=Rule.NONE))
+
+
+@cache
+def levels() -> Level:
+    return jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
+
+
+@cache
+def witnesses() -> list[Witness]:
+    success = scout(levels(), IDS, ONCE, DEFAULT_RULES).success
+    found = [of for pair in zip(*success, strict=True) for of in repeating(Success(*pair), Source.SCOUT)]
+    shares = survival(levels(), IDS, found, 32, DEFAULT_RULES).tolist()
+    return [of._replace(portability=share) for of, share in zip(found, shares, strict=True)]
+
+
+def test_a_fragile_witness_becomes_steady_and_no_other_is_touched() -> None:
+    (same, better), env_steps = rework(levels(), IDS, witnesses(), PROCEDURE, DEFAULT_RULES)
+    before = witnesses()[FRAGILE]
+    assert same is witnesses()[STEADY]
+    assert env_steps[STEADY] == 0 < env_steps[FRAGILE]
+    assert better is not None
+    assert before.portability is not None
+    assert before.portability < 0.5 < (better.portability or 0)
+    assert better.source is Source.SEARCH
+    record = replay(take(levels(), np.array([FRAGILE])), better.action[..., None])
+    assert steps_to_goal(record.done) == better.steps
+    assert record.goal[record.done].all()
+
+    mirrored = take(levels(), np.array([1, 0]))
+    (again, _), steps = rework(mirrored, IDS[::-1], witnesses()[::-1], PROCEDURE, DEFAULT_RULES)
+    assert again is not None
+    np.testing.assert_array_equal(again.action, better.action)
+    assert (again.steps, again.portability, steps[0]) == (better.steps, better.portability, env_steps[FRAGILE])
+
+    result = label(levels(), IDS, 4096, PROCEDURE)
+    verdicts = result.verdicts
+    assert [of.search_steps for of in verdicts] == env_steps.tolist()
+    assert result.spent.searched == env_steps.sum()
+    assert (verdicts[FRAGILE].witness, verdicts[FRAGILE].portability) == (Source.SEARCH, better.portability)
+    assert verdicts[FRAGILE].cells is None, "nobody searched before"
+
+
+def test_an_experts_own_witness_stays_unless_most_replays_fail() -> None:
+    """Those that are varied are the same actions whoever found them."""
+    found, own = witnesses()[FRAGILE], Source.SAMPLED
+    assert found.portability is not None
+    for source, share, stays in ((own, 0.5, True), (own, 0.45, False), (Source.SCOUT, 0.5, False)):
+        before = found._replace(source=source, portability=share)
+        some = take(levels(), np.array([FRAGILE]))
+        (after,), _ = rework(some, IDS[[FRAGILE]], [before], PROCEDURE, DEFAULT_RULES)
+        assert after is not None
+        assert (after is before) == stays
+        assert after.source is (own if stays else Source.SEARCH)
+
+
+def test_without_rounds_or_replays_nothing_is_reworked() -> None:
+    for procedure in (
+        replace(PROCEDURE, search=replace(PROCEDURE.search, steady=0)),
+        replace(PROCEDURE, expert=replace(PROCEDURE.expert, replays=0)),
+    ):
+        found, env_steps = rework(levels(), IDS, witnesses(), procedure, DEFAULT_RULES)
+        assert all(a is b for a, b in zip(found, witnesses(), strict=True))
+        assert not env_steps.any()

@@ -1,0 +1,104 @@
+"""Advantages against a loop, and a bandit that PPO must learn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from levelproof.experts.config import ExpertConfig, Network
+from levelproof.experts.policy import forward, log_probability, network_of, sample
+from levelproof.experts.training import ppo
+from levelproof.experts.training.ppo import LevelConstants, Samples
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.observe.flat import dynamic_features
+
+SIZE = SIZES["s"]
+DYNAMIC = len(dynamic_features(SIZE))
+
+
+def test_advantages() -> None:
+    config, rng = ExpertConfig(discount=0.9, gae_lambda=0.8), np.random.default_rng(0)
+    value, reward = rng.normal(size=(2, 20, 3)).astype(np.float32)
+    done, last = rng.random((20, 3)) < 0.2, rng.normal(size=3).astype(np.float32)
+    expected, running, following = np.zeros_like(value), np.zeros(3), last
+    for t in reversed(range(20)):
+        alive = 1 - done[t]
+        running = reward[t] + 0.9 * following * alive - value[t] + 0.9 * 0.8 * alive * running
+        expected[t], following = running, value[t]
+    np.testing.assert_allclose(ppo.advantages(value, reward, done, last, config), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_samples_keep_every_number_at_its_place() -> None:
+    rng, time, lanes = np.random.default_rng(1), 4, 3
+    moving = rng.normal(size=(time, DYNAMIC, lanes)).astype(np.float32)
+    action = rng.integers(0, 2, (time, len(CHOICES), lanes))
+    log_probs, value, advantage, rehearsed = rng.normal(size=(4, time, lanes)).astype(np.float32)
+    back = ppo.from_rows(ppo.as_rows(Samples(moving, action, log_probs, value, advantage, rehearsed)))
+    np.testing.assert_array_equal(back.moving, np.moveaxis(moving, 1, 0).reshape(DYNAMIC, -1))
+    np.testing.assert_array_equal(back.action, np.moveaxis(action, 1, 0).reshape(len(CHOICES), -1))
+    for mine, theirs in zip(back[2:], (log_probs, value, advantage, rehearsed), strict=True):
+        np.testing.assert_array_equal(mine, theirs.reshape(-1))
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("kind", [Network.FLAT, pytest.param(Network.ENTITY, marks=pytest.mark.campaign)])
+def test_learns_a_bandit(kind: Network, seed: int) -> None:
+    """One action entry pays when it is 2: after a few updates it is chosen nearly always."""
+    config = ExpertConfig(network=kind, width=16, encoding=16, environments=32, horizon=8, learning_rate=3e-3)
+    network, count = network_of(SIZE, config), config.steps_per_update
+    features = jax.jit(network.constant)(sample_levels(np.array([seed]), SIZE))
+    constant = jax.tree.map(lambda x: np.asarray(x)[..., 0], features)
+    train_state = jax.jit(lambda key: ppo.init(key, network, constant, config))(jax.random.key(seed))
+    constants, moving = LevelConstants(constant, jnp.ones(len(CHOICES), bool)), jnp.ones((DYNAMIC, count))
+
+    @jax.jit
+    def learn(now, key):
+        logits, value = forward(network, now.params, constants.features, moving)
+        action = sample(logits, jax.random.uniform(key, (len(CHOICES), count)))
+        reward = (action[1] == 2).astype(jnp.float32)
+        log_probs = log_probability(logits, action, constants.live[:, None])
+        seen = moving, action, log_probs, value, reward - value, jnp.zeros(count)
+        samples = Samples(*(x[None] for x in seen))
+        rows = ppo.as_rows(samples)
+        return ppo.update(now, jax.random.fold_in(key, 1), network, constants, rows, config), reward.mean()
+
+    rewards = []
+    for key in jax.random.split(jax.random.key(seed), 40):
+        train_state, reward = learn(train_state, key)
+        rewards.append(float(reward))
+    assert rewards[0] < 0.5
+    assert rewards[-1] > 0.95
+
+
+@pytest.mark.parametrize(("environments", "horizon"), [(32, 16), (7, 5), (1, 9), (6, 1)])
+def test_shuffling(environments: int, horizon: int) -> None:
+    config = ExpertConfig(
+        environments=environments,
+        horizon=horizon,
+        minibatches=1,
+        rehearsals=0,
+        attempts=1,
+        sticky_attempts=0,
+        moved_attempts=0,
+    )
+    shuffle = jax.jit(lambda seed: ppo.shuffled(jax.random.key(seed), config))
+    orders = [np.asarray(shuffle(seed)) for seed in range(20)]
+    for order in orders:
+        assert sorted(order) == list(range(environments * horizon))
+        for run in order.reshape(horizon, environments):
+            assert sorted(run % environments) == list(range(environments))
+    if environments * horizon > 10:
+        assert len({tuple(order) for order in orders}) == len(orders)
+
+
+def test_every_sample_can_come_first() -> None:
+    config = ExpertConfig(
+        environments=4, horizon=4, minibatches=1, rehearsals=0, attempts=1, sticky_attempts=0, moved_attempts=0
+    )
+    many = jax.jit(jax.vmap(lambda key: ppo.shuffled(key, config)))
+    orders = many(jax.random.split(jax.random.key(0), 4000))
+    counts = np.bincount(np.asarray(orders)[:, 0], minlength=16)
+    assert counts.min() > 250 - 5 * 16
+    assert counts.max() < 250 + 5 * 16

@@ -1,0 +1,248 @@
+"""Continuous batching on real levels: who leaves when, and that nothing of it shows in a result."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.alone import label
+from levelproof.experts import advance as advance_module
+from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.labels import Label, Source
+from levelproof.experts.pool.found import Looking
+from levelproof.experts.pool.pool import Pool, Submission, capacity_of
+from levelproof.experts.pool.queue import empty_queue, enter
+from levelproof.experts.search.search import Searching
+from levelproof.experts.training.advance import advance
+from levelproof.experts.training.progress import NEVER
+from levelproof.experts.training.slots import LevelQueue, Mode, empty_slots
+from levelproof.experts.training.stop import rules_of
+from levelproof.experts.verdict.judge import Trained
+from levelproof.experts.witness.success import Success, no_success
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from tests.experts.small import CONFIG, IDS, SHAPED, WHOLE, untouched
+
+SOLVED = StopConfig(rule=Rule.SOLVED, successes=2, share=0.6, wait=2048)
+HALVED = StopConfig(rule=Rule.HALVING, successes=4, first_rung=4 * 512, gain=10.0)
+UPDATES = 24  # 12,288 env steps
+
+
+def train(
+    levels: Level, level_ids: np.ndarray, updates: int, config: ExpertConfig, stopping: StopConfig, **how: Any
+) -> tuple[list[Trained], Submission]:
+    pool = Pool(updates * config.steps_per_update, untouched(stopping, config), DEFAULT_RULES)
+    submission = pool.submit(levels, level_ids, **how)
+    while not pool.step():
+        pass
+    return submission.trained(config), submission
+
+
+def queue_of(levels: Level, updates: int) -> LevelQueue:
+    """As in a pool, so that it uses the same program."""
+    queue = empty_queue(levels, capacity_of(CONFIG), CONFIG)
+    return enter(queue, range(len(IDS)), levels, IDS, no_success(len(IDS)), CONFIG, updates)
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
+
+
+@pytest.fixture(scope="module")
+def solved(levels: Level) -> list[Trained]:
+    return train(levels, IDS, UPDATES, CONFIG, SOLVED)[0]
+
+
+@pytest.fixture(scope="module")
+def whole(levels: Level) -> list[Trained]:
+    return train(levels, IDS, UPDATES, CONFIG, WHOLE, keep=True)[0]
+
+
+def same(a, b) -> None:
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_levels_leave_when_they_are_solved(solved: list[Trained], whole: list[Trained]) -> None:
+    steps = [len(of.curve) for of in solved]
+    assert min(steps) < UPDATES, "one of these levels should be solved early"
+    assert max(steps) == UPDATES, "one of these levels should not be solved"
+    assert [len(of.curve) for of in whole] == [UPDATES] * len(IDS)
+    for of in solved:
+        assert int(of.evaluations[-1].progress.env_steps) == len(of.curve) * CONFIG.steps_per_update
+
+
+def test_an_evaluation_leaves_no_trace_in_training(solved: list[Trained], whole: list[Trained]) -> None:
+    for early, late in zip(solved, whole, strict=True):
+        np.testing.assert_array_equal(early.curve, late.curve[: len(early.curve)])
+
+
+@pytest.mark.parametrize("at", [[5, 1, 3], [6], [2, 6, 5, 4, 0]])
+def test_a_result_depends_neither_on_slot_nor_on_neighbours(
+    levels: Level, solved: list[Trained], at: list[int]
+) -> None:
+    some, _ = train(take(levels, np.array(at)), IDS[at], UPDATES, CONFIG, SOLVED)
+    for i, of in zip(at, some, strict=True):
+        same(of, solved[i])
+
+
+def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
+    """No slot is empty while a level waits, and every level has one slot."""
+    queue = queue_of(levels, 2)
+    slots = empty_slots(2, queue, CONFIG)
+    modes, indices = [], []
+    for _ in range(400):
+        slots, seen = advance(slots, queue, CONFIG, rules_of(WHOLE, CONFIG), SHAPED)
+        modes.append(np.asarray(seen.mode))
+        indices.append(np.where(modes[-1] == Mode.EMPTY, -1, np.asarray(seen.queue_index)))
+        if (modes[-1] == Mode.EMPTY).all():
+            break
+    modes, indices = np.array(modes), np.array(indices)
+    assert sorted(set(indices.reshape(-1)) - {-1}) == list(range(len(IDS)))
+    waited_for = (indices == len(IDS) - 1).any(1).argmax()  # the last level has come
+    assert (modes[:waited_for] != Mode.EMPTY).all()
+    for index in range(len(IDS)):
+        rows, slot = np.nonzero(indices == index)
+        assert len(set(slot)) == 1
+        assert (np.diff(rows) == 1).all()
+        assert (modes[rows, slot[0]] == [Mode.TRAIN] * 2 + [Mode.EVALUATE] * CONFIG.record_rollouts).all()
+
+
+def test_nothing_is_compiled_again(levels: Level) -> None:
+    """Another number of levels, another budget and another rule use the same program."""
+    train(take(levels, np.arange(3)), IDS[:3], 2, CONFIG, SOLVED)
+    before = advance._cache_size()
+    for stopping in (SOLVED, WHOLE, HALVED):
+        train(levels, IDS, 3, CONFIG, stopping)
+    assert advance._cache_size() == before
+
+
+def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) -> None:
+    halved, submission = train(levels, IDS, UPDATES, CONFIG, HALVED)
+    never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
+    assert never
+    for i in never:
+        assert len(halved[i].curve) in (4, 8)  # at the first rung there is nothing to compare with
+    assert submission.trained_rollouts == sum(len(of.curve) for of in halved)
+    verdicts = label(levels, IDS, UPDATES * 512, untouched(HALVED)).verdicts
+    reasons = {i: verdict.label_reason for i, verdict in enumerate(verdicts) if verdict.label is Label.UNSOLVED}
+    assert all("at a rung the best return had not grown" in reasons[i] for i in never)
+
+
+def test_a_fruitless_expert_says_why_it_left(levels: Level, whole: list[Trained]) -> None:
+    never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
+    stopping = replace(HALVED, first_rung=UPDATES * 512, fruitless=5 * 512)
+    verdicts = label(levels, IDS, UPDATES * 512, untouched(stopping)).verdicts
+    assert never
+    for i in never:
+        assert verdicts[i].env_steps == 5 * 512
+        if verdicts[i].label is Label.UNSOLVED:
+            assert verdicts[i].label_reason.startswith(
+                "the expert never reached the goal in training, so it left after 2560 env steps; none of the 4 attempts"
+            )
+    assert Label.UNSOLVED in {verdicts[i].label for i in never}
+
+
+def test_a_success_of_training_is_a_witness_where_evaluation_has_none(levels: Level) -> None:
+    """Which level that is depends on the machine's rounding, so several budgets are looked at."""
+    found = set()
+    for updates in (2, 3, 4, 6, 8, 12):
+        for verdict in label(levels, IDS, updates * 512, untouched(replace(WHOLE, successes=4))).verdicts:
+            found.add(verdict.witness)
+            if verdict.steps_to_first_success is not None:
+                assert verdict.label is Label.SOLVED
+            if verdict.witness is Source.EXPLORATION:
+                assert not verdict.most_probable_succeeds
+    assert Source.EXPLORATION in found
+
+
+@pytest.mark.campaign
+def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[Trained]) -> None:
+    polished, _ = train(levels, IDS, UPDATES, CONFIG, replace(SOLVED, polish=4 * 512))
+    early = [i for i, of in enumerate(solved) if len(of.curve) < UPDATES - 4]
+    assert early
+    for i in early:
+        assert len(polished[i].curve) == len(solved[i].curve) + 4
+        assert len(polished[i].evaluations) == 2
+        same(polished[i].evaluations[0], solved[i].evaluations[0])
+
+
+@pytest.mark.parametrize("stopping", [WHOLE, SOLVED, HALVED], ids=["budget", "solved", "halving"])
+def test_going_on_equals_having_trained_through(levels: Level, stopping: StopConfig) -> None:
+    """A level that left at a rung, too: it is over, and uses none of the larger budget."""
+    through, _ = train(levels, IDS, UPDATES, CONFIG, stopping, keep=True)
+    first, _ = train(levels, IDS, UPDATES // 2, CONFIG, stopping, keep=True)
+    left = [i for i, of in enumerate(first) if stopping == WHOLE or not of.candidates]
+    assert (stopping == HALVED) == any(len(first[i].curve) < UPDATES // 2 for i in left)
+    begun = {number: first[i].expert for number, i in enumerate(left)}
+    later, submission = train(
+        take(levels, np.array(left)), IDS[left], UPDATES, CONFIG, stopping, begun=begun, keep=True
+    )  # type: ignore[arg-type]
+    assert submission.trained_rollouts == sum(len(through[i].curve) - len(first[i].curve) for i in left)
+    for i, of in zip(left, later, strict=True):
+        same(of, through[i])
+
+
+def test_a_success_before_training_is_rehearsed_from_the_first_update(levels: Level, whole: list[Trained]) -> None:
+    """It ends at its goal, so the first of its episodes does; and those lanes do not count as the expert's own."""
+    looks = replace(untouched(WHOLE), scout=ScoutConfig(rounds=1))
+    found = Looking(levels, IDS, looks, DEFAULT_RULES, Searching(looks.search, DEFAULT_RULES)).found
+    trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=found)
+    assert 0 < (found.success.length > 0).sum() < len(IDS)
+    for i, of in enumerate(trained):
+        assert np.array_equal(of.evaluations[-1].success.action, found.success.action[i]) or not found.success.length[i]
+        if not found.success.length[i]:
+            same(of.curve, whole[i].curve[:2])
+
+
+def test_a_success_of_a_lane_that_repeats_its_actions_is_not_the_experts_own() -> None:
+    """Such a lane mostly ignores what the expert draws, as a lane that rehearses does."""
+    ids = np.arange(100, 164)
+    trained, _ = train(jax.tree.map(np.asarray, sample_levels(ids, SIZES["s"])), ids, 1, CONFIG, WHOLE)
+    last = [(of.evaluations[-1], of.curve[0]) for of in trained]
+    forced = [share for shown, share in last if shown.success.length and shown.progress.first_success == NEVER]
+    assert forced, "in some of these levels no other lane reaches the goal"
+    assert all(np.isnan(share) or share == 0 for share in forced)
+
+
+def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level, whole: list[Trained]) -> None:
+    begun = {}
+    for i, weight in enumerate((np.inf, np.nan)):
+        kept = whole[i].expert
+        assert kept
+        training = kept.begun.training
+        params = jax.tree.map(lambda x, weight=weight: np.full_like(x, weight), training.train_state.params)
+        # what it finds by chance would be a witness: it takes doing nothing for its success
+        success = Success(np.zeros_like(training.success.action), np.ones_like(training.success.length))
+        training = training._replace(train_state=training.train_state._replace(params=params), success=success)
+        begun[int(IDS[i])] = kept._replace(begun=kept.begun._replace(training=training))
+    some, budget = take(levels, np.arange(2)), 2 * UPDATES * 512
+    for verdict in label(some, IDS[:2], budget, untouched(WHOLE), begun=begun).verdicts:
+        assert verdict.label is Label.UNSOLVED
+        assert verdict.env_steps == (UPDATES + 1) * 512
+        assert f"its network's numbers stopped being finite after {verdict.env_steps} env steps" in verdict.label_reason
+
+
+@pytest.mark.campaign
+def test_all_slots_at_once_as_on_an_accelerator(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same course and nearly the same numbers: sums are taken in another order."""
+    queue = queue_of(levels, 3)
+
+    def go(advance) -> list:
+        slots, seen = empty_slots(2, queue, CONFIG), []
+        for _ in range(3 + CONFIG.record_rollouts + 2):  # an update of the second levels is among them
+            slots, report = advance(slots, queue, CONFIG, rules_of(WHOLE, CONFIG), SHAPED)
+            seen.append(report)
+        return [jax.device_get(seen), jax.device_get(slots.slot.training)]
+
+    one_by_one, ours = go(advance)
+    monkeypatch.setattr(advance_module, "over_slots", lambda function, *slots: jax.vmap(function)(*slots))
+    together, theirs = go(jax.jit(advance.__wrapped__, static_argnums=(2, 4)))
+    same([(r.queue_index, r.mode, r.left) for r in one_by_one], [(r.queue_index, r.mode, r.left) for r in together])
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), ours.train_state.params, theirs.train_state.params
+    )

@@ -1,0 +1,70 @@
+"""Success rates: of attempts that decide nothing, whoever makes them beside whom."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.pool.pool import Pool
+from levelproof.experts.pool.run import TrainingRun, UnitResult
+from levelproof.experts.verdict.afresh import attempt
+from levelproof.experts.verdict.judge import shares
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from tests.experts.small import CONFIG, untouched
+from tests.experts.test_slots import SOLVED
+
+IDS = np.arange(100, 124)
+ALL = replace(SOLVED, successes=CONFIG.attempts)  # a level is solved when every attempt of an evaluation succeeds
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
+
+
+@pytest.fixture(scope="module")
+def run(levels: Level) -> TrainingRun:
+    pool = Pool(24 * CONFIG.steps_per_update, untouched(ALL), DEFAULT_RULES)
+    run = TrainingRun(pool, levels, IDS)
+    while not pool.step():
+        run.look()
+    return run
+
+
+@pytest.fixture(scope="module")
+def result(run: TrainingRun) -> UnitResult:
+    return run.finish()
+
+
+def test_a_success_rate_is_not_that_of_the_evaluation_that_ended_training(run: TrainingRun, result: UnitResult) -> None:
+    """Where every attempt of that succeeded, others need not."""
+    assert run.submission
+    ended = zip(run.left, run.submission.trained(CONFIG), strict=True)
+    lucky = [index for index, of in ended if shares(of.evaluations[-1], CONFIG)[0] == 1]
+    rates = np.array([result.verdicts[index].success_rate for index in lucky])
+    assert len(rates) > 4
+    assert 0.5 < rates.mean() < 1
+
+
+def test_its_env_steps_count(run: TrainingRun, result: UnitResult) -> None:
+    assert run.submission
+    for index, of in zip(run.left, run.submission.trained(CONFIG), strict=True):
+        more = result.verdicts[index].evaluation_steps - of.evaluation_steps
+        assert CONFIG.attempts <= more <= CONFIG.attempts * RECORD_STEPS
+    assert result.spent.evaluated == sum(of.evaluation_steps for of in result.verdicts)
+    assert result.ledger
+    seconds = [result.ledger.of(int(index)).evaluation for index in run.left]
+    assert min(seconds) > 0
+
+
+def test_a_success_rate_depends_on_the_level_alone(levels: Level, run: TrainingRun, result: UnitResult) -> None:
+    assert run.submission
+    trained, some = run.submission.trained(CONFIG), [7, 2, 5]
+    policies = [trained[i].policy for i in some]
+    found = attempt(take(levels, run.left[some]), IDS[run.left[some]], policies, CONFIG, DEFAULT_RULES)  # pyright: ignore
+    np.testing.assert_array_equal(found.success_rate, [result.verdicts[i].success_rate for i in run.left[some]])

@@ -1,0 +1,136 @@
+"""Which witness is chosen, and what evaluations say."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from levelproof.experts.config import RECORD_STEPS, Choice, ExpertConfig
+from levelproof.experts.labels import Cause, Source
+from levelproof.experts.training import progress
+from levelproof.experts.verdict.judge import (
+    MOST_CANDIDATES,
+    Evaluation,
+    Witness,
+    candidates_of,
+    repeated,
+    shares,
+    successful_episodes,
+)
+from levelproof.experts.witness.success import Success
+
+CONFIG = ExpertConfig(environments=8, rehearsals=2, attempts=3, sticky_attempts=2, moved_attempts=2)
+
+
+def evaluation(*episodes: list[tuple[int, bool]], success: int = 0, config: ExpertConfig = CONFIG) -> Evaluation:
+    """Environments with these episodes: (last step, whether it reached the goal). Actions count the steps."""
+    done, goal = np.zeros((2, RECORD_STEPS, config.environments), bool)
+    for environment, ends in enumerate(episodes):
+        for end, reached in ends:
+            done[end, environment], goal[end, environment] = True, reached
+    action = np.arange(RECORD_STEPS)[:, None, None] + 1000 * np.arange(config.attempts) + np.zeros((1, 6, 1), int)
+    played = Success(np.full((RECORD_STEPS, 6), 7, np.int8), np.int32(success))
+    return Evaluation(action, done, goal, progress.start(config.environments), played, np.int8(Cause.NONE))
+
+
+def best_of(evaluations: list[Evaluation], source: Source, config: ExpertConfig) -> Witness | None:
+    return next(iter(candidates_of(evaluations, source, config)), None)
+
+
+def test_a_record_is_the_first_attempt_without_failure() -> None:
+    one = evaluation([(9, True), (20, False)], [(99, True), (199, True)], [(30, True)])
+    witness = best_of([one], Source.SCOUT, replace(CONFIG, replays=0))
+    assert witness is not None
+    assert (witness.source, witness.steps) == (Source.SAMPLED, 100)
+    np.testing.assert_array_equal(witness.action[:, 0], np.arange(RECORD_STEPS) + 1000)
+
+
+def test_the_shortest_success_is_repeated() -> None:
+    one = evaluation([(9, True), (14, True), (20, False)], [(99, True)], [(30, True)])
+    witness = best_of([one], Source.SCOUT, replace(CONFIG, witness=Choice.SHORTEST))
+    assert witness is not None
+    assert (witness.source, witness.steps) == (Source.MOST_PROBABLE, 5)
+    np.testing.assert_array_equal(witness.action[:12, 0], [10, 11, 12, 13, 14] * 2 + [10, 11])
+
+
+def test_the_best_of_several_evaluations_counts() -> None:
+    before, polished = evaluation([(99, True)]), evaluation([(49, True)])
+    failed = evaluation([(9, False)])
+    for several in ([before, polished], [polished, before], [polished, failed]):
+        witness = best_of(several, Source.SCOUT, CONFIG)
+        assert witness is not None
+        assert witness.steps == 50
+
+
+def test_all_that_succeed_are_candidates_the_shortest_first() -> None:
+    one, two = evaluation([(99, True)], [(9, True), (29, False)], [(30, True)]), evaluation([(30, True)], [(20, True)])
+    steps = lambda found: [(witness.steps, witness.source) for witness in found]
+    sampled, probable = Source.SAMPLED, Source.MOST_PROBABLE
+    found = candidates_of([one, two], Source.SCOUT, CONFIG)
+    assert steps(found) == [(21, sampled), (31, sampled), (31, probable), (100, probable)]
+    assert steps(candidates_of([one, two], Source.SCOUT, replace(CONFIG, replays=0))) == [
+        (31, probable),
+        (100, probable),
+    ]
+    for witness in found:
+        assert witness.action.shape == (RECORD_STEPS, 6)
+
+
+def test_of_many_candidates_the_shortest_are_kept_and_of_copies_one() -> None:
+    config = replace(CONFIG, witness=Choice.SHORTEST)
+    ends = [(end, True) for end in np.cumsum(np.arange(20, 8, -1)).tolist()]
+    one = evaluation(ends)
+    found = candidates_of([one, one, one], Source.SCOUT, config)
+    assert [witness.steps for witness in found] == [n for n in [*range(9, 20), 21] for _ in "123"]
+    whole = [[(end, True)] for end in range(40, 10, -1)]
+    many = replace(CONFIG, environments=len(whole), attempts=len(whole), sticky_attempts=0, moved_attempts=0)
+    shortest = candidates_of([evaluation(*whole, config=many)], Source.SCOUT, many)
+    assert [witness.steps for witness in shortest] == list(range(12, 12 + MOST_CANDIDATES))
+    assert len(candidates_of([one], Source.SCOUT, replace(config, replays=0))) == 1
+    copies = evaluation(*[[(9, True), (19, True), (29, True)]] * 3)
+    copies.action[:] = 1
+    assert [witness.steps for witness in candidates_of([copies], Source.SCOUT, config)] == [10]
+
+
+def test_a_rehearsed_success_is_a_witness_only_if_wanted_and_only_where_there_is_no_other() -> None:
+    failed, solved = evaluation([(9, False)], success=4), evaluation([(9, True)], success=4)
+    assert best_of([failed], Source.SCOUT, replace(CONFIG, exploration=False)) is None
+    assert best_of([evaluation([(9, False)])], Source.SCOUT, CONFIG) is None
+    found, own = best_of([failed], Source.SCOUT, CONFIG), best_of([solved], Source.SCOUT, CONFIG)
+    assert found is not None
+    assert own is not None
+    assert (found.source, found.steps) == (Source.SCOUT, 4)
+    assert own.source is Source.MOST_PROBABLE
+    assert [of.source for of in candidates_of([solved], Source.SCOUT, CONFIG)] == [own.source]
+
+
+def test_shares() -> None:
+    """Attempts 0 to 2, two sticky ones, two moved ones, one to spare: first episodes count, and those that last."""
+    one = evaluation(
+        [(9, False)],
+        [(9, True), (19, True), (29, True)],
+        [],
+        [(9, True), (19, False)],
+        [(9, False), (19, True)],
+        [],
+        [(3, True)],
+        [(3, True)],
+    )
+    rate, sticky, moved = shares(one, CONFIG)
+    assert (rate, sticky, moved) == (0.5, 0.5, 0.5)
+    nothing = shares(evaluation(), replace(CONFIG, sticky_attempts=0, moved_attempts=0))
+    assert nothing[0] == 0
+    assert np.isnan(nothing[1:]).all()
+
+
+def test_episodes() -> None:
+    done, goal = np.zeros((2, RECORD_STEPS), bool)
+    done[[3, 10, 255]], goal[[3, 255]] = True, True
+    assert successful_episodes(done, goal) == [(0, 4), (11, 256)]
+    assert successful_episodes(done & False, goal & False) == []
+
+
+def test_repeating_fills_the_record() -> None:
+    action = np.arange(18).reshape(3, 6)
+    filled = repeated(action, 3)
+    assert filled.shape == (RECORD_STEPS, 6)
+    np.testing.assert_array_equal(filled[255], action[0])

@@ -1,0 +1,166 @@
+"""How portable witnesses are: survival is what replays of moved starts show, and the choice goes by it."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.alone import label
+from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.labels import Label, Source
+from levelproof.experts.pool.run import UnitResult
+from levelproof.experts.procedure import Procedure
+from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.search.scout import scout
+from levelproof.experts.verdict import portability
+from levelproof.experts.verdict.judge import Witness, repeating
+from levelproof.experts.verdict.portability import LATE, choose, moved, survival
+from levelproof.experts.witness.success import Success
+from levelproof.experts.witness.witness import replay
+from levelproof.levelgen.batching import repeat, take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+
+REPLAYS = 8
+ROBUST, FRAGILE = 0, 2  # indices: what scouts find of the first survives everything, of the other next to nothing
+IDS = np.array([3, 2, 107, 100, 9, 1], np.int32)  # of size s; the last is trivial
+FOUND = 5
+ONCE = ScoutConfig(rounds=1)
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
+
+
+@pytest.fixture(scope="module")
+def witnesses(levels: Level) -> list[Witness]:
+    """What scouts find of all but the last."""
+    at = np.arange(FOUND)
+    success = scout(take(levels, at), IDS[at], ONCE, DEFAULT_RULES).success
+    each = zip(success.action, success.length, strict=True)
+    return [witness for pair in each for witness in repeating(Success(*pair), Source.SCOUT)]
+
+
+@pytest.fixture(scope="module")
+def shares(levels: Level, witnesses: list[Witness]) -> np.ndarray:
+    return survival(take(levels, np.arange(FOUND)), IDS[:FOUND], witnesses, REPLAYS, DEFAULT_RULES)
+
+
+@pytest.fixture(scope="module")
+def starts(levels: Level) -> Level:
+    """Of the first levels, moved starts."""
+    at = np.arange(FOUND)
+    lanes = repeat(take(levels, at), REPLAYS)
+    return jax.device_get(replace(lanes, state=jax.jit(moved, static_argnums=2)(lanes, IDS[at], REPLAYS)))
+
+
+def test_it_is_the_share_of_replays_that_reach_the_goal(
+    starts: Level, witnesses: list[Witness], shares: np.ndarray
+) -> None:
+    action = np.repeat(np.stack([witness.action for witness in witnesses], -1), REPLAYS, -1)
+    record = replay(starts, action)
+    end = record.done.argmax(0)
+    last = np.repeat([witness.steps + LATE for witness in witnesses], REPLAYS)
+    reached = record.goal[end, np.arange(len(end))] & (end < last)
+    np.testing.assert_array_equal(shares, reached.reshape(-1, REPLAYS).mean(-1))
+    assert shares[ROBUST] == 1
+    assert shares[FRAGILE] < 0.5
+
+
+def test_starts_are_moved_by_one_unit_in_the_last_place(levels: Level, starts: Level) -> None:
+    before, after = repeat(take(levels, np.arange(FOUND)), REPLAYS), starts
+    model = before.model
+    movable = np.asarray(model.active & ((model.inverse_mass > 0) | (model.inverse_inertia > 0)))
+    for name in ("position", "rotation", "velocity", "angular_velocity"):
+        x, y = (np.moveaxis(np.asarray(getattr(of.state, name)), 0, -2) for of in (before, after))
+        near = [x, np.nextafter(x, np.float32(np.inf)), np.nextafter(x, np.float32(-np.inf))]
+        assert np.any([y == a for a in near], 0).all()
+        if name != "rotation":  # many lie flat, where the next number is none that processors tell from 0
+            assert [np.any((y == a) & (x != 0) & movable) for a in near] == [x.any()] * 3
+        np.testing.assert_array_equal(y[..., ~movable], x[..., ~movable])
+    untouched = replace(after, state=replace(after.state, **{
+        name: getattr(before.state, name) for name in ("position", "rotation", "velocity", "angular_velocity")
+    }))  # fmt: skip
+    jax.tree.map(np.testing.assert_array_equal, untouched, before)
+
+
+@pytest.mark.parametrize("at", [[2], [4, 3, 2, 2, 1, 0]])
+def test_it_depends_on_the_level_alone(
+    levels: Level, witnesses: list[Witness], shares: np.ndarray, at: list[int]
+) -> None:
+    """Every candidate of a level meets the same starts, whatever is replayed beside it."""
+    some = survival(take(levels, np.array(at)), IDS[at], [witnesses[i] for i in at], REPLAYS, DEFAULT_RULES)
+    np.testing.assert_array_equal(some, shares[at])
+
+
+@pytest.mark.parametrize(("count", "blocks"), [(2, [16]), (17, [64]), (130, [128, 128])])
+def test_an_accelerator_replays_a_few_candidates_without_filling_itself(
+    monkeypatch: pytest.MonkeyPatch, count: int, blocks: list[int]
+) -> None:
+    seen = []
+
+    def replayed(levels, level_ids, action, steps, replays, rules):
+        seen.append(len(level_ids))
+        return level_ids.astype(np.float32)
+
+    monkeypatch.setattr(portability, "_survival", replayed)
+    monkeypatch.setattr(portability, "at_once", lambda lanes, in_cache: 128)
+    witness = Witness(np.zeros((256, 6), int), Source.SAMPLED, 1)
+    found = survival(np.zeros((1, count)), np.arange(count), [witness] * count, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
+    assert (found.tolist(), seen) == ([*range(count)], blocks)
+
+
+def test_the_most_portable_is_chosen_and_of_equals_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`steps` names a candidate here, and its number is what survives of it."""
+    replayed = []
+
+    def known(levels, level_ids, now, replays, rules):
+        replayed.extend((int(i), witness.steps) for i, witness in zip(level_ids, now, strict=True))
+        return np.array([{1: 0.25, 2: 0.5, 3: 0.5, 4: 1.0, 5: 0.0}[witness.steps] for witness in now], np.float32)
+
+    monkeypatch.setattr(portability, "survival", known)
+    candidates = [
+        [Witness(np.zeros(0), Source.SAMPLED, steps) for steps in names]
+        for names in ([1, 2, 3], [], [4, 5], [5], [1, 4, 2])
+    ]
+    levels, ids = np.zeros((1, 5)), np.arange(5)
+    chosen = choose(levels, ids, candidates, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
+    told = [(of.steps, of.portability) if of else None for of in chosen]
+    assert told == [(2, 0.5), None, (4, 1.0), (5, 0.0), (4, 1.0)]
+    assert (2, 5) not in replayed
+    assert (4, 2) not in replayed, "the one before survived all"
+    replayed.clear()
+    known_one = candidates[0][0]._replace(portability=0.75)
+    some = [[known_one, *candidates[0][1:]]]
+    (again,) = choose(levels[:, :1], ids[:1], some, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
+    assert (again, replayed) == (known_one, [(0, 2), (0, 3)]), "what is known is not found out again"
+    first = choose(levels, ids, candidates, 0, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
+    assert [(of.steps, of.portability) if of else None for of in first] == [
+        (1, None), None, (4, None), (5, None), (1, None),
+    ]  # fmt: skip
+
+
+def test_a_level_with_two_ways_has_the_portable_one(levels: Level, witnesses: list[Witness]) -> None:
+    """A way that survives is behind one that never reaches the goal, as if that were this machine's luck."""
+    good = witnesses[ROBUST]
+    lucky = good._replace(action=np.zeros_like(good.action), steps=good.steps - 1)
+    (chosen,) = choose(take(levels, np.array([ROBUST])), IDS[[ROBUST]], [[lucky, good]], REPLAYS, DEFAULT_RULES)
+    assert chosen == good._replace(portability=1.0)
+
+
+def labelled(levels: Level, replays: int) -> UnitResult:
+    procedure = Procedure(
+        ONCE, SearchConfig(env_steps=0, steady=0), ExpertConfig(replays=replays), StopConfig(rule=Rule.NONE)
+    )
+    return label(levels, IDS, 4096, procedure)
+
+
+def test_every_witness_has_its_portability_and_nothing_else_has(levels: Level, shares: np.ndarray) -> None:
+    verdicts = labelled(levels, REPLAYS).verdicts
+    assert [verdict.portability for verdict in verdicts[:FOUND]] == shares.tolist()
+    assert verdicts[FOUND].label is Label.TRIVIAL
+    assert verdicts[FOUND].portability is not None
+    assert {verdict.portability for verdict in labelled(levels, 0).verdicts} == {None}

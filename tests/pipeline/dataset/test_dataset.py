@@ -1,0 +1,242 @@
+"""A split opened for training: what the door gives is what shards hold, and starts for the environment."""
+
+import pickle
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import levelproof
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.environment import ObservationType, make
+from levelproof.pipeline.dataset.dataset import Dataset, _timed_out, open
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.store.fields import arrays_of, same_bits
+from levelproof.pipeline.store.manifest import read_manifest
+
+STEPS = 48
+
+
+def lanes_last(tree):
+    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1), tree)
+
+
+def assert_same(left, right) -> None:
+    jax.tree.map(np.testing.assert_array_equal, left, right)
+
+
+def test_its_manifest_has_the_levels_with_a_witness(split: Path, data: Dataset) -> None:
+    table = read_manifest(split).table
+    with_witness = [row["level_id"] for row in table.to_pylist() if row["shard"]]
+    assert data.manifest["level_id"].to_pylist() == with_witness
+    assert len(data) == len(with_witness)
+    some = open(split, "level_id < 20", columns=["device"])
+    assert some.manifest["level_id"].to_pylist() == [i for i in with_witness if i < 20]
+    assert "device" in some.manifest.column_names
+
+
+def test_a_trajectory_is_what_its_shard_holds(split: Path, data: Dataset) -> None:
+    one, stored = data[2], read_rows(split, data.manifest.slice(2, 1))
+    for name, values in stored.items():
+        assert same_bits(one.fields[name][..., None], values).all(), name
+    assert one.level_id == data.manifest["level_id"][2].as_py()
+    assert one.record.state.position.shape == (256, 7, 2)
+    assert one.level.role.shape == (7,)
+    assert_same(one.action, stored["record/action"][..., 0])
+    assert_same(data[-1].level_id, data[len(data) - 1].level_id)
+    with pytest.raises(IndexError, match="There is no trajectory"):
+        data[len(data)]
+
+
+def test_a_batch_has_the_trajectories_in_front(data: Dataset) -> None:
+    batch = data.read([3, 0, 3], fields=["record/state", "level"], observation=None)
+    assert batch.observation is None
+    assert batch.state.position.shape == (3, 256, 7, 2)
+    assert batch.action.shape == batch.action_mask.shape == (3, 256, 6)
+    assert batch.reward.shape == batch.done.shape == batch.goal.shape == batch.mask.shape == (3, 256)
+    assert_same(batch.action_mask[:, 7].T, action_mask(lanes_last(batch.level)))
+    assert_same(batch.state.rotation[1], data[0].state.rotation)
+    with pytest.raises(UserError, match=r"The field record/manifold/active was not read: ask for fields=\['record'\]"):
+        batch.record  # noqa: B018
+
+
+def test_ends_are_of_the_task_or_of_the_time_limit(data: Dataset) -> None:
+    every = np.arange(len(data))
+    batch = data.read(every, fields=["record/timestep"], observation=None)
+    late = batch.fields["record/timestep"] + 1 >= data.rules.max_timesteps
+    assert_same(batch.truncated, batch.done & ~batch.goal & late)
+    assert_same(batch.terminated, batch.done & ~batch.truncated)
+    assert batch.terminated.any()
+    assert not (batch.goal & ~batch.terminated).any()
+    window = data.read(every, length=56, first=200, observation=None)
+    assert_same(window.truncated, batch.truncated[:, 200:])
+
+
+def test_an_episode_as_long_as_the_limit_is_truncated() -> None:
+    done, goal = np.zeros((3, 12), bool), np.zeros((3, 12), bool)
+    done[0, [3, 7, 10]] = done[1, [1, 5, 11]] = done[2, [3]] = goal[2, 3] = True
+    expected = np.zeros((3, 12), bool)
+    expected[0, [3, 7]] = expected[1, [5, 11]] = True
+    assert_same(_timed_out(done, goal, 4), expected)
+
+
+def test_arguments_of_the_version_before_still_work_and_warn(data: Dataset) -> None:
+    plain = {"seed": 1, "observation": None}
+    with pytest.warns(DeprecationWarning, match="of batches is now") as warned:
+        old = data.batches(**{"batch": 8, "part": "train", "ahead": 1} | plain)  # type: ignore[call-arg]
+    assert {Path(warning.filename).name for warning in warned} == {"test_dataset.py"}
+    new = data.batches(batch_size=8, subset="train", prefetch=1, **plain)
+    assert_same(next(old).level_id, next(new).level_id)
+    position = new.state()
+    before = position["of"] | {"batch": 8, "part": "train"}
+    del before["batch_size"], before["subset"]
+    again = data.batches(8, subset="train", start={"position": position["position"], "of": before}, **plain)
+    assert_same(next(again).level_id, next(new).level_id)
+    with pytest.warns(DeprecationWarning, match="numbers= of read is now indices="):
+        assert_same(data.read(numbers=[1], observation=None).level_id, data.read([1], observation=None).level_id)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match=r"batches got batch_size= and batch=, its old name"):
+        data.batches(batch_size=8, batch=8)  # type: ignore[call-arg]
+
+
+def test_windows_are_parts_of_trajectories(data: Dataset) -> None:
+    cut = data.read([3, 1], length=10, first=[250, 4], fields=["record/state"], observation=None)
+    whole = data.read([3, 1], fields=["record/state"], observation=None)
+    assert_same(cut.state.position[0, :6], whole.state.position[0, 250:])
+    assert_same(cut.state.position[1], whole.state.position[1, 4:14])
+    assert cut.mask.sum(1).tolist() == [6, 10]
+    late = data.read([3], first=200, fields=["record/state"], observation=None)
+    assert_same(late.state.position[0, :56], whole.state.position[0, 200:])
+    assert late.mask.sum() == 56
+    assert_same(data.read(3, first=200, fields=["record/state"], observation=None).fields, late.fields)
+
+
+def test_an_observation_is_that_of_the_environment(data: Dataset) -> None:
+    shown = jax.jit(make(data.levels([2]))[0].get_obs)(data.state(2, 30))
+    np.testing.assert_allclose(data[2].observation[30], shown, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", list(ObservationType))
+def test_observations_of_all_kinds_are_those_of_the_environment(data: Dataset, kind: str) -> None:
+    env, _ = make(data.levels([0, 2]), observation_type=kind)
+    seen = data.read([0, 2], length=3, first=[9, 30], observation=kind).observation
+    for step in range(3):
+        shown = jax.vmap(env.get_obs)(data.state([0, 2], [9 + step, 30 + step]))
+        jax.tree.map(
+            lambda x, y, step=step: np.testing.assert_allclose(x[:, step], y, rtol=1e-6, atol=1e-6), seen, shown
+        )
+
+
+def test_episodes_started_at_stored_states_have_the_stored_future(data: Dataset) -> None:
+    """White-box evaluation from any point: by the environment, bit for bit, across ends and resets."""
+    numbers, steps = np.array([0, 1, 2, 3]), np.array([0, 10, 100, 200])
+    batch = data.read(numbers, fields=["record", "level"], observation=None)
+    assert (batch.done[:, :STEPS] | batch.done[:, 100 : 100 + STEPS]).any(), "no end on the way: choose others"
+    env, params = levelproof.make(data.levels(numbers), rules=data.rules)
+    starts = data.state(numbers)
+    actions = np.stack([batch.action[i, t : t + STEPS] for i, t in zip(numbers, steps, strict=True)], 1)
+
+    def play(state, action):
+        keys = jax.random.split(jax.random.key(0), len(numbers))
+        _, after, reward, done, info = jax.vmap(env.step, (0, 0, 0, None, 0))(keys, state, action, params, starts)
+        return after, (state, reward, done, info["GoalR"])
+
+    states, reward, done, goal = jax.jit(lambda: jax.lax.scan(play, data.state(numbers, steps), actions))()[1]
+    stored = arrays_of(batch.record.state)
+    for lane, (i, first) in enumerate(zip(numbers, steps, strict=True)):
+        for name, values in arrays_of(states.now.state).items():
+            assert same_bits(values[:, lane].T, stored[name][i, first : first + STEPS].T).all(), name
+        assert_same(states.timestep[:, lane], batch.record.timestep[i, first : first + STEPS])
+        assert_same(reward[:, lane], batch.reward[i, first : first + STEPS])
+        assert_same(done[:, lane], batch.done[i, first : first + STEPS])
+        assert_same(goal[:, lane], batch.goal[i, first : first + STEPS])
+
+
+def test_one_state_has_no_axis_in_front(data: Dataset) -> None:
+    assert_same(data.state(3, 20), jax.tree.map(lambda x: np.asarray(x)[1], data.state([1, 3], 20)))
+
+
+def test_it_goes_on_where_a_seal_has_moved_its_shards(split: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(split, tmp_path / "s"))
+    data = open(copy)
+    before = data.read([0, 1], observation=None)
+    (fragment,) = (copy / "manifest").glob("*.parquet")
+    old, new = data.manifest["shard"][0].as_py(), "shards/000000000000-000000000063-ffffffff.zarr"
+    shutil.move(copy / old, copy / new)
+    table = pq.read_table(fragment)
+    at = table.schema.get_field_index("shard")
+    names = [new if name else None for name in table["shard"].to_pylist()]
+    pq.write_table(table.set_column(at, table.schema.field(at), pa.array(names)), fragment)
+    assert_same(data.read([0, 1], observation=None), before)
+    assert set(data.manifest["shard"].to_pylist()) == {new}
+
+
+def test_a_damaged_shard_is_a_sentence(split: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(split, tmp_path / "s"))
+    data = open(copy)
+    file = next((copy / "shards").rglob("dyn32/c/0/0/0"))
+    content = bytearray(file.read_bytes())
+    content[100] ^= 1
+    file.write_bytes(content)
+    batches = data.batches(64, observation=None)
+    with pytest.raises(Failure, match=r"^The shard .* is missing or damaged \(.*\): .*$"):
+        next(batches)
+    with pytest.raises(StopIteration):
+        next(batches)
+
+
+def test_its_pickle_is_small_and_notices_other_trajectories(split: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(split, tmp_path / "s"))
+    pickled = pickle.dumps(open(copy, "level_id < 50"))
+    assert len(pickled) < 1000
+    assert len(pickle.loads(pickled)) == len(open(copy, "level_id < 50"))
+    (fragment,) = (copy / "manifest").glob("*.parquet")
+    table = pq.read_table(fragment)
+    pq.write_table(table.slice(1).replace_schema_metadata(table.schema.metadata), fragment)
+    with pytest.raises(Failure, match="has other trajectories than it had"):
+        pickle.loads(pickled)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ({"fields": ["record/stat"]}, "There is no field 'record/stat', is record/state meant"),
+        ({"fields": ["xyzzy"]}, "There is no field 'xyzzy'"),
+        ({"observation": "flat"}, "There is no observation 'flat': choose one of symbolic_flat, "),
+        ({"length": 300}, "A window cannot have 300 steps"),
+        ({"subset": "test"}, "There is no subset 'test'"),
+    ],
+)
+def test_what_cannot_be_read_is_a_sentence(data: Dataset, words: dict, sentence: str) -> None:
+    with pytest.raises(UserError, match=sentence):
+        data.batches(8, **words)
+    with pytest.raises(UserError, match=sentence):
+        data.grain(**words)
+
+
+def test_what_cannot_be_opened_is_a_sentence(split: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="There is no split at"):
+        open(tmp_path / "nothing")
+    with pytest.raises(UserError, match="has no trajectories for which level_id < 0: `levelproof inspect"):
+        open(split, "level_id < 0")
+    with pytest.raises(UserError, match=r"Cannot use the condition .*lable"):
+        open(split, "lable = 'solved'")
+    with pytest.raises(UserError, match="There is no column 'lable'"):
+        open(split, columns=["lable"])
+    with pytest.raises(UserError, match="The share of validation is 2"):
+        open(split, validation=2)
+    with pytest.raises(UserError, match="trajectories is in the subset validation: open with another validation="):
+        open(split, validation=0).batches(8, subset="validation")
+    for numbers in ([999], [-1, 0], []):
+        with pytest.raises(UserError, match="There are no trajectories"):
+            open(split).read(numbers)
+    for step in (256, -1):
+        with pytest.raises(UserError, match=f"There are no steps {step} in a record"):
+            open(split).state(0, step)
+        with pytest.raises(UserError, match=rf"There are no steps \[{step}\] in a record"):
+            open(split).read([0], first=step)

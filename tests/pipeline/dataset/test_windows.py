@@ -1,0 +1,32 @@
+"""Windows lie one behind the other and cover a record."""
+
+import numpy as np
+import pytest
+
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.pipeline.dataset.windows import Windows
+from levelproof.pipeline.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("length", "each", "last"), [(None, 1, 256), (256, 1, 256), (64, 4, 64), (100, 3, 56), (1, 256, 1)]
+)
+def test_windows_cover_a_record(length: int | None, each: int, last: int) -> None:
+    windows = Windows.of(length)
+    assert windows.each == each
+    which, first = windows.at(np.arange(2 * each))
+    assert which.tolist() == [0] * each + [1] * each
+    record = np.stack([np.arange(RECORD_STEPS), np.arange(RECORD_STEPS) + 1000])
+    cut = windows.cut({"record/x": record[which], "level/x": which}, first)
+    mask = windows.mask(first)
+    assert mask.shape == cut["record/x"].shape == (2 * each, windows.length)
+    assert np.array_equal(cut["record/x"][mask], record.ravel())
+    assert mask[each - 1].sum() == last
+    assert (cut["record/x"][~mask] % 1000 == RECORD_STEPS - 1).all()
+    assert np.array_equal(cut["level/x"], which)
+
+
+@pytest.mark.parametrize("length", [0, -3, 257, 2.0])
+def test_no_window_has_such_a_length(length) -> None:
+    with pytest.raises(UserError, match=f"A window cannot have {length} steps"):
+        Windows.of(length)

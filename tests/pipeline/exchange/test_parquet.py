@@ -1,0 +1,72 @@
+"""A split's levels as parquet files: rows, worlds, and what is left out."""
+
+from pathlib import Path
+
+import duckdb
+import jax
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import levelproof
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.exchange import parquet
+from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.layout import MANIFEST
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.schema import CONFIG_KEY
+from tests.pipeline.made import PLAYED, made_job, played_split
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return played_split(tmp_path_factory.mktemp("data"))
+
+
+def test_rows_and_worlds_are_those_of_the_split(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    """Stored levels and those made again, side by side, in several files."""
+    seen, real = [], parquet.require_manifest
+    for name, rows in {"FILE": 40, "GROUP": 20, "CHUNK": 16}.items():
+        monkeypatch.setattr(parquet, name, rows)
+    monkeypatch.setattr(parquet, "require_manifest", lambda *words, **how: seen.append(real(*words, **how)) or seen[-1])
+    assert main(["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels")]) == 0
+    assert capsys.readouterr().out.startswith(f"{tmp_path / 'levels'}: {PLAYED} levels. In Python: ")
+    assert sorted(path.name for path in (tmp_path / "levels").iterdir()) == [
+        "levels-00000.parquet",
+        "levels-00001.parquet",
+    ]
+    assert [of.table.num_rows for of in seen if len(of.table.column_names) > 1] == [20, 20, 20, 4], "some at a time"
+    table = pq.read_table(tmp_path / "levels")
+    assert table.select(COLUMNS.names).equals(read_manifest(split).table.replace_schema_metadata())
+    made = levelproof.sample_levels(np.arange(PLAYED), levelproof.SIZES["s"], made_job().distribution)
+    jax.tree.map(np.testing.assert_array_equal, levelproof.levels_from(table), made)
+    fragment = next((split / MANIFEST).glob("*.parquet"))
+    ours = pq.read_schema(tmp_path / "levels/levels-00000.parquet").metadata
+    assert ours[CONFIG_KEY] == pq.read_schema(fragment).metadata[CONFIG_KEY]
+    query = f"SELECT level_id FROM '{tmp_path}/levels/*.parquet' WHERE list_contains(role, 3) ORDER BY ALL"
+    red = np.flatnonzero((np.asarray(made.role) == 3).any(0))
+    assert [row[0] for row in duckdb.sql(query).fetchall()] == red.tolist()
+
+
+def test_a_condition_chooses(split: Path, tmp_path: Path, capsys) -> None:
+    command = ["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels"), "--where"]
+    assert main([*command, "label = 'solved'"]) == 0
+    assert set(pq.read_table(tmp_path / "levels")["label"].to_pylist()) == {"solved"}
+    assert main([*command, "label = 'solved'"]) == 2
+    assert "There is something at" in capsys.readouterr().err
+    command[command.index("-o") + 1] = str(tmp_path / "others")
+    assert main([*command, "level_id < 0"]) == 2
+    assert capsys.readouterr().err.startswith(f"Error: No level of {split} is level_id < 0: ")
+    assert not (tmp_path / "others").exists()
+
+
+def test_a_level_that_comes_out_otherwise_is_left_out(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    """As on a machine whose bits differ: its row says another content than its id makes here."""
+    first = next(row for row in read_manifest(split).table.to_pylist() if row["label"] == "unsolved")
+    real = parquet.content_hashes
+    monkeypatch.setattr(parquet, "content_hashes", lambda level: ["other", *real(level)[1:]])
+    assert main(["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels")]) == 0
+    assert f"{PLAYED - 1} levels, without 1 that come out otherwise here" in capsys.readouterr().out
+    assert first["level_id"] not in pq.read_table(tmp_path / "levels")["level_id"].to_pylist()

@@ -1,0 +1,147 @@
+"""A page at play: it asks a real server over a websocket, and the engine answers."""
+
+import json
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from levelproof.experts.config import RECORD_STEPS, ScoutConfig, StopConfig
+from levelproof.experts.witness.witness import replay, succeeds
+from levelproof.levelgen.files.level_file import from_document, write_level_file
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.play import training
+from levelproof.pipeline.play.open import level_to_play
+from levelproof.pipeline.play.server import HOST, serving
+from levelproof.pipeline.play.session import empty_file
+from levelproof.pipeline.store.manifest import require_manifest
+from tests.experts.small import untouched
+from tests.pace import patience
+from tests.pipeline.command import assert_refused, here
+
+ANSWER_SECONDS = 120  # limit of an answer from the page's server
+QUICK = replace(untouched(StopConfig()), scout=ScoutConfig(rounds=4))
+
+
+@pytest.fixture(scope="module")
+def address(split: Path) -> Iterator[str]:
+    """Of a server that plays a level with a witness."""
+    rows = require_manifest(split).table.to_pylist()
+    solved = next(row for row in rows if row["shard"])
+    file, actions = level_to_play(split, solved["level_id"], "m")
+    with serving(file, actions, QUICK, 20_000, 0) as server:
+        yield f"http://{HOST}:{server.socket.getsockname()[1]}"
+
+
+@pytest.fixture
+def page(address: str) -> Iterator[ClientConnection]:
+    limits = {"max_size": 2**26, "open_timeout": patience(10)}
+    with connect(f"{address.replace('http', 'ws')}/socket", origin=address, **limits) as connection:  # pyright: ignore[reportArgumentType]
+        yield connection
+
+
+def ask(page: ClientConnection, question: str, /, **words: Any) -> dict[str, Any]:
+    page.send(json.dumps({"ask": question, "id": 1, **words}))
+    while "training" in (answer := json.loads(page.recv(patience(ANSWER_SECONDS)))):
+        pass
+    return answer
+
+
+def test_steps_of_the_page_are_those_of_the_engine(page: ClientConnection) -> None:
+    film = ask(page, "play")
+    assert ask(page, "restart")["places"] == film["places"][0]
+    for step, action in enumerate(film["actions"], 1):
+        moment = ask(page, "step", action=action)
+        if step < len(film["actions"]):
+            assert moment["places"] == film["places"][step]
+            assert not moment["done"]
+    assert moment["goal"]
+    assert moment["timestep"] == len(film["actions"])
+    assert ask(page, "step", action=[0] * 6)["timestep"] == 1  # the next episode
+
+
+def test_a_saved_level_brings_its_witness_and_is_a_level_file(page: ClientConnection, tmp_path: Path) -> None:
+    document = ask(page, "save")["document"]
+    path = tmp_path / "witness.json"
+    path.write_text(json.dumps(document))
+    file, actions = level_to_play(path, None, "m")
+    assert actions is not None
+    assert actions.tolist() == document["witness"]["actions"]
+    padded = np.zeros((RECORD_STEPS, 6, 1), int)
+    padded[: len(actions), :, 0] = actions
+    record = replay(file.level, padded, file.rules)
+    assert succeeds(record.done[: len(actions)], record.goal[: len(actions)])[0]
+    document["witness"]["actions"] = [[0] * 6] * 3  # which do not solve it
+    assert ask(page, "load", document=document)["witness"] is False
+
+
+def test_edits_are_made_taken_back_and_refused(page: ClientConnection) -> None:
+    ask(page, "empty", size="m")
+    level = ask(page, "edit", name="add_body", **{"with": ["circle", 1.0, 2.0]})
+    body = ask(page, "at", x=1.0, y=2.0)["bodies"][0]
+    assert body in level["bodies"]
+    ask(page, "edit", name="set_role", **{"with": [body, 1]})
+    green = from_document(ask(page, "save")["document"]).level
+    assert green.role[body] == 1
+    assert ask(page, "undo")["redo"]
+    assert from_document(ask(page, "save")["document"]).level.role[body] == 0
+    assert ask(page, "redo")["undo"]
+    assert from_document(ask(page, "save")["document"]).level.role[body] == 1
+    for name, words in (("delete", ["body", 0]), ("move", [body, 1e9, 0]), ("resize", [body, float("nan")])):
+        assert ask(page, "edit", name=name, **{"with": words})["error"].endswith(".")
+    for nonsense in ({"ask": "__init__"}, {"ask": "edit"}, {"ask": "step", "action": [9] * 6}, {"ask": ["step"]}, {}):
+        page.send(json.dumps(nonsense))
+        assert json.loads(page.recv(patience(ANSWER_SECONDS)))["error"].endswith(".")
+    assert ask(page, "load", document={"env_state": 1})["error"]
+
+
+@pytest.mark.campaign
+def test_an_expert_is_trained_while_the_page_looks_on(page: ClientConnection, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "BETWEEN", 0.0)
+    assert "error" not in ask(page, "train")
+    told, end = [], time.monotonic() + patience(ANSWER_SECONDS)
+    while not told or told[-1].get("stage") not in ("done", "failed"):
+        assert time.monotonic() < end
+        message = json.loads(page.recv(patience(ANSWER_SECONDS)))
+        told.append(message["training"])
+    assert told[-1]["label"] == "solved", told[-1]
+    assert any("curve" in message for message in told)
+    seen = [message for message in told if "attempts" in message]
+    assert all(len(of["attempts"]) == len(of["goals"]) == training.ATTEMPTS for of in seen)
+    assert seen
+    start, drawn = ask(page, "restart")["places"], np.array(seen[0]["attempts"])
+    assert drawn.shape == (training.ATTEMPTS, training.SHOWN_STEPS, len(start))
+    film = told[-1]["film"]
+    assert ask(page, "play")["actions"] == film["actions"]
+
+
+def test_only_its_own_page_may_ask(address: str) -> None:
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(f"{address.replace('http', 'ws')}/socket", origin="http://example.com")  # pyright: ignore[reportArgumentType]
+    for path, host in (("/", "example.com"), ("/../session.py", ""), ("/nothing", "")):
+        request = urllib.request.Request(address + path, headers={"Host": host} if host else {})
+        with pytest.raises(urllib.error.HTTPError):
+            urllib.request.urlopen(request)
+    for path in ("/", "/draw.js", "/curve.js", "/palette.css", "/main.js"):
+        assert urllib.request.urlopen(address + path).read()
+
+
+def test_what_cannot_be_played_is_one_sentence(split: Path, tmp_path: Path, address: str) -> None:
+    assert_refused(here(["play", str(tmp_path / "none.json")], tmp_path), 2, "none.json")
+    assert_refused(here(["play", str(split)], tmp_path), 2, "Add its id")
+    assert_refused(here(["play", "--size", "giant"], tmp_path), 2, "giant")
+    assert_refused(here(["play", "--port", address.rpartition(":")[2]], tmp_path), 2, "--port")
+    assert_refused(here(["play", "--port", "65536"], tmp_path), 2, "port 65536", "must be 0-65535", "--port")
+    level = tmp_path / "level.json"
+    write_level_file(empty_file("m"), level)
+    with pytest.raises(UserError, match="leave out"):
+        level_to_play(level, 1, "m")
+    assert level_to_play(level, None, "m")[1] is None

@@ -1,0 +1,111 @@
+"""`levelproof play` in a real browser: a level is built by hand, edited, and played until green touches blue."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from levelproof.levelgen.files.level_file import from_document
+from levelproof.pipeline.play.server import HOST, serving
+from levelproof.pipeline.play.session import empty_file
+from tests.pace import patience
+from tests.pipeline.look.test_gallery_browser import UNNAMED, chromium, patient
+from tests.pipeline.look.test_play import QUICK
+
+__all__ = ["chromium"]  # a fixture
+pytestmark = pytest.mark.campaign
+VIEW, BORDER, TOP = 5.16, 0.08, 5.08  # m, of the canvas
+
+
+@pytest.fixture
+def page(chromium: Any) -> Iterator[Any]:
+    with serving(empty_file("m"), None, QUICK, 20_000, 0) as server:
+        opened = patient(chromium.new_page(viewport={"width": 1280, "height": 900}, accept_downloads=True))
+        opened.failures = []
+        opened.on("pageerror", lambda error: opened.failures.append(str(error)))
+        opened.goto(f"http://{HOST}:{server.socket.getsockname()[1]}/")
+        opened.wait_for_function("document.querySelector('#pads').textContent.includes('Nothing acts')")
+        yield opened
+        assert not opened.failures
+        opened.close()
+
+
+def click(page: Any, x: float, y: float) -> None:
+    """At a point of the world, m."""
+    box = page.locator("#stage").bounding_box()
+    scale = box["width"] / VIEW
+    page.mouse.click(box["x"] + (x + BORDER) * scale, box["y"] + (TOP - y) * scale)
+
+
+def button(page: Any, name: str, role: str = "button") -> None:
+    page.get_by_role(role, name=name, exact=True).click()
+
+
+def place(page: Any, shape: str, x: float, y: float, role: str) -> None:
+    """A body with a role."""
+    button(page, shape, "radio")
+    click(page, x, y)
+    page.wait_for_selector("[data-tool=select][aria-checked=true]")  # which it goes back to
+    click(page, x, y)
+    button(page, role)
+    page.wait_for_function(f"document.querySelector('#what').textContent.toLowerCase().startsWith('{role}')")
+
+
+def test_a_level_is_built_edited_played_and_saved(page: Any, tmp_path: Path) -> None:
+    place(page, "Circle", 1.0, 0.7, "green")
+    place(page, "Rectangle", 4.0, 0.7, "blue")
+    button(page, "Fix it")
+    page.wait_for_function("document.querySelector('#what').textContent.includes('cannot move')")
+    button(page, "Thruster", "radio")
+    box = page.locator("#stage").bounding_box()
+    scale = box["width"] / VIEW
+    at = lambda x, y: (box["x"] + (x + BORDER) * scale, box["y"] + (TOP - y) * scale)
+    page.mouse.move(*at(1.0, 0.7))
+    page.mouse.down()
+    page.mouse.move(*at(1.4, 0.7))
+    page.mouse.up()
+    page.wait_for_selector("#pads button")
+    assert not page.evaluate(UNNAMED)
+
+    page.keyboard.down("1")
+    page.wait_for_function(
+        "document.querySelector('#outcome').textContent.startsWith('Solved')", timeout=1000 * patience(60)
+    )
+    page.keyboard.up("1")
+    with page.expect_download() as saved:
+        button(page, "Save level with witness")
+    path = tmp_path / "witness.json"
+    saved.value.save_as(path)
+    document = json.loads(path.read_text())
+    assert len(document["witness"]["actions"]) > 3
+    assert sorted(from_document(document).level.role[4:].ravel().tolist())[-2:] == [1, 2]
+
+    button(page, "Watch")
+    page.wait_for_function("document.querySelector('#outcome').textContent.startsWith('The witness reaches')")
+    button(page, "Undo")
+    page.wait_for_function("document.querySelector('#pads').textContent.includes('Nothing acts')")
+    page.locator("#open").set_input_files(path)
+    page.wait_for_selector("#pads button")
+    assert page.locator("#watch").is_enabled()
+
+
+def test_an_expert_trains_in_sight(page: Any, tmp_path: Path) -> None:
+    place(page, "Circle", 1.0, 0.7, "green")
+    place(page, "Rectangle", 4.0, 0.7, "blue")
+    button(page, "Thruster", "radio")
+    click(page, 1.0, 0.7)
+    page.wait_for_selector("#pads button")
+    button(page, "Train an expert for this level")
+    done = "/^(solved|unsolved|trivial|unsolvable):/.test(document.querySelector('#stage-of-training').textContent)"
+    page.wait_for_function(done, timeout=1000 * patience(240))
+    assert page.locator("#learning").is_hidden() == (page.locator("#curve path").count() == 0)
+
+
+def test_a_learning_curve_is_seen(page: Any) -> None:
+    rates = "levelproof.drawCurve(document.querySelector('#curve'), [null, 0.25, null, 0.5])"
+    assert page.locator("#curve").is_hidden()
+    page.evaluate(rates)
+    assert page.locator("#curve").is_visible()
+    assert "from 25% to 50%" in (page.locator("#curve").get_attribute("aria-label") or "")
