@@ -22,7 +22,7 @@ from benchmarks.oracle import tell
 from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
 from levelproof.configs.numbers import parse_count
-from levelproof.experts.config import MOST_COUNTED
+from levelproof.experts.config import MAX_COUNTED
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.search.explore import Search, begin, explore, success_of
 from levelproof.experts.search.search import side_by_side
@@ -37,7 +37,7 @@ from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
 FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
 LEVELS = {"s": 256, "m": 128, "l": 64}
 LEAST = 16_384  # env steps at which the curve begins
-CONFIG = SearchConfig(MOST_COUNTED // 2, bodies=0, patience=0, per_cell=0, rounds=64)  # the default one, without an end
+CONFIG = SearchConfig(MAX_COUNTED // 2, bodies=0, patience=0, per_cell=0, rounds=64)  # the default one, without an end
 COLOURS = {"s": "#0072b2", "m": "#d55e00", "l": "#009e73"}  # Okabe and Ito
 PLOT = "search.svg"
 

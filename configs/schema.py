@@ -23,10 +23,10 @@ HASH_DIGITS = 16
 Density = Literal["full", "resume", "witness"]  # how much of a record is stored
 KEY_EVERY = 32  # env steps between key frames, by default
 KEYS_EVERY = tuple(2**i for i in range(1, 9))  # what they may be: they divide a record
-MOST_FRAME_SKIP = 64  # where records are simulated again by those who read them
-MOST_BODIES = 48  # the most that was tried; compiling takes minutes from there
+MAX_FRAME_SKIP = 64  # where records are simulated again by those who read them
+MAX_BODIES = 48  # the most that was tried; compiling takes minutes from there
 # Levels of an untimed work unit by the number of bodies: about as long to train, multiples of the experts side by side
-UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MOST_BODIES, 4))
+UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MAX_BODIES, 4))
 
 # Where, how many, by whom and on what machine: these change neither a level nor its expert, so one split may mix them.
 WITHOUT_EFFECT = frozenset(
@@ -95,16 +95,16 @@ class JobConfig:
         _ = self.checkpoint_seconds
         if self.key_every not in KEYS_EVERY:
             raise ConfigError(f"key_every is {self.key_every}: choose one of {', '.join(map(str, KEYS_EVERY))}.")
-        if self.density != "full" and self.task.frame_skip > MOST_FRAME_SKIP:
-            raise ConfigError(f"task.frame_skip is {self.task.frame_skip}: above {MOST_FRAME_SKIP}, use density=full.")
+        if self.density != "full" and self.task.frame_skip > MAX_FRAME_SKIP:
+            raise ConfigError(f"task.frame_skip is {self.task.frame_skip}: above {MAX_FRAME_SKIP}, use density=full.")
         if not self.out:
             raise ConfigError("out is empty: name a folder, as in out=data.")
 
     def _check_size(self) -> None:
         size = size_of(self.size)
         check_size(size)
-        if size.bodies > MOST_BODIES:
-            raise ConfigError(f"size is {self.size}: experts train among at most {MOST_BODIES} polygons and circles.")
+        if size.bodies > MAX_BODIES:
+            raise ConfigError(f"size is {self.size}: experts train among at most {MAX_BODIES} polygons and circles.")
         if not self.level_files and not control_weights(size, self.distribution):
             raise ConfigError(
                 f"size is {self.size}: it has no room for what must act, of which {', '.join(CONTROL_WEIGHTS)} in "

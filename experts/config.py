@@ -6,8 +6,8 @@ from enum import StrEnum
 from levelproof.physics.bounds import require
 
 RECORD_STEPS = 256  # env steps of a record, with automatic reset inside
-MOST_DOUBLINGS = 6  # of the wait between evaluations
-MOST_COUNTED = 2**31 - 1  # env steps and updates are counted in 32 bits on the device
+MAX_DOUBLINGS = 6  # of the wait between evaluations
+MAX_COUNTED = 2**31 - 1  # env steps and updates are counted in 32 bits on the device
 
 
 class Network(StrEnum):
@@ -155,8 +155,8 @@ def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> Non
             f"budget is {budget}: one update of an expert takes {config.steps_per_update} env steps "
             f"({config.environments} environments x {config.horizon}), so give at least that many"
         )
-    if budget > MOST_COUNTED:
-        raise ValueError(f"budget is {budget}: an expert can count no more than {MOST_COUNTED} env steps")
+    if budget > MAX_COUNTED:
+        raise ValueError(f"budget is {budget}: an expert can count no more than {MAX_COUNTED} env steps")
     if stopping.rule in (Rule.SOLVED, Rule.HALVING) and stopping.successes > config.attempts:
         raise ValueError(
             f"stop.successes is {stopping.successes}: with expert.attempts={config.attempts} give at most "
@@ -164,14 +164,14 @@ def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> Non
         )
     updates = config.updates_in(budget)
     waits = {
-        "wait": config.updates_in(stopping.wait) << MOST_DOUBLINGS,
+        "wait": config.updates_in(stopping.wait) << MAX_DOUBLINGS,
         "polish": config.updates_in(stopping.polish),
         "steady": config.updates_in(stopping.steady),
         "first_rung": config.updates_in(stopping.first_rung),
     }
     for name, longest in waits.items():
-        if updates + longest > MOST_COUNTED:
+        if updates + longest > MAX_COUNTED:
             raise ValueError(
                 f"stop.{name} is {getattr(stopping, name)}: with a budget of {budget}, updates would have to be "
-                f"counted beyond {MOST_COUNTED}, so give less"
+                f"counted beyond {MAX_COUNTED}, so give less"
             )

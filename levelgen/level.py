@@ -20,7 +20,7 @@ SIZES: dict[str, Size] = {
     "m": Size(polygons=6, circles=3, joints=2, thrusters=2),
     "l": Size(polygons=12, circles=4, joints=6, thrusters=2),
 }
-MOST_THINGS = 64  # of a kind in a level; a level file with so many of each has 3 MB
+MAX_THINGS = 64  # of a kind in a level; a level file with so many of each has 3 MB
 MOTOR_BINDINGS = 4  # entries of an action that motors obey
 THRUSTER_BINDINGS = 2  # entries that thrusters obey
 ACTIONS = MOTOR_BINDINGS + THRUSTER_BINDINGS
@@ -108,8 +108,8 @@ def size_of(name: str | Size) -> Size:
     if name_of(size) != name:
         raise ValueError(f"size is {name}: that is {name_of(size)}, so write that")
     for kind, count in zip(size._fields, size, strict=True):
-        if count > MOST_THINGS:
-            raise ValueError(f"size is {name}: at most {MOST_THINGS} {kind} fit into a level")
+        if count > MAX_THINGS:
+            raise ValueError(f"size is {name}: at most {MAX_THINGS} {kind} fit into a level")
     return size
 
 

@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Int
 
-from levelproof.experts.config import MOST_COUNTED
+from levelproof.experts.config import MAX_COUNTED
 from levelproof.physics.bounds import require
 
-MOST_ROUNDS = 1024  # of what a success gets afterwards
-MOST_RUNGS = 16  # each is four times the one before, and env steps are counted in 32 bits
-MOST_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are counted in 32 bits
+MAX_ROUNDS = 1024  # of what a success gets afterwards
+MAX_RUNGS = 16  # each is four times the one before, and env steps are counted in 32 bits
+MAX_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are counted in 32 bits
 
 
 class Ends(NamedTuple):
@@ -56,14 +56,14 @@ class SearchConfig:
     rounds: int = 2  # between looks of the host
 
     def __post_init__(self) -> None:
-        require(self, ("bodies", "per_cell", "patience"), 0, MOST_COUNTED)
+        require(self, ("bodies", "per_cell", "patience"), 0, MAX_COUNTED)
         require(
-            self, ("env_steps", "variations", "polish"), 0, MOST_COUNTED // 2
+            self, ("env_steps", "variations", "polish"), 0, MAX_COUNTED // 2
         )  # and what the last round has too many
-        require(self, ("steady",), 0, MOST_ROUNDS)
-        require(self, ("trials",), 1, MOST_ROUNDS)
+        require(self, ("steady",), 0, MAX_ROUNDS)
+        require(self, ("trials",), 1, MAX_ROUNDS)
         require(self, ("lanes", "segment", "stretch", "rounds", "first_rung"), 1)
-        require(self, ("entries",), 1, MOST_ENTRIES)
+        require(self, ("entries",), 1, MAX_ENTRIES)
         require(self, ("nearer", "anew"), 0, 1)
         require(self, ("width",), 0, above=True)
         require(self, ("growth",), 1, above=True)
@@ -72,7 +72,7 @@ class SearchConfig:
             raise ValueError(f"redrawn is {self.redrawn}: give chances above 0 and at most 1")
         if self.lanes % len(self.redrawn):
             raise ValueError(f"lanes is {self.lanes}: give a multiple of {len(self.redrawn)}, the chances in redrawn")
-        if self.steps_per_round > MOST_COUNTED // 4:
+        if self.steps_per_round > MAX_COUNTED // 4:
             raise ValueError(f"lanes is {self.lanes}: a round, with stretch and segment, is too long; give less")
 
     def scaled(self, bodies: int) -> "SearchConfig":
@@ -90,7 +90,7 @@ class SearchConfig:
     def ends(self) -> Ends:
         """When it ends. There is no rung that matters after `env_steps`, which end it anyway."""
         first = -(-self.first_rung // self.steps_per_round) * self.steps_per_round
-        rungs = np.array([min(first * 4**i, MOST_COUNTED) for i in range(MOST_RUNGS)], np.int32)
+        rungs = np.array([min(first * 4**i, MAX_COUNTED) for i in range(MAX_RUNGS)], np.int32)
         return Ends(*map(np.int32, (self.env_steps, self.variations, self.patience, self.per_cell)), rungs)  # pyright: ignore
 
     @property

@@ -13,7 +13,7 @@ from levelproof.physics.manifold import faces
 from levelproof.physics.types import MAX_VERTICES, Model, State
 from levelproof.physics.vector import Vec, nonzero, select, vec
 
-MOST_PAIRS = 2  # of a green and a blue body that are measured; sampled levels have one
+MAX_PAIRS = 2  # of a green and a blue body that are measured; sampled levels have one
 FAR = 1e6  # m; where there is none
 
 
@@ -40,8 +40,8 @@ def goals_of(level: Level) -> Goals:
     both = ((role[:, None] == Role.GREEN) & (role[None] == Role.BLUE)).reshape(bodies * bodies, -1)
     turn = jnp.where(both, jnp.cumsum(both, axis=0), 0)
     number = jnp.arange(bodies * bodies)[:, None]
-    pair = jnp.stack([jnp.where(turn == 1 + k, number, 0).sum(0) for k in range(MOST_PAIRS)])
-    there = jnp.arange(MOST_PAIRS)[:, None] < both.sum(0)
+    pair = jnp.stack([jnp.where(turn == 1 + k, number, 0).sum(0) for k in range(MAX_PAIRS)])
+    there = jnp.arange(MAX_PAIRS)[:, None] < both.sum(0)
     green, blue = jnp.divmod(pair, bodies)
     return Goals(_shape(level.model, green), _shape(level.model, blue), there)
 

@@ -16,7 +16,7 @@ from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.rules import TaskParams
 
-MOST_HALVINGS = 6  # stretches are from a whole success to a 64th of it
+MAX_HALVINGS = 6  # stretches are from a whole success to a 64th of it
 T = TypeVar("T")
 
 
@@ -87,7 +87,7 @@ def below(bits: UInt32[Array, " lane"], bound: Int[Array, "*lane"]) -> Int[Array
 
 def drawn(bits: UInt32[Array, "6 lane"], length: Int[Array, ""]) -> Edit:
     """Random changes: a quarter leave out a beginning, half hold nothing."""
-    stretch = lambda bits: jnp.maximum(length >> below(bits, jnp.int32(MOST_HALVINGS + 1)), 1)
+    stretch = lambda bits: jnp.maximum(length >> below(bits, jnp.int32(MAX_HALVINGS + 1)), 1)
     first = jnp.where(bits[0] >> 30 == 0, 0, below(bits[1], length))
     holds = bits[0] >> 31 == 1
     return Edit(first, stretch(bits[2]), below(bits[3], length), jnp.where(holds, stretch(bits[4]), 0))

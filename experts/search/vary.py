@@ -20,7 +20,7 @@ from levelproof.experts.search.explore import NEARER, patient, with_success
 from levelproof.experts.search.near import FAR, gap
 from levelproof.experts.search.play import CODES, WITHOUT, Arena, Walk, act, arena, decode, fresh_walk, most_steps
 from levelproof.experts.search.rows import from_rows, to_rows
-from levelproof.experts.search.shorten import MOST_HALVINGS, below
+from levelproof.experts.search.shorten import MAX_HALVINGS, below
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.rules import TaskParams
@@ -29,7 +29,7 @@ KEPT = 8  # trajectories of a level
 BEYOND = 16  # env steps, at least, that are played after the one at which the trajectory that is varied was nearest
 CHANGES = 2  # at most, in a variation
 LESS_PATIENT = 4  # times, than Go-Explore: what they find comes sooner (docs/tried/cells.md)
-MOST_MOVED = 8  # env steps by which what follows comes sooner or later
+MAX_MOVED = 8  # env steps by which what follows comes sooner or later
 
 
 class Approaches(NamedTuple):
@@ -242,10 +242,10 @@ def changed(
     """In half of the cases some live entries are drawn anew for a stretch; else what follows comes sooner or later."""
     step, length = jnp.arange(len(code)), jnp.maximum(steps, 1)
     first = below(bits[0], length)
-    stretch = jnp.maximum(length >> below(bits[1], jnp.int32(MOST_HALVINGS + 1)), 1)
+    stretch = jnp.maximum(length >> below(bits[1], jnp.int32(MAX_HALVINGS + 1)), 1)
     after, kind = step >= first, bits[4] & 3
 
-    moved = jnp.minimum(stretch, 1 + below(bits[4] >> 2, jnp.int32(MOST_MOVED)))
+    moved = jnp.minimum(stretch, 1 + below(bits[4] >> 2, jnp.int32(MAX_MOVED)))
     sooner, later = jnp.minimum(step + moved, len(code) - 1), jnp.maximum(step - moved, first)
     code = code[jnp.where(after & (kind == 2), sooner, jnp.where(after & (kind == 3), later, step))]
 

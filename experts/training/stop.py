@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelproof.experts.config import MOST_DOUBLINGS, RECORD_STEPS, ExpertConfig, Rule, StopConfig
+from levelproof.experts.config import MAX_DOUBLINGS, RECORD_STEPS, ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Cause
 from levelproof.experts.training.progress import NEVER, Progress
 
@@ -125,7 +125,7 @@ def steady_on(course: Course, deadline: Int[Array, "..."], rules: StopRules) -> 
 
 def _wait(course: Course, rules: StopRules) -> Int[Array, "..."]:
     """Updates before another evaluation is worth it."""
-    return rules.wait << jnp.minimum(course.failed, MOST_DOUBLINGS)
+    return rules.wait << jnp.minimum(course.failed, MAX_DOUBLINGS)
 
 
 def solves(

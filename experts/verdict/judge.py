@@ -24,7 +24,7 @@ from levelproof.experts.training.slots import Begun
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import Record, steps_to_goal, succeeds
 
-MOST_CANDIDATES = 16  # of an evaluation
+MAX_CANDIDATES = 16  # of an evaluation
 
 
 class Evaluation(NamedTuple):
@@ -115,13 +115,13 @@ def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
     source = lambda attempt: Source.SAMPLED if attempt else Source.MOST_PROBABLE
     if config.witness == Choice.RECORD:
         steps, usable = steps_to_goal(done), np.flatnonzero(succeeds(done, goal))
-        usable = usable[np.argsort(steps[usable], kind="stable")][:MOST_CANDIDATES] if config.replays else usable[:1]
+        usable = usable[np.argsort(steps[usable], kind="stable")][:MAX_CANDIDATES] if config.replays else usable[:1]
         return [Witness(evaluation.action[..., i], source(i), int(steps[i])) for i in usable]
     episodes = [(end - start, attempt, start) for attempt in range(attempts)
                 for start, end in successful_episodes(done[:, attempt], goal[:, attempt])]  # fmt: skip
     played = lambda steps, attempt, start: evaluation.action[start : start + steps, :, attempt]
     distinct = {played(*episode).tobytes(): episode for episode in sorted(episodes, reverse=True)}  # the first stays
-    shortest = sorted(distinct.values())[: MOST_CANDIDATES if config.replays else 1]
+    shortest = sorted(distinct.values())[: MAX_CANDIDATES if config.replays else 1]
     return [Witness(repeated(played(*episode), episode[0]), source(episode[1]), episode[0]) for episode in shortest]
 
 

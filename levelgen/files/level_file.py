@@ -29,7 +29,7 @@ from levelproof.levelgen.sampling.shuffle import separate
 from levelproof.levelgen.task.rules import NO_DISTANCE, TaskParams
 from levelproof.physics.types import FIXED_POLYGONS, Params, Size
 
-MOST_BYTES = 4_000_000  # of a file; the reference's own have at most 52,438
+MAX_BYTES = 4_000_000  # of a file; the reference's own have at most 52,438
 PATHS = {  # where levelgen.files.kinetix has what a file keeps with a thing
     "role": "{}_shape_roles",
     "density": "{}_densities",
@@ -57,10 +57,10 @@ def read_level_file(path: str | os.PathLike[str]) -> LevelFile:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):  # a pipe or a device may never end
             raise LevelFileError("it is no ordinary file")
-        if about.st_size > MOST_BYTES:
-            raise LevelFileError(f"it has {about.st_size:,} bytes, and no level needs more than {MOST_BYTES:,}")
+        if about.st_size > MAX_BYTES:
+            raise LevelFileError(f"it has {about.st_size:,} bytes, and no level needs more than {MAX_BYTES:,}")
         with path.open("rb") as file:
-            return parse(file.read(MOST_BYTES))
+            return parse(file.read(MAX_BYTES))
     except OSError as error:
         raise LevelFileError(f"Cannot read the level file {path} ({error.strerror or error}).") from None
     except LevelFileError as error:

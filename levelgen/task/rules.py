@@ -18,7 +18,7 @@ from levelproof.physics.step import step as physics_step
 from levelproof.physics.types import Params, State
 from levelproof.physics.vector import rows, select, vec
 
-MOST_STEPS = 10**6
+MAX_STEPS = 10**6
 NO_DISTANCE = -1.0  # last_distance before the first step of an episode
 
 
@@ -32,7 +32,7 @@ class TaskParams:
     physics: Params = field(default_factory=Params)  # constants of the engine
 
     def __post_init__(self) -> None:
-        require(self, ("frame_skip", "max_timesteps"), 1, MOST_STEPS)
+        require(self, ("frame_skip", "max_timesteps"), 1, MAX_STEPS)
         require(self, ("dense_reward_scale",), 0)
 
 

@@ -42,7 +42,11 @@ def _minari(split: Path, where: str | None, out: Path, actions: str = "multi_dis
 
 # What writes the levels of a split for which a condition holds (None: each format's own) to a new file or folder
 FORMATS: dict[str, Callable[..., None]] = {"kinetix": _kinetix, "minari": _minari, "parquet": _parquet}
-ACTIONS = ("multi_discrete", "combined", "continuous")  # of pipeline.exchange.minari.episodes.ActionKind, without importing it
+ACTIONS = (
+    "multi_discrete",
+    "combined",
+    "continuous",
+)  # of pipeline.exchange.minari.episodes.ActionKind, without importing it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -49,7 +49,7 @@ RESCAN = 5.0  # s between looks at which machines a cluster has
 GPU_PATIENCE = 10.0  # s of waiting for a GPU that is free, after which workers do without
 PATIENCE = 60.0  # s without any worker after which people are told why
 STARTS = 3  # times in a row that a worker does not start, after which its place is given up
-MOST_SILENT = 1800.0  # s without a word after which a worker is given up; a large program compiles for minutes
+MAX_SILENT = 1800.0  # s without a word after which a worker is given up; a large program compiles for minutes
 
 
 class WorkerActor:
@@ -231,8 +231,8 @@ class Crew:
             time.sleep(POLL)
             return []
         outcomes = self._heard(asked, POLL)
-        for handle in self._scheduler.silent(time.monotonic() - MOST_SILENT):
-            outcomes += self._lose(handle, f"The worker on {handle.host} was silent for {duration(MOST_SILENT)}")
+        for handle in self._scheduler.silent(time.monotonic() - MAX_SILENT):
+            outcomes += self._lose(handle, f"The worker on {handle.host} was silent for {duration(MAX_SILENT)}")
         self._give_up()
         return outcomes
 

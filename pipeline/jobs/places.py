@@ -12,12 +12,12 @@ Machine = Mapping[str, Any]  # as Ray describes it
 GB = 10**9  # bytes
 # Bytes of a worker by the number of bodies, at most. Compiling takes the most: 1.35 GB were measured for s, 1.64 for l
 BYTES = ((SIZES["s"].bodies, 1.5 * GB), (SIZES["l"].bodies, 1.8 * GB))
-MOST_BYTES = 2.5 * GB  # of a worker of larger sizes; an estimate
+MAX_BYTES = 2.5 * GB  # of a worker of larger sizes; an estimate
 
 
 def bytes_of_worker(size: Size) -> int:
     """Memory that a worker for levels of this size needs."""
-    return int(next((each for most, each in BYTES if size.bodies <= most), MOST_BYTES))
+    return int(next((each for most, each in BYTES if size.bodies <= most), MAX_BYTES))
 
 
 def places(machines: Mapping[str, Machine], kind: str, most: int, memory: int) -> Counter[str]:

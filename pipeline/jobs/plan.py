@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from levelproof.configs.schema import MOST_FRAME_SKIP, JobConfig
+from levelproof.configs.schema import MAX_FRAME_SKIP, JobConfig
 from levelproof.experts.labels import WITNESSED, Label
 from levelproof.experts.steps import Seconds
 from levelproof.pipeline.errors import Failure, UserError
@@ -149,7 +149,7 @@ def _stored(job: JobConfig, split: Path, table: pa.Table, folder: Path) -> dict[
         return {}
     arrays, ids = read_rows(split, rows), rows.column("level_id").to_pylist()
     found = {}
-    for density in ("full",) if job.task.frame_skip > MOST_FRAME_SKIP else ("full", "resume", "witness"):
+    for density in ("full",) if job.task.frame_skip > MAX_FRAME_SKIP else ("full", "resume", "witness"):
         path = folder / f"{density}.zarr"
         write_shard(path, ids, arrays, Encoding(density, job.key_every, job.task))
         found[density] = PerWitness(stored_bytes(path) / len(ids), sum(entry.is_dir() for entry in path.iterdir()))

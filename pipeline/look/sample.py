@@ -16,7 +16,7 @@ from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.runtime import prepare_jax
 
 LEVELS = 15  # unless the command says how many
-MOST_LEVELS = 100
+MAX_LEVELS = 100
 COLUMNS = 5
 PIXELS = 220  # width of one level's picture
 
@@ -30,8 +30,8 @@ def sample(job: JobConfig, out: Path) -> None:
     ids = job.level_ids
     if out.suffix.lower() != ".png":
         raise UserError(f"Cannot draw to {out}: its name has to end in .png.")
-    if len(ids) > MOST_LEVELS:
-        raise UserError(f"levels is {job.levels}: a sheet has room for {MOST_LEVELS}.")
+    if len(ids) > MAX_LEVELS:
+        raise UserError(f"levels is {job.levels}: a sheet has room for {MAX_LEVELS}.")
     prepare_jax()
     page = sheet_of(job)
     with writing_to(out):

@@ -31,7 +31,7 @@ from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures a second
 LAST_SECONDS = 1.5  # how long a film rests on its last picture
-MOST_FRAME_SKIP = 8  # with which doing nothing is played: a level file's rules may have any
+MAX_FRAME_SKIP = 8  # with which doing nothing is played: a level file's rules may have any
 SHOWN_SECONDS = (0.02, 2.0)  # shortest and longest of a picture; rules may have any time step
 SHEET = (3, 2)  # columns and rows of a still
 
@@ -120,7 +120,7 @@ def recorded_film(
 
 def _without_witness(level: Level, rules: TaskParams, caption: Caption, told: str, plays: bool) -> Film:
     """What doing nothing does, or the initial world."""
-    if not plays or rules.frame_skip > MOST_FRAME_SKIP:
+    if not plays or rules.frame_skip > MAX_FRAME_SKIP:
         scene = scene_of(level, level.state, caption=replace(caption, clock="0.0 s"))
         return Film([scene], [LAST_SECONDS], f"{told}, so this is its initial world")
     record, end = do_nothing(level, rules)

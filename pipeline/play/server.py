@@ -30,7 +30,7 @@ HOST = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
 SHARED = ("draw.js", "curve.js", "style.css")  # files of the gallery's pages that this one uses, too
 PALETTE = "palette.css"
-MOST_BYTES = 8_000_000  # of a question: a level file
+MAX_BYTES = 8_000_000  # of a question: a level file
 SOCKET = "/socket"
 
 
@@ -55,7 +55,7 @@ def serving(
         Visit(connection, Session(file, actions), procedure, budget).run()
 
     try:
-        server = serve(handler, HOST, port, process_request=_file, max_size=MOST_BYTES, compression=None)
+        server = serve(handler, HOST, port, process_request=_file, max_size=MAX_BYTES, compression=None)
     except (OSError, OverflowError) as error:  # the latter: no port has this number
         reason = getattr(error, "strerror", None) or str(error).rstrip(".")
         raise UserError(f"Cannot listen on port {port} ({reason}): choose another one with --port.") from None

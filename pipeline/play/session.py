@@ -24,7 +24,7 @@ from levelproof.pipeline.look.gallery.worlds import drawn_bodies, world_of
 from levelproof.pipeline.version import __version__
 
 WITNESS = "witness"  # entry of a level file: actions that solve the level, which other programs do not read
-MOST_UNDONE = 200  # edits that can be taken back
+MAX_UNDONE = 200  # edits that can be taken back
 Asked = dict[str, Any]
 
 
@@ -98,7 +98,7 @@ class Session:
         before = self._file.level
         after = EDITS[asked["name"]](before, *asked["with"])
         from_document(to_document(replace(self._file, level=after)))  # nothing is edited into what no file can hold
-        self._done = [*self._done[1 - MOST_UNDONE :], before]
+        self._done = [*self._done[1 - MAX_UNDONE :], before]
         self._undone = []
         return self._changed(after)
 

@@ -22,12 +22,12 @@ from levelproof.pipeline.store.columns import COLUMNS, OWN, schema_of
 from levelproof.pipeline.store.remote import bytes_of, is_remote
 from levelproof.pipeline.store.thrift import PLAIN, Column, footer_in, pages_in
 
-MOST_FOOTER = 2**24  # bytes; most of them are digests
-MOST_ROWS, MOST_GROUPS = 2**20, 2**9  # of a fragment; a sealed one has 100,000 rows, in groups of 16,384
+MAX_FOOTER = 2**24  # bytes; most of them are digests
+MAX_ROWS, MAX_GROUPS = 2**20, 2**9  # of a fragment; a sealed one has 100,000 rows, in groups of 16,384
 FEWEST_BYTES = 8  # of a file for each row: content hashes alone take more, however they are packed
 # Bytes in memory: of what is read at once, for each of its rows, and for a learning curve, of as many updates as the
 # largest budgets have
-MOST_FIXED, MOST_A_ROW, MOST_A_CURVE = 2**26, 2**12, 2**17
+MAX_FIXED, MAX_A_ROW, MAX_A_CURVE = 2**26, 2**12, 2**17
 A_VALUE = 16  # bytes that a value takes besides those of its page
 CURVE = "learning_curve"
 UNSEEN = "content_hash"  # is compared and never shown
@@ -37,8 +37,8 @@ DAMAGE = (OSError, pa.ArrowException, LookupError, ValueError, TypeError, Attrib
 CAREFULLY = {
     "pre_buffer": False,
     "page_checksum_verification": True,
-    "thrift_string_size_limit": MOST_FOOTER,
-    "thrift_container_size_limit": MOST_GROUPS,
+    "thrift_string_size_limit": MAX_FOOTER,
+    "thrift_container_size_limit": MAX_GROUPS,
 }
 
 
@@ -54,11 +54,11 @@ class Bounded:
         self._source, size = source, source.size()
         source.seek(max(0, size - TAIL))
         length = int.from_bytes(source.read(4), "little")
-        if length > min(MOST_FOOTER, size - TAIL):
+        if length > min(MAX_FOOTER, size - TAIL):
             raise ValueError("its footer is longer than that of any fragment")
         source.seek(size - TAIL - length)
         self.rows, self._groups, made_by = footer_in(source.read(length))
-        if not 0 <= self.rows <= min(MOST_ROWS, size // FEWEST_BYTES) or len(self._groups) > MOST_GROUPS:
+        if not 0 <= self.rows <= min(MAX_ROWS, size // FEWEST_BYTES) or len(self._groups) > MAX_GROUPS:
             raise ValueError("it has more rows than any fragment of its size")
         if min((group.rows for group in self._groups), default=0) < 0 or sum(g.rows for g in self._groups) != self.rows:
             raise ValueError("its groups have other numbers of rows than all of it")
@@ -129,7 +129,7 @@ class Bounded:
 
     def _require_room(self, wanted: int, names: Sequence[str]) -> None:
         """Raises ValueError where so many bytes of these columns are more than fragments have."""
-        if wanted > MOST_FIXED + (MOST_A_ROW + MOST_A_CURVE * (CURVE in names)) * self.rows:
+        if wanted > MAX_FIXED + (MAX_A_ROW + MAX_A_CURVE * (CURVE in names)) * self.rows:
             raise ValueError("its rows would take more memory than those of any fragment")
 
 

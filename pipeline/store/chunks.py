@@ -21,7 +21,7 @@ from numcodecs import blosc  # pyright: ignore[reportAttributeAccessIssue]
 from levelproof.pipeline.store.contents import ContentsError
 from levelproof.pipeline.store.remote import RemoteFile, bytes_of, is_remote
 
-MOST_METADATA = 2**24  # bytes of a zarr.json; a level takes up to 12
+MAX_METADATA = 2**24  # bytes of a zarr.json; a level takes up to 12
 CHECKSUM = 4  # bytes of a CRC-32C
 ENTRY = 16  # bytes of an index for each chunk: where it starts, and how many bytes it has
 BLOSC_HEADER = Struct("<4xI4xI")  # how many bytes a buffer decodes to, and has
@@ -135,9 +135,9 @@ def read_whole(shard: Path, name: str) -> bytes:
         ContentsError, OSError: it is no ordinary file, or cannot be read.
     """
     if is_remote(shard):
-        return bytes_of(shard / name, MOST_METADATA)
+        return bytes_of(shard / name, MAX_METADATA)
     path = ordinary_file(shard, name)
-    if path.stat().st_size > MOST_METADATA:
+    if path.stat().st_size > MAX_METADATA:
         raise ContentsError(f"its {name} is larger than that of any shard")
     return path.read_bytes()
 

@@ -22,7 +22,7 @@ from levelproof.pipeline.store.remote import is_remote
 RUN = re.compile(rf"{EVENTS}/[0-9]{{8}}T[0-9]{{12}}-[0-9a-f]{{8}}\.jsonl")
 HALF = re.compile(rf"{EVENTS}/\.[0-9]{{8}}T[0-9]{{12}}-[0-9a-f]{{8}}\.jsonl\.[0-9]+")  # what a run that died wrote
 KEPT = 20  # runs of a split
-MOST_BYTES = 2**22  # of a file; one of ours is a tenth of that
+MAX_BYTES = 2**22  # of a file; one of ours is a tenth of that
 
 Event = Mapping[str, Any]  # `time` in s since 1970, `event`, and what belongs to it
 
@@ -59,9 +59,9 @@ def events_of(path: Path) -> list[dict[str, Any]]:
         UserError, StoreFailure: the store refuses.
     """
     try:
-        if not is_remote(path) and path.stat().st_size > MOST_BYTES:
+        if not is_remote(path) and path.stat().st_size > MAX_BYTES:
             return []
-        data = get(path, MOST_BYTES).data if is_remote(path) else path.read_bytes()
+        data = get(path, MAX_BYTES).data if is_remote(path) else path.read_bytes()
     except OSError:
         return []
     found = []

@@ -24,7 +24,7 @@ from levelproof.pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_
 
 FULL = (stored_as("full"),)
 DENSITIES = {stored_as(density, every) for density in get_args(Density) for every in KEYS_EVERY}
-MOST_BRACKETS = 500  # of settings, in a fragment's metadata: Python gives up on 1,000 that lie in each other
+MAX_BRACKETS = 500  # of settings, in a fragment's metadata: Python gives up on 1,000 that lie in each other
 KNOWN = {"label": {*Label}, "witness": {*Source, None}, "size": set()}  # what stands in a column; of sizes, many
 
 
@@ -124,7 +124,7 @@ def _config_in(text: bytes, written: str) -> tuple[dict[str, Any], str]:
     `written` is the hash beside it, by the version that wrote both.
     """
     config = json.loads(text)
-    if not isinstance(config, dict) or text.count(b"[") + text.count(b"{") > MOST_BRACKETS:
+    if not isinstance(config, dict) or text.count(b"[") + text.count(b"{") > MAX_BRACKETS:
         raise ValueError("its settings are none")
     if hash_of(config) != written:
         raise ValueError("its footer has another configuration than was written")

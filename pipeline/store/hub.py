@@ -18,7 +18,7 @@ from levelproof.pipeline.errors import StoreFailure, UserError
 ATTEMPTS = 6
 PAUSE = 0.5  # s before the second attempt, at most; twice that before each further one
 TIMEOUT = 30  # s of one attempt
-MOST_LIST = 2**25  # bytes of a page of a list; the hub's have a thousand files
+MAX_LIST = 2**25  # bytes of a page of a list; the hub's have a thousand files
 NEXT = re.compile(r'<([^<>]+)>; *rel="next"')  # of the header Link: where a long list goes on
 
 
@@ -83,7 +83,7 @@ def _page(url: str) -> tuple[dict[str, tuple[str, int]], str]:
             with urlopen(request, timeout=TIMEOUT) as answer:
                 more = NEXT.search(answer.headers.get("Link", ""))
                 follows = more[1] if more and more[1].startswith(f"{_endpoint()}/") else ""
-                return _files(answer.read(MOST_LIST)), follows
+                return _files(answer.read(MAX_LIST)), follows
         except HTTPError as error:
             if error.code == 404:
                 return {}, ""

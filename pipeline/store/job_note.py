@@ -16,7 +16,7 @@ from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.objects import get
 from levelproof.pipeline.store.remote import is_remote
 
-MOST_BYTES = 2**25  # of a file; a run of level ids takes about 30
+MAX_BYTES = 2**25  # of a file; a run of level ids takes about 30
 DIGEST = "sha256"  # its key
 
 
@@ -84,10 +84,10 @@ def _bytes(path: Path) -> bytes:
     if not is_remote(path):
         if not path.exists():
             raise FileNotFoundError(path)
-        if path.is_symlink() or not path.is_file() or path.stat().st_size > MOST_BYTES:
+        if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_BYTES:
             raise NoteError("it is no ordinary file of a few megabytes")
     try:
-        return get(path, MOST_BYTES).data if is_remote(path) else path.read_bytes()
+        return get(path, MAX_BYTES).data if is_remote(path) else path.read_bytes()
     except FileNotFoundError:
         raise
     except OSError as error:

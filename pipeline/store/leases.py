@@ -31,7 +31,7 @@ RENEWAL = 5.0  # s between renewals
 SIGHT = 12.0  # s of looking on without a renewal after which no writer is said to be there; two renewals and more
 NOTICE = 2.0  # s of waiting after which people are told for what
 POLL = 0.5  # s between two looks
-MOST_BYTES = 2**16  # of a lock file
+MAX_BYTES = 2**16  # of a lock file
 RENEWALS = "renewals"  # in a lock's text: of a lease; a folder's lock, which may be copied to a store, has none
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # another one on each machine, and after each start
 
@@ -177,7 +177,7 @@ def is_leased(split: Path, say: Callable[[str], None]) -> bool:
     while True:
         asked = time.monotonic()
         try:
-            found = get(split / WRITER_LOCK, MOST_BYTES).data
+            found = get(split / WRITER_LOCK, MAX_BYTES).data
         except OSError:  # there is none, or what is there is none
             return False
         holder = _said(found)
@@ -236,7 +236,7 @@ def _writer(split: Path) -> str:
 
 def _lock_text(path: Path) -> bytes:
     with open(path, "rb", opener=regular) as file:
-        return file.read(MOST_BYTES)
+        return file.read(MAX_BYTES)
 
 
 def _about(token: str, **more: int) -> str:

@@ -46,7 +46,7 @@ from levelproof.pipeline.store.remote import as_typed, at_once, is_remote
 
 MAGIC = b"levelproof checkpoint "  # begins a head
 VERSION = 1  # of the format
-MOST_HEAD = 2**20  # bytes; a level id takes 12
+MAX_HEAD = 2**20  # bytes; a level id takes 12
 MALFORMED = (BadZipFile, EOFError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
 OWN = 0o600  # mode of a file: `require_own` refuses one that others can write to, whatever the umask
 
@@ -208,10 +208,10 @@ def _head(path: Path) -> _Head:
         _DamagedError: it is damaged.
     """
     if is_remote(path):
-        return _head_in(*objects.begin_of(path, MOST_HEAD), path)
+        return _head_in(*objects.begin_of(path, MAX_HEAD), path)
     require_own(path, "remove it")
     with path.open("rb") as file:
-        return _head_in(file.readline(MOST_HEAD), os.fstat(file.fileno()).st_size, path)
+        return _head_in(file.readline(MAX_HEAD), os.fstat(file.fileno()).st_size, path)
 
 
 def _head_in(data: bytes, size: int, path: Path) -> _Head:

@@ -15,7 +15,7 @@ CHECKSUM = 4  # bytes of a CRC-32C behind each piece: a machine that lost its po
 USED = 60.0  # s; a piece is marked as used once in this time
 LEFT = 0.9  # share of the bound that is left when it was exceeded
 ABANDONED = 3600.0  # s; who writes a piece for longer was killed
-MOST_PIECE = 2**24  # bytes
+MAX_PIECE = 2**24  # bytes
 PARTS = 16  # the folder is looked through each time that this part of the bound was added
 
 
@@ -40,7 +40,7 @@ class PieceCache:
             return None
         try:
             about = os.fstat(descriptor)
-            if about.st_size > MOST_PIECE:
+            if about.st_size > MAX_PIECE:
                 return None
             if time.time() - about.st_mtime > USED:
                 os.utime(path, follow_symlinks=False)

@@ -14,7 +14,7 @@ from levelproof.pipeline.store.layout import NOTE, QUARANTINE, entries, ids_of, 
 from levelproof.pipeline.store.remote import at_once, is_remote
 from levelproof.pipeline.store.runs import runs, without
 
-MOST_LINE = 2**20  # bytes of a note's first line, which names its levels
+MAX_LINE = 2**20  # bytes of a note's first line, which names its levels
 LEVELS = re.compile(r"Levels: ([0-9]{1,12}-[0-9]{1,12}(?:, [0-9]{1,12}-[0-9]{1,12})*)\n")
 
 
@@ -60,10 +60,10 @@ def _levels_in(note: Path) -> list[tuple[int, int]]:
     """Runs of level ids in the first line of a note; none in one of an earlier version, or if it cannot be read."""
     try:
         if is_remote(note):
-            data, _ = objects.begin_of(note, MOST_LINE)
+            data, _ = objects.begin_of(note, MAX_LINE)
         else:
             with note.open("rb") as file:
-                data = file.readline(MOST_LINE)
+                data = file.readline(MAX_LINE)
     except (OSError, LevelproofError):
         return []
     found = LEVELS.match(data.decode(errors="replace"))

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
 INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for servers that do not list
-MOST_INDEX = 2**25  # bytes of it; a name takes 34
+MAX_INDEX = 2**25  # bytes of it; a name takes 34
 PIECE = 2**20  # bytes; of 4 MB, random trajectories of 10 kB would fetch four times as much
-MOST_PIECES = 8  # of one request: neighbours are fetched together
+MAX_PIECES = 8  # of one request: neighbours are fetched together
 REQUESTS = 16  # at once
-MOST_WHOLE = 2**29  # bytes of a file that is read as a whole: fragments
+MAX_WHOLE = 2**29  # bytes of a file that is read as a whole: fragments
 CACHE_GB = "LEVELPROOF_CACHE_GB"
 RETRIES: dict[str, Any] = {
     "max_retries": 8,  # of a request that is throttled, refused, cut off or not answered; with jitter
@@ -149,7 +149,7 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
         return found
     store, key = place(folder / INDEX)
     try:
-        text = ask(folder / INDEX, lambda: data_of(obstore_module().get(store, key), MOST_INDEX))
+        text = ask(folder / INDEX, lambda: data_of(obstore_module().get(store, key), MAX_INDEX))
     except FileNotFoundError:
         raise UserError(
             f"There is no split at {as_typed(folder.parent)}, or its server was not told what it has: a split on a web "
@@ -158,7 +158,7 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
     return {folder / name: Stored("", 0) for name in text.decode(errors="replace").split() if "/" not in name}
 
 
-def bytes_of(path: Path, most: int = MOST_WHOLE) -> bytes:
+def bytes_of(path: Path, most: int = MAX_WHOLE) -> bytes:
     """A whole file of at most so many bytes.
 
     Raises:
@@ -267,7 +267,7 @@ def _runs(numbers: Iterable[int]) -> list[list[int]]:
     """Ascending numbers, cut where they are no neighbours, and where there are too many."""
     runs: list[list[int]] = []
     for n in numbers:
-        if runs and runs[-1][-1] == n - 1 and len(runs[-1]) < MOST_PIECES:
+        if runs and runs[-1][-1] == n - 1 and len(runs[-1]) < MAX_PIECES:
             runs[-1].append(n)
         else:
             runs.append([n])

@@ -11,7 +11,7 @@ import numpy as np
 
 from levelproof.configs.convert import plain, typed
 from levelproof.configs.errors import ConfigError
-from levelproof.configs.schema import KEY_EVERY, KEYS_EVERY, MOST_FRAME_SKIP, Density
+from levelproof.configs.schema import KEY_EVERY, KEYS_EVERY, MAX_FRAME_SKIP, Density
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 
 SHARD_VERSION = 2
@@ -61,8 +61,8 @@ class Encoding:
             raise ContentsError("it does not say how records are stored") from error
         if density not in get_args(Density) or type(key_every) is not int or key_every not in KEYS_EVERY:
             raise ContentsError("it does not say how records are stored")
-        if density != "full" and encoding.rules.frame_skip > MOST_FRAME_SKIP:
-            raise ContentsError(f"its env steps have more than {MOST_FRAME_SKIP} physics steps")
+        if density != "full" and encoding.rules.frame_skip > MAX_FRAME_SKIP:
+            raise ContentsError(f"its env steps have more than {MAX_FRAME_SKIP} physics steps")
         return encoding
 
 

@@ -20,7 +20,7 @@ from tempfile import gettempdir, mkdtemp
 PREFIX = "levelproof-scratch-"
 LOCK, FILES = "lock", "files"
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-MOST_ABOUT = 2**12  # bytes of a lock file
+MAX_ABOUT = 2**12  # bytes of a lock file
 
 
 @contextmanager
@@ -90,7 +90,7 @@ def _sweep(folder: Path) -> None:
             return
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         is_empty = not (folder / FILES).exists()  # its maker died before it wrote anything
-        if _is_at(lock, folder / LOCK) and (is_empty or _is_here(os.read(lock, MOST_ABOUT))):
+        if _is_at(lock, folder / LOCK) and (is_empty or _is_here(os.read(lock, MAX_ABOUT))):
             _remove(folder)
     finally:
         os.close(lock)

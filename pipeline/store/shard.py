@@ -16,7 +16,7 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from levelproof.configs.schema import MOST_FRAME_SKIP
+from levelproof.configs.schema import MAX_FRAME_SKIP
 from levelproof.levelgen.level import name_of
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure
@@ -97,7 +97,7 @@ def _require_given_back(
     level_ids: Sequence[int], arrays: Mapping[str, np.ndarray], stored: Mapping[str, np.ndarray], encoding: Encoding
 ) -> None:
     """Raises Failure where arrays do not come back from what is stored of them."""
-    if encoding.rules.frame_skip > MOST_FRAME_SKIP:
+    if encoding.rules.frame_skip > MAX_FRAME_SKIP:
         raise Failure(f"An env step has {encoding.rules.frame_skip} physics steps: store records with density=full.")
     found = restored(stored, [field for field in field_table(arrays) if field.name not in stored], encoding)
     for name, values in found.arrays.items():

@@ -30,7 +30,7 @@ from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.levels import recorded_settings
 from levelproof.pipeline.read.pace import Pace
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.bounds import DAMAGE, MOST_ROWS, bounded
+from levelproof.pipeline.store.bounds import DAMAGE, MAX_ROWS, bounded
 from levelproof.pipeline.store.checksums import digests_of, has_own
 from levelproof.pipeline.store.job_note import JobNote, sound_note
 from levelproof.pipeline.store.layout import (
@@ -301,7 +301,7 @@ def _between(first: int, last: int, note: JobNote | None, findings: Findings) ->
     if not from_files(findings.config or {}) and not any(a <= first <= last <= b for a, b in wanted):
         wanted = [*wanted, (first, last)]
     ids = (i for a, b in wanted for i in range(max(a, first), min(b, last) + 1))
-    return set(islice(ids, MOST_ROWS))  # which its name and a note may say are many more
+    return set(islice(ids, MAX_ROWS))  # which its name and a note may say are many more
 
 
 def _ids_in(data: Sequence[Path]) -> set[int]:

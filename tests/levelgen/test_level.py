@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from levelproof.levelgen.level import MOST_THINGS, SIZES, Level, concatenate_levels, name_of, size_of
+from levelproof.levelgen.level import MAX_THINGS, SIZES, Level, concatenate_levels, name_of, size_of
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.physics.types import Size
 
 
-@given(st.builds(Size, *[st.integers(0, MOST_THINGS)] * 4))
+@given(st.builds(Size, *[st.integers(0, MAX_THINGS)] * 4))
 def test_every_size_has_one_name(size: Size) -> None:
     assert size_of(name_of(size)) == size
 

@@ -31,6 +31,6 @@ class Fragile(cluster.WorkerActor):
 
 
 if __name__ == "__main__":
-    cluster.MOST_SILENT = float(sys.argv[2])
+    cluster.MAX_SILENT = float(sys.argv[2])
     cluster.WorkerActor = Fragile  # type: ignore[misc]
     sys.exit(cli.main(sys.argv[3:]))

@@ -23,9 +23,9 @@ ROWS = 16  # trajectories of a chunk
 BLOSC = Blosc(cname="zstd", clevel=3, shuffle=Blosc.NOSHUFFLE, blocksize=1 << 18)
 # What is read
 NUMBER = r"[<|][biuf][1248]"  # types of fields
-MOST_TEXT = 2**20  # bytes of a description
-MOST_ROWS = 2**40  # and of other numbers in it
-MOST_BYTES = 2**30  # of a chunk
+MAX_TEXT = 2**20  # bytes of a description
+MAX_ROWS = 2**40  # and of other numbers in it
+MAX_BYTES = 2**30  # of a chunk
 BLOSC_HEADER = 16  # bytes, which is what a block may grow by
 
 
@@ -127,7 +127,7 @@ def _array(path: Path) -> StoredArray:
     try:
         shape, chunks, compressor = about["shape"], about["chunks"], about["compressor"]
         dtype = _dtype(about["dtype"])
-        good = all(type(n) is int and 0 <= n <= MOST_ROWS for n in (*shape, *chunks)) and 0 not in chunks
+        good = all(type(n) is int and 0 <= n <= MAX_ROWS for n in (*shape, *chunks)) and 0 not in chunks
         if not good or len(shape) != len(chunks) or list(shape[1:]) not in ([RECORD_STEPS], [RECORD_STEPS, 1]):
             raise refuse(f"has the shape {str(shape)[:40]}, and it should be (trajectories, {RECORD_STEPS})")
         if len(shape) == 2:  # the axis that trajectories have too many is the first of every field
@@ -135,8 +135,8 @@ def _array(path: Path) -> StoredArray:
             if any(of.shape[:1] != (1,) for of in fields.values()):
                 raise refuse("has fields without an axis of length 1 before their own")
             dtype = np.dtype([(name, of.base, of.shape[1:]) for name, of in fields.items()])
-        if chunks[2:] not in ([], [1]) or chunks[0] * chunks[1] * dtype.itemsize > MOST_BYTES:
-            raise refuse(f"has chunks {str(chunks)[:40]} of more than {MOST_BYTES:,} bytes")
+        if chunks[2:] not in ([], [1]) or chunks[0] * chunks[1] * dtype.itemsize > MAX_BYTES:
+            raise refuse(f"has chunks {str(chunks)[:40]} of more than {MAX_BYTES:,} bytes")
         if compressor is not None and compressor["id"] != "blosc":
             raise refuse(f"is compressed by {str(compressor['id'])[:20]!r}, and only blosc is read")
         if about.get("filters") or about["order"] != "C" or about.get("dimension_separator", ".") != ".":
@@ -153,7 +153,7 @@ def _dtype(fields: Any) -> np.dtype:
     parts = []
     for name, kind, *rest in fields:
         shape = rest[0] if rest else []
-        if not re.fullmatch(NUMBER, kind) or not all(type(n) is int and 0 <= n <= MOST_ROWS for n in shape):
+        if not re.fullmatch(NUMBER, kind) or not all(type(n) is int and 0 <= n <= MAX_ROWS for n in shape):
             raise FormatError(f"its field {str(name)[:60]} is of type {str(kind)[:20]}, and no number or flag")
         parts.append((name, kind, tuple(shape)))
     return np.dtype(parts)
@@ -164,7 +164,7 @@ def _description(path: Path) -> dict[str, Any]:
         raise FormatError(f"there is no {path.name} in {path.parent}")
     try:
         with path.open() as file:
-            about = json.loads(file.read(MOST_TEXT))
+            about = json.loads(file.read(MAX_TEXT))
     except (OSError, ValueError, RecursionError) as error:
         raise FormatError(f"its {path} cannot be read ({type(error).__name__})") from None
     return about if isinstance(about, dict) else {}

@@ -8,7 +8,7 @@ from levelproof.experts.config import RECORD_STEPS, Choice, ExpertConfig
 from levelproof.experts.labels import Cause, Source
 from levelproof.experts.training import progress
 from levelproof.experts.verdict.judge import (
-    MOST_CANDIDATES,
+    MAX_CANDIDATES,
     Evaluation,
     Witness,
     candidates_of,
@@ -84,7 +84,7 @@ def test_of_many_candidates_the_shortest_are_kept_and_of_copies_one() -> None:
     whole = [[(end, True)] for end in range(40, 10, -1)]
     many = replace(CONFIG, environments=len(whole), attempts=len(whole), sticky_attempts=0, moved_attempts=0)
     shortest = candidates_of([evaluation(*whole, config=many)], Source.SCOUT, many)
-    assert [witness.steps for witness in shortest] == list(range(12, 12 + MOST_CANDIDATES))
+    assert [witness.steps for witness in shortest] == list(range(12, 12 + MAX_CANDIDATES))
     assert len(candidates_of([one], Source.SCOUT, replace(config, replays=0))) == 1
     copies = evaluation(*[[(9, True), (19, True), (29, True)]] * 3)
     copies.action[:] = 1

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from levelproof.levelgen.files.entries import LevelFileError
 from levelproof.levelgen.files.kinetix import MANIFOLDS
 from levelproof.levelgen.files.level_file import (
-    MOST_BYTES,
+    MAX_BYTES,
     LevelFile,
     from_document,
     parse,
@@ -34,7 +34,7 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Params, Size
 
 RULES = TaskParams(frame_skip=3, max_timesteps=100, dense_reward_scale=0.5, physics=Params(dt=0.01, motor_power=500.0))
-MOST_MEMORY = 250e6  # bytes, for the worst that MOST_BYTES can say
+MAX_MEMORY = 250e6  # bytes, for the worst that MAX_BYTES can say
 
 
 @functools.cache
@@ -86,7 +86,7 @@ def test_a_sampled_level_survives_a_round_trip(size: Size, tmp_path: Path) -> No
 @pytest.mark.parametrize("size", [Size(5, 0, 0, 0), Size(4, 1, 0, 0), Size(64, 64, 64, 64)], ids=str)
 def test_the_smallest_and_the_largest_sizes_fit(size: Size, tmp_path: Path) -> None:
     write_level_file(LevelFile(empty_level(size, 1), TaskParams()), tmp_path / "level.json")
-    assert (tmp_path / "level.json").stat().st_size < MOST_BYTES
+    assert (tmp_path / "level.json").stat().st_size < MAX_BYTES
     assert read_level_file(tmp_path / "level.json").level.size == size
 
 
@@ -236,8 +236,8 @@ def test_a_world_without_places_for_bodies() -> None:
         (b"", "it is not JSON"),
         (b"\xff\xfe", "it is no text"),
         (b"{", "it is not JSON"),
-        (b"[" * MOST_BYTES, "nested too deeply"),
-        (b'{"a":' * (MOST_BYTES // 5), "nested too deeply"),
+        (b"[" * MAX_BYTES, "nested too deeply"),
+        (b'{"a":' * (MAX_BYTES // 5), "nested too deeply"),
         (b"1" * 5000, "it is not JSON"),
         (b"[]", "the whole is a list, it has to be an object"),
         (b"{}", "^env_state is missing$"),
@@ -325,8 +325,8 @@ BITS = {"objects": b"{},", "fuller objects": b'{"":0},', "lists in lists": b"[" 
 @pytest.mark.parametrize("bit", BITS.values(), ids=BITS)
 def test_memory_is_bounded_whatever_the_file_says(bit: bytes, tmp_path: Path) -> None:
     path = tmp_path / "level.json"
-    path.write_bytes(b"[" + bit * ((MOST_BYTES - 3) // len(bit)) + b"0]")
-    assert peak_memory(path) < MOST_MEMORY
+    path.write_bytes(b"[" + bit * ((MAX_BYTES - 3) // len(bit)) + b"0]")
+    assert peak_memory(path) < MAX_MEMORY
 
 
 def test_a_gigabyte_is_not_read(tmp_path: Path) -> None:

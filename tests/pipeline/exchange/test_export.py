@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from levelproof.experts.witness.witness import Record, replay, succeeds
-from levelproof.levelgen.files.level_file import MOST_BYTES, LevelFile, read_level_file, write_level_file
+from levelproof.levelgen.files.level_file import MAX_BYTES, LevelFile, read_level_file, write_level_file
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import TaskParams
@@ -133,8 +133,8 @@ def test_hostile_files_get_one_sentence_each(file, tmp_path, capsys) -> None:
     million = document | {"static_env_params": document["static_env_params"] | {"num_circles": 10**6}}
     for hostile, words in {
         "": "is not JSON",
-        "[" * MOST_BYTES: "nested too deeply",
-        "[]" * MOST_BYTES: "no level needs more than 4,000,000",
+        "[" * MAX_BYTES: "nested too deeply",
+        "[]" * MAX_BYTES: "no level needs more than 4,000,000",
         json.dumps(million): "num_circles is 1000000",
         text.replace('"radius": 0.0', '"radius": NaN', 1): "polygon[0].radius is NaN",
         text.replace('"a_index": ', '"a_index": 9', 1): "joint[0].a_index is 9",

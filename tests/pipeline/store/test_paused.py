@@ -206,7 +206,7 @@ def test_a_checkpoint_in_a_store_survives_its_time_outs(
     split = Path("s3://bucket/data/5k/s")
     save_paused(split, UNIT, kept, JOB)
     same(load_paused(split, range(8), JOB), kept)
-    monkeypatch.setattr(store, "MOST_HEAD", 2**12)
+    monkeypatch.setattr(store, "MAX_HEAD", 2**12)
     server.log.clear()
     assert pruned(split, 7) == []
     assert [line.rpartition(" ")[2] for line in server.log if ".paused" in line] == ["bytes=0-4095"]

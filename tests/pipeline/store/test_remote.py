@@ -178,7 +178,7 @@ def test_the_second_time_nothing_is_fetched(bucket: Bucket, split: Path) -> None
 
 def test_one_trajectory_fetches_pieces_and_not_its_shard(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote, "PIECE", 2**12)
-    monkeypatch.setattr(remote, "MOST_PIECES", 1)
+    monkeypatch.setattr(remote, "MAX_PIECES", 1)
     rows = witnessed(S3)
     bucket.server.log.clear()
     read_rows(S3, rows.slice(5, 1), ["record/action"])
@@ -321,7 +321,7 @@ def test_what_is_longer_than_it_can_be_is_not_read_to_its_end(tmp_path: Path, mo
         assert is_leased(there, print)
         assert len(events_of(there / "run.jsonl")) == 1
         for module in (job_note, leases, events):
-            monkeypatch.setattr(module, "MOST_BYTES", 20)
+            monkeypatch.setattr(module, "MAX_BYTES", 20)
         with pytest.raises(NoteError, match="OSError"):
             read_note(there)
         assert not is_leased(there, print)

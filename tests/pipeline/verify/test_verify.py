@@ -231,7 +231,7 @@ def test_of_a_damaged_fragment_no_more_levels_are_lost_than_one_has(
     split: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever its name and the note say."""
-    monkeypatch.setattr("levelproof.pipeline.verify.verify.MOST_ROWS", 100)
+    monkeypatch.setattr("levelproof.pipeline.verify.verify.MAX_ROWS", 100)
     (split / MANIFEST / f"{unit_name(0, MAX_LEVEL_ID)}.parquet").write_bytes(b"PAR1")
     assert len(examine(split).lost) <= 102
     note_job(split, made_job(), ["levelproof", "generate"], [(0, MAX_LEVEL_ID)])

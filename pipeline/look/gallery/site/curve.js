@@ -3,7 +3,7 @@
 
 (function () {
   const [LEFT, RIGHT, TOP, BOTTOM] = [30, 314, 8, 102]; // of the view box 0 0 320 120
-  const MOST_DOTS = 60;
+  const MAX_DOTS = 60;
 
   // Draws rates into an <svg> within a <figure>, which is hidden where there is no curve.
   function drawCurve(svg, rates) {
@@ -16,7 +16,7 @@
     const text = (words, x, y, anchor) => `<text x="${x}" y="${y}" text-anchor="${anchor}">${words}</text>`;
     const grid = [0, 0.5, 1].map((rate) => `<line x1="${LEFT}" x2="${RIGHT}" y1="${y(rate)}" y2="${y(rate)}"/>${text(`${100 * rate}%`, LEFT - 5, Number(y(rate)) + 3, "end")}`);
     const path = known.map(([update, rate], i) => `${i ? "L" : "M"}${x(update)} ${y(rate)}`);
-    const dots = known.length > MOST_DOTS ? [] : known.map(([update, rate]) => `<circle cx="${x(update)}" cy="${y(rate)}" r="2"/>`);
+    const dots = known.length > MAX_DOTS ? [] : known.map(([update, rate]) => `<circle cx="${x(update)}" cy="${y(rate)}" r="2"/>`);
     svg.innerHTML = [...grid, `<path d="${path.join("")}"/>`, ...dots, text("update 1", LEFT, 115, "start"), text(rates.length, RIGHT, 115, "end")].join("");
     const words = `Share of training episodes that reached the goal, in each of ${rates.length} updates`;
     const [first, last] = [known[0], known[known.length - 1]].map(([, rate]) => `${Math.round(100 * rate)}%`);

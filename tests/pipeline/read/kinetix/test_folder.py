@@ -17,7 +17,7 @@ from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectori
 from levelproof.pipeline.read.kinetix.zarr2 import FormatError
 from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, ours_of, trajectories_in
 
-MOST_MEMORY = 20e6  # bytes; a chunk of four trajectories has 1.5 MB
+MAX_MEMORY = 20e6  # bytes; a chunk of four trajectories has 1.5 MB
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def test_hostile_folders_get_one_sentence_and_little_memory(
     try:
         with pytest.raises(FormatError) as error:
             read(theirs)
-        assert tracemalloc.get_traced_memory()[1] < MOST_MEMORY
+        assert tracemalloc.get_traced_memory()[1] < MAX_MEMORY
     finally:
         tracemalloc.stop()
     assert words in str(error.value)
