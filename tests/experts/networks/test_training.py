@@ -12,7 +12,7 @@ from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from tests.experts.small import CONFIG
-from tests.experts.test_slots import SOLVED, UPDATES, same, train
+from tests.experts.training.test_slots import SOLVED, UPDATES, same, train
 
 IDS = np.array([0, 2, 6, 7])
 

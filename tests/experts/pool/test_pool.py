@@ -19,7 +19,7 @@ from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, WHOLE, untouched
-from tests.experts.test_slots import SOLVED, same
+from tests.experts.training.test_slots import SOLVED, same
 
 IDS = np.arange(100, 136)
 UPDATES = 6

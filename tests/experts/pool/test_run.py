@@ -19,7 +19,7 @@ from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, IDS, WHOLE, untouched
-from tests.experts.test_slots import same
+from tests.experts.training.test_slots import same
 
 UPDATES = 24
 BUDGET = UPDATES * CONFIG.steps_per_update + 100

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from levelproof.experts import advance as advance_module
 from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
 from levelproof.experts.labels import Label, Source
 from levelproof.experts.pool.found import Looking
 from levelproof.experts.pool.pool import Pool, Submission, capacity_of
 from levelproof.experts.pool.queue import empty_queue, enter
 from levelproof.experts.search.search import Searching
+from levelproof.experts.training import advance as advance_module
 from levelproof.experts.training.advance import advance
 from levelproof.experts.training.progress import NEVER
 from levelproof.experts.training.slots import LevelQueue, Mode, empty_slots

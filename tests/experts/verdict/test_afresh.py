@@ -16,7 +16,7 @@ from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, untouched
-from tests.experts.test_slots import SOLVED
+from tests.experts.training.test_slots import SOLVED
 
 IDS = np.arange(100, 124)
 ALL = replace(SOLVED, successes=CONFIG.attempts)  # a level is solved when every attempt of an evaluation succeeds

@@ -90,6 +90,7 @@ from rich.console import Console
 from levelproof.pipeline.jobs import cluster
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Round, Scheduler, UnitOutcome, WorkUnit
+from levelproof.pipeline.stopping import Stop
 from levelproof.pipeline.store.locks import only_writer
 from tests.pipeline.made import made_job
 
@@ -120,7 +121,8 @@ with only_writer(split, print):
     split.mkdir()
     with only_writer(pathlib.Path(os.path.relpath(split)), print):  # the other command, by another path to the folder
         board = Board(Tally(2, 0, 0), Console(stderr=True))
-        cluster.run(made_job("data", "unit=2", "workers=1"), split, Scheduler([WorkUnit((0, 1))], 2), settle, board)
+        job, scheduler = made_job("data", "unit=2", "workers=1"), Scheduler([WorkUnit((0, 1))], 2)
+        cluster.run(job, split, scheduler, settle, board, Stop())
 """
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from levelproof.configs.compose import compose_job
-from levelproof.pipeline.runtime import LAST
+from levelproof.pipeline.stopping import LAST
 from levelproof.pipeline.store.paused import load_paused
 from tests.pace import patience
 from tests.pipeline.command import heed_ctrl_c, here, run, start, until

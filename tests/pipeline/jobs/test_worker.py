@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from levelproof.configs.schema import JobConfig
-from levelproof.experts import pool as pool_module
 from levelproof.experts.config import ScoutConfig
 from levelproof.experts.labels import WITNESSED
+from levelproof.experts.pool import pool as pool_module
 from levelproof.experts.search.config import SearchConfig
 from levelproof.pipeline.jobs import worker as worker_module
 from levelproof.pipeline.jobs.schedule import Order, Round, UnitOutcome, WorkUnit

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from levelproof.experts.labels import Label, unsolved_reason
+from levelproof.experts.labels import Cause, Label, unsolved_reason
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import Failure, UserError
@@ -94,7 +94,7 @@ def test_experts_that_diverged_are_counted(tmp_path: Path, capsys: pytest.Captur
     job, ids = made_job(str(tmp_path), "levels=3"), [0, 1, 2]
     split = split_path(job.out, job.budget, job.size)
     split.mkdir(parents=True)
-    reasons = [unsolved_reason(8, True, False, diverged) for diverged in (None, 1024, 2048)]
+    reasons = [unsolved_reason(8, False, cause, 1024) for cause in (Cause.NONE, Cause.DIVERGED, Cause.DIVERGED)]
     verdicts = [made_verdict(Label.UNSOLVED, label_reason=reason) for reason in reasons]
     result = dataclasses.replace(made_result(ids, [Label.UNSOLVED] * 3), verdicts=verdicts)
     commit(job, split, WorkUnit(tuple(ids)), result)

@@ -12,7 +12,7 @@ from levelproof.pipeline.play.server import HOST, serving
 from levelproof.pipeline.play.session import empty_file
 from tests.pace import patience
 from tests.pipeline.look.test_gallery_browser import UNNAMED, chromium, patient
-from tests.pipeline.look.test_play import QUICK
+from tests.pipeline.play.test_play import QUICK
 
 __all__ = ["chromium"]  # a fixture
 pytestmark = pytest.mark.campaign

@@ -56,8 +56,9 @@ def test_experts_from_before_there_were_causes_come_back(tmp_path: Path, over: b
     def saved(value: np.generic) -> Path:
         training = kept.begun.training
         training = training._replace(course=training.course._replace(over=value))
-        save_experts(tmp_path / "0.npz", {0: kept._replace(begun=kept.begun._replace(training=training))})
-        return tmp_path / "0.npz"
+        path = tmp_path / f"{value.dtype}.npz"
+        save_experts(path, {0: kept._replace(begun=kept.begun._replace(training=training))})
+        return path
 
     back = load_experts(saved(np.bool_(over)), job)[0].begun.training.course.over
     assert (back.dtype, back) == (np.int8, Cause.RUNG if over else Cause.NONE)

@@ -21,8 +21,9 @@ from levelproof.configs.errors import ConfigError
 from levelproof.configs.schema import KEYS_EVERY
 from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.steps import EnvSteps
+from levelproof.experts.witness import resume
 from levelproof.experts.witness.resume import checksum, timesteps
-from levelproof.experts.witness.witness import Record, replay, resume
+from levelproof.experts.witness.witness import Record, replay
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.sampler import sample_levels

@@ -1,5 +1,6 @@
 """Files that a command opens in a split that it did not make: whatever has their names, nothing else is written to."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -53,8 +54,8 @@ def split(tmp_path: Path) -> Path:
 
 
 def socket_at(path: Path, _: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as one:
-        one.bind(str(path))
+    with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as one:  # a socket's path must be short
+        one.bind(path.name)
 
 
 PLANTED: dict[str, Callable[[Path, Path], object]] = {

@@ -341,7 +341,7 @@ def test_a_server_that_lies_about_sizes_is_one_sentence() -> None:
 @pytest.mark.campaign
 def test_processes_share_a_cache_and_may_be_killed(bucket: Bucket, split: Path) -> None:
     code = (
-        "import sys, hashlib\nfrom pathlib import Path\nfrom pipeline.read.rows import read_rows\n"
+        "import sys, hashlib\nfrom pathlib import Path\nfrom levelproof.pipeline.read.rows import read_rows\n"
         "from levelproof.pipeline.store.manifest import read_manifest\nsplit = Path(sys.argv[1])\n"
         "table = read_manifest(split).table\nprint('at work', flush=True)\n"
         "found = read_rows(split, table.filter(table['shard'].is_valid()))\n"
@@ -435,7 +435,7 @@ def test_commands_that_read_take_urls_and_others_say_what_they_need(
 def test_a_forked_process_is_told_how_to_start(tmp_path: Path) -> None:
     """Its threads would not be there: it would wait forever, and so would the process that it is of."""
     code = (
-        "import os\nfrom pathlib import Path\nfrom pipeline.store import remote\n"
+        "import os\nfrom pathlib import Path\nfrom levelproof.pipeline.store import remote\n"
         "remote.place(Path('s3://bucket/data'))\n"
         "child = os.fork()\n"
         "try:\n    remote.bytes_of(Path('s3://bucket/data')) if not child else os.waitpid(child, 0)\n"

@@ -8,7 +8,7 @@ import pytest
 from levelproof.experts.labels import Label
 from levelproof.levelgen.level import SIZES
 from levelproof.physics.pairs import pairs_of
-from levelproof.pipeline.read.kinetix import export as module
+from levelproof.pipeline.exchange import kinetix as module
 from levelproof.pipeline.read.kinetix import zarr2
 from levelproof.pipeline.read.kinetix.records import dtype_of
 from levelproof.pipeline.read.kinetix.zarr2 import write_group

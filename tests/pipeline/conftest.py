@@ -1,4 +1,4 @@
-"""What all that looks at a split looks at; nobody writes to it."""
+"""A split to look at, which no test writes to; folders of tests may replace it by their own."""
 
 from pathlib import Path
 
