@@ -1,4 +1,4 @@
-"""What training code gets: trajectories or windows of them, batch first."""
+"""Batches of trajectories or windows, batch axis first."""
 
 import difflib
 from collections.abc import Iterable
@@ -22,59 +22,75 @@ T = TypeVar("T")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Batch:
-    """Trajectories, or windows of them: numpy arrays [batch, time, ...]. One of them: the same without `batch`.
+    """Trajectories or windows as a pytree of numpy arrays [batch, time, ...]; no batch axis for a single trajectory.
 
-    A step is what is seen, what is done then, and what that gives. Episodes follow each other in a record: behind a
-    step that is `done`, the level starts again.
+    Step t holds the observation, the action taken from it, and the reward and flags of that action. A record is 256
+    steps with automatic reset: the step after one that is `done` is the first of the level's next episode.
+
+    Attributes:
+        level_id: ids of the levels, int64 [batch].
+        first: step of the record at which each window starts, int64 [batch].
+        mask: bool [batch, time]; False for padding, whose steps repeat others.
+        observation: of the requested type, jax arrays [batch, time, ...] (`symbolic_flat`: float32 [batch, time,
+            feature]); None if none was requested.
+        action: multi-discrete codes (`levelgen.task.actions`), int32 [batch, time, 6].
+        action_mask: entries of an action that can have an effect in the level, bool [batch, time, 6].
+        reward: float32 [batch, time].
+        done: whether the step ended its episode, bool [batch, time].
+        terminated: whether the task ended it, so that the value of what follows is 0, bool [batch, time].
+        truncated: whether the time limit ended it, so that learners bootstrap from the state reached, bool [batch,
+            time].
+        goal: whether the step reached the goal, bool [batch, time].
+        fields: the other requested fields by name.
     """
 
     level_id: Int[np.ndarray, " batch"]
-    first: Int[np.ndarray, " batch"]  # step of the record at which a window starts
-    mask: Bool[np.ndarray, "batch time"]  # False: a step that only fills up a window or a batch
-    observation: Any  # of the kind that was asked for, jax arrays [batch, time, ...]; None: none was
-    action: Int[np.ndarray, "batch time 6"]  # multi-discrete (`levelgen.task.actions`)
-    action_mask: Bool[np.ndarray, "batch time 6"]  # which entries of an action can have an effect
+    first: Int[np.ndarray, " batch"]
+    mask: Bool[np.ndarray, "batch time"]
+    observation: Any
+    action: Int[np.ndarray, "batch time 6"]
+    action_mask: Bool[np.ndarray, "batch time 6"]
     reward: Float[np.ndarray, "batch time"]
-    done: Bool[np.ndarray, "batch time"]  # the step ended its episode
-    terminated: Bool[np.ndarray, "batch time"]  # by the task: nothing follows, and the value there is 0
-    truncated: Bool[np.ndarray, "batch time"]  # by the time limit: the value there is that of the state reached
-    goal: Bool[np.ndarray, "batch time"]  # by reaching the goal
-    fields: dict[str, np.ndarray]  # the others that were asked for, by their names
+    done: Bool[np.ndarray, "batch time"]
+    terminated: Bool[np.ndarray, "batch time"]
+    truncated: Bool[np.ndarray, "batch time"]
+    goal: Bool[np.ndarray, "batch time"]
+    fields: dict[str, np.ndarray]
 
     @property
     def state(self) -> State:
-        """The world before each action."""
+        """States before each action, [batch, time, ...]. Raise UserError unless `record/state` was read."""
         return self._tree(State, "record/state/")
 
     @property
     def record(self) -> Record:
-        """All that changes along time."""
+        """Records, [batch, time, ...]. Raise UserError unless `record` was read."""
         return self._tree(Record, "record/")
 
     @property
     def level(self) -> Level:
-        """The levels that are played, [batch, ...]."""
+        """Levels, [batch, ...]. Raise UserError unless `level` was read."""
         return self._tree(Level, "level/")
 
     def _tree(self, kind: type[T], path: str) -> T:
         try:
             return tree_of(kind, self.fields, path)
         except KeyError as error:
-            raise UserError(f"The field {error.args[0]} was not read: ask for fields=[{path[:-1]!r}].") from None
+            raise UserError(f"The field {error.args[0]} was not read: pass fields=[{path[:-1]!r}].") from None
 
 
-def named(fields: Iterable[str], size: Size) -> list[str]:
-    """The names of fields: each as it is, or all that are below a name, such as `record/state`.
+def expand_fields(fields: Iterable[str], size: Size) -> list[str]:
+    """Expand prefixes such as `record/state` to the names of all fields below them; drop duplicates.
 
     Raises:
-        UserError: there is no such field.
+        UserError: a field does not exist.
     """
     known, chosen = [field.name for field in table_for(size)], []
-    for word in [fields] if isinstance(fields, str) else fields:
-        found = [name for name in known if name == word or name.startswith(f"{word}/")]
-        if not found:
-            near = difflib.get_close_matches(word, [*known, "record/state", "record", "level"], n=1, cutoff=0.3)
-            hint = f", is {near[0]} meant" if near else ""
-            raise UserError(f"There is no field {word!r}{hint}? levelproof.Record and levelproof.Level have them all.")
-        chosen += found
+    for prefix in [fields] if isinstance(fields, str) else fields:
+        matches = [name for name in known if name == prefix or name.startswith(f"{prefix}/")]
+        if not matches:
+            near = difflib.get_close_matches(prefix, [*known, "record/state", "record", "level"], n=1, cutoff=0.3)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise UserError(f"There is no field {prefix!r}{hint}: levelproof.Record and levelproof.Level list them.")
+        chosen += matches
     return list(dict.fromkeys(chosen))

@@ -1,4 +1,4 @@
-"""Batches read ahead by threads, from any position on."""
+"""Resumable iteration over batches, which threads prefetch."""
 
 import weakref
 from collections import deque
@@ -10,32 +10,36 @@ from levelproof.pipeline.dataset.batch import Batch
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import own_cores
 
-RENAMED = {"batch": "batch_size", "part": "subset"}  # in positions of the version before
+RENAMED = {"batch": "batch_size", "part": "subset"}  # old names in states saved by the previous version
 
 
 class Batches(Iterator[Batch]):
-    """Made by `Dataset.batches`. Its threads end with it: when it is used up, closed or forgotten."""
+    """Iterator over batches, from `Dataset.batches`. Its threads stop when it is exhausted, closed or collected."""
 
     def __init__(
-        self, load: Callable[[int], Batch], count: int | None, of: Mapping[str, Any], prefetch: int, start: Any
+        self, load: Callable[[int], Batch], count: int | None, settings: Mapping[str, Any], prefetch: int, start: Any
     ) -> None:
-        """Batch `position` is `load(position)`, for all below `count` (None: no end).
+        """Start iterating, and prefetching.
 
-        `of` tells these batches from others, `prefetch` is how many are read before they are asked for, and `start` is
-        None or what `state` gave.
+        Args:
+            load: returns the batch at a position; called in threads.
+            count: number of batches; None: endless.
+            settings: arguments that determine the sequence of batches, as JSON.
+            prefetch: number of batches to read ahead.
+            start: a result of `state` to resume from; None: the first batch.
 
         Raises:
-            UserError: `start` is a position among other batches.
+            UserError: `start` is invalid, or was saved with other settings.
         """
-        self._load, self._count, self._of = load, count, dict(of)
-        self._position = 0 if start is None else _position_in(start, self._of)
+        self._load, self._count, self._settings = load, count, dict(settings)
+        self._position = 0 if start is None else _position_in(start, self._settings)
         self._pool = ThreadPoolExecutor(len(own_cores()), "levelproof-reader")
         self._ahead: deque[Future[Batch]] = deque()
-        self._most = max(prefetch, 0) + 1
+        self._max_ahead = max(prefetch, 0) + 1
         self._end = weakref.finalize(self, self._pool.shutdown, wait=False, cancel_futures=True)
 
     def __next__(self) -> Batch:
-        while self._end.alive and len(self._ahead) < self._most and self._has(self._position + len(self._ahead)):
+        while self._end.alive and len(self._ahead) < self._max_ahead and self._has(self._position + len(self._ahead)):
             self._ahead.append(self._pool.submit(self._load, self._position + len(self._ahead)))
         if not self._ahead:
             self.close()
@@ -49,11 +53,11 @@ class Batches(Iterator[Batch]):
         return batch
 
     def state(self) -> dict[str, Any]:
-        """Where this is, as JSON has it: `batches(..., start=state)` goes on with the batch that would come next."""
-        return {"position": self._position, "of": self._of}
+        """Return the position as JSON values: `batches(..., start=state)` resumes with the batch that would be next."""
+        return {"position": self._position, "of": self._settings}
 
     def close(self) -> None:
-        """Stop reading ahead; there is no next batch then."""
+        """Stop prefetching and end the iteration."""
         self._ahead.clear()
         self._end()
 
@@ -61,14 +65,14 @@ class Batches(Iterator[Batch]):
         return self._count is None or position < self._count
 
 
-def _position_in(start: Any, of: Mapping[str, Any]) -> int:
+def _position_in(start: Any, settings: Mapping[str, Any]) -> int:
     try:
         position = start["position"]
-        others = {RENAMED.get(name, name): value for name, value in dict(start["of"]).items()}
-        differing = [name for name in of if others[name] != of[name]]
+        saved = {RENAMED.get(name, name): value for name, value in dict(start["of"]).items()}
+        differing = [name for name in settings if saved[name] != settings[name]]
     except (KeyError, TypeError, ValueError):
-        raise UserError("The start is no position of batches: give what their state() returned.") from None
+        raise UserError("The start is not a state of batches: pass what their state() returned.") from None
     if differing or type(position) is not int or position < 0:
-        told = ", ".join(f"{name} was {others[name]}, now {of[name]}" for name in differing)
-        raise UserError(f"The start is a position among other batches ({told}): use the same settings.")
+        changes = ", ".join(f"{name} was {saved[name]}, now {settings[name]}" for name in differing)
+        raise UserError(f"The start was saved with other settings ({changes}): use the same ones.")
     return position

@@ -1,4 +1,4 @@
-"""The environment on levels at hand, or on those of a split."""
+"""Construction of the environment from levels or from a split."""
 
 import os
 from dataclasses import replace
@@ -29,27 +29,35 @@ def make(
 ) -> tuple[Environment, EnvParams]:
     """Make an environment and its default parameters, from levels or from a split.
 
+    The environment has gymnax's functions, such as `env.reset(key, params)` and `env.step(key, state, action, params)`,
+    for one environment: batch them with `jax.vmap`.
+
     Args:
-        levels: what resets draw from, with equal chances; level axis last.
+        levels: levels from which resets draw uniformly; level axis last.
         action_type: `discrete`, `multi_discrete` or `continuous`.
         observation_type: `symbolic_flat`, `symbolic_flat_padded`, `symbolic_entity` or `pixels`.
-        rules: of the task; None: those of the split, or the defaults.
-        auto_reset: whether a step that ends an episode gives the first state of the next one.
-        final_observation: whether `info["final_observation"]` has the observation before an automatic reset, too.
-        split: path or URL of a split, such as `data/128k/s`, instead of `levels`: all its levels, in the order of their
-            ids (`env.level_ids`), whether they have a witness or not.
-        where: an SQL condition on the manifest's columns, such as `label = 'solved' AND steps_to_goal < 64`.
+        rules: task rules; None: those of the split, or the defaults.
+        auto_reset: whether a step that ends an episode returns the first state and observation of the next one.
+        final_observation: whether `info["final_observation"]` has the observation before an automatic reset.
+        split: path or URL of a split, such as `data/128k/s`, instead of `levels`: uses all its levels, with or without
+            a witness, sorted by id (`env.level_ids`).
+        where: SQL condition on the manifest's columns that selects levels of the split, such as `label = 'solved' AND
+            steps_to_goal < 64`; None: all.
+
+    Returns:
+        The environment, and its parameters, which hold the levels.
 
     Raises:
-        UserError: neither or both of levels and split are given, there is no such split, or no level fits.
+        UserError: neither or both of `levels` and `split` are given, the split does not exist, the condition is
+            invalid, or no level meets it.
         Failure: the split is damaged.
-        ValueError: no such type, no level, or `jax_enable_x64` is on.
+        ValueError: a type is unknown, there are no levels, or `jax_enable_x64` is on.
     """
     if (levels is None) == (split is None):
-        raise UserError("make takes either levels or split=, the path of a split: give one of them.")
+        raise UserError("make takes either levels or split=, the path of a split: pass one of them.")
     if split is None or levels is not None:
         if where is not None:
-            raise UserError("where= is a condition on the levels of a split: give split= with it, not levels.")
+            raise UserError("where= is a condition on the levels of a split: pass split= with it, not levels.")
         assert levels is not None
         return environment.make(
             levels, action_type, observation_type, rules or DEFAULT_RULES, auto_reset, final_observation
@@ -58,9 +66,10 @@ def make(
     rows = select(manifest.table, where)
     if not rows.num_rows:
         raise UserError(
-            f"The split {split} has no level for which {where}: `levelproof inspect {split}` shows its levels."
+            f"The split {split} has no level for which {where} holds: `levelproof inspect {split}` shows its levels."
         )
-    jax.devices()  # JAX starts as the caller has set it up, not as `levels_of` would: for a worker of one thread
+    # Initialise JAX with the caller's settings, before `levels_of` would limit it to one thread, as for a worker
+    jax.devices()
     env, params = environment.make(
         levels_of(manifest, rows),
         action_type,

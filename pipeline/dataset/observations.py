@@ -1,4 +1,4 @@
-"""Observations of stored states, made where JAX computes: on the accelerator where there is one."""
+"""Observations of stored states, computed on JAX's default device."""
 
 from dataclasses import replace
 from functools import partial
@@ -13,11 +13,11 @@ from levelproof.levelgen.task.environment import LOOKS, ObservationType
 from levelproof.physics.types import State
 from levelproof.pipeline.errors import UserError
 
-COMPILING = Lock()  # threads that meet a program for the first time would compile it side by side
+COMPILING = Lock()  # or threads that need the same new program would each compile it
 
 
-def kind_of(name: str | None) -> ObservationType | None:
-    """Raises UserError where the environment has no such kind of observation."""
+def parse_observation(name: str | None) -> ObservationType | None:
+    """Parse the name of an observation type. Raise UserError if the environment has no such type."""
     try:
         return None if name is None else ObservationType(name)
     except ValueError:
@@ -25,14 +25,14 @@ def kind_of(name: str | None) -> ObservationType | None:
         raise UserError(f"There is no observation {name!r}: choose one of {kinds}, or None.") from None
 
 
-def observed(kind: ObservationType, level: Level, states: State) -> Any:
-    """What the environment shows, [batch, time, ...], of levels [batch, ...] in states [batch, time, ...]."""
+def observe(kind: ObservationType, level: Level, states: State) -> Any:
+    """Observe levels [batch, ...] in states [batch, time, ...]; return jax arrays [batch, time, ...]."""
     with COMPILING:
-        return _observed(kind, level, states)
+        return _observe(kind, level, states)
 
 
 @partial(jax.jit, static_argnames="kind")
-def _observed(kind: ObservationType, level: Level, states: State) -> Any:
+def _observe(kind: ObservationType, level: Level, states: State) -> Any:
     level, states = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), 0, -1), (level, states))
-    seen = jax.vmap(lambda state: LOOKS[kind](replace(level, state=state), state))(states)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), seen)
+    shown = jax.vmap(lambda state: LOOKS[kind](replace(level, state=state), state))(states)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), shown)

@@ -1,8 +1,8 @@
-"""Which item stands where in an epoch: shuffled without a list of all items, parted among hosts, the same everywhere.
+"""Deterministic order of an epoch: shuffled without a list of all items, and apportioned to hosts.
 
 The shuffle is a keyed permutation of 0 .. count - 1: a Feistel network over the next power of four, walked along its
-cycles until it is back inside (Black and Rogaway, Ciphers with Arbitrary Finite Domains, CT-RSA 2002), with the
-finaliser of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014) as its round function. It keeps no secrets.
+cycles until it is back in range (Black and Rogaway, Ciphers with Arbitrary Finite Domains, CT-RSA 2002), with the
+finaliser of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014) as its round function. It is not cryptographically secure.
 """
 
 from dataclasses import dataclass
@@ -17,63 +17,66 @@ ROUNDS = 6
 
 @dataclass(frozen=True)
 class EpochOrder:
-    """The batches of all epochs, as one host has them."""
+    """The batches of all epochs on one host."""
 
     count: int  # items
-    batch_size: int  # items of a batch on this host
-    seed: int | None  # None: in the order of items
+    batch_size: int  # items per batch on this host
+    seed: int | None  # None: no shuffling
     process_index: int = 0
     process_count: int = 1
 
     def __post_init__(self) -> None:
         if not (type(self.batch_size) is int and self.batch_size > 0):
-            raise UserError(f"A batch cannot have {self.batch_size} items: give a number from 1.")
+            raise UserError(f"A batch cannot have {self.batch_size} items: use an integer from 1.")
         if not 0 <= self.process_index < self.process_count:
             raise UserError(
                 f"There is no process {self.process_index} of {self.process_count}: "
-                "process_index goes from 0 to process_count - 1."
+                "process_index must be from 0 to process_count - 1."
             )
         if self.seed is not None and self.seed < 0:
-            raise UserError(f"The seed is {self.seed}: give a number from 0, or None for no shuffling.")
+            raise UserError(f"The seed is {self.seed}: use an integer from 0, or None for no shuffling.")
 
     @property
     def batches(self) -> int:
-        """Of an epoch, on every host."""
+        """Number of batches per epoch, equal on every host."""
         return -(-self.count // (self.batch_size * self.process_count))
 
     def items(self, position: int) -> tuple[Int[np.ndarray, " batch"], Bool[np.ndarray, " batch"]]:
-        """The items of a batch, counted from the first epoch's first, and which of them are no repetition.
+        """Return the items of a batch, and which of them are not padding.
 
-        Every item comes once an epoch; what is missing to a last whole batch on every host is filled up.
+        Every item occurs once per epoch; repeated items pad the last batch on every host.
+
+        Args:
+            position: index of the batch, counted from the start of the first epoch.
         """
         epoch, step = divmod(position, self.batches)
         first = (step * self.process_count + self.process_index) * self.batch_size
-        places = np.arange(first, first + self.batch_size)
-        items = places % self.count
+        ranks = np.arange(first, first + self.batch_size)
+        items = ranks % self.count
         if self.seed is not None:
-            items = permuted(items, self.count, self.seed, epoch)
-        return items, places < self.count
+            items = permute(items, self.count, self.seed, epoch)
+        return items, ranks < self.count
 
 
-def permuted(places: Int[np.ndarray, "*n"], count: int, seed: int, epoch: int = 0) -> Int[np.ndarray, "*n"]:
-    """What stands at these places of a permutation of 0 .. count - 1."""
+def permute(positions: Int[np.ndarray, "*n"], count: int, seed: int, epoch: int = 0) -> Int[np.ndarray, "*n"]:
+    """Return the items at these positions of a keyed permutation of 0 .. count - 1."""
     keys = np.random.SeedSequence([seed, epoch]).generate_state(ROUNDS, np.uint64)
     half = np.uint64(max((count - 1).bit_length() + 1, 2) // 2)  # bits
-    found = _network(places.astype(np.uint64), keys, half)
-    while (outside := found >= count).any():
-        found[outside] = _network(found[outside], keys, half)
-    return found.astype(np.int64)
+    items = _network(positions.astype(np.uint64), keys, half)
+    while (outside := items >= count).any():
+        items[outside] = _network(items[outside], keys, half)
+    return items.astype(np.int64)
 
 
 def _network(x: np.ndarray, keys: np.ndarray, half: np.uint64) -> np.ndarray:
     mask = (np.uint64(1) << half) - np.uint64(1)
     left, right = x >> half, x & mask
     for key in keys:
-        left, right = right, left ^ (_mixed(right + key) & mask)
+        left, right = right, left ^ (_mix(right + key) & mask)
     return (left << half) | right
 
 
-def _mixed(x: np.ndarray) -> np.ndarray:
+def _mix(x: np.ndarray) -> np.ndarray:
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))

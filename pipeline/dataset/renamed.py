@@ -1,4 +1,4 @@
-"""Arguments that have another name now: the old one still works for a version, with a warning."""
+"""Renamed arguments: the old name works for one more version, with a warning."""
 
 import warnings
 from collections.abc import Callable
@@ -9,26 +9,26 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def renamed(**names: str) -> Callable[[F], F]:
-    """Let a function take arguments by their old names, too: `renamed(old="new")`.
+    """Make a function accept arguments by their old names, too: `renamed(old="new")`.
 
     Raises:
-        TypeError: a call gives both names of an argument.
+        TypeError: a call passes an argument under both names.
     """
 
     def decorate(function: F) -> F:
         @wraps(function)
-        def call(*args: Any, **given: Any) -> Any:
-            for old in names.keys() & given.keys():
+        def call(*args: Any, **kwargs: Any) -> Any:
+            for old in names.keys() & kwargs.keys():
                 new = names[old]
-                if new in given:
-                    raise TypeError(f"{function.__name__} got {new}= and {old}=, its old name: give {new}= alone")
+                if new in kwargs:
+                    raise TypeError(f"{function.__name__} got {new}= and {old}=, its old name: pass {new}= alone")
                 warnings.warn(
-                    f"{old}= of {function.__name__} is now {new}=; the next version knows the new name alone",
+                    f"{old}= of {function.__name__} is now {new}=; the next version accepts only the new name",
                     DeprecationWarning,
                     stacklevel=2,
                 )
-                given[new] = given.pop(old)
-            return function(*args, **given)
+                kwargs[new] = kwargs.pop(old)
+            return function(*args, **kwargs)
 
         return call  # pyright: ignore[reportReturnType]
 

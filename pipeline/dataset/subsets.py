@@ -1,4 +1,4 @@
-"""The subsets train and validation, told apart by what levels consist of: copies of a level are never in both."""
+"""The subsets train and validation, split by content hash, so that copies of a level are never in both."""
 
 from collections.abc import Sequence
 
@@ -8,32 +8,32 @@ from jaxtyping import Bool
 from levelproof.pipeline.errors import Failure, UserError
 
 SUBSETS = TRAIN, VALIDATION = "train", "validation"
-DIGITS = 8  # at the end of a content hash; its first ones make ids of level files
+DIGITS = 8  # taken from the end of a content hash, because ids of level files use the start
 
 
 def check_share(share: float) -> None:
-    """Raises UserError where it is none."""
+    """Raise UserError unless 0 <= share <= 1."""
     if not 0 <= share <= 1:
-        raise UserError(f"The share of validation is {share}: give a number from 0 to 1.")
+        raise UserError(f"The share of validation is {share}: use a number from 0 to 1.")
 
 
 def in_subset(content_hashes: Sequence[str], subset: str | None, share: float) -> Bool[np.ndarray, " level"]:
-    """Which levels are in a subset (None: all are); `share` of all hashes is validation.
+    """Return which levels are in a subset (None: all); `share` of all hashes belong to validation.
 
-    It depends on a level's hash and the share alone. With a larger share, what was validation still is.
+    Depends only on the level's hash and the share. A larger share keeps all levels that are already in validation.
 
     Raises:
-        UserError: there is no such subset.
-        Failure: a hash is none.
+        UserError: the subset does not exist.
+        Failure: a hash is invalid.
     """
     if subset is None:
         return np.ones(len(content_hashes), bool)
     if subset not in SUBSETS:
         raise UserError(f"There is no subset {subset!r}: choose {' or '.join(SUBSETS)}, or None for both.")
     try:
-        drawn = np.frombuffer(bytes.fromhex("".join(one[-DIGITS:] for one in content_hashes)), ">u4")
+        drawn = np.frombuffer(bytes.fromhex("".join(content_hash[-DIGITS:] for content_hash in content_hashes)), ">u4")
     except ValueError:
         drawn = np.zeros(0, ">u4")
     if len(drawn) != len(content_hashes):
-        raise Failure("The manifest has content hashes that are none: run `levelproof verify` on its split.")
+        raise Failure("The manifest has invalid content hashes: run `levelproof verify` on its split.")
     return (drawn < share * 16**DIGITS) == (subset == VALIDATION)

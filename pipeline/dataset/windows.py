@@ -1,4 +1,4 @@
-"""How a record is cut into windows: one behind the other from its first step, the last one filled up."""
+"""Cutting of records into consecutive windows, the last one padded."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,36 +11,36 @@ from levelproof.pipeline.errors import UserError
 
 
 class Windows(NamedTuple):
-    """Windows of `length` steps lie at 0, length, 2 * length, ... of each record."""
+    """Windows of `length` steps that start at steps 0, length, 2 * length, ... of each record."""
 
     length: int
 
     @staticmethod
     def of(length: int | None) -> "Windows":
-        """None: whole records.
+        """Return windows of `length` steps; None: whole records.
 
         Raises:
-            UserError: no record has so many steps.
+            UserError: `length` is not an integer from 1 to the steps of a record.
         """
         if length is not None and not (type(length) is int and 0 < length <= RECORD_STEPS):
-            raise UserError(f"A window cannot have {length} steps: give 1 to {RECORD_STEPS}, or None for all.")
+            raise UserError(f"A window cannot have {length} steps: use 1 to {RECORD_STEPS}, or None for whole records.")
         return Windows(length or RECORD_STEPS)
 
     @property
-    def each(self) -> int:
-        """Windows of a record."""
+    def per_record(self) -> int:
+        """Number of windows per record."""
         return -(-RECORD_STEPS // self.length)
 
-    def at(self, items: Int[np.ndarray, " item"]) -> tuple[Int[np.ndarray, " item"], Int[np.ndarray, " item"]]:
-        """The trajectory of each window, and the step at which it starts."""
-        return items // self.each, items % self.each * self.length
+    def locate(self, items: Int[np.ndarray, " item"]) -> tuple[Int[np.ndarray, " item"], Int[np.ndarray, " item"]]:
+        """Return the trajectory index of each window, and the step at which it starts."""
+        return items // self.per_record, items % self.per_record * self.length
 
     def mask(self, first: Int[np.ndarray, " item"]) -> Bool[np.ndarray, "item time"]:
-        """Which steps of windows that start there are steps of their record; the others repeat its last step."""
+        """Return which steps of windows starting at `first` lie within the record; the others are padding."""
         return first[:, None] + np.arange(self.length) < RECORD_STEPS
 
     def cut(self, arrays: Mapping[str, np.ndarray], first: Int[np.ndarray, " item"]) -> dict[str, np.ndarray]:
-        """The windows of whole records [item, time, ...]; what does not change along time is left as it is."""
+        """Cut windows from records [item, time, ...], padded with the last step; keep fields without a time axis."""
         if self.length == RECORD_STEPS and not first.any():
             return dict(arrays)
         steps = np.minimum(first[:, None] + np.arange(self.length), RECORD_STEPS - 1)

@@ -1,1 +1,1 @@
-"""Splits for other programs: Kinetix, Minari, tables and level files."""
+"""Exports of splits: Kinetix, Minari, tables and level files."""

@@ -1,4 +1,4 @@
-"""A split as the reference has its data: a folder that `kinetix.data.TrajectoryDatasetManager` opens."""
+"""Export to the reference's format: a folder that `kinetix.data.TrajectoryDatasetManager` opens."""
 
 from pathlib import Path
 
@@ -18,14 +18,14 @@ from levelproof.pipeline.store.shown import shown
 from levelproof.pipeline.words import many
 
 BLOCK = 4 * ROWS  # trajectories in memory at a time
-ARRAY = 64 * ROWS  # trajectories of an array: the reference shuffles arrays, and what they have
+ARRAY = 64 * ROWS  # trajectories per array: the reference shuffles arrays, and trajectories within each
 
 
 def export_kinetix(split: Path, where: str | None, out: Path) -> None:
-    """Write the levels of `split` that have a witness and for which a condition holds, and say so.
+    """Write the witnesses of `split` that meet the condition (None: solved) to a new folder `out`; print a summary.
 
     Raises:
-        UserError: no split, no such level, a condition that DuckDB cannot use, or `out` is there already.
+        UserError: the split does not exist, the condition is invalid, no level qualifies, or `out` exists.
         Failure: the split is damaged.
     """
     rows = witnessed(split, where or SOLVED)
@@ -34,13 +34,13 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
     with new_folder(out) as folder:
         for first in shown(range(0, count, BLOCK), "trajectories"):
             fields = read_rows(split, rows.slice(first, BLOCK))
-            made = trajectories_of(tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/"))
+            trajectories = trajectories_of(tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/"))
             array, at = divmod(first, ARRAY)
-            for part in range(0, len(made), ROWS):
-                write_chunk(folder / name_of_array(array), (at + part) // ROWS, made[part : part + ROWS])
+            for row in range(0, len(trajectories), ROWS):
+                write_chunk(folder / array_name(array), (at + row) // ROWS, trajectories[row : row + ROWS])
         dtype = dtype_of(size_of(rows.column("size")[0].as_py()))
         for first in range(0, count, ARRAY):
-            write_array(folder / name_of_array(first // ARRAY), min(ARRAY, count - first), dtype)
+            write_array(folder / array_name(first // ARRAY), min(ARRAY, count - first), dtype)
         write_group(folder)
     print(
         f"{out}: {many(count, 'trajectory')} of {as_typed(split)}, "
@@ -49,6 +49,6 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
     )
 
 
-def name_of_array(number: int) -> str:
-    """Names sort as the arrays do."""
-    return f"{number:06d}"
+def array_name(index: int) -> str:
+    """Name an array so that names sort by index."""
+    return f"{index:06d}"

@@ -1,4 +1,4 @@
-"""Levels of a split for other programs: as a level file, which the reference and its editor open."""
+"""Export of a single level as a level file, which the reference and its editor open."""
 
 from pathlib import Path
 
@@ -8,14 +8,14 @@ from levelproof.pipeline.read.levels import find_level, levels_of, rules_of, wri
 
 
 def export(split: Path, level_id: int, out: Path) -> None:
-    """Write a level of `split` and the rules it was played by to `out`, and tell so in one line.
+    """Write a level of `split` and the rules that it was played by to `out`; print a line about it.
 
     Raises:
-        UserError: no such level, one that a level file cannot hold, or a file that cannot be written.
+        UserError: the level does not exist, does not fit in a level file, or the file cannot be written.
         Failure: the split is damaged.
     """
     if out.suffix.lower() != ".json":
-        raise UserError(f"Cannot export to {out}: its name has to end in .json.")
+        raise UserError(f"Cannot export to {out}: its name must end in .json.")
     manifest, row = find_level(split, level_id)
     file = LevelFile(levels_of(manifest, manifest.table), rules_of(manifest))
     try:

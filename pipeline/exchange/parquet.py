@@ -1,6 +1,6 @@
-"""Levels and manifest for people who want tasks: parquet files with a row a level, its world in typed columns.
+"""Export of levels and manifest to parquet files: one row per level, its world in typed columns.
 
-`levelproof.levels_from` makes levels of the rows again. Memory is that of a few thousand levels.
+`levelproof.levels_from` converts rows back to levels. Memory holds a few thousand levels at a time.
 """
 
 from collections.abc import Iterator
@@ -24,43 +24,43 @@ from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.manifest import Manifest, require_manifest, settings_metadata
 from levelproof.pipeline.words import many
 
-GROUP = 16 * CHUNK  # rows: what is in memory at once, and what a query reads or skips
-FILE = 25 * GROUP  # rows of a file, about as many as a sealed manifest's files have
+GROUP = 16 * CHUNK  # rows per row group: those in memory at a time, and the unit that a query reads or skips
+FILE = 25 * GROUP  # rows per file, about as many as in a file of a sealed manifest
 
-WORDS = [name for name in COLUMNS.names if pa.types.is_string(COLUMNS.field(name).type)]
+STRING_COLUMNS = [name for name in COLUMNS.names if pa.types.is_string(COLUMNS.field(name).type)]
 
 
 def export_parquet(split: Path, where: str | None, out: Path) -> None:
-    """Write the levels of `split` for which the SQL condition holds to a new folder `out`, and tell so in one line.
+    """Write the levels of `split` that meet the condition (None: all) to a new folder `out`; print a summary.
 
-    Levels without a witness are made again from their ids. One that comes out otherwise here than where its row was
-    made (other versions, another machine) is left out, and counted.
+    Regenerates levels without a witness from their ids. Omits and counts those that differ here from their row, as on
+    other versions or another machine.
 
     Raises:
-        UserError: no split, no such level, a condition that DuckDB cannot use, or a folder that is there already.
-        Failure: the split is damaged, or the disk refuses.
+        UserError: the split does not exist, the condition is invalid, no level meets it, or `out` exists.
+        Failure: the split is damaged, or a write fails.
     """
     manifest = require_manifest(split, columns_in(where), compact=True)
     ids = select(manifest.table, where).column("level_id").to_numpy()
     if not len(ids):
-        raise UserError(f"No level of {split} is {where}: choose another condition with --where.")
+        raise UserError(f"No level of {split} meets the condition {where}: choose another one with --where.")
     metadata = settings_metadata(manifest.fragments[0].config_hash, manifest.fragments[0].config)
     written = 0
     with new_folder(out) as folder:
-        for number, first in enumerate(range(0, len(ids), FILE)):
+        for index, first in enumerate(range(0, len(ids), FILE)):
             groups = _groups(split, ids[first : first + FILE])
-            written += _write(folder / f"levels-{number:05d}.parquet", groups, metadata)
+            written += _write(folder / f"levels-{index:05d}.parquet", groups, metadata)
     left_out = len(ids) - written
     print(
         f"{out}: {many(written, 'level')}"
-        + (f", without {left_out} that come out otherwise here" if left_out else "")
+        + (f", without {left_out} that differ on this machine" if left_out else "")
         + ". "
         f'In Python: levelproof.levels_from(pyarrow.parquet.read_table("{out}"))'
     )
 
 
 def _groups(split: Path, ids: np.ndarray) -> Iterator[pa.Table]:
-    """Rows and worlds of these levels, GROUP of them at a time."""
+    """Yield tables of rows and worlds of these levels, GROUP rows each."""
     with Pace("levels", len(ids), Console(stderr=True)) as pace:
         for first in range(0, len(ids), GROUP):
             manifest, group = require_manifest(split, level_ids=ids[first : first + GROUP]), []
@@ -71,12 +71,13 @@ def _groups(split: Path, ids: np.ndarray) -> Iterator[pa.Table]:
 
 
 def with_worlds(manifest: Manifest, rows: pa.Table) -> pa.Table:
-    """These rows of a manifest, with their levels' columns beside them, but for those that come out otherwise here."""
+    """Append level columns to manifest rows, without rows whose level differs on this machine."""
     level = levels_of(manifest, rows)
     same = np.ones(rows.num_rows, bool)
-    made = np.flatnonzero(rows.column("shard").is_null())
+    generated = np.flatnonzero(rows.column("shard").is_null())
     hashes = rows.column("content_hash").to_pylist()
-    same[made] = [ours == hashes[i] for i, ours in zip(made, content_hashes(take(level, made)), strict=True)]
+    ours = content_hashes(take(level, generated))
+    same[generated] = [own == hashes[i] for i, own in zip(generated, ours, strict=True)]
     rows = rows.filter(pa.array(same))
     for name, column in columns_for(take(level, np.flatnonzero(same))).items():
         rows = rows.append_column(name, column)
@@ -84,13 +85,13 @@ def with_worlds(manifest: Manifest, rows: pa.Table) -> pa.Table:
 
 
 def _write(path: Path, groups: Iterator[pa.Table], metadata: dict[bytes, bytes]) -> int:
-    """The number of rows."""
+    """Write a file; return its number of rows."""
     first, count = next(groups), 0
     with pq.ParquetWriter(
         path,
         first.schema.with_metadata(metadata),
         compression="zstd",
-        use_dictionary=WORDS,  # pyright: ignore[reportArgumentType]  # not of numbers: it takes all NaN for one
+        use_dictionary=STRING_COLUMNS,  # pyright: ignore[reportArgumentType]  # dictionaries of numbers would merge all NaN
         write_page_checksum=True,
     ) as file:
         for table in (first, *groups):

@@ -1,8 +1,7 @@
-"""Levels as columns of a table, and back, bit for bit: one column for each array of `Level`, one row a level.
+"""Levels as table columns and back, bit for bit: one column per array of `Level`, one row per level.
 
-A column has the name of the dataclass's field, such as `position` or `joint_anchor_a`; no two fields share one, and
-none has the name of a column of the manifest. Its entries are nested lists in the shape of the array. Knows nothing of
-files.
+A column has the name of the dataclass's field, such as `position` or `joint_anchor_a`; names are unique, also among the
+manifest's columns. Entries are nested lists in the shape of the array. Does no I/O.
 """
 
 import numpy as np
@@ -17,44 +16,47 @@ from levelproof.pipeline.store.schema import FieldSpec
 
 
 def column_fields(size: Size) -> dict[str, FieldSpec]:
-    """The fields of a level of this size by the names of their columns; what a size has none of has no column."""
+    """Return the non-empty fields of levels of this size, by column name."""
     return {field.name.rpartition("/")[2]: field for field in level_fields(size) if field.count}
 
 
 def columns_for(level: Level) -> dict[str, pa.Array]:
-    """The columns of these levels, a row for each."""
+    """Convert levels, level axis last, to columns with one row per level."""
     arrays = arrays_of(level, "level/")
-    return {name: _nested(np.moveaxis(arrays[of.name], -1, 0)) for name, of in column_fields(level.size).items()}
+    return {name: _nested(np.moveaxis(arrays[field.name], -1, 0)) for name, field in column_fields(level.size).items()}
 
 
 def levels_from(table: pa.Table) -> Level:
-    """The levels in the rows of a table that `levelproof export --format parquet` wrote, level axis last.
+    """Convert rows of a table from `levelproof export --format parquet` to levels.
 
-    Any rows in any order will do, with `size` and the columns of levels; others are not looked at.
+    Args:
+        table: any rows of one size, at least one, in any order; needs the column `size` and those of levels, and
+            ignores others.
+
+    Returns:
+        Numpy arrays, level axis last, in row order: bit for bit the exported levels.
 
     Raises:
-        UserError: rows are of several sizes, or columns are missing or hold what no level can.
+        UserError: the rows have several sizes, or a column is missing or holds values that no level can have.
     """
     try:
         sizes = table.column("size").unique().to_pylist()
         if len(sizes) != 1:
-            raise UserError(f"The table has levels of the sizes {sizes}: choose rows of one size.")
+            raise UserError(f"The table has levels of sizes {sizes}: select rows of one size.")
         size = size_of(sizes[0])
         columns = {field.name: name for name, field in column_fields(size).items()}
-        arrays = {of.name: _array(table, columns.get(of.name), of) for of in level_fields(size)}
+        arrays = {field.name: _array(table, columns.get(field.name), field) for field in level_fields(size)}
         check_numbers(arrays, size)
-    except (KeyError, ContentsError, ValueError, TypeError) as error:  # pyarrow's errors are some of these
+    except (KeyError, ContentsError, ValueError, TypeError) as error:  # pyarrow's errors derive from these
         reason = str(error).strip("'\"").splitlines()[0]
-        raise UserError(
-            f"The table has not the columns of levels ({reason}): read them as they were written."
-        ) from None
+        raise UserError(f"The table lacks valid level columns ({reason}): pass rows as `export` wrote them.") from None
     return tree_of(Level, arrays, "level/")
 
 
 def _nested(values: np.ndarray) -> pa.Array:
-    """(level, ...) as one entry a level, of lists within lists.
+    """Convert (level, ...) to one nested list per level.
 
-    Not of fixed-size lists: pyarrow 26 dies of a segmentation fault where rows of those, in chunks, are filtered.
+    Avoids fixed-size lists: pyarrow 26 crashes with a segmentation fault when it filters chunked rows of those.
     """
     column = pa.array(np.ascontiguousarray(values).reshape(-1))
     for length in reversed(values.shape[1:]):
@@ -63,7 +65,7 @@ def _nested(values: np.ndarray) -> pa.Array:
 
 
 def _array(table: pa.Table, name: str | None, field: FieldSpec) -> np.ndarray:
-    """The inverse, level axis last."""
+    """Invert `_nested`, level axis last; zeros if the size has no such column (`name` None)."""
     dtype, shape = np.dtype(field.dtype), (table.num_rows, *field.shape)
     if name is None:
         return np.moveaxis(np.zeros(shape, dtype), 0, -1)
@@ -71,5 +73,5 @@ def _array(table: pa.Table, name: str | None, field: FieldSpec) -> np.ndarray:
     while pa.types.is_nested(column.type):
         column = pa.chunked_array([chunk.flatten() for chunk in column.chunks], column.type.value_type)
     if column.null_count or column.type != pa.from_numpy_dtype(dtype):
-        raise ContentsError(f"{name} is not all of {dtype}")
+        raise ContentsError(f"{name} is not entirely {dtype}")
     return np.ascontiguousarray(np.moveaxis(column.to_numpy().reshape(shape), 0, -1))

@@ -51,14 +51,14 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
     _require_made(split, findings)
     job = _job(split, findings, settings)
     left = _left(findings)
-    lost = findings.lost - findings.beyond.keys()
+    lost = findings.lost - findings.unrepairable.keys()
     if files := from_files(job.results):
         ids = lost & findings.origins.keys()
     else:
         ids = lost | {i for first, last in findings.missing for i in range(first, last + 1)}
     with locked(split, partial(say, console)), nobody_commits(split, partial(say, console)):
         _note(split, job, findings)
-        take_out(split, lost, findings.unlike, list(findings.fragments))
+        take_out(split, lost, findings.changed, list(findings.fragments))
     with taken(split, partial(say, console)):
         pass  # what nothing names any more goes
     origins = {i: findings.origins[i] for i in sorted(ids)} if files else None
@@ -130,8 +130,8 @@ def _budget(split: Path, env_steps: int) -> str:
 def _left(findings: Findings) -> list[str]:
     """What cannot be made again here."""
     left = []
-    for reason in dict.fromkeys(findings.beyond.values()):
-        ids = [level_id for level_id, of in findings.beyond.items() if of == reason]
+    for reason in dict.fromkeys(findings.unrepairable.values()):
+        ids = [level_id for level_id, of in findings.unrepairable.items() if of == reason]
         left.append(f"Not made again: {told_levels(runs(ids))}, for {reason}.")
     ids = [i for i in findings.lost if from_files(findings.config or {}) and i not in findings.origins]
     if gone := (findings.missing if from_files(findings.config or {}) else []) + runs(ids):
@@ -142,7 +142,7 @@ def _left(findings: Findings) -> list[str]:
 def _note(split: Path, job: JobConfig, findings: Findings) -> None:
     """Have what is lost wanted beside what was, before anything goes: whoever goes on makes it."""
     note = sound_note(split)
-    wanted = note.level_ids.tolist() if note else findings.there
+    wanted = note.level_ids.tolist() if note else findings.present
     note_job(split, job, _command(split), merged(wanted, runs(sorted(findings.lost))))
 
 

@@ -30,7 +30,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Failure, StoreFailure
 from levelproof.pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
-from levelproof.pipeline.read.level_files import LevelUnseen, levels_at
+from levelproof.pipeline.read.level_files import LevelUnavailable, levels_at
 from levelproof.pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
 from levelproof.pipeline.store.disk import refusal
 from levelproof.pipeline.store.fields import arrays_of, unlike_fields
@@ -87,7 +87,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     """A failed attempt as a value: exceptions do not travel between processes."""
     reason, fatal = "".join(traceback.format_exception(error)), ""
-    if isinstance(error, (LockRefused, SourceUnseen, LevelUnseen, LeaseLost, StoreFailure, CheckpointUnread)):
+    if isinstance(error, (LockRefused, SourceUnseen, LevelUnavailable, LeaseLost, StoreFailure, CheckpointUnread)):
         fatal = str(error)
     elif isinstance(error, OSError) and (sentence := refusal(error, Path(gettempdir()) if is_remote(split) else split)):
         fatal = f"{sentence}."

@@ -1,1 +1,1 @@
-"""Splits read back: checked, and given to other programs."""
+"""Reading of splits, of level files, and of the reference's folders."""

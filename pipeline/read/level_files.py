@@ -1,4 +1,4 @@
-"""Level files as a job's levels: which there are below a folder, and each level again where it is needed."""
+"""Level files as a job's levels: listing those below a folder, and loading a level by its origin."""
 
 import socket
 from collections.abc import Sequence
@@ -23,53 +23,55 @@ from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.origins import Origin, can_be_noted, place_of
 
 
-class LevelUnseen(Failure):
-    """A process does not find a level where it was."""
+class LevelUnavailable(Failure):
+    """A level's file is missing on this machine, or now contains another level."""
 
 
 @dataclass(frozen=True)
 class Listing:
-    """What there is below a folder."""
+    """Levels listing below a folder."""
 
-    levels: dict[str, dict[int, Origin]] = field(default_factory=dict)  # by size and id, in the order of paths
-    copies: list[str] = field(default_factory=list)  # sentences on files whose level another one has, too
-    refused: list[str] = field(default_factory=list)  # sentences on files that cannot be used
+    levels: dict[str, dict[int, Origin]] = field(default_factory=dict)  # by size and id, in path order
+    copies: list[str] = field(default_factory=list)  # one sentence per file that repeats another file's level
+    refused: list[str] = field(default_factory=list)  # one sentence per unusable file
 
 
 def levels_below(folder: Path, job: JobConfig) -> Listing:
-    """The levels of all files below a folder, or of one file, that can be played by the job's rules.
+    """List the levels of all files below a folder, or of one file, that the job's rules can play.
 
     Raises:
-        UserError: there is no such folder, or no file in it.
+        UserError: the folder does not exist, or has no file.
     """
     one = folder.is_file() or place_of(str(folder.absolute()))
     paths = [folder] if one else sorted(folder.rglob("*.json"))
     if not paths:
         what = "There is no level file in" if folder.is_dir() else "There is no folder of level files at"
-        raise UserError(f"{what} {folder}: name a folder that has some, or a level file, with level_files=PATH.")
-    found = Listing()
+        raise UserError(f"{what} {folder}: set level_files=PATH to a folder of level files, or to one file.")
+    listing = Listing()
     for path in paths:
         try:
             origin = _usable(path.absolute(), job)
         except LevelFileError as error:
-            found.refused.append(str(error))
+            listing.refused.append(str(error))
             continue
-        of_size = found.levels.setdefault(origin.size, {})
-        first = of_size.setdefault(level_id_for(origin.content_hash), origin)
+        same_size = listing.levels.setdefault(origin.size, {})
+        first = same_size.setdefault(level_id_for(origin.content_hash), origin)
         if first.content_hash != origin.content_hash:
-            found.refused.append(
-                f"Cannot use the level file {path}: its level has by chance the id of the one in {first.file}, "
-                "so label it elsewhere, with out=NAME."
+            listing.refused.append(
+                f"Cannot use the level file {path}: its level id collides with that of {first.file}: "
+                "label it in another split, with out=NAME."
             )
         elif first is not origin:
-            found.copies.append(f"{path} has the same level as {first.file}, which stands for both.")
-    return found
+            listing.copies.append(f"{path} has the same level as {first.file}, which represents both.")
+    return listing
 
 
 def _usable(path: Path, job: JobConfig) -> Origin:
-    """Raises LevelFileError where a file has no level, or one that the job cannot have."""
+    """Return the origin of a file's level. Raise LevelFileError if it has none that the job can use."""
     if not can_be_noted(str(path)):
-        raise LevelFileError(f"Cannot use the level file {path}: no terminal shows its name, so give it another one.")
+        raise LevelFileError(
+            f"Cannot use the level file {path}: its name has characters that terminals cannot show: rename it."
+        )
     file = _level_in(path)
     size = name_of(file.level.size)
     try:
@@ -78,32 +80,35 @@ def _usable(path: Path, job: JobConfig) -> Origin:
         raise LevelFileError(f"Cannot use the level file {path}: {error!s:.300}") from None
     if other := _other_rules(file, job):
         raise LevelFileError(
-            f"Cannot use the level file {path}: it is played by other rules, so say {' '.join(other)}, "
-            "and label it apart from files with other ones."
+            f"Cannot use the level file {path}: its rules differ from the job's: set {' '.join(other)}, "
+            "and label it separately from files with other rules."
         )
     return Origin(content_hashes(file.level)[0], str(path), size)
 
 
 def _level_in(path: Path) -> LevelFile:
-    """Of a level file, or of a record.
+    """Read the level of a level file, or of a record in a folder of the reference.
 
     Raises:
-        LevelFileError: there is no level, or one that cannot be used.
+        LevelFileError: the level is missing or unusable.
     """
     if (place := place_of(str(path))) is None:
         return read_level_file(path)
     try:
         folder = open_folder(place.folder)
-        found = read_trajectories(folder.named(place.array), place.row, place.row + 1)
+        trajectories = read_trajectories(folder.named(place.array), place.row, place.row + 1)
     except FormatError as error:
         raise LevelFileError(f"Cannot use the level of {path}: {error}.") from None
-    if found.wrong[0]:
-        raise LevelFileError(f"Cannot use the level of {path}: {found.wrong[0]}.")
-    return LevelFile(found.level, DEFAULT_RULES)
+    if trajectories.wrong[0]:
+        raise LevelFileError(f"Cannot use the level of {path}: {trajectories.wrong[0]}.")
+    return LevelFile(trajectories.level, DEFAULT_RULES)
 
 
 def _other_rules(file: LevelFile, job: JobConfig) -> list[str]:
-    """The settings that would make the job's rules those of a file; of one of them no file says anything."""
+    """Return the settings, NAME=VALUE, that would give the job the file's rules.
+
+    Ignores `faithful_padding`, which level files do not store.
+    """
     padding = job.task.physics.faithful_padding
     theirs = replace(file.rules, physics=replace(file.rules.physics, faithful_padding=padding))
     ours = flat(plain(job.task))
@@ -111,15 +116,15 @@ def _other_rules(file: LevelFile, job: JobConfig) -> list[str]:
 
 
 def levels_at(origins: Sequence[Origin]) -> Level:
-    """Side by side; raises as `level_at`."""
+    """Load several levels, level axis last. Raises as `level_at`."""
     return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *map(level_at, origins))
 
 
 def level_at(origin: Origin) -> Level:
-    """A level again, one lane.
+    """Load a level from its shard or its file; level axis last, of length 1.
 
     Raises:
-        LevelUnseen: its file is not here, or has another level now.
+        LevelUnavailable: its file is missing, or now contains another level.
         Failure: its shard is damaged.
     """
     if origin.shard:
@@ -128,9 +133,9 @@ def level_at(origin: Origin) -> Level:
     try:
         level = _level_in(Path(origin.file)).level
     except LevelFileError as error:
-        raise LevelUnseen(
-            f"{str(error)[:-1]} on {socket.gethostname()}: put it back, into a folder that all machines share."
+        raise LevelUnavailable(
+            f"{str(error)[:-1]} on {socket.gethostname()}: put it back, in a folder that all machines share."
         ) from None
     if content_hashes(level) != [origin.content_hash] or name_of(level.size) != origin.size:
-        raise LevelUnseen(f"The level file {origin.file} has another level than it had: put the one that it had back.")
+        raise LevelUnavailable(f"The level file {origin.file} no longer contains the level that it had: restore it.")
     return level

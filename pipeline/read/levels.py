@@ -1,4 +1,4 @@
-"""One level that a user names, by its id in a split or by a level file, and the file that is made of it."""
+"""Levels of a split by id, level files that users name, and the output files of single levels."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,14 +25,17 @@ from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.origins import ASKED, origin_of
 from levelproof.pipeline.words import many
 
-COLUMNS = ("label", "label_reason", *ASKED)  # of a level that is drawn or exported
+COLUMNS = ("label", "label_reason", *ASKED)  # read for a level that is drawn or exported
 
 
 def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
-    """The manifest's row of a level, with as little as has to be read for it: COLUMNS, and the level's id.
+    """Read the manifest row of a level (COLUMNS and `level_id`), opening as few fragments as possible.
+
+    Returns:
+        The manifest with this row alone, and the row.
 
     Raises:
-        UserError: there is no split, or it has no such level.
+        UserError: the split or the level does not exist.
         Failure: a fragment is damaged.
     """
     manifest = require_manifest(split, COLUMNS, [level_id])
@@ -45,12 +48,12 @@ def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
 
 
 def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
-    """The levels of these rows, with COLUMNS, in their order: numpy arrays, level axis last.
+    """Return the levels of these rows (with COLUMNS), in row order: numpy arrays, level axis last.
 
-    As their shards have them, or made again from their ids or files where they have no shard.
+    Reads levels from their shards; regenerates those without a shard from their ids or files.
 
     Raises:
-        Failure: a shard is damaged, or a file is gone or another one; or as `recorded_settings`.
+        Failure: a shard is damaged, a file is missing or has changed, or as `recorded_settings`.
     """
     stored = rows.column("shard").is_valid().to_numpy()
     size = size_of(rows.column("size")[0].as_py())
@@ -65,29 +68,29 @@ def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
             parts.append(levels_at([origin_of(manifest.split, row) for row in others.to_pylist()]))
         else:
             parts.append(sample_levels(others.column("level_id").to_numpy(), size, distribution))
-    back = np.argsort(np.concatenate([np.flatnonzero(stored), np.flatnonzero(~stored)]))
-    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1)[..., back], *parts)
+    order = np.argsort(np.concatenate([np.flatnonzero(stored), np.flatnonzero(~stored)]))
+    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1)[..., order], *parts)
 
 
 def distribution_of(manifest: Manifest) -> Distribution | None:
-    """What a split's levels are sampled from; None: they come from files. Raises as `recorded_settings`."""
+    """Return the distribution of a split's levels; None: they come from files. Raises as `recorded_settings`."""
     config = manifest.config or {}
     with recorded_settings(manifest.split):
         return None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
 
 
 def rules_of(manifest: Manifest) -> TaskParams:
-    """The rules that a split's levels are played by. Raises as `recorded_settings`."""
+    """Return the task rules of a split. Raises as `recorded_settings`."""
     with recorded_settings(manifest.split):
         return typed(TaskParams, (manifest.config or {})["task"], "task")
 
 
 @contextmanager
 def recorded_settings(split: Path) -> Iterator[None]:
-    """Settings that a split records are understood meanwhile.
+    """Report settings that the `with` block cannot parse as those of another version.
 
     Raises:
-        Failure: this program has other ones.
+        Failure: the block raised ValueError, KeyError or TypeError.
     """
     try:
         yield
@@ -99,10 +102,10 @@ def recorded_settings(split: Path) -> Iterator[None]:
 
 @contextmanager
 def writing_to(out: Path) -> Iterator[None]:
-    """A file that a user named is written meanwhile, in a folder that is made where it is not there.
+    """Create the parent folder of `out`, and report I/O errors of the `with` block, which writes `out`.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: `out` cannot be written.
     """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -112,15 +115,15 @@ def writing_to(out: Path) -> Iterator[None]:
 
 
 def is_level_file(source: Path) -> bool:
-    """Whether a user who writes this means a level file, not a split."""
+    """Whether a user who types this path means a level file, not a split."""
     return source.is_file() or (source.suffix.lower() == ".json" and not source.is_dir())
 
 
 def level_file(path: Path) -> LevelFile:
-    """What a level file says.
+    """Read a level file.
 
     Raises:
-        UserError: it cannot be used.
+        UserError: the file is unreadable or invalid.
     """
     try:
         return read_level_file(path)

@@ -1,4 +1,4 @@
-"""What people see while something long is looked at: a bar on a terminal, a line now and then elsewhere. On stderr."""
+"""Progress of long reads: a bar on a terminal, elsewhere a line every LINE_EVERY seconds."""
 
 import time
 from types import TracebackType
@@ -10,7 +10,7 @@ LINE_EVERY = 30.0  # s between plain lines
 
 
 class Pace:
-    """Counts what is done of a total."""
+    """Progress display of a `with` block; `console` None: no output."""
 
     def __init__(self, what: str, total: int, console: Console | None) -> None:
         self._what, self._console, self._line_at = what, console, time.monotonic()
@@ -27,7 +27,7 @@ class Pace:
         self._bar.stop()
 
     def advance(self, count: int) -> None:
-        """So many more are done."""
+        """Add `count` finished items."""
         self._bar.advance(self._task, count)
         (task,) = self._bar.tasks
         text = f"{task.completed:,.0f}/{task.total:,.0f} {self._what} · {task.speed or 0:,.0f}/s"

@@ -1,4 +1,4 @@
-"""What shards hold of some rows of a manifest, side by side, whatever shards they lie in."""
+"""Arrays of manifest rows, gathered from whatever shards hold them."""
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -12,69 +12,75 @@ from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.remote import at_once
 from levelproof.pipeline.store.shard import Shard, open_shard, read_together
 
-COLUMNS = ("level_id", "size", "shard", "row")  # that rows need to be read
+COLUMNS = ("level_id", "size", "shard", "row")  # required of rows
 
 Open = Callable[[Path, str, str], Shard]
 
 
 def read_rows(split: Path, rows: pa.Table, fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-    """Named arrays of these rows, in their order: level axis last and, for `record/` fields, time first.
+    """Read arrays of these rows by field name, in row order: level axis last; time first in `record/` fields.
 
-    Where a shard is gone because a seal has put its levels elsewhere, the manifest is asked again.
+    If a seal has current levels to another shard, rereads the manifest and retries.
 
     Args:
-        split: that the rows are of.
-        rows: of its manifest, at least one, all with a witness; at least COLUMNS.
-        fields: names to return (default: all).
+        split: path or URL of the split.
+        rows: manifest rows with at least COLUMNS; at least one row, all with a witness.
+        fields: names of the fields to return; None: all.
 
     Raises:
-        Failure: a shard is missing or damaged, or has other levels than the manifest says.
+        Failure: a shard is missing or damaged, or its levels differ from the manifest.
     """
     wanted = None if fields is None else list(fields)
     while True:
         try:
-            arrays = read_placed(split, rows, wanted)
+            arrays = gather_rows(split, rows, wanted)
             return {name: np.ascontiguousarray(np.moveaxis(x, 0, -1)) for name, x in arrays.items()}
         except Failure:
-            moved = moved_rows(split, rows)
-            if same_places(rows, moved):
+            current = current_rows(split, rows)
+            if same_positions(rows, current):
                 raise
-            rows = moved
+            rows = current
 
 
 def read_row(split: Path, row: Mapping[str, Any], fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-    """The same of one row, a mapping with COLUMNS."""
+    """Read the arrays of one row, a mapping with COLUMNS, as `read_rows`; the level axis has length 1."""
     return read_rows(split, pa.Table.from_pylist([{name: row[name] for name in COLUMNS}]), fields)
 
 
-def moved_rows(split: Path, rows: pa.Table) -> pa.Table:
-    """The same levels as the manifest has them now, in their order.
+def current_rows(split: Path, rows: pa.Table) -> pa.Table:
+    """Reread the manifest rows (COLUMNS) of the levels of `rows`, in the same order.
 
     Raises:
-        Failure: it has not all of them any more.
+        Failure: the manifest no longer has some of the levels.
     """
     ids = rows.column("level_id").to_numpy()
     table = read_manifest(split, COLUMNS, ids).table
     known = table.column("level_id").to_numpy()
-    if not (there := np.isin(ids, known)).all():
-        raise Failure(f"The split {split} has no level {ids[~there][0]} any more: open it again.")
+    if not (present := np.isin(ids, known)).all():
+        raise Failure(f"The split {split} no longer has level {ids[~present][0]}: open it again.")
     return table.take(np.searchsorted(known, ids))
 
 
-def same_places(one: pa.Table, other: pa.Table) -> bool:
-    """Whether rows lie in the same shards; either may have dictionaries."""
-    return one["shard"].cast(pa.string()).equals(other["shard"].cast(pa.string())) and one["row"].equals(other["row"])
+def same_positions(left: pa.Table, right: pa.Table) -> bool:
+    """Whether two tables name the same shards and rows; either may be dictionary-encoded."""
+    return left["shard"].cast(pa.string()).equals(right["shard"].cast(pa.string())) and left["row"].equals(right["row"])
 
 
-def read_placed(
+def gather_rows(
     split: Path, rows: pa.Table, fields: Iterable[str] | None = None, opened: Open = open_shard
 ) -> dict[str, np.ndarray]:
-    """Named arrays of rows that lie where they say, level axis FIRST, then time: views of what shards hold.
+    """Gather arrays by field name from the shards that the rows name: level axis FIRST, then time; may be views.
 
-    `opened` opens a shard of a split by its name and its levels' size; a cache may stand in for it.
+    Unlike `read_rows`, does not follow levels that a seal has moved.
+
+    Args:
+        split: path or URL of the split.
+        rows: as `read_rows`.
+        fields: as `read_rows`.
+        opened: opens a shard, given the split, the shard's name and the size of its levels; a cache may replace it.
 
     Raises:
-        Failure: as `read_rows`.
+        Failure: a shard is missing or damaged, or its levels differ from the manifest.
     """
     ids, sizes, names, row = (rows.column(name).to_pylist() for name in COLUMNS)
     by_shard: dict[str, list[int]] = {}
@@ -85,5 +91,8 @@ def read_placed(
     for (shard, held), mine in zip(parts, by_shard.values(), strict=True):
         known = [shard.level_ids[k] if 0 <= k < len(shard.level_ids) else None for k in held]
         if known != [ids[i] for i in mine]:
-            raise Failure(f"The shard {shard.path} has not the levels that the manifest says: verify {split}.")
+            raise Failure(
+                f"The shard {shard.path} does not have the levels that the manifest lists: "
+                f"run `levelproof verify {split}`."
+            )
     return read_together(parts, fields, places=[*by_shard.values()])

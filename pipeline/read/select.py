@@ -1,4 +1,4 @@
-"""Rows of a manifest for which an SQL condition holds, by DuckDB."""
+"""Selection of manifest rows by an SQL condition, evaluated by DuckDB."""
 
 import re
 from pathlib import Path
@@ -11,31 +11,33 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.manifest import require_manifest
 
-SOLVED = "label = 'solved'"  # exported where nothing else is asked for
-WITNESSED = ("level_id", "size", "budget", "shard", "row")  # columns that exporters read
-TABLE = "manifest"  # its name in SQL
-ALL_OF_THEM = {TABLE, "columns"}  # words of conditions that can mean every column
+SOLVED = "label = 'solved'"  # default condition of exports
+EXPORT_COLUMNS = ("level_id", "size", "budget", "shard", "row")
+TABLE = "manifest"  # name of the manifest in SQL
+WILDCARDS = {TABLE, "columns"}  # words that may refer to every column in DuckDB, as in COLUMNS(*)
 
 
 def columns_in(where: str | None) -> list[str]:
-    """The columns that a condition may ask for: those whose names are among its words."""
+    """Return the columns that a condition may refer to: those whose names are among its words."""
     words = set(re.findall(r"\w+", (where or "").lower()))
-    return [name for name in COLUMNS.names if name in words or words & ALL_OF_THEM]
+    return [name for name in COLUMNS.names if name in words or words & WILDCARDS]
 
 
 def select(table: pa.Table, where: str | None) -> pa.Table:
-    """The manifest's rows for which the SQL condition holds, sorted by level id.
+    """Return the manifest rows that meet the SQL condition (None: all), sorted by level id.
 
-    `table` is sorted by level id, and has the columns of the condition (`columns_in`), and any others.
+    Args:
+        table: manifest rows sorted by level id, with at least the columns of the condition (`columns_in`).
+        where: the condition.
 
     Raises:
-        UserError: DuckDB cannot use the condition.
+        UserError: the condition is invalid.
     """
     if where is None:
         return table
     with duckdb.connect() as connection:
         connection.register(TABLE, table)
-        connection.execute("SET enable_external_access = false")  # a condition reads the manifest, no other file
+        connection.execute("SET enable_external_access = false")  # conditions must not read files
         try:
             chosen = connection.sql(f"SELECT level_id FROM {TABLE} WHERE ({where}\n)").fetchnumpy()["level_id"]
         except duckdb.Error as error:
@@ -48,13 +50,13 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
 
 
 def witnessed(split: Path, where: str) -> pa.Table:
-    """Rows of the levels that have a witness and for which a condition holds, by level id, with what reads them.
+    """Return the rows (EXPORT_COLUMNS) of levels that have a witness and meet the condition, sorted by level id.
 
     Raises:
-        UserError: there is none.
+        UserError: no level qualifies, or the condition is invalid.
         Failure: a fragment is damaged.
     """
-    rows = select(require_manifest(split, [*columns_in(where), *WITNESSED]).table, where)
+    rows = select(require_manifest(split, [*columns_in(where), *EXPORT_COLUMNS]).table, where)
     rows = rows.filter(rows.column("shard").is_valid())
     if not rows.num_rows:
         raise UserError(f"No level of {split} for which {where} holds has a witness: choose others with --where.")

@@ -1,1 +1,1 @@
-"""Whether a split is what its manifest says, byte by byte."""
+"""Verification of splits: every byte, level, label and witness."""

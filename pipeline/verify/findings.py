@@ -1,4 +1,4 @@
-"""What came of looking at a split: what was looked at, what is wrong, and what it takes to make that again."""
+"""Result of verifying a split: what was checked, what is wrong, and what a repair needs."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -13,53 +13,55 @@ from levelproof.pipeline.words import many
 
 @dataclass
 class Findings:
-    """Of a split, or of some fragments of one."""
+    """Findings about a split."""
 
     levels: int = 0
     shards: int = 0
     witnesses: int = 0
-    same_bits: int = 0  # of the witnesses: replayed bit for bit
-    wrong: dict[str, set[int]] = field(default_factory=dict)  # sentences, and the levels that each hits
-    missing: list[tuple[int, int]] = field(default_factory=list)  # runs of levels that the last command wanted
-    # For who repairs
-    there: list[tuple[int, int]] = field(default_factory=list)  # runs of levels in fragments that are sound
-    fragments: dict[Path, str] = field(default_factory=dict)  # damaged ones, and how
-    unlike: set[str] = field(default_factory=set)  # shards and experts that are not what was committed
-    lost: set[int] = field(default_factory=set)  # levels whose row or data is not to be believed
-    origins: dict[int, Origin] = field(default_factory=dict)  # of those that no id makes
-    beyond: dict[int, str] = field(default_factory=dict)  # those that cannot be made again here, and why
-    budget: str = ""  # as typed
-    stored: str = ""  # the settings that say how records are stored (`configs.schema.stored_as`)
-    config: dict[str, Any] | None = None  # the settings that decide results
+    same_bits: int = 0  # witnesses replayed bit for bit
+    wrong: dict[str, set[int]] = field(default_factory=dict)  # sentences, and the levels that each affects
+    missing: list[tuple[int, int]] = field(
+        default_factory=list
+    )  # runs of levels that the last command requested, and no fragment has
+    # For repairs
+    present: list[tuple[int, int]] = field(default_factory=list)  # runs of levels in sound fragments
+    fragments: dict[Path, str] = field(default_factory=dict)  # damaged fragments, and why
+    changed: set[str] = field(default_factory=set)  # shards and experts that differ from what was committed
+    lost: set[int] = field(default_factory=set)  # levels whose row or data is wrong or missing
+    origins: dict[int, Origin] = field(default_factory=dict)  # of lost levels that come from files
+    unrepairable: dict[int, str] = field(default_factory=dict)  # lost levels that this machine cannot remake, and why
+    budget: str = ""  # as the user typed it
+    stored: str = ""  # settings of how records are stored (`configs.schema.stored_as`)
+    config: dict[str, Any] | None = None  # settings that decide results
 
-    def tell(self, sentence: str, level_ids: Iterable[int]) -> None:
-        """Note something that is wrong, and the levels that have to be made again for it."""
+    def add(self, sentence: str, level_ids: Iterable[int]) -> None:
+        """Add a sentence on what is wrong, and the levels that must be remade."""
         self.wrong.setdefault(sentence, set()).update(level_ids)
         self.lost.update(self.wrong[sentence])
 
     @property
     def sentences(self) -> list[str]:
-        """What is wrong, each with the levels that it hits."""
+        """What is wrong, with the affected levels."""
         return [
             sentence if sentence.startswith("Level ") or not level_ids else f"{sentence[:-1]} ({_levels(level_ids)})."
             for sentence, level_ids in self.wrong.items()
         ]
 
     def report(self, split: Path) -> str:
-        """A line for everything that is wrong, and what was looked at."""
-        where = as_typed(split)
-        looked = (
-            f"{where}: {many(self.levels, 'level')} made again, {many(self.shards, 'shard')} read, "
+        """Return one line per problem, and a summary of what was checked."""
+        summary = (
+            f"{as_typed(split)}: {many(self.levels, 'level')} regenerated, {many(self.shards, 'shard')} read, "
             f"{many(self.witnesses, 'witness')} replayed, {self.same_bits:,} of them bit for bit, "
             f"{many(len(self.wrong), 'problem')}."
         )
-        return "\n".join([*self.sentences, looked])
+        return "\n".join([*self.sentences, summary])
 
     def as_json(self) -> dict[str, Any]:
+        """Return the findings for `verify --json`."""
         counts = {name: getattr(self, name) for name in ("levels", "shards", "witnesses", "same_bits")}
         wrong = [{"what": sentence, "levels": runs(sorted(ids))} for sentence, ids in self.wrong.items()]
         return counts | {"wrong": wrong, "missing": self.missing}
 
 
 def _levels(level_ids: Iterable[int]) -> str:
-    return f"it hits {told_levels(runs(sorted(level_ids)))}"
+    return f"affects {told_levels(runs(sorted(level_ids)))}"

@@ -1,8 +1,8 @@
-"""Is a split what it claims to be? Every byte held against its checksum, every level made again from its id or its
-file, every label that needs no expert worked out again, every witness replayed.
+"""Verification of a split: compares every byte with its checksum, regenerates every level from its id or file,
+recomputes every label that needs no expert, and replays every witness.
 
-Bits are promised on the stack that made a row. On another one a level has to look as its id makes it, its world has to
-be the one that its row's content hash says, and its witness has to reach the goal.
+Bits must match on the stack (versions and device) that made a row. On another stack a level must match the signature of
+the one that its id makes, its world must match its row's content hash, and its witness must reach the goal.
 """
 
 import json
@@ -59,21 +59,21 @@ from levelproof.pipeline.store.origins import origin_of
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.runs import runs, told_levels, without
 from levelproof.pipeline.store.shard import Shard, open_shard
-from levelproof.pipeline.verify.evidence import COLUMNS, Evidence, Making, same_stack
+from levelproof.pipeline.verify.evidence import COLUMNS, Evidence, Recipe, same_stack
 from levelproof.pipeline.verify.findings import Findings
 
-AT_ONCE = 4 * CHUNK  # rows that are looked at together, where fragments have fewer
-ATTEMPTS = 3  # at a split of which fragments are sealed meanwhile
+GROUP_ROWS = 4 * CHUNK  # minimum number of rows per group of fragments
+ATTEMPTS = 3  # if fragments are sealed concurrently
 
 Part = tuple[Fragment, pa.Table]  # a fragment and its rows
 
 
 def verify(split: Path, as_json: bool, console: Console) -> Exit:
-    """Print what is wrong with `split`; FAILED if anything is.
+    """Verify `split`, print what is wrong, and return FAILED if anything is.
 
     Raises:
-        UserError: no split.
-        Failure: other levels are made here, or fragments of several configurations lie side by side.
+        UserError: the split does not exist.
+        Failure: this version makes other levels, or the split mixes several configurations.
     """
     findings = examine(split, console)
     if as_json:
@@ -86,49 +86,50 @@ def verify(split: Path, as_json: bool, console: Console) -> Exit:
 
 
 def examine(split: Path, console: Console | None = None) -> Findings:
-    """Look at every file, every row and every shard of a split; `console` is shown how far that is.
+    """Check every file, row and shard of a split; show progress on `console`.
 
-    Raises: as `verify`.
+    Raises:
+        UserError, Failure: as `verify`.
     """
     prepare_jax()
     for _ in range(ATTEMPTS - 1):
         before = _inodes(split)
-        findings = _examined(split, console)
+        findings = _examine_once(split, console)
         if not findings.wrong or _inodes(split) == before:
             return findings
-    return _examined(split, console)
+    return _examine_once(split, console)
 
 
 def _inodes(split: Path) -> set[tuple[Path, int]]:
-    """Fragments, each with the number by which the file system knows what has its name now."""
+    """Return fragments with their inode numbers: a seal changes them."""
     return {*entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()}
 
 
-def _examined(split: Path, console: Console | None) -> Findings:
+def _examine_once(split: Path, console: Console | None) -> Findings:
     findings = Findings()
     note, paths = _note(split, findings), fragment_paths(split)
-    making: Making | None = None
-    named: set[str] = set()  # by fragments that are sound
-    known = [np.zeros(0, np.int64)]
+    recipe: Recipe | None = None
+    named: set[str] = set()  # shards and experts that sound fragments name
+    ids = [np.zeros(0, np.int64)]
     with Pace("levels", sum(map(_rows_in, paths)), console) as pace:
         for parts in _groups(paths, findings):
-            making = making or _making(split, parts[0][0], findings)
+            recipe = recipe or _recipe(split, parts[0][0], findings)
             findings.budget = parts[0][1].column("budget")[0].as_py()
             findings.stored = min(parts[0][0].densities, default="")
             _require_one_configuration(split, parts, findings.config or {})
-            _look_into(parts, making, findings, pace)
-            known += [rows.column("level_id").to_numpy() for _, rows in parts]
+            _check_fragments(parts, recipe, findings, pace)
+            ids += [rows.column("level_id").to_numpy() for _, rows in parts]
             named |= {name for fragment, _ in parts for name in fragment.digests}
-    there = np.unique(np.concatenate(known))
-    findings.there = runs(there)
+    present = np.unique(np.concatenate(ids))
+    findings.present = runs(present)
     say = lambda text: console and console.print(text, highlight=False, markup=False, soft_wrap=True)
     running = is_written(split, say)
-    _damaged(split, note, there, named, running, findings)
+    _find_lost_levels(split, note, present, named, running, findings)
     if note and not running:
-        gone = without(without(note.level_ids.tolist(), there), np.array(sorted(findings.lost), np.int64))
-        if gone:
-            findings.missing = gone
-            findings.wrong[f"The last command wanted {told_levels(gone)}, and no fragment has them."] = set()
+        missing = without(without(note.level_ids.tolist(), present), np.array(sorted(findings.lost), np.int64))
+        if missing:
+            findings.missing = missing
+            findings.wrong[f"The last command requested {told_levels(missing)}, but no fragment has them."] = set()
     return findings
 
 
@@ -139,8 +140,8 @@ def _note(split: Path, findings: Findings) -> JobNote | None:
     elif not fragment_paths(split):
         require_manifest(split, [])  # raises: there is no split
     else:
-        findings.tell(
-            f"The file {split / JOB} is missing or damaged: nobody knows which levels the last command wanted.", []
+        findings.add(
+            f"The file {split / JOB} is missing or damaged: the levels that the last command requested are unknown.", []
         )
     return note
 
@@ -152,36 +153,36 @@ def _rows_in(path: Path) -> int:
 
 
 def _groups(paths: Sequence[Path], findings: Findings) -> Iterator[list[Part]]:
-    """Fragments and their rows, as many together as make AT_ONCE rows; those that are damaged are noted."""
+    """Yield fragments and their rows in groups of about GROUP_ROWS rows; note damaged ones in `findings`."""
     group: list[Part] = []
     for path in paths:
         try:
             part = _part(path)
-            group += [part] if part[0].rows else []  # others are fences
+            group += [part] if part[0].rows else []  # empty ones are fences
         except Failure as failure:
             findings.fragments[path] = str(failure)
-        if sum(rows.num_rows for _, rows in group) >= AT_ONCE or (group and path == paths[-1]):
+        if sum(rows.num_rows for _, rows in group) >= GROUP_ROWS or (group and path == paths[-1]):
             yield group
             group = []
 
 
 def _part(path: Path) -> Part:
-    """A fragment that is as it was committed. Of another one nothing is looked at: that can end a process.
+    """Read a fragment, after its checksum: parsing a damaged one can crash the process.
 
     Raises:
-        Failure: it is damaged or gone.
+        Failure: the fragment is damaged or missing.
     """
     try:
         if not has_own(path):
-            raise Failure(f"The fragment {path} is not what was committed: bytes of it have changed.")
+            raise Failure(f"The fragment {path} is not what was committed: its bytes have changed.")
         fragment, rows = read_fragment(path, ["level_id", *COLUMNS])
     except OSError as error:
         raise Failure(f"The fragment {path} cannot be read ({error.strerror or type(error).__name__}).") from None
     return fragment, rows
 
 
-def _making(split: Path, fragment: Fragment, findings: Findings) -> Making:
-    """Raises Failure where this program makes other levels, or plays them by other rules."""
+def _recipe(split: Path, fragment: Fragment, findings: Findings) -> Recipe:
+    """Return how to make and play the levels. Raise Failure if this version cannot."""
     findings.config = config = fragment.config
     with recorded_settings(split):
         if config["sampler_version"] != SAMPLER_VERSION:
@@ -189,7 +190,7 @@ def _making(split: Path, fragment: Fragment, findings: Findings) -> Making:
         size_of(config["size"])
         rules = typed(TaskParams, config["task"], "task")
         distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
-    return Making(split, config["size"], distribution, rules)
+    return Recipe(split, config["size"], distribution, rules)
 
 
 def _require_one_configuration(split: Path, parts: Sequence[Part], config: dict[str, Any]) -> None:
@@ -201,32 +202,32 @@ def _require_one_configuration(split: Path, parts: Sequence[Part], config: dict[
             )
 
 
-def _look_into(parts: Sequence[Part], making: Making, findings: Findings, pace: Pace) -> None:
-    """Look at some fragments that are sound, and at all that they name."""
+def _check_fragments(parts: Sequence[Part], recipe: Recipe, findings: Findings, pace: Pace) -> None:
+    """Check the rows of some sound fragments, and the shards and experts that they name."""
     rows = pa.concat_tables([rows for _, rows in parts])
     digests = {name: files for fragment, _ in parts for name, files in fragment.digests.items()}
     in_shards, in_experts = _named(rows, "shard"), _named(rows, "experts")
-    shards = {name: _opened(name, making, ids, findings) for name, ids in in_shards.items()}
-    unlike = {name: _unlike(making.split, name, digests.get(name, {})) for name in [*in_shards, *in_experts]}
-    findings.unlike |= {name for name, files in unlike.items() if files}
+    shards = {name: _opened(name, recipe, ids, findings) for name, ids in in_shards.items()}
+    changed = {name: _changed_files(recipe.split, name, digests.get(name, {})) for name in [*in_shards, *in_experts]}
+    findings.changed |= {name for name, files in changed.items() if files}
     for first in range(0, rows.num_rows, CHUNK):
         block = rows.slice(first, CHUNK)
-        Evidence(block, making, shards, findings).examine()
+        Evidence(block, recipe, shards, findings).examine()
         pace.advance(block.num_rows)
     for name, level_ids in {**in_shards, **in_experts}.items():
-        if not unlike[name] or shards.get(name, "") is None:  # sound, or told
+        if not changed[name] or shards.get(name, "") is None:  # sound, or already reported
             continue
-        first, more = making.split / name / unlike[name][0], len(unlike[name]) - 1
+        first, more = recipe.split / name / changed[name][0], len(changed[name]) - 1
         wrong = f"The file {first}{f' and {more} more beside it' if more else ''} is not what was committed."
-        if name in in_experts or any(file.endswith("zarr.json") for file in unlike[name]):
-            findings.tell(wrong, level_ids)
-        elif not findings.lost & level_ids:  # all of them can be copied from it
+        if name in in_experts or any(file.endswith("zarr.json") for file in changed[name]):
+            findings.add(wrong, level_ids)
+        elif not findings.lost & level_ids:  # every level can still be copied from it
             findings.wrong[wrong] = level_ids
-    _note_losses(rows, making, findings)
+    _note_losses(rows, recipe, findings)
 
 
 def _named(rows: pa.Table, column: str) -> dict[str, set[int]]:
-    """The shards or experts that rows name, and their levels."""
+    """Map the shards or experts that rows name to their levels."""
     named: dict[str, set[int]] = {}
     for level_id, name in zip(rows.column("level_id").to_pylist(), rows.column(column).to_pylist(), strict=True):
         if name is not None:
@@ -234,19 +235,19 @@ def _named(rows: pa.Table, column: str) -> dict[str, set[int]]:
     return named
 
 
-def _opened(name: str, making: Making, level_ids: set[int], findings: Findings) -> Shard | None:
+def _opened(name: str, recipe: Recipe, level_ids: set[int], findings: Findings) -> Shard | None:
     try:
-        shard = open_shard(making.split, name, making.size)
+        shard = open_shard(recipe.split, name, recipe.size)
     except Failure as failure:
-        findings.unlike.add(name)
-        findings.tell(str(failure), level_ids)
+        findings.changed.add(name)
+        findings.add(str(failure), level_ids)
         return None
     findings.shards += 1
     return shard
 
 
-def _unlike(split: Path, name: str, digests: Mapping[str, str]) -> list[str]:
-    """The files of a shard or of experts that are not what they were: changed, missing or new."""
+def _changed_files(split: Path, name: str, digests: Mapping[str, str]) -> list[str]:
+    """List the files of a shard or of experts that are changed, missing or new."""
     try:
         found = digests_of(data_path(split, name), digests)
     except (Failure, OSError):
@@ -254,58 +255,58 @@ def _unlike(split: Path, name: str, digests: Mapping[str, str]) -> list[str]:
     return sorted(file for file in {**found, **digests} if found.get(file) != digests.get(file))
 
 
-def _note_losses(rows: pa.Table, making: Making, findings: Findings) -> None:
-    """What it takes to make those of these levels again that are lost."""
+def _note_losses(rows: pa.Table, recipe: Recipe, findings: Findings) -> None:
+    """Note for each lost level where it comes from, or why this machine cannot remake it."""
     rows = rows.filter(np.isin(rows.column("level_id").to_numpy(), list(findings.lost)))
     for row, same in zip(rows.to_pylist(), same_stack(rows), strict=True):
         level_id = row["level_id"]
         if not same:
-            findings.beyond[level_id] = f"it was made on another stack, of {row['device']}"
-        if making.distribution is None:
-            findings.origins[level_id] = origin_of(making.split, row | {"shard": None})
+            findings.unrepairable[level_id] = f"it was made on another stack, of {row['device']}"
+        if recipe.distribution is None:
+            findings.origins[level_id] = origin_of(recipe.split, row | {"shard": None})
             try:
                 level_at(findings.origins[level_id])
             except Failure as failure:
-                findings.beyond[level_id] = str(failure)[:-1]
-        if level_id in findings.beyond:
-            findings.unlike -= {row["shard"], row["experts"]}
+                findings.unrepairable[level_id] = str(failure)[:-1]
+        if level_id in findings.unrepairable:
+            findings.changed -= {row["shard"], row["experts"]}
 
 
-def _damaged(
-    split: Path, note: JobNote | None, there: np.ndarray, named: set[str], running: bool, findings: Findings
+def _find_lost_levels(
+    split: Path, note: JobNote | None, present: np.ndarray, named: set[str], running: bool, findings: Findings
 ) -> None:
-    """Find whose levels are lost with fragments that are damaged or, unless a run is writing, missing."""
+    """Report levels lost with damaged fragments and, unless a run is writing, with missing fragments."""
     unnamed = [path for path in data_paths(split) if path.relative_to(split).as_posix() not in named]
     for fragment, wrong in findings.fragments.items():
         first, last = ids_of(fragment)
-        mine = made_within(unnamed, fragment)
-        unnamed = [path for path in unnamed if path not in mine]
-        ids = _ids_in(mine) | {first, last} | _between(first, last, note, findings)
-        findings.tell(wrong, _not_in(there, ids))
+        own = made_within(unnamed, fragment)
+        unnamed = [path for path in unnamed if path not in own]
+        ids = _ids_in(own) | {first, last} | _between(first, last, note, findings)
+        findings.add(wrong, _not_in(present, ids))
     if running:
         return
     begun = {attempt_of(path) for path in entries(split, MANIFEST, BEGUN, DirEntry.is_file)}
     for path in unnamed:
-        lost = _not_in(there, _ids_in([path]))
+        lost = _not_in(present, _ids_in([path]))
         if lost and attempt_of(path) not in begun:
-            findings.tell(f"No fragment names {path}: the one that did is missing.", lost)
+            findings.add(f"No fragment names {path}: the one that did is missing.", lost)
 
 
-def _not_in(there: np.ndarray, ids: set[int]) -> set[int]:
-    return ids.difference(there[np.isin(there, list(ids))].tolist())
+def _not_in(present: np.ndarray, ids: set[int]) -> set[int]:
+    return ids.difference(present[np.isin(present, list(ids))].tolist())
 
 
 def _between(first: int, last: int, note: JobNote | None, findings: Findings) -> set[int]:
-    """Which levels a fragment had that nobody can read any more: those that were wanted, or all, if ids make levels."""
+    """Return the levels of an unreadable fragment: those requested or, if levels come from ids, its whole range."""
     wanted = note.level_ids.tolist() if note else []
     if not from_files(findings.config or {}) and not any(a <= first <= last <= b for a, b in wanted):
         wanted = [*wanted, (first, last)]
     ids = (i for a, b in wanted for i in range(max(a, first), min(b, last) + 1))
-    return set(islice(ids, MAX_ROWS))  # which its name and a note may say are many more
+    return set(islice(ids, MAX_ROWS))  # because its name and a note may claim far more
 
 
 def _ids_in(data: Sequence[Path]) -> set[int]:
-    """Levels that surely are in these shards and experts."""
+    """Return levels that these shards and experts certainly hold."""
     ids = {level_id for path in data for level_id in unit_ids(path)}
     for path in data:
         with suppress(Failure):

@@ -1,1 +1,1 @@
-"""Episodes of a split as a Minari dataset."""
+"""Export of episodes to a Minari dataset."""

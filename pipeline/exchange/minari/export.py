@@ -1,7 +1,7 @@
-"""A split as a Minari dataset: `minari.load_dataset` opens it, and what trains on such datasets trains on it.
+"""Export to a Minari dataset, which `minari.load_dataset` opens.
 
-Spaces and metadata are written by the library; episodes by h5py, as the library lays them out, but compressed: most of
-an observation is constant within a level. Memory is that of a few records.
+Minari writes spaces and metadata. h5py writes episodes in Minari's layout, compressed, because most of an observation
+is constant within a level. Memory holds a few records at a time.
 """
 
 from collections.abc import Iterator
@@ -34,17 +34,17 @@ if TYPE_CHECKING:
     from gymnasium.spaces import Space
 
 NAMESPACE = "levelproof"
-FILE = "main_data.hdf5"  # Minari's name
-COMPRESSED = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-BLOCKS = 2 * BLOCK  # records in memory at a time
-NUMBERS = f"numpy.stack(numpy.unravel_index(action, {CHOICES}), -1)"
+FILE = "main_data.hdf5"  # name that Minari expects
+COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+READ_ROWS = 2 * BLOCK  # records in memory at a time
+UNRAVEL = f"numpy.stack(numpy.unravel_index(action, {CHOICES}), -1)"
 
 
 def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = ActionKind.MULTI_DISCRETE) -> None:
-    """Write the witnesses of the levels for which a condition holds to a new folder of Minari datasets, and say so.
+    """Write witnesses that meet the condition (None: solved) to a new folder of Minari datasets; print a summary.
 
     Raises:
-        UserError: no split, no such level, a condition that DuckDB cannot use, `out` is there already, or the packages
+        UserError: the split does not exist, the condition is invalid, no level qualifies, `out` exists, or the packages
             of the extra `minari` are not installed.
         Failure: the split is damaged.
     """
@@ -55,7 +55,7 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
     dataset_id = f"{NAMESPACE}/{budget}/{name}-v0"
     prepare_jax()
     with new_folder(out) as folder:
-        data = (folder / dataset_id / "data").absolute()  # Minari loses its way in relative ones
+        data = (folder / dataset_id / "data").absolute()  # Minari mishandles relative paths
         storage = _new_storage(data, size, kind)
         episodes, steps = _write(data / FILE, _episodes(split, rows, rules, kind))
         storage.update_metadata(
@@ -69,7 +69,7 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
                 "algorithm_name": "PPO experts of one level each, random play and search; replayed",
                 "description": f"Witnesses of {many(rows.num_rows, 'level')} of size {size}, made with a budget of "
                 f"{budget} env steps a level. infos has success, level_id, and which entries of an action do "
-                "something. " + (f"Six entries of an action: {NUMBERS}" if kind == ActionKind.COMBINED else ""),
+                "something. " + (f"Six entries of an action: {UNRAVEL}" if kind == ActionKind.COMBINED else ""),
             }
         )
     print(
@@ -79,11 +79,11 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
 
 
 def _episodes(split: Path, rows: pa.Table, rules: TaskParams, kind: ActionKind) -> Iterator[Episode]:
-    for first in shown(range(0, rows.num_rows, BLOCKS), "records"):
-        some = rows.slice(first, BLOCKS)
-        fields = read_rows(split, some)
+    for first in shown(range(0, rows.num_rows, READ_ROWS), "records"):
+        block = rows.slice(first, READ_ROWS)
+        fields = read_rows(split, block)
         level, record = tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/")
-        yield from episodes_of(some.column("level_id").to_numpy(), level, record, rules, kind)
+        yield from episodes_of(block.column("level_id").to_numpy(), level, record, rules, kind)
 
 
 def _minari() -> Any:
@@ -97,14 +97,14 @@ def _minari() -> Any:
 
 
 def _new_storage(data: Path, size: str, kind: ActionKind) -> Any:
-    """Minari's own, with spaces and without episodes."""
+    """Create a Minari storage with spaces and without episodes."""
     _minari()
     from gymnasium.spaces import Box
     from minari.dataset.minari_storage import MinariStorage
 
     data.mkdir(parents=True)
-    seen = Box(-LIMIT, LIMIT, (feature_count(size_of(size)),), np.float32)
-    return MinariStorage.new(data, observation_space=seen, action_space=_actions(kind), data_format="hdf5")
+    observations = Box(-LIMIT, LIMIT, (feature_count(size_of(size)),), np.float32)
+    return MinariStorage.new(data, observation_space=observations, action_space=_actions(kind), data_format="hdf5")
 
 
 def _actions(kind: ActionKind) -> "Space":
@@ -119,7 +119,7 @@ def _actions(kind: ActionKind) -> "Space":
 
 
 def _write(path: Path, episodes: Iterator[Episode]) -> tuple[int, int]:
-    """How many episodes and steps."""
+    """Write episodes; return the numbers of episodes and steps."""
     import h5py
 
     count = steps = 0
@@ -135,12 +135,12 @@ def _write(path: Path, episodes: Iterator[Episode]) -> tuple[int, int]:
 
 
 def _put_infos(group: "h5py.Group", episode: Episode) -> None:
-    """An entry for each observation, as Minari's collector has them: the first is that of the reset."""
-    seen = len(episode.observations)
+    """Write infos with one entry per observation, as Minari's collector does: the first belongs to the reset."""
+    length = len(episode.observations)
     _put(group, "success", np.append(False, episode.success))
-    _put(group, "level_id", np.full(seen, episode.level_id, np.int64))
-    _put(group, "action_mask", np.broadcast_to(episode.action_mask, (seen, len(episode.action_mask))))
+    _put(group, "level_id", np.full(length, episode.level_id, np.int64))
+    _put(group, "action_mask", np.broadcast_to(episode.action_mask, (length, len(episode.action_mask))))
 
 
 def _put(group: "h5py.Group", name: str, values: np.ndarray) -> None:
-    group.create_dataset(name, data=values, chunks=values.shape, **COMPRESSED)
+    group.create_dataset(name, data=values, chunks=values.shape, **COMPRESSION)

@@ -1,1 +1,1 @@
-"""Trajectories as the reference has them on disk: a zarr v2 group of arrays of records."""
+"""The reference's trajectories on disk: a zarr v2 group of structured arrays."""

@@ -1,4 +1,4 @@
-"""Trajectories of a folder in the reference's layout as levels and actions of ours. Nobody vouches for what it says."""
+"""Levels and actions from folders in the reference's layout. The folders are untrusted: every value is checked."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,22 +20,27 @@ from levelproof.pipeline.read.kinetix.zarr2 import FormatError, StoredArray, arr
 from levelproof.pipeline.store.contents import highest
 from levelproof.pipeline.store.fields import arrays_of
 
-COUNTED = ("polygon/n_vertices", "circle/radius", "joint/active", "thruster/active")  # in the order of Size
-MOST = 100_000_000  # trajectories of a folder; the largest that is released has 6 million
+COUNTED_FIELDS = (
+    "polygon/n_vertices",
+    "circle/radius",
+    "joint/active",
+    "thruster/active",
+)  # whose lengths are the fields of Size, in order
+MAX_TRAJECTORIES = 100_000_000  # of a folder; the largest released has 6 million
 INT32 = np.iinfo(np.int32)
 
 
 class Trajectories(NamedTuple):
-    """What some rows of an array have that cannot be worked out again."""
+    """Levels and actions of some rows of an array, from which records can be replayed."""
 
-    level: Level  # of each row, its first state
+    level: Level  # from the first state of each row
     action: Int[np.ndarray, "256 6 level"]
-    wrong: list[str]  # of each row, what no level can have; empty: nothing
+    wrong: list[str]  # per row, why its level or actions are invalid; empty: valid
 
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder whose description can be used."""
+    """A folder of trajectories with checked metadata."""
 
     path: Path
     size: Size
@@ -43,11 +48,11 @@ class Folder:
 
     @cached_property
     def rows(self) -> int:
-        """Trajectories of all arrays."""
+        """Number of trajectories in all arrays."""
         return sum(array.rows for array in self.arrays)
 
     def named(self, name: str) -> StoredArray:
-        """Raises FormatError where there is no such array."""
+        """Return an array by name. Raise FormatError if it does not exist."""
         for array in self.arrays:
             if array.path.name == name:
                 return array
@@ -55,23 +60,23 @@ class Folder:
 
 
 def open_folder(path: Path) -> Folder:
-    """The trajectories below a folder.
+    """Open a folder of trajectories: read and check its metadata.
 
     Raises:
-        FormatError: it has none that can be used.
+        FormatError: the folder has no usable trajectories.
     """
     arrays = arrays_in(path)
     size = _size_of(arrays[0])
     for array in arrays:
         _check_fields(array, size)
     folder = Folder(path, size, arrays)
-    if folder.rows > MOST:
-        raise FormatError(f"it says that it has {folder.rows:,} trajectories, and at most {MOST:,} are read")
+    if folder.rows > MAX_TRAJECTORIES:
+        raise FormatError(f"it claims {folder.rows:,} trajectories, more than the maximum of {MAX_TRAJECTORIES:,}")
     return folder
 
 
 def read_trajectories(array: StoredArray, first: int, last: int) -> Trajectories:
-    """Rows `first` to `last - 1`. Of their states the first alone is kept: the others follow from it.
+    """Read rows `first` to `last - 1`. Keeps only the first state of each: the actions determine the others.
 
     Raises:
         FormatError: a chunk is missing or damaged.
@@ -84,29 +89,29 @@ def read_trajectories(array: StoredArray, first: int, last: int) -> Trajectories
         at = slice(row - first, row - first + len(values))
         action[at, step : step + values.shape[1]] = values["action"]
         if step == 0:
-            for name, of in fields.items():
-                of[at] = values[f"{WORLD}{name}"][:, 0]
+            for name, column in fields.items():
+                column[at] = values[f"{WORLD}{name}"][:, 0]
     wrong = [""] * count
-    for i, what in _impossible(fields, action):
-        wrong[i] = what
-    level = level_from_kinetix({name: _tamed(of) for name, of in fields.items()})
-    for i, what in _useless(level):
-        wrong[i] = wrong[i] or what
+    for i, reason in _invalid_values(fields, action):
+        wrong[i] = reason
+    level = level_from_kinetix({name: _convertible(column) for name, column in fields.items()})
+    for i, reason in _invalid_levels(level):
+        wrong[i] = wrong[i] or reason
     return Trajectories(level, np.moveaxis(action, 0, -1).astype(np.int32), wrong)
 
 
 def _size_of(array: StoredArray) -> Size:
     names = array.dtype.names or ()
-    counts = [array.dtype[f"{WORLD}{name}"].shape for name in COUNTED if f"{WORLD}{name}" in names]
-    if len(counts) == len(COUNTED) and all(len(shape) == 1 and shape[0] <= MAX_THINGS for shape in counts):
+    counts = [array.dtype[f"{WORLD}{name}"].shape for name in COUNTED_FIELDS if f"{WORLD}{name}" in names]
+    if len(counts) == len(COUNTED_FIELDS) and all(len(shape) == 1 and shape[0] <= MAX_THINGS for shape in counts):
         size = Size(*(shape[0] for shape in counts))
         if size.polygons >= FIXED_POLYGONS and size.bodies > FIXED_POLYGONS:
             return size
-    raise FormatError(f"the fields of its array {array.path.name} are those of no size of levels")
+    raise FormatError(f"the fields of its array {array.path.name} do not match any level size")
 
 
 def _check_fields(array: StoredArray, size: Size) -> None:
-    """Raises FormatError where a field that is read is not there, or is of another shape or kind."""
+    """Raise FormatError if a required field is missing, or differs in shape or kind."""
     wanted = dtype_of(size)
     for name in ("action", *(f"{WORLD}{name}" for name in LEVEL_FIELDS)):
         if name not in (array.dtype.names or ()):
@@ -115,43 +120,44 @@ def _check_fields(array: StoredArray, size: Size) -> None:
         if theirs.shape != shape or (theirs.base.kind in "iu") != (ours.kind == "i") or theirs.base.itemsize > 8:
             raise FormatError(
                 f"the field {name} of its array {array.path.name} is {theirs.base} of shape {theirs.shape}, "
-                f"and a level of size {name_of(size)} has {ours} of shape {shape}"
+                f"but must be {ours} of shape {shape} for levels of size {name_of(size)}"
             )
 
 
-def _impossible(fields: Fields, action: np.ndarray) -> Iterator[tuple[int, str]]:
-    """Rows, and what in them is no number of a state or an action."""
+def _invalid_values(fields: Fields, action: np.ndarray) -> Iterator[tuple[int, str]]:
+    """Yield rows with a value that no state or action can have, and the reason."""
     bad = ((action < 0) | (action >= np.array(CHOICES))).any((1, 2))
-    yield from ((int(i), "its actions are none of this task") for i in np.flatnonzero(bad))
-    for name, of in fields.items():
-        if of.dtype.kind == "b":
-            odd = np.ascontiguousarray(of).view(np.uint8) > 1
-        elif of.dtype.kind == "f":
+    yield from ((int(i), "its actions are not actions of this task") for i in np.flatnonzero(bad))
+    for name, column in fields.items():
+        kind = column.dtype.kind
+        if kind == "b":
+            bad = np.ascontiguousarray(column).view(np.uint8) > 1
+        elif kind == "f":
             with np.errstate(over="ignore"):
-                odd = ~np.isfinite(of.astype(np.float32))
+                bad = ~np.isfinite(column.astype(np.float32))
         else:
-            odd = (of < INT32.min) | (of > INT32.max)
-        for i in np.flatnonzero(odd.reshape(len(of), -1).any(1)):
-            yield int(i), f"its {name} has what is no {'flag' if of.dtype.kind == 'b' else 'number'}"
+            bad = (column < INT32.min) | (column > INT32.max)
+        for i in np.flatnonzero(bad.reshape(len(column), -1).any(1)):
+            yield int(i), f"its {name} has a value that is not a {'flag' if kind == 'b' else 'finite 32-bit number'}"
     for i in np.flatnonzero(fields["timestep"] != 0):
-        yield int(i), "it does not begin with an episode"
+        yield int(i), "it does not begin at the start of an episode"
 
 
-def _useless(level: Level) -> Iterator[tuple[int, str]]:
-    """Levels that the engine cannot have, and why."""
+def _invalid_levels(level: Level) -> Iterator[tuple[int, str]]:
+    """Yield levels that the engine cannot simulate, and the reason."""
     arrays = arrays_of(level, "level/")
     for name, most in highest(level.size).items():
         if name in arrays:
             bad = (arrays[name] < 0) | (arrays[name] > most)
             for i in np.flatnonzero(bad.reshape(-1, bad.shape[-1]).any(0)):
-                yield int(i), f"its {name.removeprefix('level/')} has numbers that no such level can have"
+                yield int(i), f"its {name.removeprefix('level/')} has values out of range for this size"
     for bad, kind, why in flaws(level):
         for i in np.flatnonzero(np.asarray(bad).any(0)):
-            yield int(i), f"a {kind} of it {why}"
+            yield int(i), f"one {kind} {why}"
 
 
-def _tamed(values: np.ndarray) -> np.ndarray:
-    """The same in numbers that convert, whatever bits they have."""
+def _convertible(values: np.ndarray) -> np.ndarray:
+    """Clip values so that they convert to 32 bits without undefined behaviour or warnings."""
     if values.dtype.kind == "b":
         return np.ascontiguousarray(values).view(np.uint8) != 0
     with np.errstate(over="ignore"):

@@ -1,6 +1,6 @@
-"""Levels and their records as the reference has them on disk: one structured array of trajectories by time.
+"""Conversion of levels and records to the reference's disk layout: a structured array (trajectory, time).
 
-A field has one more axis than it needs, of length 1, before its own: the reference's reader drops it.
+Each field has an extra leading axis of length 1, which the reference's reader drops.
 """
 
 from functools import cache
@@ -31,8 +31,8 @@ from levelproof.pipeline.store.contents import none_of
 
 T = TypeVar("T")
 
-WORLD = "env_state/"  # before the names of the reference's state
-# Of a state, what a level consists of
+WORLD = "env_state/"  # prefix of the reference's state fields
+# Fields of the first state that make up a level
 LEVEL_FIELDS = tuple(
     dict.fromkeys(
         name.replace("*", body).replace("@", manifold)
@@ -41,10 +41,10 @@ LEVEL_FIELDS = tuple(
         for manifold in MANIFOLDS
     )
 )
-# m, where the reference has joints and thrusters that are not active, at an episode's start. Later such a joint is at
-# 0, and such a thruster where it would be
-UNUSED = {"joint": np.float32(256), "thruster": np.float32(0)}
-OF_RECORD = {
+# m, position of inactive joints and thrusters at an episode's start, in the reference. Later an inactive joint is at 0,
+# an inactive thruster where an active one would be
+INACTIVE_POSITION = {"joint": np.float32(256), "thruster": np.float32(0)}
+RECORD_FIELDS = {
     "joint_point": f"{WORLD}joint/global_position",
     "thruster_point": f"{WORLD}thruster/global_position",
     "timestep": f"{WORLD}timestep",
@@ -55,19 +55,19 @@ OF_RECORD = {
 
 
 def fields_of(level: Level, record: Record) -> Fields:
-    """The 85 fields of trajectories: (trajectory, 256, ...), or (trajectory, 1, ...) where a level decides them.
+    """Return the 85 fields of trajectories: (trajectory, 256, ...), or (trajectory, 1, ...) if constant in a level.
 
     Args:
-        level: level axis last.
-        record: of each level; time first, level last.
+        level: levels, level axis last.
+        record: one record per level; time first, level last.
     """
     size, count = level.size, record.done.shape[-1]
     moving = to_kinetix(size, _lanes(record.state), STATE) | to_kinetix(size, _lanes(record.manifold), MANIFOLD)
     moving = {
         f"{WORLD}{name}": values.reshape(count, RECORD_STEPS, *values.shape[1:]) for name, values in moving.items()
     }
-    moving |= {theirs: np.moveaxis(np.asarray(getattr(record, ours)), -1, 0) for ours, theirs in OF_RECORD.items()}
-    for kind, at_start in UNUSED.items():
+    moving |= {theirs: np.moveaxis(np.asarray(getattr(record, ours)), -1, 0) for ours, theirs in RECORD_FIELDS.items()}
+    for kind, at_start in INACTIVE_POSITION.items():
         unused = ~np.asarray(getattr(level.model, f"{kind}_active")).T[:, None, :, None]
         points, start = moving[f"{WORLD}{kind}/global_position"], moving[f"{WORLD}timestep"][..., None, None] == 0
         later = np.float32(0) if kind == "joint" else points
@@ -83,7 +83,7 @@ def fields_of(level: Level, record: Record) -> Fields:
 
 
 def trajectories_of(level: Level, record: Record) -> np.ndarray:
-    """The same as one array (trajectory, 256) of `dtype_of` the level's size."""
+    """Pack `fields_of` levels and records into one array (trajectory, 256) of dtype `dtype_of(level.size)`."""
     fields = fields_of(level, record)
     made = np.zeros((len(fields["done"]), RECORD_STEPS), dtype_of(level.size))
     for name, values in fields.items():
@@ -93,11 +93,11 @@ def trajectories_of(level: Level, record: Record) -> np.ndarray:
 
 @cache
 def dtype_of(size: Size) -> np.dtype:
-    """A step of a trajectory."""
+    """Return the dtype of one step of a trajectory."""
     fields = fields_of(*none_of(size))
     return np.dtype([(name, fields[name].dtype, (1, *fields[name].shape[2:])) for name in sorted(fields)])
 
 
 def _lanes(tree: T) -> T:
-    """Each step of each level as a lane, level by level."""
+    """Merge the axes level and time into one lane axis, level-major."""
     return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1).reshape(*x.shape[1:-1], -1), tree)

@@ -1,6 +1,6 @@
-"""Arrays of trajectories in zarr's format 2, which zarr 3 writes no structured arrays of: a folder of chunk files.
+"""Reader and writer of trajectory arrays in zarr format 2, in which zarr 3 writes no structured arrays.
 
-An array is a folder with its description, `.zarray`, and a file for each chunk; a group is a folder with `.zgroup`.
+An array is a folder with metadata, `.zarray`, and one file per chunk; a group is a folder with `.zgroup`.
 """
 
 import json
@@ -18,24 +18,25 @@ from levelproof.configs.errors import readable
 from levelproof.experts.config import RECORD_STEPS
 
 ARRAY, GROUP = ".zarray", ".zgroup"
-ROWS = 16  # trajectories of a chunk
-# A step's 1,487 or more bytes come again nearly alike: blocks have to hold many. As large as the released data
+ROWS = 16  # trajectories per chunk
+# Successive steps, 1,487 bytes or more each, are nearly alike, so compression needs blocks of many steps: 256 KiB
+# compresses as well as the released data
 BLOSC = Blosc(cname="zstd", clevel=3, shuffle=Blosc.NOSHUFFLE, blocksize=1 << 18)
-# What is read
-NUMBER = r"[<|][biuf][1248]"  # types of fields
-MAX_TEXT = 2**20  # bytes of a description
-MAX_ROWS = 2**40  # and of other numbers in it
-MAX_BYTES = 2**30  # of a chunk
-BLOSC_HEADER = 16  # bytes, which is what a block may grow by
+# Limits on files that are read
+NUMBER = r"[<|][biuf][1248]"  # dtypes of fields
+MAX_TEXT = 2**20  # bytes of metadata
+MAX_ROWS = 2**40  # also the limit of other integers in the metadata
+MAX_BYTES = 2**30  # per decoded chunk
+BLOSC_HEADER = 16  # bytes; incompressible data grows by this much
 
 
 def write_group(path: Path) -> None:
-    """The mark of a group, in a folder that is there."""
+    """Mark an existing folder as a group."""
     (path / GROUP).write_text(json.dumps({"zarr_format": 2}))
 
 
 def write_chunk(path: Path, number: int, values: np.ndarray) -> None:
-    """One chunk of an array, (trajectory, time), of at most ROWS trajectories; the rest of the chunk is zero."""
+    """Write a chunk (trajectory, time) of at most ROWS trajectories, padded with zeros to ROWS."""
     chunk = np.zeros((ROWS, *values.shape[1:]), values.dtype)
     chunk[: len(values)] = values
     path.mkdir(exist_ok=True)
@@ -43,7 +44,7 @@ def write_chunk(path: Path, number: int, values: np.ndarray) -> None:
 
 
 def write_array(path: Path, rows: int, dtype: np.dtype) -> None:
-    """The description of an array whose chunks are written."""
+    """Write the metadata of an array, after its chunks."""
     about = {
         "zarr_format": 2,
         "shape": (rows, RECORD_STEPS),
@@ -58,7 +59,7 @@ def write_array(path: Path, rows: int, dtype: np.dtype) -> None:
 
 
 class FormatError(ValueError):
-    """A folder has no trajectories that can be read; the message is the end of a sentence."""
+    """A folder has no readable trajectories; the message completes a sentence about the folder."""
 
     def __str__(self) -> str:
         return readable(super().__str__())
@@ -66,20 +67,20 @@ class FormatError(ValueError):
 
 @dataclass(frozen=True)
 class StoredArray:
-    """An array as its description has it, which is checked; its chunks are when they are read."""
+    """An array with checked metadata; its chunks are checked when read."""
 
     path: Path
     rows: int
     chunks: tuple[int, int]  # trajectories and steps
     dtype: np.dtype  # each field with its own shape
     compressor: dict[str, Any] | None
-    suffix: str  # of the names of chunks, for one more axis of length 1
+    suffix: str  # of chunk names: ".0" per extra axis of length 1
 
     def read(self, first: int, last: int) -> Iterator[tuple[int, int, np.ndarray]]:
-        """Chunk by chunk what there is of rows `first` to `last - 1`: its first row and step, and (row, step).
+        """Yield rows `first` to `last - 1` chunk by chunk: first row, first step, and values (row, step).
 
         Raises:
-            FormatError: a chunk is missing or damaged, or lies about its size.
+            FormatError: a chunk is missing or damaged, or its size disagrees with its header.
         """
         rows, steps = self.chunks
         for i, j in product(range(first // rows, -(-last // rows)), range(-(-RECORD_STEPS // steps))):
@@ -92,10 +93,10 @@ class StoredArray:
             if not path.is_file():
                 raise FormatError("is missing")
             if path.stat().st_size > wanted + BLOSC_HEADER:
-                raise FormatError("is larger than what is in it")
+                raise FormatError("is larger than its contents")
             raw = path.read_bytes()
             if self.compressor is not None:
-                sizes = [int.from_bytes(raw[at : at + 4], "little") for at in (4, 12)]  # decoded and as it is
+                sizes = [int.from_bytes(raw[at : at + 4], "little") for at in (4, 12)]  # bytes: decoded, encoded
                 if sizes != [wanted, len(raw)]:
                     raise FormatError(f"is not the {wanted:,} bytes of its array's chunks")
                 raw = BLOSC.decode(raw)
@@ -107,13 +108,13 @@ class StoredArray:
 
 
 def arrays_in(folder: Path) -> list[StoredArray]:
-    """All arrays of a group, in the order of their names, but for empty ones.
+    """List the non-empty arrays of a group, sorted by name.
 
     Raises:
-        FormatError: it is no such group, or an array of it cannot be one of trajectories.
+        FormatError: the folder is not a zarr 2 group, or an array cannot contain trajectories.
     """
-    if _description(folder / GROUP).get("zarr_format") != 2:
-        raise FormatError(f"its {GROUP} is not of zarr's format 2")
+    if _metadata(folder / GROUP).get("zarr_format") != 2:
+        raise FormatError(f"its {GROUP} is not of zarr format 2")
     paths = sorted(path.parent for path in folder.glob(f"*/{ARRAY}"))
     found = [array for array in map(_array, paths) if array.rows]
     if not found:
@@ -122,44 +123,46 @@ def arrays_in(folder: Path) -> list[StoredArray]:
 
 
 def _array(path: Path) -> StoredArray:
-    about = _description(path / ARRAY)
+    about = _metadata(path / ARRAY)
     refuse = lambda what: FormatError(f"its array {path.name} {what}")
     try:
         shape, chunks, compressor = about["shape"], about["chunks"], about["compressor"]
         dtype = _dtype(about["dtype"])
         good = all(type(n) is int and 0 <= n <= MAX_ROWS for n in (*shape, *chunks)) and 0 not in chunks
         if not good or len(shape) != len(chunks) or list(shape[1:]) not in ([RECORD_STEPS], [RECORD_STEPS, 1]):
-            raise refuse(f"has the shape {str(shape)[:40]}, and it should be (trajectories, {RECORD_STEPS})")
-        if len(shape) == 2:  # the axis that trajectories have too many is the first of every field
+            raise refuse(f"has the shape {str(shape)[:40]}, but must have (trajectories, {RECORD_STEPS})")
+        if len(shape) == 2:  # the extra axis is the first of every field
             fields = {name: dtype[name] for name in dtype.names or ()}
-            if any(of.shape[:1] != (1,) for of in fields.values()):
-                raise refuse("has fields without an axis of length 1 before their own")
-            dtype = np.dtype([(name, of.base, of.shape[1:]) for name, of in fields.items()])
+            if any(field.shape[:1] != (1,) for field in fields.values()):
+                raise refuse("has fields without a leading axis of length 1")
+            dtype = np.dtype([(name, field.base, field.shape[1:]) for name, field in fields.items()])
         if chunks[2:] not in ([], [1]) or chunks[0] * chunks[1] * dtype.itemsize > MAX_BYTES:
             raise refuse(f"has chunks {str(chunks)[:40]} of more than {MAX_BYTES:,} bytes")
         if compressor is not None and compressor["id"] != "blosc":
-            raise refuse(f"is compressed by {str(compressor['id'])[:20]!r}, and only blosc is read")
+            raise refuse(f"is compressed by {str(compressor['id'])[:20]!r}, but must use blosc")
         if about.get("filters") or about["order"] != "C" or about.get("dimension_separator", ".") != ".":
-            raise refuse("has filters, another order than C, or chunks in folders of their own")
+            raise refuse("has filters, an order other than C, or nested chunk folders")
     except FormatError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise refuse(f"has a description that says nothing ({type(error).__name__})") from None
+        raise refuse(f"has invalid metadata ({type(error).__name__})") from None
     return StoredArray(path, shape[0], (chunks[0], chunks[1]), dtype, compressor, ".0" * (len(shape) - 2))
 
 
 def _dtype(fields: Any) -> np.dtype:
-    """Of numbers and flags only: nothing that would have to be unpickled."""
+    """Parse a structured dtype of numbers and flags only: other types might be unpickled."""
     parts = []
     for name, kind, *rest in fields:
         shape = rest[0] if rest else []
         if not re.fullmatch(NUMBER, kind) or not all(type(n) is int and 0 <= n <= MAX_ROWS for n in shape):
-            raise FormatError(f"its field {str(name)[:60]} is of type {str(kind)[:20]}, and no number or flag")
+            raise FormatError(
+                f"its field {str(name)[:60]} has the type {str(kind)[:20]}, which is not a number or flag"
+            )
         parts.append((name, kind, tuple(shape)))
     return np.dtype(parts)
 
 
-def _description(path: Path) -> dict[str, Any]:
+def _metadata(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FormatError(f"there is no {path.name} in {path.parent}")
     try:

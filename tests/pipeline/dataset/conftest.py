@@ -1,4 +1,4 @@
-"""One small real split for all tests here, which read it."""
+"""A small real split, shared by the tests of this folder, which only read it."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Batches: every trajectory once an epoch, from any position on, read ahead by threads that end."""
+"""`Dataset.batches`: every trajectory once per epoch, resumable, prefetched by threads that stop."""
 
 import gc
 import json
@@ -21,8 +21,8 @@ def readers() -> int:
     return sum(thread.name.startswith("levelproof-reader") for thread in threading.enumerate())
 
 
-def seen(batches: Batches) -> list[tuple[int, int]]:
-    """(level id, first step) of all that is no repetition."""
+def items_of(batches: Batches) -> list[tuple[int, int]]:
+    """Return (level id, first step) of all items that are not padding."""
     return [
         (level, first)
         for batch in batches
@@ -31,31 +31,31 @@ def seen(batches: Batches) -> list[tuple[int, int]]:
     ]
 
 
-def test_every_trajectory_comes_once_in_an_order_of_the_seed(data: Dataset) -> None:
-    first, again, other = (seen(data.batches(8, **PLAIN | {"seed": seed})) for seed in (3, 3, 4))
+def test_batches_yield_each_trajectory_once_in_an_order_set_by_the_seed(data: Dataset) -> None:
+    first, again, other = (items_of(data.batches(8, **PLAIN | {"seed": seed})) for seed in (3, 3, 4))
     assert first == again != other
     assert sorted(first) == sorted(other) == [(i, 0) for i in data.manifest["level_id"].to_pylist()]
-    assert seen(data.batches(8, observation=None)) == sorted(first)
+    assert items_of(data.batches(8, observation=None)) == sorted(first)
 
 
-def test_epochs_have_orders_of_their_own(data: Dataset) -> None:
-    both, n = seen(data.batches(8, epochs=2, **PLAIN)), len(data)
+def test_batches_reshuffle_every_epoch(data: Dataset) -> None:
+    both, n = items_of(data.batches(8, epochs=2, **PLAIN)), len(data)
     assert both[:n] != both[n:]
     assert sorted(both[:n]) == sorted(both[n:])
 
 
-def test_parts_share_nothing(data: Dataset) -> None:
-    train, validation = (seen(data.batches(8, subset=subset, **PLAIN)) for subset in ("train", "validation"))
+def test_batches_of_the_two_subsets_are_disjoint(data: Dataset) -> None:
+    train, validation = (items_of(data.batches(8, subset=subset, **PLAIN)) for subset in ("train", "validation"))
     assert len(train) > len(validation) > 0
     assert sorted(train + validation) == [(i, 0) for i in data.manifest["level_id"].to_pylist()]
 
 
-def test_windows_of_all_trajectories(data: Dataset) -> None:
-    found = seen(data.batches(16, length=100, **PLAIN))
+def test_batches_yield_all_windows_of_all_trajectories(data: Dataset) -> None:
+    found = items_of(data.batches(16, length=100, **PLAIN))
     assert sorted(found) == [(i, first) for i in data.manifest["level_id"].to_pylist() for first in (0, 100, 200)]
 
 
-def test_hosts_have_as_many_batches_and_share_the_trajectories(data: Dataset) -> None:
+def test_batches_distribute_trajectories_evenly_over_hosts(data: Dataset) -> None:
     hosts = [data.batches(4, process_index=i, process_count=3, **PLAIN) for i in range(3)]
     batches = [list(host) for host in hosts]
     assert len({len(own) for own in batches}) == 1
@@ -63,25 +63,25 @@ def test_hosts_have_as_many_batches_and_share_the_trajectories(data: Dataset) ->
     assert sorted(np.concatenate(ids).tolist()) == data.manifest["level_id"].to_pylist()
 
 
-def test_it_goes_on_where_it_was(data: Dataset) -> None:
+def test_batches_resume_from_their_state(data: Dataset) -> None:
     batches = data.batches(8, epochs=3, **PLAIN)
     for _ in range(4):
         next(batches)
     state = json.loads(json.dumps(batches.state()))
-    rest = seen(batches)
-    assert seen(data.batches(8, epochs=3, start=state, **PLAIN)) == rest
+    rest = items_of(batches)
+    assert items_of(data.batches(8, epochs=3, start=state, **PLAIN)) == rest
     assert rest
 
 
-def test_a_position_among_other_batches_is_refused(data: Dataset) -> None:
+def test_batches_reject_a_state_of_other_settings(data: Dataset) -> None:
     state = data.batches(8, **PLAIN).state()
-    with pytest.raises(UserError, match="The start is a position among other batches \\(seed was 3, now 4\\)"):
+    with pytest.raises(UserError, match="The start was saved with other settings \\(seed was 3, now 4\\)"):
         data.batches(8, start=state, observation=None, seed=4)
-    with pytest.raises(UserError, match="The start is no position of batches"):
+    with pytest.raises(UserError, match="The start is not a state of batches"):
         data.batches(8, start={"step": 3})
 
 
-def test_threads_end_when_nobody_wants_batches_any_more(data: Dataset) -> None:
+def test_batches_stop_their_threads_when_collected(data: Dataset) -> None:
     batches = data.batches(4, epochs=None, **PLAIN)
     next(batches)
     assert readers()
@@ -90,28 +90,28 @@ def test_threads_end_when_nobody_wants_batches_any_more(data: Dataset) -> None:
     wait_until(lambda: not readers(), 10, "threads still read")
 
 
-def test_so_many_are_read_ahead_and_no_more() -> None:
-    asked, go = [], threading.Event()
+def test_batches_read_ahead_exactly_prefetch_batches() -> None:
+    requested, go = [], threading.Event()
 
     def load(position: int):
-        asked.append(position)
+        requested.append(position)
         go.wait(patience(10))
         return position
 
     batches = Batches(load, None, {}, 3, None)  # type: ignore[arg-type]
     go.set()
     assert next(batches) == 0
-    wait_until(lambda: len(asked) >= 4, 10, asked)
-    time.sleep(0.1)  # in which no more are asked for
-    assert sorted(asked) == [0, 1, 2, 3]
+    wait_until(lambda: len(requested) >= 4, 10, requested)
+    time.sleep(0.1)  # time in which a fifth batch could be requested
+    assert sorted(requested) == [0, 1, 2, 3]
     batches.close()
     with pytest.raises(StopIteration):
         next(batches)
 
 
 @pytest.mark.campaign
-def test_memory_is_bounded_however_much_is_read(data: Dataset) -> None:
-    """A million trajectories of a split that is read many times."""
+def test_batches_use_bounded_memory(data: Dataset) -> None:
+    """A million trajectories are read, by many epochs of a small split."""
 
     def resident() -> int:
         with open("/proc/self/statm") as file:

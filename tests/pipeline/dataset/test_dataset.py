@@ -1,4 +1,4 @@
-"""A split opened for training: what the door gives is what shards hold, and starts for the environment."""
+"""`Dataset`: trajectories equal to those in shards, and states to start the environment from."""
 
 import pickle
 import shutil
@@ -30,7 +30,7 @@ def assert_same(left, right) -> None:
     jax.tree.map(np.testing.assert_array_equal, left, right)
 
 
-def test_its_manifest_has_the_levels_with_a_witness(split: Path, data: Dataset) -> None:
+def test_manifest_has_the_levels_with_a_witness(split: Path, data: Dataset) -> None:
     table = read_manifest(split).table
     with_witness = [row["level_id"] for row in table.to_pylist() if row["shard"]]
     assert data.manifest["level_id"].to_pylist() == with_witness
@@ -40,7 +40,7 @@ def test_its_manifest_has_the_levels_with_a_witness(split: Path, data: Dataset) 
     assert "device" in some.manifest.column_names
 
 
-def test_a_trajectory_is_what_its_shard_holds(split: Path, data: Dataset) -> None:
+def test_getitem_returns_what_the_shard_stores(split: Path, data: Dataset) -> None:
     one, stored = data[2], read_rows(split, data.manifest.slice(2, 1))
     for name, values in stored.items():
         assert same_bits(one.fields[name][..., None], values).all(), name
@@ -53,7 +53,7 @@ def test_a_trajectory_is_what_its_shard_holds(split: Path, data: Dataset) -> Non
         data[len(data)]
 
 
-def test_a_batch_has_the_trajectories_in_front(data: Dataset) -> None:
+def test_read_returns_arrays_with_the_batch_axis_first(data: Dataset) -> None:
     batch = data.read([3, 0, 3], fields=["record/state", "level"], observation=None)
     assert batch.observation is None
     assert batch.state.position.shape == (3, 256, 7, 2)
@@ -61,11 +61,11 @@ def test_a_batch_has_the_trajectories_in_front(data: Dataset) -> None:
     assert batch.reward.shape == batch.done.shape == batch.goal.shape == batch.mask.shape == (3, 256)
     assert_same(batch.action_mask[:, 7].T, action_mask(lanes_last(batch.level)))
     assert_same(batch.state.rotation[1], data[0].state.rotation)
-    with pytest.raises(UserError, match=r"The field record/manifold/active was not read: ask for fields=\['record'\]"):
+    with pytest.raises(UserError, match=r"The field record/manifold/active was not read: pass fields=\['record'\]"):
         batch.record  # noqa: B018
 
 
-def test_ends_are_of_the_task_or_of_the_time_limit(data: Dataset) -> None:
+def test_read_tells_terminated_from_truncated(data: Dataset) -> None:
     every = np.arange(len(data))
     batch = data.read(every, fields=["record/timestep"], observation=None)
     late = batch.fields["record/timestep"] + 1 >= data.rules.max_timesteps
@@ -77,7 +77,7 @@ def test_ends_are_of_the_task_or_of_the_time_limit(data: Dataset) -> None:
     assert_same(window.truncated, batch.truncated[:, 200:])
 
 
-def test_an_episode_as_long_as_the_limit_is_truncated() -> None:
+def test_timed_out_marks_episodes_as_long_as_the_limit() -> None:
     done, goal = np.zeros((3, 12), bool), np.zeros((3, 12), bool)
     done[0, [3, 7, 10]] = done[1, [1, 5, 11]] = done[2, [3]] = goal[2, 3] = True
     expected = np.zeros((3, 12), bool)
@@ -85,7 +85,7 @@ def test_an_episode_as_long_as_the_limit_is_truncated() -> None:
     assert_same(_timed_out(done, goal, 4), expected)
 
 
-def test_arguments_of_the_version_before_still_work_and_warn(data: Dataset) -> None:
+def test_old_argument_names_still_work_and_warn(data: Dataset) -> None:
     plain = {"seed": 1, "observation": None}
     with pytest.warns(DeprecationWarning, match="of batches is now") as warned:
         old = data.batches(**{"batch": 8, "part": "train", "ahead": 1} | plain)  # type: ignore[call-arg]
@@ -103,7 +103,7 @@ def test_arguments_of_the_version_before_still_work_and_warn(data: Dataset) -> N
         data.batches(batch_size=8, batch=8)  # type: ignore[call-arg]
 
 
-def test_windows_are_parts_of_trajectories(data: Dataset) -> None:
+def test_read_cuts_windows_from_trajectories(data: Dataset) -> None:
     cut = data.read([3, 1], length=10, first=[250, 4], fields=["record/state"], observation=None)
     whole = data.read([3, 1], fields=["record/state"], observation=None)
     assert_same(cut.state.position[0, :6], whole.state.position[0, 250:])
@@ -115,14 +115,14 @@ def test_windows_are_parts_of_trajectories(data: Dataset) -> None:
     assert_same(data.read(3, first=200, fields=["record/state"], observation=None).fields, late.fields)
 
 
-def test_an_observation_is_that_of_the_environment(data: Dataset) -> None:
+def test_getitem_observation_equals_the_environments(data: Dataset) -> None:
     shown = jax.jit(make(data.levels([2]))[0].get_obs)(data.state(2, 30))
     np.testing.assert_allclose(data[2].observation[30], shown, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", list(ObservationType))
-def test_observations_of_all_kinds_are_those_of_the_environment(data: Dataset, kind: str) -> None:
+def test_read_observations_of_all_types_equal_the_environments(data: Dataset, kind: str) -> None:
     env, _ = make(data.levels([0, 2]), observation_type=kind)
     seen = data.read([0, 2], length=3, first=[9, 30], observation=kind).observation
     for step in range(3):
@@ -132,23 +132,25 @@ def test_observations_of_all_kinds_are_those_of_the_environment(data: Dataset, k
         )
 
 
-def test_episodes_started_at_stored_states_have_the_stored_future(data: Dataset) -> None:
-    """White-box evaluation from any point: by the environment, bit for bit, across ends and resets."""
-    numbers, steps = np.array([0, 1, 2, 3]), np.array([0, 10, 100, 200])
-    batch = data.read(numbers, fields=["record", "level"], observation=None)
-    assert (batch.done[:, :STEPS] | batch.done[:, 100 : 100 + STEPS]).any(), "no end on the way: choose others"
-    env, params = levelproof.make(data.levels(numbers), rules=data.rules)
-    starts = data.state(numbers)
-    actions = np.stack([batch.action[i, t : t + STEPS] for i, t in zip(numbers, steps, strict=True)], 1)
+def test_playing_on_from_a_stored_state_reproduces_the_stored_steps(data: Dataset) -> None:
+    """Bit for bit, through the environment, across ends of episodes and resets."""
+    indices, steps = np.array([0, 1, 2, 3]), np.array([0, 10, 100, 200])
+    batch = data.read(indices, fields=["record", "level"], observation=None)
+    assert (batch.done[:, :STEPS] | batch.done[:, 100 : 100 + STEPS]).any(), (
+        "no episode ends on the way: choose other trajectories"
+    )
+    env, params = levelproof.make(data.levels(indices), rules=data.rules)
+    starts = data.state(indices)
+    actions = np.stack([batch.action[i, t : t + STEPS] for i, t in zip(indices, steps, strict=True)], 1)
 
     def play(state, action):
-        keys = jax.random.split(jax.random.key(0), len(numbers))
+        keys = jax.random.split(jax.random.key(0), len(indices))
         _, after, reward, done, info = jax.vmap(env.step, (0, 0, 0, None, 0))(keys, state, action, params, starts)
         return after, (state, reward, done, info["GoalR"])
 
-    states, reward, done, goal = jax.jit(lambda: jax.lax.scan(play, data.state(numbers, steps), actions))()[1]
+    states, reward, done, goal = jax.jit(lambda: jax.lax.scan(play, data.state(indices, steps), actions))()[1]
     stored = arrays_of(batch.record.state)
-    for lane, (i, first) in enumerate(zip(numbers, steps, strict=True)):
+    for lane, (i, first) in enumerate(zip(indices, steps, strict=True)):
         for name, values in arrays_of(states.now.state).items():
             assert same_bits(values[:, lane].T, stored[name][i, first : first + STEPS].T).all(), name
         assert_same(states.timestep[:, lane], batch.record.timestep[i, first : first + STEPS])
@@ -157,11 +159,11 @@ def test_episodes_started_at_stored_states_have_the_stored_future(data: Dataset)
         assert_same(goal[:, lane], batch.goal[i, first : first + STEPS])
 
 
-def test_one_state_has_no_axis_in_front(data: Dataset) -> None:
+def test_state_of_one_index_has_no_leading_axis(data: Dataset) -> None:
     assert_same(data.state(3, 20), jax.tree.map(lambda x: np.asarray(x)[1], data.state([1, 3], 20)))
 
 
-def test_it_goes_on_where_a_seal_has_moved_its_shards(split: Path, tmp_path: Path) -> None:
+def test_read_follows_levels_moved_by_a_seal(split: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(split, tmp_path / "s"))
     data = open(copy)
     before = data.read([0, 1], observation=None)
@@ -176,7 +178,7 @@ def test_it_goes_on_where_a_seal_has_moved_its_shards(split: Path, tmp_path: Pat
     assert set(data.manifest["shard"].to_pylist()) == {new}
 
 
-def test_a_damaged_shard_is_a_sentence(split: Path, tmp_path: Path) -> None:
+def test_batches_report_a_damaged_shard_and_end(split: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(split, tmp_path / "s"))
     data = open(copy)
     file = next((copy / "shards").rglob("dyn32/c/0/0/0"))
@@ -190,7 +192,7 @@ def test_a_damaged_shard_is_a_sentence(split: Path, tmp_path: Path) -> None:
         next(batches)
 
 
-def test_its_pickle_is_small_and_notices_other_trajectories(split: Path, tmp_path: Path) -> None:
+def test_pickle_is_small_and_rejects_a_changed_split(split: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(split, tmp_path / "s"))
     pickled = pickle.dumps(open(copy, "level_id < 50"))
     assert len(pickled) < 1000
@@ -198,28 +200,28 @@ def test_its_pickle_is_small_and_notices_other_trajectories(split: Path, tmp_pat
     (fragment,) = (copy / "manifest").glob("*.parquet")
     table = pq.read_table(fragment)
     pq.write_table(table.slice(1).replace_schema_metadata(table.schema.metadata), fragment)
-    with pytest.raises(Failure, match="has other trajectories than it had"):
+    with pytest.raises(Failure, match="no longer has the trajectories that it had"):
         pickle.loads(pickled)
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("arguments", "sentence"),
     [
-        ({"fields": ["record/stat"]}, "There is no field 'record/stat', is record/state meant"),
+        ({"fields": ["record/stat"]}, "There is no field 'record/stat' \\(did you mean record/state\\?\\)"),
         ({"fields": ["xyzzy"]}, "There is no field 'xyzzy'"),
         ({"observation": "flat"}, "There is no observation 'flat': choose one of symbolic_flat, "),
         ({"length": 300}, "A window cannot have 300 steps"),
         ({"subset": "test"}, "There is no subset 'test'"),
     ],
 )
-def test_what_cannot_be_read_is_a_sentence(data: Dataset, words: dict, sentence: str) -> None:
+def test_batches_and_grain_reject_invalid_arguments(data: Dataset, arguments: dict, sentence: str) -> None:
     with pytest.raises(UserError, match=sentence):
-        data.batches(8, **words)
+        data.batches(8, **arguments)
     with pytest.raises(UserError, match=sentence):
-        data.grain(**words)
+        data.grain(**arguments)
 
 
-def test_what_cannot_be_opened_is_a_sentence(split: Path, tmp_path: Path) -> None:
+def test_open_read_and_state_reject_invalid_arguments(split: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="There is no split at"):
         open(tmp_path / "nothing")
     with pytest.raises(UserError, match="has no trajectories for which level_id < 0: `levelproof inspect"):
@@ -230,11 +232,11 @@ def test_what_cannot_be_opened_is_a_sentence(split: Path, tmp_path: Path) -> Non
         open(split, columns=["lable"])
     with pytest.raises(UserError, match="The share of validation is 2"):
         open(split, validation=2)
-    with pytest.raises(UserError, match="trajectories is in the subset validation: open with another validation="):
+    with pytest.raises(UserError, match="trajectories is in the subset validation: pass another validation= to open"):
         open(split, validation=0).batches(8, subset="validation")
-    for numbers in ([999], [-1, 0], []):
+    for indices in ([999], [-1, 0], []):
         with pytest.raises(UserError, match="There are no trajectories"):
-            open(split).read(numbers)
+            open(split).read(indices)
     for step in (256, -1):
         with pytest.raises(UserError, match=f"There are no steps {step} in a record"):
             open(split).state(0, step)

@@ -1,4 +1,4 @@
-"""The environment on a split's levels."""
+"""`levelproof.make` on the levels of a split."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return played_split(tmp_path_factory.mktemp("environment"))
 
 
-def test_it_plays_every_level_of_a_split_by_the_splits_rules(split: Path) -> None:
+def test_make_uses_all_levels_and_the_rules_of_a_split(split: Path) -> None:
     env, params = levelproof.make(split=split, auto_reset=False)
     table = read_manifest(split).table
     ids = table["level_id"].to_numpy()
@@ -27,7 +27,7 @@ def test_it_plays_every_level_of_a_split_by_the_splits_rules(split: Path) -> Non
     assert env.rules == levelproof.open(split).rules
 
 
-def test_a_condition_chooses_levels(split: Path) -> None:
+def test_make_selects_levels_by_a_condition(split: Path) -> None:
     env, params = levelproof.make(split=str(split), where="shard IS NOT NULL", action_type="discrete")
     data = levelproof.open(split)
     np.testing.assert_array_equal(env.level_ids, data.manifest["level_id"])
@@ -36,12 +36,12 @@ def test_a_condition_chooses_levels(split: Path) -> None:
     assert state.level_index.shape == ()
 
 
-def test_what_cannot_be_made_is_a_sentence(split: Path, tmp_path: Path) -> None:
+def test_make_rejects_invalid_arguments(split: Path, tmp_path: Path) -> None:
     levels = levelproof.sample_levels(np.arange(2), "s")
     assert levelproof.make(levels)[0].rules == DEFAULT_RULES
-    for given in {}, {"levels": levels, "split": split}:
+    for arguments in {}, {"levels": levels, "split": split}:
         with pytest.raises(levelproof.UserError, match="make takes either levels or split="):
-            levelproof.make(**given)
+            levelproof.make(**arguments)
     with pytest.raises(levelproof.UserError, match="where= is a condition on the levels of a split"):
         levelproof.make(levels, where="label = 'solved'")
     with pytest.raises(levelproof.UserError, match="has no level for which level_id < 0"):

@@ -1,4 +1,4 @@
-"""Trajectories one by one, for grain and PyTorch."""
+"""`TrajectorySource`: single trajectories for grain and PyTorch."""
 
 import os
 import pickle
@@ -10,7 +10,7 @@ from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
 
 
-def test_elements_are_windows_by_name(data: Dataset) -> None:
+def test_source_elements_are_windows_by_name(data: Dataset) -> None:
     source = data.grain(length=100, fields=["level/role"])
     assert len(source) == 3 * len(data)
     one, whole = source[5], data[1]
@@ -25,7 +25,7 @@ def test_elements_are_windows_by_name(data: Dataset) -> None:
         source[len(source)]
 
 
-def test_a_worker_process_gets_a_small_pickle(data: Dataset) -> None:
+def test_source_pickles_small_and_restores(data: Dataset) -> None:
     source = data.grain(subset="train", length=64, observation=None)
     pickled = pickle.dumps(source)
     assert len(pickled) < 1000
@@ -36,13 +36,13 @@ def test_a_worker_process_gets_a_small_pickle(data: Dataset) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 @pytest.mark.filterwarnings("ignore:.*fork")
-def test_a_forked_process_reads_but_makes_no_observations(data: Dataset) -> None:
-    plain, seeing = data.grain(observation=None), data.grain()
+def test_forked_process_reads_but_computes_no_observations(data: Dataset) -> None:
+    plain, observing = data.grain(observation=None), data.grain()
     child = os.fork()
     if not child:
         try:
             plain[0]
-            seeing[0]
+            observing[0]
         except UserError as error:
             os._exit(7 if "multiprocessing_context='spawn'" in str(error) else 1)
         finally:
@@ -52,9 +52,9 @@ def test_a_forked_process_reads_but_makes_no_observations(data: Dataset) -> None
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("workers", [0, 2])
-def test_grain_shuffles_and_batches_it(data: Dataset, workers: int) -> None:
+def test_grain_loads_shuffles_and_batches_a_source(data: Dataset, workers: int) -> None:
     grain = pytest.importorskip("grain")
-    pytest.importorskip("absl.flags").FLAGS.mark_as_parsed()  # grain's workers look at them
+    pytest.importorskip("absl.flags").FLAGS.mark_as_parsed()  # grain's workers read them
     source = data.grain(subset="train", length=64, observation=None)
     loader = grain.DataLoader(
         data_source=source,
@@ -80,7 +80,7 @@ def test_grain_shuffles_and_batches_it(data: Dataset, workers: int) -> None:
 @pytest.mark.parametrize(
     ("context", "observation"), [("fork", None), ("spawn", None), ("spawn", "symbolic_flat"), (None, "symbolic_flat")]
 )
-def test_a_torch_loader_takes_it_as_it_is(data: Dataset, context: str | None, observation: str | None) -> None:
+def test_torch_dataloader_accepts_a_source(data: Dataset, context: str | None, observation: str | None) -> None:
     torch = pytest.importorskip("torch")
     source = data.torch(subset="train", observation=observation)
     loader = torch.utils.data.DataLoader(

@@ -1,4 +1,4 @@
-"""Train and validation are told apart by content alone."""
+"""`in_subset`: train and validation depend on content hashes alone."""
 
 import hashlib
 
@@ -11,7 +11,7 @@ from levelproof.pipeline.errors import Failure, UserError
 HASHES = [f"c1:{hashlib.sha256(str(i).encode()).hexdigest()[:32]}" for i in range(5000)]
 
 
-def test_every_level_is_on_one_side_and_copies_with_it() -> None:
+def test_in_subset_puts_each_level_and_its_copies_in_one_subset() -> None:
     train, validation = in_subset(HASHES, "train", 0.1), in_subset(HASHES, "validation", 0.1)
     assert (train ^ validation).all()
     assert 0.08 < validation.mean() < 0.12
@@ -20,20 +20,20 @@ def test_every_level_is_on_one_side_and_copies_with_it() -> None:
     assert in_subset(HASHES, None, 0.1).all()
 
 
-def test_a_larger_share_keeps_what_was_held_out() -> None:
+def test_in_subset_keeps_validation_levels_when_the_share_grows() -> None:
     assert not (in_subset(HASHES, "validation", 0.1) & in_subset(HASHES, "train", 0.3)).any()
     assert in_subset(HASHES, "validation", 1).all()
     assert in_subset(HASHES, "train", 0).all()
 
 
-def test_what_is_no_part_is_refused() -> None:
+def test_in_subset_and_check_share_reject_invalid_arguments() -> None:
     with pytest.raises(UserError, match="There is no subset 'test': choose train or validation"):
         in_subset(HASHES, "test", 0.1)
     with pytest.raises(UserError, match=r"The share of validation is 1\.5"):
         check_share(1.5)
 
 
-@pytest.mark.parametrize("odd", ["c1:no number", "c1:12 4567", ""])
-def test_a_hash_that_is_none_is_a_sentence(odd: str) -> None:
-    with pytest.raises(Failure, match="content hashes that are none"):
-        in_subset([HASHES[0], odd], "train", 0.1)
+@pytest.mark.parametrize("invalid", ["c1:no number", "c1:12 4567", ""])
+def test_in_subset_reports_invalid_hashes(invalid: str) -> None:
+    with pytest.raises(Failure, match="invalid content hashes"):
+        in_subset([HASHES[0], invalid], "train", 0.1)

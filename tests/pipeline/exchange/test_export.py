@@ -1,4 +1,4 @@
-"""Levels of a real split as level files, and level files at the command line, hostile ones included."""
+"""Level files: exported from a real split, and read by commands, hostile ones included."""
 
 import dataclasses
 import json
@@ -51,7 +51,7 @@ def assert_same(ours: Level, theirs: Level) -> None:
 
 
 @pytest.mark.parametrize("label", ["solved", "unsolved"])
-def test_an_exported_level_is_the_one_that_its_id_makes(split, tmp_path, capsys, label) -> None:
+def test_export_writes_the_level_that_its_id_makes(split, tmp_path, capsys, label) -> None:
     level_id, out = level_with(split, label)["level_id"], tmp_path / "new" / "level.JSON"
     assert main(["export", str(split), str(level_id), "-o", str(out)]) == 0
     assert capsys.readouterr().out == f"{out}: level {level_id} of size s, for Kinetix\n"
@@ -61,16 +61,16 @@ def test_an_exported_level_is_the_one_that_its_id_makes(split, tmp_path, capsys,
     assert file.rules == job.task
 
 
-def test_a_witness_solves_the_exported_level(split, tmp_path) -> None:
+def test_witness_solves_the_exported_level(split, tmp_path) -> None:
     row = level_with(split, "solved")
     export(split, row["level_id"], tmp_path / "level.json")
     file = read_level_file(tmp_path / "level.json")
     action = tree_of(Record, Shard(split / row["shard"]).read([row["row"]]), "record/").action
-    again = replay(file.level, action, file.rules)
-    assert succeeds(np.asarray(again.done), np.asarray(again.goal)).all()
+    replayed = replay(file.level, action, file.rules)
+    assert succeeds(np.asarray(replayed.done), np.asarray(replayed.goal)).all()
 
 
-def test_exported_levels_open_in_the_reference(reference, split, tmp_path) -> None:
+def test_reference_opens_exported_levels(reference, split, tmp_path) -> None:
     files = [tmp_path / f"{label}.json" for label in ("solved", "unsolved")]
     for path in files:
         export(split, level_with(split, path.stem)["level_id"], path)
@@ -79,17 +79,17 @@ def test_exported_levels_open_in_the_reference(reference, split, tmp_path) -> No
     assert_same(jax.tree.map(lambda *x: np.concatenate(x, -1), *ours), theirs)
 
 
-def test_what_cannot_be_exported(split, tmp_path) -> None:
+def test_export_rejects_invalid_arguments(split, tmp_path) -> None:
     with pytest.raises(UserError, match=rf"^There is no level {PLAYED} in .*64 levels, from 0 to 63\.$"):
         export(split, PLAYED, tmp_path / "level.json")
-    with pytest.raises(UserError, match=r"its name has to end in \.json\.$"):
+    with pytest.raises(UserError, match=r"its name must end in \.json\.$"):
         export(split, 0, tmp_path / "level.npz")
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"^Cannot write .*: choose another file with -o"):
         export(split, 0, tmp_path / "file" / "level.json")
 
 
-def test_a_damaged_shard_is_no_level(split, tmp_path, capsys) -> None:
+def test_export_reports_a_damaged_shard(split, tmp_path, capsys) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(split, copy)
     row = level_with(copy, "solved")
@@ -98,40 +98,40 @@ def test_a_damaged_shard_is_no_level(split, tmp_path, capsys) -> None:
     assert "is missing or damaged" in capsys.readouterr().err
 
 
-def test_a_level_file_is_drawn(split, tmp_path, capsys) -> None:
+def test_show_draws_a_level_file(split, tmp_path, capsys) -> None:
     file = tmp_path / "level.json"
-    export(split, 1, file)  # doing nothing soon solves it: few pictures
+    export(split, 1, file)  # trivial after a few steps, so films are short
     capsys.readouterr()
     for suffix in (".png", ".gif", ".mp4", ".svg"):
         assert main(["show", str(file), "-o", str(tmp_path / f"level{suffix}")]) == 0
     still, *films = capsys.readouterr().out.splitlines()
-    told = "level.json, a level of size s: a level file has no witness, so this is"
-    assert still.endswith(f"{told} its initial world")
-    assert all(f"{told} what doing nothing does (" in film for film in films)
+    description = "level.json, a level of size s: a level file has no witness, so this is"
+    assert still.endswith(f"{description} its initial world")
+    assert all(f"{description} what doing nothing does (" in film for film in films)
     assert (tmp_path / "level.gif").read_bytes().startswith(b"GIF8")
     assert "doing nothing · 0.0 s" in (tmp_path / "level.svg").read_text()
 
 
-def refused(capsys, words: list[str]) -> str:
-    assert main(words) == 2
+def error_of(capsys, arguments: list[str]) -> str:
+    assert main(arguments) == 2
     (sentence,) = capsys.readouterr().err.splitlines()
     assert sentence.startswith("Error: ")
     assert sentence.endswith((".", ")"))
     return sentence
 
 
-def test_an_id_belongs_to_a_split_and_not_to_a_level_file(file, split, capsys) -> None:
-    assert "leave out the id 3" in refused(capsys, ["show", str(file), "3"])
-    assert "Add its id, such as 0" in refused(capsys, ["show", str(split)])
-    assert "There is no split at" in refused(capsys, ["show", "nothing"])
-    assert "Cannot read the level file nothing.json" in refused(capsys, ["show", "nothing.json"])
+def test_show_takes_an_id_with_a_split_and_not_with_a_level_file(file, split, capsys) -> None:
+    assert "leave out the id 3" in error_of(capsys, ["show", str(file), "3"])
+    assert "Add its id, such as 0" in error_of(capsys, ["show", str(split)])
+    assert "There is no split at" in error_of(capsys, ["show", "nothing"])
+    assert "Cannot read the level file nothing.json" in error_of(capsys, ["show", "nothing.json"])
 
 
-def test_hostile_files_get_one_sentence_each(file, tmp_path, capsys) -> None:
+def test_show_rejects_hostile_level_files_in_one_sentence(file, tmp_path, capsys) -> None:
     text, path = file.read_text(), tmp_path / "hostile.json"
     document = json.loads(text)
     million = document | {"static_env_params": document["static_env_params"] | {"num_circles": 10**6}}
-    for hostile, words in {
+    for hostile, expected in {
         "": "is not JSON",
         "[" * MAX_BYTES: "nested too deeply",
         "[]" * MAX_BYTES: "no level needs more than 4,000,000",
@@ -141,14 +141,14 @@ def test_hostile_files_get_one_sentence_each(file, tmp_path, capsys) -> None:
         text.replace('"role": 0', '"role": "red"', 1): 'polygon[0].role is "red"',
     }.items():
         path.write_text(hostile)
-        sentence = refused(capsys, ["show", str(path), "-o", str(tmp_path / "level.png")])
-        assert words in sentence
+        sentence = error_of(capsys, ["show", str(path), "-o", str(tmp_path / "level.png")])
+        assert expected in sentence
         assert f"the level file {path}: " in sentence
     assert not (tmp_path / "level.png").exists()
 
 
-def test_a_level_with_extreme_values_is_drawn(file, tmp_path) -> None:
-    """What is within the bounds costs no more than another picture."""
+def test_show_draws_a_level_with_extreme_values(file, tmp_path) -> None:
+    """Extreme values within bounds need no more memory or time than others."""
     level = read_level_file(file).level
     far = jax.tree.map(lambda x: np.full_like(x, 1000.0) if x.dtype == np.float32 else x, level)
     still = level.model.inverse_mass * 0

@@ -1,4 +1,4 @@
-"""`levelproof export --format kinetix`: what is in the folder, when it appears, and what is refused."""
+"""`levelproof export --format kinetix`: contents of the folder, atomic creation, and rejected arguments."""
 
 from pathlib import Path
 
@@ -19,27 +19,27 @@ from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
 from tests.pipeline.read.kinetix.folder import trajectories_in
 
-BYTES = {"s": 1487, "m": 2473, "l": 8053}  # of a step, as zarr 2.18 and the reference have it
+BYTES = {"s": 1487, "m": 2473, "l": 8053}  # per step, in zarr 2.18 and the reference
 UNITS = [[Label.SOLVED, Label.UNSOLVED, Label.TRIVIAL], [Label.SOLVED]]
 
 
 @pytest.fixture(scope="module")
 def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of any bits."""
+    """A split whose arrays hold arbitrary bits."""
     return made_split(tmp_path_factory.mktemp("data"), UNITS)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_step_has_the_bytes_that_the_reference_reads(size: str) -> None:
+def test_dtype_of_matches_the_step_size_of_the_reference(size: str) -> None:
     assert dtype_of(SIZES[size]).itemsize == BYTES[size]
     assert len(dtype_of(SIZES[size]).names or ()) == 85
 
 
-def test_every_bit_of_a_record_is_there(split: Path, tmp_path: Path) -> None:
+def test_export_kinetix_keeps_every_bit_of_a_record(split: Path, tmp_path: Path) -> None:
     done = here(["export", str(split), "--format", "kinetix", "-o", "new/k"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert "new/k: 2 trajectories of" in done.stdout
-    told = trajectories_in(tmp_path / "new/k")
+    exported = trajectories_in(tmp_path / "new/k")
     rows = require_manifest(split).table.to_pylist()
     assert [row["label"] for row in rows] == [label for unit in UNITS for label in unit]
     table = require_manifest(split).table.take([0, 3])
@@ -47,7 +47,7 @@ def test_every_bit_of_a_record_is_there(split: Path, tmp_path: Path) -> None:
     polygons, pairs = SIZES["s"].polygons, len(pairs_of(SIZES["s"]).polygon)
 
     def assert_same(theirs: str, values: np.ndarray) -> None:
-        found = told[theirs][:, :, 0]
+        found = exported[theirs][:, :, 0]
         want = np.broadcast_to(values, found.shape).astype(values.dtype)
         assert found.dtype == want.dtype, theirs
         assert found.tobytes() == want.tobytes(), theirs
@@ -70,7 +70,7 @@ def test_every_bit_of_a_record_is_there(split: Path, tmp_path: Path) -> None:
     assert_same("env_state/collision_matrix", still("model/collides"))
 
 
-def test_which_levels_go_out_is_said_with_where(split: Path, tmp_path: Path) -> None:
+def test_export_kinetix_selects_levels_by_where(split: Path, tmp_path: Path) -> None:
     for where, count in (("true", 3), ("label = 'trivial'", 1), ("level_id > 0 AND label = 'solved'", 1)):
         done = here(["export", str(split), "--format", "kinetix", "-o", f"k{where}", "--where", where], tmp_path)
         assert many(count, "trajectory") in done.stdout, done.stderr
@@ -80,13 +80,13 @@ def test_which_levels_go_out_is_said_with_where(split: Path, tmp_path: Path) -> 
     assert not (tmp_path / "none").exists()
 
 
-def test_trajectories_are_cut_into_arrays_and_blocks(
+def test_export_kinetix_splits_trajectories_into_arrays_and_blocks(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["export", str(split), "--format", "kinetix", "--where", "true", "-o"]
     assert here([*words, "one"], tmp_path).returncode == 0
-    for of, name, value in ((zarr2, "ROWS", 1), (module, "ROWS", 1), (module, "BLOCK", 2), (module, "ARRAY", 2)):
-        monkeypatch.setattr(of, name, value)
+    for target, name, value in ((zarr2, "ROWS", 1), (module, "ROWS", 1), (module, "BLOCK", 2), (module, "ARRAY", 2)):
+        monkeypatch.setattr(target, name, value)
     assert here([*words, "cut"], tmp_path).returncode == 0
     assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == [".zgroup", "000000", "000001"]
     one, cut = (trajectories_in(tmp_path / name) for name in ("one", "cut"))
@@ -94,12 +94,14 @@ def test_trajectories_are_cut_into_arrays_and_blocks(
     assert one.tobytes() == cut.tobytes()
 
 
-def test_a_folder_appears_whole_or_not_at_all(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_kinetix_creates_the_folder_atomically(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = ["export", str(split), "--format", "kinetix", "-o", "k"]
-    seen: list[list[str]] = []
+    names_before: list[list[str]] = []
 
     def last(folder: Path) -> None:
-        seen.append([path.name[:3] for path in tmp_path.iterdir()])
+        names_before.append([path.name[:3] for path in tmp_path.iterdir()])
         write_group(folder)
 
     with monkeypatch.context() as patch:
@@ -108,7 +110,7 @@ def test_a_folder_appears_whole_or_not_at_all(split: Path, tmp_path: Path, monke
     assert not (tmp_path / "k").exists()
     monkeypatch.setattr(module, "write_group", last)
     assert here(words, tmp_path).returncode == 0
-    assert seen == [[".k."]], "killed before its last step, it leaves no k"
+    assert names_before == [[".k."]], "killed before its last step, it leaves no k"
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "k").rglob("*")}
     assert_refused(here(words, tmp_path), 2, "something at k already", "-o")
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "k").rglob("*")}
@@ -116,7 +118,7 @@ def test_a_folder_appears_whole_or_not_at_all(split: Path, tmp_path: Path, monke
     assert_refused(here([*words[:-1], "file/k"], tmp_path), 2, "Cannot write file/k")
 
 
-def test_what_a_format_is_for(split: Path, tmp_path: Path) -> None:
+def test_export_rejects_arguments_of_other_formats(split: Path, tmp_path: Path) -> None:
     assert_refused(here(["export", str(split)], tmp_path), 2, "give its id", "--format")
     assert_refused(here(["export", str(split), "0", "--where", "true"], tmp_path), 2, "without --where")
     assert_refused(here(["export", str(split), "0", "--actions", "combined"], tmp_path), 2, "leave it out for json")

@@ -1,4 +1,4 @@
-"""A split's levels as parquet files: rows, worlds, and what is left out."""
+"""Parquet exports: rows, worlds, and omitted levels."""
 
 from pathlib import Path
 
@@ -25,19 +25,24 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return played_split(tmp_path_factory.mktemp("data"))
 
 
-def test_rows_and_worlds_are_those_of_the_split(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    """Stored levels and those made again, side by side, in several files."""
-    seen, real = [], parquet.require_manifest
+def test_export_parquet_keeps_rows_and_worlds(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    """Across several files that mix stored and regenerated levels."""
+    manifests, real = [], parquet.require_manifest
+
+    def recording(*args, **kwargs):
+        manifests.append(real(*args, **kwargs))
+        return manifests[-1]
+
     for name, rows in {"FILE": 40, "GROUP": 20, "CHUNK": 16}.items():
         monkeypatch.setattr(parquet, name, rows)
-    monkeypatch.setattr(parquet, "require_manifest", lambda *words, **how: seen.append(real(*words, **how)) or seen[-1])
+    monkeypatch.setattr(parquet, "require_manifest", recording)
     assert main(["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels")]) == 0
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'levels'}: {PLAYED} levels. In Python: ")
     assert sorted(path.name for path in (tmp_path / "levels").iterdir()) == [
         "levels-00000.parquet",
         "levels-00001.parquet",
     ]
-    assert [of.table.num_rows for of in seen if len(of.table.column_names) > 1] == [20, 20, 20, 4], "some at a time"
+    assert [each.table.num_rows for each in manifests if len(each.table.column_names) > 1] == [20, 20, 20, 4]
     table = pq.read_table(tmp_path / "levels")
     assert table.select(COLUMNS.names).equals(read_manifest(split).table.replace_schema_metadata())
     made = levelproof.sample_levels(np.arange(PLAYED), levelproof.SIZES["s"], made_job().distribution)
@@ -50,7 +55,7 @@ def test_rows_and_worlds_are_those_of_the_split(split: Path, tmp_path: Path, cap
     assert [row[0] for row in duckdb.sql(query).fetchall()] == red.tolist()
 
 
-def test_a_condition_chooses(split: Path, tmp_path: Path, capsys) -> None:
+def test_export_parquet_selects_levels_by_where(split: Path, tmp_path: Path, capsys) -> None:
     command = ["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels"), "--where"]
     assert main([*command, "label = 'solved'"]) == 0
     assert set(pq.read_table(tmp_path / "levels")["label"].to_pylist()) == {"solved"}
@@ -58,15 +63,15 @@ def test_a_condition_chooses(split: Path, tmp_path: Path, capsys) -> None:
     assert "There is something at" in capsys.readouterr().err
     command[command.index("-o") + 1] = str(tmp_path / "others")
     assert main([*command, "level_id < 0"]) == 2
-    assert capsys.readouterr().err.startswith(f"Error: No level of {split} is level_id < 0: ")
+    assert capsys.readouterr().err.startswith(f"Error: No level of {split} meets the condition level_id < 0: ")
     assert not (tmp_path / "others").exists()
 
 
-def test_a_level_that_comes_out_otherwise_is_left_out(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    """As on a machine whose bits differ: its row says another content than its id makes here."""
+def test_export_parquet_omits_levels_that_differ_here(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    """As on a machine with other bits: the content hash in the row differs from that of the regenerated level."""
     first = next(row for row in read_manifest(split).table.to_pylist() if row["label"] == "unsolved")
     real = parquet.content_hashes
     monkeypatch.setattr(parquet, "content_hashes", lambda level: ["other", *real(level)[1:]])
     assert main(["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels")]) == 0
-    assert f"{PLAYED - 1} levels, without 1 that come out otherwise here" in capsys.readouterr().out
+    assert f"{PLAYED - 1} levels, without 1 that differ on this machine" in capsys.readouterr().out
     assert first["level_id"] not in pq.read_table(tmp_path / "levels")["level_id"].to_pylist()

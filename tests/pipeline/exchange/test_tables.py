@@ -1,4 +1,4 @@
-"""Levels as columns of a table, and back: every bit, whatever it means."""
+"""`columns_for` and `levels_from`: levels as table columns and back, in every bit."""
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -21,7 +21,7 @@ def table_of(level: Level, size: str) -> pa.Table:
 
 
 @pytest.mark.parametrize("size", [*SIZES, EMPTY])
-def test_every_bit_comes_back_from_a_file(size: str, tmp_path) -> None:
+def test_levels_from_restores_every_bit_from_a_file(size: str, tmp_path) -> None:
     level = empty_level(size_of(EMPTY), 3) if size == EMPTY else made_level(size)
     pq.write_table(table_of(level, size), tmp_path / "levels.parquet", use_dictionary=False)
     back = arrays_of(levels_from(pq.read_table(tmp_path / "levels.parquet")))
@@ -30,13 +30,13 @@ def test_every_bit_comes_back_from_a_file(size: str, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_no_two_columns_share_a_name(size: str) -> None:
+def test_column_names_are_unique(size: str) -> None:
     fields = column_fields(SIZES[size])
-    assert {of.name for of in fields.values()} == set(arrays_of(made_level(size), "level/"))
+    assert {field.name for field in fields.values()} == set(arrays_of(made_level(size), "level/"))
     assert not set(fields) & set(COLUMNS.names)
 
 
-def test_rows_may_be_chosen_and_put_in_order() -> None:
+def test_levels_from_accepts_selected_and_reordered_rows() -> None:
     level = made_level("s", 5)
     table = table_of(level, "s")
     chosen = arrays_of(levels_from(pa.concat_tables([table.slice(3, 2), table.slice(1, 1)])))
@@ -44,8 +44,8 @@ def test_rows_may_be_chosen_and_put_in_order() -> None:
         assert same_bits(values[..., [3, 4, 1]], chosen[name]).all(), name
 
 
-def test_rows_in_many_chunks_are_filtered() -> None:
-    """As of a file with many row groups."""
+def test_levels_from_accepts_rows_filtered_from_many_chunks() -> None:
+    """A file with many row groups reads as many chunks."""
     level = made_level("m", 40)
     chunks = pa.concat_tables([table_of(level, "m").slice(first, 8) for first in range(0, 40, 8)])
     even = arrays_of(levels_from(chunks.filter(pa.array([i % 2 == 0 for i in range(40)]))))
@@ -53,7 +53,7 @@ def test_rows_in_many_chunks_are_filtered() -> None:
         assert same_bits(values[..., ::2], even[name]).all(), name
 
 
-def test_what_has_no_levels_is_refused() -> None:
+def test_levels_from_rejects_tables_without_valid_levels() -> None:
     table = table_of(made_level("s"), "s")
     other = lambda name, column: table.set_column(table.schema.get_field_index(name), name, column)
     ragged = pa.array([[1.0], [2.0, 3.0], []], pa.list_(pa.float32()))
@@ -68,5 +68,5 @@ def test_what_has_no_levels_is_refused() -> None:
         other("size", pa.array(["x"] * 3)),
         table.slice(0, 0),
     ):
-        with pytest.raises(UserError, match=r"^The table has "):
+        with pytest.raises(UserError, match=r"^The table (has levels of sizes|lacks valid level columns) "):
             levels_from(wrong)

@@ -18,7 +18,7 @@ from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here
-from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, ours_of, trajectories_in
+from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, to_ours, trajectories_in
 
 ROWS = SOLVED + OTHERS
 NAMES = [*(f"first#{i}" for i in range(ROWS // 2)), *(f"second#{i}" for i in range(ROWS - ROWS // 2))]
@@ -51,14 +51,14 @@ def test_every_trajectory_is_a_row_that_says_where_it_was(once: Path) -> None:
     rows = rows_of(once / "data/1M/s")
     assert [row["level_id"] for row in rows] == list(range(ROWS))
     assert [row["file"] for row in rows] == [f"{once}/theirs/{name}" for name in NAMES]
-    level, _ = ours_of(trajectories_in(once / "theirs"))
+    level, _ = to_ours(trajectories_in(once / "theirs"))
     assert [row["content_hash"] for row in rows] == content_hashes(level)
     assert {(row["size"], row["budget"], row["env_steps"]) for row in rows} == {("s", "1M", 0)}
 
 
 def test_labels_are_what_a_replay_of_the_actions_shows(once: Path) -> None:
     split = once / "data/1M/s"
-    level, record = ours_of(trajectories_in(once / "theirs"))
+    level, record = to_ours(trajectories_in(once / "theirs"))
     again = replay(level, record.action)
     whole = succeeds(np.asarray(again.done), np.asarray(again.goal))
     rows, table = rows_of(split), read_manifest(split).table
@@ -123,7 +123,7 @@ def test_it_is_not_repaired(folder: Path) -> None:
     before = sorted(path for path in split.rglob("*"))
     done = here(["verify", str(split), "--repair", "executor=inline"], folder)
     assert_refused(done, 2, "was imported", f"levelproof import FOLDER -o {split}")
-    assert "it hits levels" in done.stdout
+    assert "affects levels" in done.stdout
     assert sorted(path for path in split.rglob("*")) == before
 
 
@@ -189,9 +189,9 @@ def test_what_is_no_level_is_left_out_and_told(once: Path, tmp_path: Path) -> No
     assert "4 were left out." in done.stdout
     said = [line for line in done.stderr.splitlines() if line.startswith("Left out:")]
     assert len(said) == module.TOLD
-    assert "odd/array#1, its actions are none of this task." in said[0]
-    assert "#2, its polygon/position has what is no number." in said[1]
-    assert "#3, its model/joint_a has numbers that no such level can have." in said[2]
+    assert "odd/array#1, its actions are not actions of this task." in said[0]
+    assert "#2, its polygon/position has a value that is not a finite 32-bit number." in said[1]
+    assert "#3, its model/joint_a has values out of range for this size." in said[2]
     assert [row["level_id"] for row in rows_of(tmp_path / "data/1M/s")] == [0, 5, 6]
     assert look(tmp_path / "data/1M/s")["wanted"] == ROWS - 4
     want = [rows_of(once / "data/1M/s")[i]["content_hash"] for i in (0, 5, 6)]

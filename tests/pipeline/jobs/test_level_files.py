@@ -22,7 +22,7 @@ from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.look.inspect import survey
 from levelproof.pipeline.look.rows import Asked
 from levelproof.pipeline.look.status import look
-from levelproof.pipeline.read.level_files import LevelUnseen, level_at, levels_below
+from levelproof.pipeline.read.level_files import LevelUnavailable, level_at, levels_below
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.origins import Origin
 from levelproof.pipeline.verify.verify import examine
@@ -70,7 +70,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     said = done.stderr.splitlines()
     assert any("copy.json has the same level as" in line and "a.json" in line for line in said)
     assert any(line.startswith("Cannot use the level file") and "bad.json: it is not JSON" in line for line in said)
-    assert any("rules.json: it is played by other rules, so say task.frame_skip=4" in line for line in said)
+    assert any("rules.json: its rules differ from the job's: set task.frame_skip=4" in line for line in said)
     assert said[-1] == "2 of the level files in mine were left out, for the reasons above."
     return folder
 
@@ -151,7 +151,9 @@ def test_without_shard_and_file_a_level_is_gone(tmp_path: Path) -> None:
     assert here(["export", str(split), str(row["level_id"]), "-o", "out.json"], tmp_path).returncode == 0
     assert content_hashes(read_level_file(tmp_path / "out.json").level) == [row["content_hash"]]
     write(tmp_path / "mine", TRIVIAL, "b.json")
-    assert any("cannot be made again" in text and "has another level" in text for text in examine(split).wrong)
+    assert any(
+        "cannot be made again" in text and "no longer contains the level" in text for text in examine(split).wrong
+    )
     file.unlink()
     assert any("cannot be made again" in text and "No such file" in text for text in examine(split).wrong)
     assert_refused(
@@ -162,7 +164,7 @@ def test_without_shard_and_file_a_level_is_gone(tmp_path: Path) -> None:
 
 
 def test_a_worker_that_does_not_see_a_file_stops_the_job(tmp_path: Path) -> None:
-    with pytest.raises(LevelUnseen) as error:
+    with pytest.raises(LevelUnavailable) as error:
         level_at(Origin("c1:0", str(tmp_path / "gone.json"), "s"))
     assert "all machines share" in failure(tmp_path, WorkUnit((0,)), error.value).fatal
 
@@ -213,7 +215,7 @@ def test_two_levels_with_one_id_are_told_apart(folder: Path, tmp_path: Path, mon
     write(tmp_path / "two", UNSOLVABLE, "b.json")
     listing = levels_below(tmp_path / "two", compose_job([f"level_files={tmp_path}"]))
     assert list(listing.levels["s"]) == [7]
-    assert "b.json: its level has by chance the id of the one in" in listing.refused[0]
+    assert "b.json: its level id collides with that of" in listing.refused[0]
     row = rows_of(folder / "data/5k/s")["a.json"]
     monkeypatch.setattr("levelproof.pipeline.read.level_files.level_id_for", lambda _: row["level_id"])
     done = here(["generate", f"level_files={tmp_path / 'two/b.json'}", *WORDS], folder)

@@ -1,4 +1,4 @@
-"""Damage of every kind is found, wherever in a split it is, and named with the levels that it hits."""
+"""`examine` on damaged splits: it finds any damage in any file, and names the levels affected."""
 
 import random
 import shutil
@@ -21,7 +21,7 @@ from tests.pipeline.made import honest_split
 
 pytestmark = pytest.mark.slow
 FLIPS = 1000
-LESS = ("resume", "witness")
+SPARSE = ("resume", "witness")
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def unsealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def mixed(unsealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four units in two sealed fragments, and two units that came later."""
+    """Two sealed fragments of four units, and two units added later."""
     split, later = tmp_path_factory.mktemp("mixed") / "s", tmp_path_factory.mktemp("later")
     shutil.copytree(unsealed, split)
     kept = fragment_paths(split)[4:]
@@ -45,7 +45,7 @@ def mixed(unsealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def converted(split: Path, folder: Path, density: Density) -> Path:
-    """Three sealed fragments, whose shards store less."""
+    """Copy a split and seal it into three fragments at a lower density."""
     shutil.copytree(split, folder / "s")
     seal_split(folder / "s", 8, Console(quiet=True), density, 16)
     return folder / "s"
@@ -62,7 +62,7 @@ def witness(unsealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def files_of(split: Path) -> dict[Path, set[int]]:
-    """All that is committed, and the levels that each file is there for."""
+    """Map each committed file to the levels that depend on it."""
     files: dict[Path, set[int]] = {split / JOB: set()}
     for fragment in fragment_paths(split):
         rows = read_fragment(fragment, ["level_id", "shard", "experts"])[1].to_pylist()
@@ -81,16 +81,16 @@ def flip(file: Path, random: random.Random) -> None:
     file.write_bytes(content)
 
 
-def hit(found: Findings) -> set[int]:
+def damaged_levels(found: Findings) -> set[int]:
     return {level_id for level_ids in found.wrong.values() for level_id in level_ids}
 
 
 def assert_named(found: Findings, split: Path, file: Path, levels: set[int]) -> None:
-    """Nothing but this file is damaged: all of its levels are named, or of its trajectories some."""
+    """Check that only this file's levels are named: all of them, or some if the file stores trajectories."""
     assert found.sentences
     if file.name == JOB:
         assert f"The file {file} is" in found.sentences[0]
-    named = hit(found)
+    named = damaged_levels(found)
     if "c" in file.relative_to(split).parts:
         assert named
         assert named <= levels
@@ -106,7 +106,7 @@ def copied(tmp_path: Path) -> Callable[[Path], Path]:
 def assert_all_named(
     split: Path, files: dict[Path, set[int]], change: Callable[[Path], None], some: list[Path]
 ) -> None:
-    """A change of some files is seen in each of them, and what is hit is what they hold; they are put back."""
+    """Change some files, check that `examine` names levels of each and no others, and restore the files."""
     before = {file: file.read_bytes() for file in some}
     for file in some:
         change(file)
@@ -114,79 +114,80 @@ def assert_all_named(
     for file, data in before.items():
         file.write_bytes(data)
     assert (split / JOB not in some) or any(f"{split / JOB}" in sentence for sentence in found.sentences)
-    named = hit(found)
+    named = damaged_levels(found)
     assert named <= set[int]().union(*(files[file] for file in some))
     for file in set(some) - {split / JOB}:
         assert named & files[file], file
         assert "c" in file.relative_to(split).parts or files[file] <= named, file
 
 
-@pytest.mark.parametrize("kind", ["unsealed", "mixed", *LESS])
-def test_flips_in_many_files_at_once(kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest) -> None:
-    """One in each of ten; what is hit is what they hold, and what they do not is looked at nevertheless."""
-    split, chance = copied(request.getfixturevalue(kind)), random.Random(0)
+@pytest.mark.parametrize("kind", ["unsealed", "mixed", *SPARSE])
+def test_examine_finds_flips_in_ten_files_at_once(
+    kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest
+) -> None:
+    """Damage in one file does not hide damage in another."""
+    split, rng = copied(request.getfixturevalue(kind)), random.Random(0)
     assert not examine(split).wrong
     files = files_of(split)
-    chosen = [*chance.sample(sorted(files.keys() - {split / JOB}), 9), split / JOB]
-    assert_all_named(split, files, lambda file: flip(file, chance), chosen)
+    chosen = [*rng.sample(sorted(files.keys() - {split / JOB}), 9), split / JOB]
+    assert_all_named(split, files, lambda file: flip(file, rng), chosen)
 
 
-def spoil(file: Path, chance: random.Random) -> None:
-    """A byte is another one, or the file is shorter, longer, empty, or all zeros."""
+def spoil(file: Path, rng: random.Random) -> None:
+    """Change a byte, shorten, lengthen, empty or zero the file."""
     data = file.read_bytes()
-    match chance.randrange(8):
+    match rng.randrange(8):
         case 0:
-            file.write_bytes(data[: chance.randrange(len(data))])
+            file.write_bytes(data[: rng.randrange(len(data))])
         case 1:
-            file.write_bytes(data + bytes([chance.randrange(256)]))
+            file.write_bytes(data + bytes([rng.randrange(256)]))
         case 2:
             file.write_bytes(b"")
         case 3:
             file.write_bytes(bytes(len(data)))
         case _:
-            flip(file, chance)
+            flip(file, rng)
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("kind", LESS)
-def test_a_thousand_damages_of_splits_that_store_less(
+@pytest.mark.parametrize("kind", SPARSE)
+def test_examine_finds_damage_at_lower_densities(
     kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest
 ) -> None:
-    """In ten files at a time."""
-    split, chance = copied(request.getfixturevalue(kind)), random.Random(5)
+    split, rng = copied(request.getfixturevalue(kind)), random.Random(5)
     files = files_of(split)
     for _ in range(FLIPS // 2 // 10):
-        chosen = chance.sample(sorted(files), 10)
-        assert_all_named(split, files, lambda file: spoil(file, chance), chosen)
+        chosen = rng.sample(sorted(files), 10)
+        assert_all_named(split, files, lambda file: spoil(file, rng), chosen)
     assert not examine(split).wrong
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", ["unsealed", "mixed"])
-def test_each_of_a_thousand_flips(kind: str, request: pytest.FixtureRequest) -> None:
-    """A fifth of them alone, so that nothing else may be named; the others in four files at a time."""
-    split, chance = request.getfixturevalue(kind), random.Random(1)
+def test_examine_finds_each_of_a_thousand_flips(kind: str, request: pytest.FixtureRequest) -> None:
+    """Flip a fifth of them alone, so that no other level may be named; the others in four files at a time."""
+    split, rng = request.getfixturevalue(kind), random.Random(1)
     files = files_of(split)
     for _ in range(FLIPS // 10):
-        file = chance.choice(sorted(files))
+        file = rng.choice(sorted(files))
         before = file.read_bytes()
         try:
-            flip(file, chance)
+            flip(file, rng)
             assert_named(examine(split), split, file, files[file])
         finally:
             file.write_bytes(before)
     for _ in range(FLIPS // 10):
-        assert_all_named(split, files, lambda file: flip(file, chance), chance.sample(sorted(files), 4))
+        assert_all_named(split, files, lambda file: flip(file, rng), rng.sample(sorted(files), 4))
     assert not examine(split).wrong
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", ["unsealed", "mixed"])
-def test_each_file_cut_off_lengthened_or_gone(kind: str, request: pytest.FixtureRequest) -> None:
-    split, chance = request.getfixturevalue(kind), random.Random(2)
+def test_examine_finds_each_truncated_lengthened_or_missing_file(kind: str, request: pytest.FixtureRequest) -> None:
+    split, rng = request.getfixturevalue(kind), random.Random(2)
     for file, levels in sorted(files_of(split).items()):
         before = file.read_bytes()
-        for after in (before[: chance.randrange(len(before))], before[:-1], before + b"\0", b"", None):
+        for after in (before[: rng.randrange(len(before))], before[:-1], before + b"\0", b"", None):
             if after is None:
                 file.unlink()
             else:
@@ -195,7 +196,7 @@ def test_each_file_cut_off_lengthened_or_gone(kind: str, request: pytest.Fixture
             file.write_bytes(before)
             if file.suffix == ".parquet" and after is None:
                 missing = {i for first, last in found.missing for i in range(first, last + 1)}
-                assert hit(found) | missing == levels
+                assert damaged_levels(found) | missing == levels
             else:
                 assert_named(found, split, file, levels)
 
@@ -207,9 +208,11 @@ def exchange(a: Path, b: Path) -> None:
     other.rename(b)
 
 
-@pytest.mark.parametrize("kind", ["unsealed", "mixed", *(pytest.param(x, marks=pytest.mark.campaign) for x in LESS)])
-def test_what_is_exchanged(kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest) -> None:
-    """Two shards, two fragments, two files of chunks; and a file that was not there."""
+@pytest.mark.parametrize("kind", ["unsealed", "mixed", *(pytest.param(x, marks=pytest.mark.campaign) for x in SPARSE)])
+def test_examine_finds_exchanged_and_extra_files(
+    kind: str, copied: Callable[[Path], Path], request: pytest.FixtureRequest
+) -> None:
+    """Exchange two shards, two fragments and two chunk files; then add a file."""
     split = copied(request.getfixturevalue(kind))
     fragments, shards = fragment_paths(split), sorted((split / "shards").iterdir())
     files = files_of(split)
@@ -218,8 +221,8 @@ def test_what_is_exchanged(kind: str, copied: Callable[[Path], Path], request: p
         exchange(a, b)
         found = examine(split)
         exchange(a, b)
-        levels = set[int]().union(*(of for file, of in files.items() if {a, b} & {file, *file.parents}))
-        assert hit(found) == levels, (a, b)
+        levels = set[int]().union(*(ids for file, ids in files.items() if {a, b} & {file, *file.parents}))
+        assert damaged_levels(found) == levels, (a, b)
     (shards[0] / "more").touch()
     assert examine(split).sentences == [
         f"The file {shards[0]}/more is not what was committed ({_hits(files[shards[0] / 'zarr.json'])})."
@@ -232,7 +235,7 @@ def _hits(levels: set[int]) -> str:
     return _levels(levels)
 
 
-def test_what_is_missing(copied: Callable[[Path], Path], unsealed: Path) -> None:
+def test_examine_finds_missing_files(copied: Callable[[Path], Path], unsealed: Path) -> None:
     split = copied(unsealed)
     files = files_of(split)
     first, second = fragment_paths(split)[:2]
@@ -242,16 +245,18 @@ def test_what_is_missing(copied: Callable[[Path], Path], unsealed: Path) -> None
     shutil.rmtree(shard)
     found = examine(split)
     assert found.missing == [] or set(range(*found.missing[0])) <= files[first]
-    assert hit(found) | {i for a, b in found.missing for i in range(a, b + 1)} == files[first] | levels
+    assert damaged_levels(found) | {i for a, b in found.missing for i in range(a, b + 1)} == files[first] | levels
     (split / JOB).unlink()
-    assert any("nobody knows which levels" in sentence for sentence in examine(split).sentences)
+    assert any("the last command requested are unknown" in sentence for sentence in examine(split).sentences)
 
 
-def test_a_seal_and_a_repair_keep_the_digests_of_experts(tmp_path: Path) -> None:
-    """They neither read the experts nor take damage for the truth."""
+def test_seal_and_repair_keep_the_digests_of_experts(tmp_path: Path) -> None:
+    """Neither reads the experts, so neither commits a digest of damaged ones."""
     split = honest_split(tmp_path, 4, 2, experts=True)
     first, second = sorted((split / "experts").iterdir())
-    committed = {name: of for path in fragment_paths(split) for name, of in read_fragment(path)[0].digests.items()}
+    committed = {
+        name: digest for path in fragment_paths(split) for name, digest in read_fragment(path)[0].digests.items()
+    }
     data = bytearray(first.read_bytes())
     data[len(data) // 2] ^= 1
     first.write_bytes(data)

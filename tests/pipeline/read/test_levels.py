@@ -1,4 +1,4 @@
-"""One level that a user names: found without reading the others."""
+"""One level of a split, found without reading the others."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,14 +15,14 @@ from levelproof.pipeline.store.manifest import Manifest, read_fragment, read_man
 from tests.pipeline.made import made_split
 
 
-def test_one_fragment_and_few_columns_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_find_level_reads_one_fragment_and_few_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     split, read = made_split(tmp_path, [[Label.SOLVED] * 2] * 4), []
 
-    def noted(path: Path, columns: list[str], *how: Any) -> object:
+    def recording(path: Path, columns: list[str], *rest: Any) -> object:
         read.append((path.stem, set(columns)))
-        return read_fragment(path, columns, *how)
+        return read_fragment(path, columns, *rest)
 
-    monkeypatch.setattr(manifest, "read_fragment", noted)
+    monkeypatch.setattr(manifest, "read_fragment", recording)
     found, row = find_level(split, 5)
     assert (row["level_id"], row["row"], row["label"]) == (5, 1, "solved")
     assert found.config is not None
@@ -35,7 +35,7 @@ def test_one_fragment_and_few_columns_are_read(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.parametrize("settings", [None, 3, {"no_setting": 1}])
 @pytest.mark.parametrize(("group", "read"), [("task", rules_of), ("distribution", distribution_of)])
-def test_settings_of_another_program_are_a_sentence(
+def test_rules_of_and_distribution_of_report_settings_of_another_version(
     tmp_path: Path, group: str, read: Callable[[Manifest], Any], settings: Any
 ) -> None:
     found = read_manifest(made_split(tmp_path, [[Label.SOLVED]]), [])

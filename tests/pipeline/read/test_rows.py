@@ -1,4 +1,4 @@
-"""Rows of a manifest, whatever shards they lie in: in their order, and found again where a seal has moved them."""
+"""`read_rows`: arrays in row order across shards, and after a seal has moved levels."""
 
 import shutil
 from pathlib import Path
@@ -29,8 +29,8 @@ def split(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "s"))
 
 
-def changed(split: Path, column: str, values: list) -> None:
-    """Another column in the split's first fragment."""
+def replace_column(split: Path, column: str, values: list) -> None:
+    """Replace a column of the split's first fragment."""
     fragment = min((split / "manifest").glob("*.parquet"))
     table = pq.read_table(fragment)
     at = table.schema.get_field_index(column)
@@ -42,7 +42,7 @@ def witnessed(split: Path) -> pa.Table:
     return table.filter(pc.is_valid(table["shard"]))  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_rows_come_in_their_order_across_shards(split: Path) -> None:
+def test_read_rows_keeps_row_order_across_shards(split: Path) -> None:
     rows = witnessed(split).take([7, 0, 3, 1, 6, 0])
     assert len(set(rows["shard"].to_pylist())) == 3
     found = read_rows(split, rows)
@@ -52,31 +52,31 @@ def test_rows_come_in_their_order_across_shards(split: Path) -> None:
         assert all(same_bits(found[name][..., i : i + 1], alone[name]).all() for name in alone)
 
 
-def test_only_the_fields_that_are_asked_for(split: Path) -> None:
+def test_read_rows_returns_only_requested_fields(split: Path) -> None:
     found = read_rows(split, witnessed(split), ["record/reward", "level/role"])
     assert {name: x.shape[-1] for name, x in found.items()} == {"record/reward": 8, "level/role": 8}
 
 
-def test_a_shard_that_a_seal_took_away_is_looked_for_again(split: Path) -> None:
-    """As a seal leaves it: the levels lie in another shard, which the manifest names now."""
+def test_read_rows_follows_levels_moved_by_a_seal(split: Path) -> None:
+    """The split is as after a seal: the manifest names another shard for the levels."""
     rows = witnessed(split)
     before = read_rows(split, rows)
     old, new = Path(rows["shard"][0].as_py()), Path("shards/000000000000-000000000001-ffffffff.zarr")
     shutil.move(split / old, split / new)
-    changed(split, "shard", [str(new)] * 2)
+    replace_column(split, "shard", [str(new)] * 2)
     after = read_rows(split, rows)
     assert all(same_bits(after[name], before[name]).all() for name in before)
 
 
-def test_a_shard_that_is_gone_is_a_sentence(split: Path) -> None:
+def test_read_rows_reports_a_missing_shard(split: Path) -> None:
     rows = witnessed(split)
     shutil.rmtree(split / rows["shard"][0].as_py())
     with pytest.raises(Failure, match="missing or damaged"):
         read_rows(split, rows)
 
 
-def test_a_row_of_another_level_is_refused(split: Path) -> None:
+def test_read_rows_rejects_a_row_of_another_level(split: Path) -> None:
     for wrong in ([1, 0], [-1, -1], [0, 2]):
-        changed(split, "row", wrong)
-        with pytest.raises(Failure, match="has not the levels that the manifest says"):
+        replace_column(split, "row", wrong)
+        with pytest.raises(Failure, match="does not have the levels that the manifest lists"):
             read_rows(split, witnessed(split).slice(0, 2))

@@ -1,4 +1,4 @@
-"""Nothing of a split is unpickled, whatever reads it."""
+"""Unpickling: no reader of splits or folders does it."""
 
 import _pickle
 import pickle
@@ -19,24 +19,24 @@ from tests.pipeline.made import made_job, played_split
 from tests.pipeline.read.kinetix.folder import GOLDEN
 
 
-def reached(*_: object, **__: object) -> None:
-    pytest.fail("something is unpickled")
+def fail(*_: object, **__: object) -> None:
+    pytest.fail("a reader unpickled data")
 
 
 class Unpickler:
-    """In place of pickle's own."""
+    """Replacement of `pickle.Unpickler` that fails the test."""
 
-    __init__ = reached
+    __init__ = fail
 
 
 @pytest.mark.campaign
-def test_pickle_is_not_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readers_never_unpickle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     split = played_split(tmp_path)
     theirs = tmp_path / "experts.npz"
     np.savez(theirs, level_id=np.array([{}], object), curve=np.zeros((1, 1)))
     for module in (pickle, _pickle):
-        monkeypatch.setattr(module, "load", reached)
-        monkeypatch.setattr(module, "loads", reached)
+        monkeypatch.setattr(module, "load", fail)
+        monkeypatch.setattr(module, "loads", fail)
         monkeypatch.setattr(module, "Unpickler", Unpickler)
     for density in (None, "resume", "witness"):
         if density:

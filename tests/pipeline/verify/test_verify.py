@@ -1,4 +1,4 @@
-"""Forged splits: each lie is found, by levels made again, labels worked out again, and witnesses replayed."""
+"""`examine` on forged splits with valid checksums: regenerated levels, labels and witnesses expose each forgery."""
 
 import itertools
 import json
@@ -48,7 +48,7 @@ def split(honest: Path, tmp_path: Path) -> Path:
 
 
 def forge(split: Path, change: Callable[[Row], None] = lambda row: None, level_ids: list[int] | None = None) -> None:
-    """Change rows, and write their fragments with every checksum, as if all were right."""
+    """Change rows, and rewrite their fragments with valid checksums."""
     for path in fragment_paths(split):
         table = pq.read_table(path)
         rows = table.to_pylist()
@@ -63,13 +63,13 @@ def forge(split: Path, change: Callable[[Row], None] = lambda row: None, level_i
         path.write_bytes(with_own(whole.getvalue().to_pybytes()))
 
 
-def of_label(split: Path, *labels: Label) -> list[Row]:
+def rows_labelled(split: Path, *labels: Label) -> list[Row]:
     return [row for row in read_manifest(split).table.to_pylist() if row["label"] in labels]
 
 
 def neighbours(split: Path) -> tuple[Row, Row]:
-    """Two levels of one shard."""
-    rows = of_label(split, *WITNESSED)
+    """Return adjacent rows of one shard."""
+    rows = rows_labelled(split, *WITNESSED)
     return next((a, b) for a, b in itertools.pairwise(rows) if a["shard"] == b["shard"])
 
 
@@ -84,48 +84,48 @@ def exchange_worlds(split: Path, a: Row, b: Row) -> None:
     forge(split)
 
 
-def of_another_stack(row: Row) -> None:
+def set_another_device(row: Row) -> None:
     row["device"] = "cpu: of another kind"
 
 
-def assert_told(split: Path, *sentences: str) -> None:
+def assert_reported(split: Path, *sentences: str) -> None:
     wrong = examine(split).sentences
     assert len(wrong) == len(sentences), wrong
-    for sentence, told in zip(sentences, sorted(wrong), strict=True):
-        assert sentence in told
+    for sentence, reported in zip(sentences, sorted(wrong), strict=True):
+        assert sentence in reported
 
 
-def test_an_honest_split_has_nothing_wrong(honest: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its small shards are replayed together, in as few blocks as they fit in."""
+def test_examine_finds_nothing_wrong_in_an_honest_split(honest: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Witnesses of small shards are replayed together, in as few blocks as possible."""
     counts: list[int] = []
     counted = lambda level, action, rules: counts.append(action.shape[-1]) or replay(level, action, rules)
     monkeypatch.setattr(evidence, "replay", counted)
     found = examine(honest)
     assert found.sentences == []
     assert (found.levels, found.shards) == (UNIT * UNITS, len(read_manifest(honest).shards))
-    assert found.witnesses == found.same_bits == len(of_label(honest, *WITNESSED))
+    assert found.witnesses == found.same_bits == len(rows_labelled(honest, *WITNESSED))
     assert counts == [found.witnesses]
 
 
-def test_an_honest_split_on_a_web_server_has_nothing_wrong(
-    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It lists no files; those that fragments name are looked at."""
+def test_examine_checks_a_split_on_a_web_server(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A web server lists no files: `examine` checks those that fragments name."""
     monkeypatch.setattr(remote, "_cache", lambda: remote.PieceCache(tmp_path / "cache", 10**9))
     write_index(split)
     shard = split / sorted(read_manifest(split, ["shard"]).shards)[0]
     with serving(files_of(split.parent)) as server:
         found = examine(Path(f"{server.url}/{split.name}"))
         assert found.sentences == []
-        assert found.witnesses == found.same_bits == len(of_label(split, *WITNESSED))
+        assert found.witnesses == found.same_bits == len(rows_labelled(split, *WITNESSED))
         with (shard / "zarr.json").open("a") as file:
             file.write(" ")
         (sentence,) = examine(Path(f"{server.url}/{split.name}")).sentences
         assert f"{shard.name}/zarr.json is not what was committed" in sentence
 
 
-def test_a_server_that_gives_out_is_no_damage(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever was to be read next."""
+def test_examine_reports_a_failing_server_as_such_and_not_as_damage(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever request fails."""
     write_index(split)
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
     remote._store.cache_clear()
@@ -146,91 +146,91 @@ def test_a_server_that_gives_out_is_no_damage(split: Path, tmp_path: Path, monke
 
 @pytest.mark.parametrize("adapts", [False, True])
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test_worlds_moved_under_each_other_s_ids(split: Path, adapts: bool, elsewhere: bool) -> None:
-    """Whether or not their rows are moved as well, and on whatever stack they say that they were made."""
+def test_examine_finds_exchanged_worlds(split: Path, adapts: bool, elsewhere: bool) -> None:
+    """With or without exchanged rows, and whichever stack the rows claim."""
     a, b = neighbours(split)
     exchange_worlds(split, a, b)
     if adapts:
         for row, other in ((a, b), (b, a)):
-            kept = {name: row[name] for name in ("level_id", "row", "shard")}
-            forge(split, lambda of, new=other | kept: of.update(new), [row["level_id"]])
+            position = {name: row[name] for name in ("level_id", "row", "shard")}
+            forge(split, lambda changed, new=other | position: changed.update(new), [row["level_id"]])
     if elsewhere:
-        forge(split, of_another_stack)
-    what = "another world in its shard" if not adapts else "has not the content hash and the signature"
-    assert_told(split, *sorted(f"Level {row['level_id']} has {what.removeprefix('has ')}" for row in (a, b)))
+        forge(split, set_another_device)
+    what = "a content hash or a signature that differs" if adapts else "a world in its shard that differs"
+    assert_reported(split, *sorted(f"Level {row['level_id']} has {what}" for row in (a, b)))
 
 
 @pytest.mark.parametrize("label", [Label.SOLVED, Label.UNSOLVED, Label.TRIVIAL])
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test_a_row_relabelled_unsolvable(split: Path, label: Label, elsewhere: bool) -> None:
-    level_id = of_label(split, label)[0]["level_id"]
-    reason = of_label(split, Label.UNSOLVABLE)[0]["label_reason"]
+def test_examine_finds_a_row_relabelled_unsolvable(split: Path, label: Label, elsewhere: bool) -> None:
+    level_id = rows_labelled(split, label)[0]["level_id"]
+    reason = rows_labelled(split, Label.UNSOLVABLE)[0]["label_reason"]
     change = {"label": "unsolvable", "label_reason": reason, "shard": None, "row": None, "steps_to_goal": None}
     forge(split, lambda row: row.update(change), [level_id])
     if elsewhere:
-        forge(split, of_another_stack)
-    proper = "it should be trivial" if label is Label.TRIVIAL else "nothing proves that"
-    assert_told(split, f"Level {level_id} is unsolvable, and {proper}.")
+        forge(split, set_another_device)
+    proper = "should be trivial" if label is Label.TRIVIAL else "nothing proves that"
+    assert_reported(split, f"Level {level_id} is unsolvable, but {proper}.")
 
 
 @pytest.mark.parametrize(("label", "other"), [("unsolvable", "unsolved"), ("trivial", "solved")])
-def test_a_label_that_hides_what_is_known(split: Path, label: str, other: str) -> None:
-    level_id = of_label(split, Label(label))[0]["level_id"]
+def test_examine_finds_a_label_that_hides_a_proof(split: Path, label: str, other: str) -> None:
+    level_id = rows_labelled(split, Label(label))[0]["level_id"]
     forge(split, lambda row: row.update(label=other), [level_id])
-    assert_told(split, f"Level {level_id} is {other}, and it should be {label}.")
+    assert_reported(split, f"Level {level_id} is {other}, but should be {label}.")
 
 
-def test_identities_exchanged(split: Path) -> None:
-    a, b = of_label(split, Label.UNSOLVED)[:2]
+def test_examine_finds_exchanged_identities(split: Path) -> None:
+    a, b = rows_labelled(split, Label.UNSOLVED)[:2]
     for row, other, name in ((a, b, "content_hash"), (b, a, "signature")):
-        forge(split, lambda of, name=name, other=other: of.update({name: other[name]}), [row["level_id"]])
-    sentence = "Level {} has not the content hash and the signature of the level that its id makes."
-    assert_told(split, *sorted(sentence.format(row["level_id"]) for row in (a, b)))
+        forge(split, lambda changed, name=name, other=other: changed.update({name: other[name]}), [row["level_id"]])
+    sentence = "Level {} has a content hash or a signature that differs from the level that its id makes."
+    assert_reported(split, *sorted(sentence.format(row["level_id"]) for row in (a, b)))
 
 
-def test_other_lies_of_rows(split: Path) -> None:
-    solved, trivial, unsolved = (of_label(split, label)[0] for label in (Label.SOLVED, Label.TRIVIAL, Label.UNSOLVED))
+def test_examine_finds_other_false_columns(split: Path) -> None:
+    solved, trivial, unsolved = (
+        rows_labelled(split, label)[0] for label in (Label.SOLVED, Label.TRIVIAL, Label.UNSOLVED)
+    )
     forge(split, lambda row: row.update(steps_to_goal=row["steps_to_goal"] + 1), [solved["level_id"]])
     forge(split, lambda row: row.update(label_reason="a feeling"), [trivial["level_id"]])
     forge(split, lambda row: row.update(failed_by_noop=not row["failed_by_noop"]), [unsolved["level_id"]])
-    last = of_label(split, Label.UNSOLVED)[-1]["level_id"]
+    last = rows_labelled(split, Label.UNSOLVED)[-1]["level_id"]
     forge(split, lambda row: row.update(size="m"), [last])
-    told = {
+    sentences = {
         solved["level_id"]: "reaches the goal in ",
-        trivial["level_id"]: "is trivial for another reason than its row has",
-        unsolved["level_id"]: "by doing nothing, the manifest says otherwise",
-        last: "is of size m, its split of s",
+        trivial["level_id"]: "is trivial, but not for the reason in its row",
+        unsolved["level_id"]: "by doing nothing, but the manifest says otherwise",
+        last: "has size m, but its split has s",
     }
-    assert_told(split, *(told[i] for i in sorted(told, key=lambda i: f"Level {i} ")))
+    assert_reported(split, *(sentences[i] for i in sorted(sentences, key=lambda i: f"Level {i} ")))
 
 
-def test_rows_of_shards_that_are_not_theirs(split: Path) -> None:
+def test_examine_finds_rows_that_name_another_levels_position(split: Path) -> None:
     a, b = neighbours(split)
     forge(split, lambda row: row.update(row=b["row"]), [a["level_id"]])
-    assert_told(
-        split, f"Level {a['level_id']} is said to be row {b['row']} of {a['shard']}, which has level {b['level_id']}"
+    assert_reported(
+        split, f"Level {a['level_id']} should be in row {b['row']} of {a['shard']}, which has level {b['level_id']}"
     )
     forge(split, lambda row: row.update(row=10**6), [a["level_id"]])
-    assert_told(split, "which has level None there")
+    assert_reported(split, "which has level None there")
 
 
-def test_a_record_that_differs_in_one_bit(split: Path) -> None:
-    row = of_label(split, Label.SOLVED)[0]
+def test_examine_finds_a_record_that_differs_in_one_bit(split: Path) -> None:
+    row = rows_labelled(split, Label.SOLVED)[0]
     shard = Shard(split / row["shard"])
     arrays = shard.read()
     arrays["record/reward"].view(np.uint32)[7, row["row"]] ^= 1
     shutil.rmtree(shard.path)
     write_shard(shard.path, shard.level_ids, arrays)
     forge(split)
-    assert_told(split, f"Level {row['level_id']} has a witness that does not replay: its reward differs.")
-    forge(split, of_another_stack)
-    assert_told(split)
+    assert_reported(split, f"Level {row['level_id']} has a witness that does not replay: its reward differs.")
+    forge(split, set_another_device)
+    assert_reported(split)
 
 
-def test_of_a_damaged_fragment_no_more_levels_are_lost_than_one_has(
-    split: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whatever its name and the note say."""
+def test_examine_bounds_the_lost_levels_of_a_damaged_fragment(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever range the fragment's name and the note claim."""
     monkeypatch.setattr("levelproof.pipeline.verify.verify.MAX_ROWS", 100)
     (split / MANIFEST / f"{unit_name(0, MAX_LEVEL_ID)}.parquet").write_bytes(b"PAR1")
     assert len(examine(split).lost) <= 102
@@ -238,8 +238,8 @@ def test_of_a_damaged_fragment_no_more_levels_are_lost_than_one_has(
     assert len(examine(split).lost) <= 102
 
 
-def test_a_hostile_shard_is_one_sentence_and_the_others_are_looked_at(split: Path) -> None:
-    row = of_label(split, Label.SOLVED)[0]
+def test_examine_reports_a_hostile_shard_once_and_checks_the_others(split: Path) -> None:
+    row = rows_labelled(split, Label.SOLVED)[0]
     shard = Shard(split / row["shard"])
     arrays = shard.read()
     arrays["level/model/joint_a"][:] = 200
@@ -249,7 +249,7 @@ def test_a_hostile_shard_is_one_sentence_and_the_others_are_looked_at(split: Pat
     found = examine(split)
     (sentence,) = found.sentences
     assert "its field level/model/joint_a has numbers that size s cannot have" in sentence
-    assert 0 < found.witnesses == len(of_label(split, *WITNESSED)) - len(shard.level_ids)
+    assert 0 < found.witnesses == len(rows_labelled(split, *WITNESSED)) - len(shard.level_ids)
     for name in ("/etc", "../../elsewhere", row["shard"]):
         if name == row["shard"]:
             shutil.rmtree(split / "shards")

@@ -1,4 +1,4 @@
-"""Witnesses as a Minari dataset: opened by the library, and equal to what the environment gives."""
+"""Minari exports: opened by Minari, and equal to what the environment returns."""
 
 import sys
 from pathlib import Path
@@ -16,14 +16,14 @@ from levelproof.levelgen.task.actions import CHOICES, continuous_controls, contr
 from levelproof.levelgen.task.observe.flat import symbolic_flat
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.cli.main import main
-from levelproof.pipeline.exchange.minari.episodes import ActionKind, episodes_of, written
+from levelproof.pipeline.exchange.minari.episodes import ActionKind, encode_actions, episodes_of
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import made_job, played_split
 
 pytestmark = pytest.mark.slow
-MANY = 16  # levels of the split that are looked at, and those of them that are solved
-EVERY = np.stack(np.unravel_index(np.arange(np.prod(CHOICES)), CHOICES), -1)  # action there is
+MANY = 16  # levels with ids below this are compared
+EVERY = np.stack(np.unravel_index(np.arange(np.prod(CHOICES)), CHOICES), -1)  # actions that exist
 
 
 @pytest.fixture(scope="module")
@@ -33,34 +33,36 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def stored(split: Path) -> dict[int, Any]:
-    """What shards have of the first solved levels, by their ids."""
+    """Stored arrays of the solved levels below MANY, by id."""
     rows = read_manifest(split).table.to_pylist()
     solved = [row for row in rows if row["label"] == "solved" and row["level_id"] < MANY]
     return {row["level_id"]: levelproof.Shard(split / row["shard"]).read([row["row"]]) for row in solved}
 
 
-def exported(split: Path, out: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> Any:
-    assert main(["export", str(split), "--format", "minari", "-o", str(out), *words]) == 0
+def export_and_load(split: Path, out: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Any:
+    assert main(["export", str(split), "--format", "minari", "-o", str(out), *arguments]) == 0
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(out))
     (name,) = minari.list_local_datasets()
     return minari.load_dataset(name)
 
 
 @jax.jit
-def seen(level: levelproof.Level, states: Any, step: int) -> Any:
+def observe(level: levelproof.Level, states: Any, step: int) -> Any:
     return symbolic_flat(level, jax.tree.map(lambda x: jnp.asarray(x)[step], states))
 
 
-def test_minari_opens_it(split: Path, stored: dict[int, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every step of every record is there once, in order, and what is seen is that of the stored states."""
-    data = exported(split, tmp_path / "out", monkeypatch, "--where", f"label = 'solved' AND level_id < {MANY}")
+def test_export_minari_writes_every_step_once_in_order(
+    split: Path, stored: dict[int, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Observations are those of the stored states."""
+    data = export_and_load(split, tmp_path / "out", monkeypatch, "--where", f"label = 'solved' AND level_id < {MANY}")
     assert data.id == "levelproof/128k/s-v0"
     assert data.total_steps == 256 * len(stored)
-    at = dict.fromkeys(stored, 0)
+    position = dict.fromkeys(stored, 0)
     for episode in data.iterate_episodes():
         (level_id,) = set(episode.infos["level_id"].tolist())
-        fields, first = stored[level_id], at[level_id]
-        rows, at[level_id] = slice(first, first + len(episode)), first + len(episode)
+        fields, first = stored[level_id], position[level_id]
+        rows, position[level_id] = slice(first, first + len(episode)), first + len(episode)
         level = tree_of(levelproof.Level, fields, "level/")
         record = tree_of(Record, fields, "record/")
         np.testing.assert_array_equal(episode.actions, record.action[rows, :, 0])
@@ -71,23 +73,23 @@ def test_minari_opens_it(split: Path, stored: dict[int, Any], tmp_path: Path, mo
         np.testing.assert_array_equal(episode.infos["success"], [False, *record.goal[rows, 0]])
         assert all(map(data.action_space.contains, episode.actions))
         assert all(map(data.observation_space.contains, episode.observations))
-        np.testing.assert_array_equal(episode.observations[0], seen(level, record.state, first)[:, 0])
-    assert set(at.values()) == {256}
+        np.testing.assert_array_equal(episode.observations[0], observe(level, record.state, first)[:, 0])
+    assert set(position.values()) == {256}
 
 
-def test_what_is_seen_last_is_what_the_next_state_is_like(stored: dict[int, Any]) -> None:
-    """Within an episode the step that the engine makes anew leads to the row that the record has."""
+def test_last_observation_of_an_episode_is_that_of_its_next_state(stored: dict[int, Any]) -> None:
+    """If a record is cut within an episode, the recomputed step must give the next row of the record."""
     fields = next(iter(stored.values()))
     level, record = tree_of(levelproof.Level, fields, "level/"), tree_of(Record, fields, "record/")
-    whole = lambda of: next(episodes_of(np.array([0]), level, of, TaskParams(), ActionKind.COMBINED))
+    first = lambda record: next(episodes_of(np.array([0]), level, record, TaskParams(), ActionKind.COMBINED))
     cut = record.done.copy()
     cut[5] = True
     shorter = Record(**vars(record) | {"done": cut})
-    assert len(whole(record).rewards) > 6
-    np.testing.assert_array_equal(whole(shorter).observations, whole(record).observations[:7])
+    assert len(first(record).rewards) > 6
+    np.testing.assert_array_equal(first(shorter).observations, first(record).observations[:7])
 
 
-def test_time_that_is_up_is_a_truncation_and_a_failure_is_none(stored: dict[int, Any]) -> None:
+def test_episodes_of_truncates_at_the_time_limit_and_terminates_on_failure(stored: dict[int, Any]) -> None:
     fields = next(iter(stored.values()))
     level, record = tree_of(levelproof.Level, fields, "level/"), tree_of(Record, fields, "record/")
     done, goal = np.zeros((256, 1), bool), np.zeros((256, 1), bool)
@@ -104,12 +106,12 @@ def test_time_that_is_up_is_a_truncation_and_a_failure_is_none(stored: dict[int,
 
 
 @pytest.mark.parametrize("kind", ["combined", "continuous"])
-def test_other_actions_are_the_same_actions(
+def test_combined_and_continuous_actions_equal_the_stored_ones(
     kind: str, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data = exported(split, tmp_path / "out", monkeypatch, "--actions", kind, "--where", "level_id < 4")
+    data = export_and_load(split, tmp_path / "out", monkeypatch, "--actions", kind, "--where", "level_id < 4")
     assert data.id == f"levelproof/128k/s-{kind}-v0"
-    theirs = written(EVERY, ActionKind(kind))
+    theirs = encode_actions(EVERY, ActionKind(kind))
     assert all(data.action_space.contains(action) for action in theirs)
     assert all(data.action_space.contains(action) for action in data[0].actions)
     if kind == "combined":
@@ -121,7 +123,9 @@ def test_other_actions_are_the_same_actions(
         jax.tree.map(np.testing.assert_array_equal, ours, continuous_controls(levels, jnp.asarray(theirs.T)))
 
 
-def test_what_cannot_be_is_refused(split: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_minari_rejects_invalid_arguments(
+    split: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
     command = ["export", str(split), "-o", str(tmp_path / "out"), "--format"]
     assert main([*command, "minari", "--where", "level_id < 0"]) == 2
     assert main([*command, "parquet", "--actions", "combined"]) == 2

@@ -1,4 +1,4 @@
-"""Folders in the reference's layout, read with zarr's own codecs and nothing of ours; and what they have as ours."""
+"""Folders in the reference's layout, read with zarr's codecs and none of our code; conversion to our types."""
 
 import json
 from itertools import product
@@ -13,12 +13,12 @@ from levelproof.levelgen.level import Level
 from levelproof.physics.types import Manifold
 
 GOLDEN = Path(__file__).parents[3] / "golden/kinetix"  # benchmarks/reference/trajectories.py wrote it
-SOLVED, OTHERS = 5, 2  # trajectories of each size there: first those that are solved
+SOLVED, OTHERS = 5, 2  # trajectories of each size in GOLDEN: solved ones first
 STEPS = 256
 
 
 def trajectories_in(folder: Path) -> np.ndarray:
-    """All of them, (trajectory, 256), in the order of arrays and rows; as the reference reads them."""
+    """Return all trajectories, (trajectory, 256), in the order of arrays and rows, as the reference reads them."""
     assert json.loads((folder / ".zgroup").read_text()) == {"zarr_format": 2}
     return np.concatenate([array_at(path) for path in sorted(folder.iterdir()) if path.is_dir()])
 
@@ -37,8 +37,8 @@ def array_at(path: Path) -> np.ndarray:
     return found[: shape[0], : shape[1]]
 
 
-def ours_of(trajectories: np.ndarray) -> tuple[Level, Record]:
-    """What the reference stored as a level and a record of ours: bits are moved, nothing is played."""
+def to_ours(trajectories: np.ndarray) -> tuple[Level, Record]:
+    """Convert trajectories of the reference to our levels and records by moving bits, without simulation."""
     count = len(trajectories)
     theirs = {name: trajectories[name][:, :, 0] for name in trajectories.dtype.names or ()}
     state = {name.removeprefix("env_state/"): x for name, x in theirs.items() if name.startswith("env_state/")}

@@ -1,4 +1,4 @@
-"""Folders of trajectories from anywhere: read as they are, or refused in one sentence."""
+"""Folders of trajectories from any source: read exactly, or rejected in one sentence."""
 
 import json
 import os
@@ -15,9 +15,9 @@ from numcodecs import Blosc
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectories
 from levelproof.pipeline.read.kinetix.zarr2 import FormatError
-from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, ours_of, trajectories_in
+from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, to_ours, trajectories_in
 
-MAX_MEMORY = 20e6  # bytes; a chunk of four trajectories has 1.5 MB
+MAX_MEMORY = 20e6  # bytes; a chunk of four trajectories takes 1.5 MB
 
 
 @pytest.fixture
@@ -26,15 +26,14 @@ def theirs(tmp_path: Path) -> Path:
 
 
 def read(folder: Path) -> None:
-    """All that is read of a folder."""
-    found = open_folder(folder)
-    for array in found.arrays:
+    """Read everything in a folder."""
+    for array in open_folder(folder).arrays:
         read_trajectories(array, 0, array.rows)
 
 
 @pytest.mark.parametrize("size", ["s", "m"])
-def test_chunks_of_any_cut_are_read(size: str) -> None:
-    folder, (level, record) = open_folder(GOLDEN / size), ours_of(trajectories_in(GOLDEN / size))
+def test_read_trajectories_accepts_any_chunk_shape(size: str) -> None:
+    folder, (level, record) = open_folder(GOLDEN / size), to_ours(trajectories_in(GOLDEN / size))
     assert (folder.size, folder.rows) == (SIZES[size], SOLVED + OTHERS)
     first, second = folder.arrays
     assert (first.chunks, second.chunks) == ((4, 256), (2, 100))
@@ -48,7 +47,7 @@ def test_chunks_of_any_cut_are_read(size: str) -> None:
 
 
 def changed(**entries: Any) -> Callable[[Path], None]:
-    """A change of the description of the first array."""
+    """Return a change of entries in the metadata of the first array."""
 
     def change(folder: Path) -> None:
         path = folder / "first/.zarray"
@@ -76,7 +75,7 @@ def pipe(folder: Path) -> None:
 
 
 def bomb(folder: Path) -> None:
-    """A chunk that says that it becomes four gigabytes."""
+    """Make a chunk claim that it decodes to four gigabytes."""
     path = folder / "first/0.0"
     raw = bytearray(path.read_bytes())
     raw[4:8] = (2**32 - 1).to_bytes(4, "little")
@@ -88,46 +87,55 @@ SIZE = [["env_state/polygon/n_vertices", "<i4", [1, 900]], ["env_state/circle/ra
         ["env_state/joint/active", "|b1", [1, 1]], ["env_state/thruster/active", "|b1", [1, 1]]]  # fmt: skip
 HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "no group": (lambda folder: (folder / ".zgroup").unlink(), "there is no .zgroup in"),
-    "zarr 3": (put(".zgroup", b'{"zarr_format": 3}'), "is not of zarr's format 2"),
+    "zarr 3": (put(".zgroup", b'{"zarr_format": 3}'), "is not of zarr format 2"),
     "no JSON": (put(".zgroup", b"{"), "cannot be read"),
     "deep": (put("first/.zarray", b"[" * 2**21), "cannot be read"),
-    "a list": (put("first/.zarray", LISTS), "its array first has a description that says nothing"),
+    "a list": (put("first/.zarray", LISTS), "its array first has invalid metadata"),
     "no arrays": (lambda folder: [shutil.rmtree(folder / name) for name in ("first", "second")], "no trajectories"),
-    "two steps": (changed(shape=[3, 2]), "has the shape [3, 2], and it should be (trajectories, 256)"),
+    "two steps": (changed(shape=[3, 2]), "has the shape [3, 2], but must have (trajectories, 256)"),
     "many": (changed(shape=[2**62, 256]), "has the shape"),
     "negative": (changed(shape=[-3, 256]), "has the shape"),
     "a word": (changed(shape="many"), "has the shape many"),
-    "too many": (changed(shape=[10**11, 256]), "has 100,000,000,004 trajectories, and at most 100,000,000 are read"),
+    "too many": (
+        changed(shape=[10**11, 256]),
+        "claims 100,000,000,004 trajectories, more than the maximum of 100,000,000",
+    ),
     "more rows": (changed(shape=[300, 256]), "its chunk"),
     "no chunks": (changed(chunks=[0, 256]), "has the shape"),
     "large chunks": (changed(chunks=[2**30, 256]), "of more than 1,073,741,824 bytes"),
     "other chunks": (changed(chunks=[3, 256]), "is not the 1,142,016 bytes"),
-    "zlib": (changed(compressor={"id": "zlib", "level": 1}), "compressed by 'zlib', and only blosc is read"),
+    "zlib": (changed(compressor={"id": "zlib", "level": 1}), "compressed by 'zlib', but must use blosc"),
     "a pickle": (changed(compressor={"id": "pickle"}), "compressed by 'pickle'"),
     "no compressor": (changed(compressor=None), "is damaged"),
     "filters": (changed(filters=[{"id": "pickle"}]), "has filters"),
-    "Fortran": (changed(order="F"), "has filters, another order than C"),
-    "objects": (fields(lambda of: of.append(["extra", "|O", [1]])), "its field extra is of type |O, and no number"),
-    "strings": (fields(lambda of: of.append(["extra", "<U9999999", [1]])), "and no number or flag"),
-    "a huge field": (fields(lambda of: of.append(["extra", "<f4", [1, 2**40]])), "its array first"),
-    "two of a name": (fields(lambda of: of.append(of[0])), "says nothing"),
-    "no action": (fields(lambda of: of.remove(next(x for x in of if x[0] == "action"))), "has no field action"),
-    "of floats": (
-        fields(lambda of: next(x for x in of if x[0] == "action").__setitem__(1, "<f4")),
-        "the field action of its array first is float32 of shape (6,), and a level of size s has int32",
+    "Fortran": (changed(order="F"), "has filters, an order other than C"),
+    "objects": (
+        fields(lambda dtype: dtype.append(["extra", "|O", [1]])),
+        "its field extra has the type |O, which is not a number",
     ),
-    "no size": (fields(lambda of: of.__setitem__(slice(None), SIZE)), "those of no size of levels"),
+    "strings": (fields(lambda dtype: dtype.append(["extra", "<U9999999", [1]])), "which is not a number or flag"),
+    "a huge field": (fields(lambda dtype: dtype.append(["extra", "<f4", [1, 2**40]])), "its array first"),
+    "a repeated name": (fields(lambda dtype: dtype.append(dtype[0])), "has invalid metadata"),
+    "no action": (
+        fields(lambda dtype: dtype.remove(next(x for x in dtype if x[0] == "action"))),
+        "has no field action",
+    ),
+    "float actions": (
+        fields(lambda dtype: next(x for x in dtype if x[0] == "action").__setitem__(1, "<f4")),
+        "the field action of its array first is float32 of shape (6,), but must be int32",
+    ),
+    "no size": (fields(lambda dtype: dtype.__setitem__(slice(None), SIZE)), "do not match any level size"),
     "missing": (lambda folder: (folder / "first/0.0").unlink(), "0.0 is missing"),
     "a pipe": (pipe, "0.0 is missing"),
     "empty": (put("first/0.0", b""), "is not the 1,522,688 bytes"),
-    "long": (put("first/0.0", bytes(2**21)), "is larger than what is in it"),
+    "long": (put("first/0.0", bytes(2**21)), "is larger than its contents"),
     "a bomb": (bomb, "is not the 1,522,688 bytes"),
     "another": (put("first/0.0", Blosc().encode(bytes(100))), "is not the 1,522,688 bytes"),
 }
 
 
 @pytest.mark.parametrize(("change", "words"), HOSTILE.values(), ids=HOSTILE)
-def test_hostile_folders_get_one_sentence_and_little_memory(
+def test_open_folder_rejects_hostile_folders_in_one_sentence_and_little_memory(
     theirs: Path, change: Callable[[Path], object], words: str
 ) -> None:
     change(theirs)
@@ -143,8 +151,8 @@ def test_hostile_folders_get_one_sentence_and_little_memory(
     assert len(str(error.value)) < 300
 
 
-def test_any_flipped_byte_is_a_sentence_or_another_trajectory(theirs: Path) -> None:
-    """A blosc chunk has no checksum: what is read after a flip is looked at as what anybody wrote."""
+def test_read_trajectories_reports_a_flipped_byte_or_returns_checked_values(theirs: Path) -> None:
+    """Blosc chunks have no checksum, so values read after a flip are checked like any untrusted ones."""
     path, rng = theirs / "first/0.0", np.random.default_rng(0)
     raw = path.read_bytes()
     for at in [*range(16), *rng.integers(16, len(raw), 24).tolist()]:

@@ -1,4 +1,4 @@
-"""The reference's own reader and renderer on what we export: `benchmarks/reference/reader.py` runs there."""
+"""The reference's reader and renderer on our exports: it runs `benchmarks/reference/reader.py`."""
 
 from pathlib import Path
 
@@ -17,12 +17,12 @@ from levelproof.pipeline.store.manifest import require_manifest
 from tests.pipeline.command import here
 
 pytestmark = pytest.mark.campaign
-ROWS = 4  # the reference's reader holds 500 batches
+ROWS = 4  # few, because the reference's reader holds 500 batches
 STEPS = (0, 5, 40)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_the_reference_opens_and_draws_what_we_export(reference: Path, size: str, tmp_path: Path) -> None:
+def test_reference_opens_and_draws_kinetix_exports(reference: Path, size: str, tmp_path: Path) -> None:
     words = [f"size={size}", "levels=24", "budget=5k", "procedure=label", "executor=inline"]
     assert here(["generate", *words], tmp_path).returncode == 0
     split = tmp_path / "data/5k" / size
@@ -32,8 +32,8 @@ def test_the_reference_opens_and_draws_what_we_export(reference: Path, size: str
     done = here(["export", str(split), "--format", "kinetix", "-o", "k", "--where", f"level_id <= {last}"], tmp_path)
     assert done.returncode == 0, done.stderr
     out = tmp_path / "seen.npz"
-    given = [out, tmp_path / "k", "--size", size, "--rows", rows.num_rows, "--steps", *STEPS]
-    oracle.run_script(reference, "reader", given, "open an export with the reference")
+    arguments = [out, tmp_path / "k", "--size", size, "--rows", rows.num_rows, "--steps", *STEPS]
+    oracle.run_script(reference, "reader", arguments, "open an export with the reference")
     with np.load(out) as file:
         seen = dict(file)
 
