@@ -1,23 +1,23 @@
-"""`levelproof card`: a dataset's page for the Hugging Face hub."""
+"""`levelproof card`: write a dataset's page for the Hugging Face hub."""
 
 import argparse
 from pathlib import Path
 
 from levelproof.pipeline.cli.command import SPLIT
 
-DOES = "write the README of a dataset of splits, for the Hugging Face hub"
+SUMMARY = "write the README of a dataset of splits, for the Hugging Face hub"
 EXAMPLE = """\
 levelproof card data/1M/s data/1M/m --license cc-by-4.0 --repo me/levels"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("splits", type=Path, nargs="+", metavar="SPLIT", help=SPLIT)
-    where = "file to write; all splits have to be below its folder (default: README.md in the folder above {budget}/)"
+    where = "file to write; all splits must be below its folder (default: README.md in the folder above {budget}/)"
     parser.add_argument("-o", "--out", type=Path, help=where)
-    parser.add_argument("--license", metavar="ID", help="the data's licence, as the hub names it, such as cc-by-4.0")
+    parser.add_argument("--license", metavar="ID", help="the data's licence by its name on the hub, such as cc-by-4.0")
     parser.add_argument("--name", help="the dataset's name (default: that of its folder)")
-    parser.add_argument("--repo", metavar="USER/NAME", help="where the dataset will be on the hub")
-    parser.add_argument("--code", metavar="URL", help="where the levelproof is that made it")
+    parser.add_argument("--repo", metavar="USER/NAME", help="name of the dataset on the hub")
+    parser.add_argument("--code", metavar="URL", help="address of the code that made the dataset")
 
 
 def run(arguments: argparse.Namespace) -> None:

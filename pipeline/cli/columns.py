@@ -1,4 +1,4 @@
-"""`levelproof columns`: every column of a manifest with its meaning, type and unit."""
+"""`levelproof columns`: list a manifest's columns with their meanings, types and units."""
 
 import argparse
 import json
@@ -11,9 +11,9 @@ from levelproof.pipeline.errors import UserError
 if TYPE_CHECKING:
     from levelproof.pipeline.store.columns import ManifestColumn
 
-DOES = "list a manifest's columns with their meanings, types and units"
+SUMMARY = "list a manifest's columns with their meanings, types and units"
 EXAMPLE = "levelproof columns steps"
-INDENT = 26  # where meanings start
+INDENT = 26  # column at which meanings start
 INTRODUCTION = """# Columns
 
 Every column of a manifest, version {version}, which has one row for every level that was tried. They are the names \
@@ -35,40 +35,42 @@ More on [labels](labels.md) and what they rest on, on [content hashes and signat
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("word", nargs="?", default="", metavar="WORD", help="only columns that have this word")
-    shape = parser.add_mutually_exclusive_group()
-    add_json(shape)
-    shape.add_argument("--markdown", action="store_true", help="print the page docs/columns.md")
+    parser.add_argument("word", nargs="?", default="", metavar="WORD", help="only columns that contain this word")
+    output = parser.add_mutually_exclusive_group()
+    add_json(output)
+    output.add_argument("--markdown", action="store_true", help="print the page docs/columns.md")
 
 
 def run(arguments: argparse.Namespace) -> None:
     from levelproof.pipeline.store.columns import DESCRIBED
 
-    has_word = lambda of: arguments.word.lower() in f"{of.name} {of.type_name} {of.unit} {of.meaning}".lower()
-    found = [of for of in DESCRIBED if has_word(of)]
+    text = lambda column: f"{column.name} {column.type_name} {column.unit} {column.meaning}".lower()
+    found = [column for column in DESCRIBED if arguments.word.lower() in text(column)]
     if not found:
-        raise UserError(f"No column has the word {arguments.word!r}: levelproof columns, without a word, lists all.")
+        raise UserError(
+            f"No column contains the word {arguments.word!r}: levelproof columns, without a word, lists all."
+        )
     if arguments.json:
-        print(json.dumps([of._asdict() | {"type": of.type_name} for of in found], indent=2))
+        print(json.dumps([column._asdict() | {"type": column.type_name} for column in found], indent=2))
     elif arguments.markdown:
         print(as_markdown(), end="")
     else:
         print(*listed(map(_entry, found), shutil.get_terminal_size().columns, INDENT), sep="\n")
 
 
-def _entry(of: "ManifestColumn") -> tuple[str, str]:
-    return of.name, f"{of.text} ({_kind(of)})"
+def _entry(column: "ManifestColumn") -> tuple[str, str]:
+    return column.name, f"{column.text} ({_type_and_unit(column)})"
 
 
-def _kind(of: "ManifestColumn") -> str:
-    return ", ".join(filter(None, [of.type_name, of.unit]))
+def _type_and_unit(column: "ManifestColumn") -> str:
+    return ", ".join(filter(None, [column.type_name, column.unit]))
 
 
 def as_markdown() -> str:
-    """The page docs/columns.md."""
+    """Return the page docs/columns.md."""
     from levelproof.pipeline.store.columns import DESCRIBED, MANIFEST_VERSION, OLDEST_VERSION
 
-    newer = " and ".join(f"`{of.name}`" for of in DESCRIBED if of.since > OLDEST_VERSION)
-    rows = [f"| `{of.name}` | {_kind(of)} | {of.text} |" for of in DESCRIBED]
+    newer = " and ".join(f"`{column.name}`" for column in DESCRIBED if column.since > OLDEST_VERSION)
+    rows = [f"| `{column.name}` | {_type_and_unit(column)} | {column.text} |" for column in DESCRIBED]
     start, end = INTRODUCTION.format(version=MANIFEST_VERSION), END.format(oldest=OLDEST_VERSION, newer=newer)
     return start + "\n".join(rows) + "\n" + end

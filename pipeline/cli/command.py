@@ -1,11 +1,11 @@
-"""The words that commands use alike."""
+"""Arguments and text formatting that several commands share."""
 
 import argparse
 import textwrap
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-EXITS = "exit codes: 0 done, 1 failed, 2 change the command,\n            3 some units quarantined, 130 stopped"
+EXITS = "exit codes: 0 done, 1 failed, 2 change the command,\n            3 some units quarantined, 130 interrupted"
 SPLIT = "folder or URL of a split, such as data/128k/s or s3://bucket/data/128k/s"
 
 
@@ -14,8 +14,8 @@ def add_split(parser: argparse.ArgumentParser) -> None:
 
 
 def add_out(parser: argparse.ArgumentParser, default: str, kinds: str = "") -> None:
-    shown = f"file to write{kinds} (default: {default})"
-    parser.add_argument("-o", "--out", type=Path, default=Path(default), help=shown)
+    text = f"file to write{kinds} (default: {default})"
+    parser.add_argument("-o", "--out", type=Path, default=Path(default), help=text)
 
 
 def add_json(parser: argparse._ActionsContainer) -> None:
@@ -23,7 +23,7 @@ def add_json(parser: argparse._ActionsContainer) -> None:
 
 
 def listed(entries: Iterable[tuple[str, str]], columns: int, indent: int) -> Iterator[str]:
-    """Names and, from column `indent` on, what each means, in lines that are at most `columns` wide."""
+    """Yield lines of names and, from column `indent` on, their meanings, wrapped at `columns` characters."""
     for name, meaning in entries:
         first = f"  {name}  "
         lines = textwrap.wrap(meaning, max(columns - indent, indent))

@@ -1,4 +1,4 @@
-"""`levelproof export`: a level, or a split, for other programs."""
+"""`levelproof export`: write a level or a split for other programs."""
 
 import argparse
 from collections.abc import Callable
@@ -7,17 +7,17 @@ from pathlib import Path
 from levelproof.pipeline.cli.command import add_split
 from levelproof.pipeline.errors import UserError
 
-DOES = "write levels and their witnesses for other programs"
+SUMMARY = "write levels and their witnesses for other programs"
 EXAMPLE = """\
 levelproof export data/128k/s 7 -o level.json          a level that Kinetix opens
-levelproof export data/128k/s --format kinetix -o k    a data set that Kinetix' reader opens
+levelproof export data/128k/s --format kinetix -o k    a dataset that Kinetix' reader opens
 levelproof export data/128k/s --format kinetix -o k --where "steps_to_goal < 64"
-levelproof export data/128k/s --format minari -o m     a data set of offline RL
-levelproof export data/128k/s --format parquet -o t    levels and manifest as a table"""
-JSON = "json"  # one level; all others take a split
+levelproof export data/128k/s --format minari -o m     a dataset for offline RL
+levelproof export data/128k/s --format parquet -o t    a table of levels and manifest"""
+JSON = "json"  # for one level; the other formats take a split
 WHERE = (
-    "only levels for which this condition on the manifest's columns holds "
-    "(default: label = 'solved'; of parquet, every level)"
+    "only levels that meet this condition on the manifest's columns "
+    "(default: label = 'solved'; for parquet, all levels)"
 )
 
 
@@ -40,22 +40,20 @@ def _minari(split: Path, where: str | None, out: Path, actions: str = "multi_dis
     export_minari(split, where, out, ActionKind(actions))
 
 
-# What writes the levels of a split for which a condition holds (None: each format's own) to a new file or folder
+# Write the levels of a split that meet a condition (None: the format's default) to a new folder
 FORMATS: dict[str, Callable[..., None]] = {"kinetix": _kinetix, "minari": _minari, "parquet": _parquet}
-ACTIONS = (
-    "multi_discrete",
-    "combined",
-    "continuous",
-)  # of pipeline.exchange.minari.episodes.ActionKind, without importing it
+ACTIONS = ("multi_discrete", "combined", "continuous")  # values of ActionKind, whose module is slow to import
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
-    parser.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help=f"a level of the split, for {JSON}")
+    parser.add_argument(
+        "level_id", type=int, nargs="?", metavar="LEVEL_ID", help=f"id of a level of the split, for {JSON}"
+    )
     parser.add_argument("--format", choices=(JSON, *FORMATS), default=JSON, help=f"what to write (default: {JSON})")
     parser.add_argument("--where", metavar="SQL", help=WHERE)
-    parser.add_argument("--actions", choices=ACTIONS, help=f"how minari has actions (default: {ACTIONS[0]})")
-    parser.add_argument("-o", "--out", type=Path, help=f"file or folder to write (default, of {JSON}: level.json)")
+    parser.add_argument("--actions", choices=ACTIONS, help=f"encoding of actions for minari (default: {ACTIONS[0]})")
+    parser.add_argument("-o", "--out", type=Path, help=f"file or folder to write (default for {JSON}: level.json)")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -65,8 +63,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.format == JSON:
         if level_id is None or where is not None:
             raise UserError(
-                f"As {JSON} one level is exported: give its id, as in levelproof export {split} 7, without --where; "
-                f"--format chooses one of {', '.join(FORMATS)} for many."
+                f"The format {JSON} is for one level: give its id, as in levelproof export {split} 7, without --where; "
+                f"for many levels, set --format to one of {', '.join(FORMATS)}."
             )
         from levelproof.pipeline.exchange.level_json import export
 
@@ -75,8 +73,8 @@ def run(arguments: argparse.Namespace) -> None:
     if level_id is not None:
         raise UserError(
             f"The format {arguments.format} is for a split, not for level {level_id} alone: "
-            f'choose levels with --where, as in --where "level_id = {level_id}".'
+            f'select it with --where, as in --where "level_id = {level_id}".'
         )
     if out is None:
-        raise UserError(f"Where to? Name what to write with -o, as in -o {arguments.format}.")
+        raise UserError(f"No output path: name the folder to write with -o, as in -o {arguments.format}.")
     FORMATS[arguments.format](split, where, out, *filter(None, [arguments.actions]))

@@ -1,22 +1,22 @@
-"""`levelproof gallery`: a split as a site to look at."""
+"""`levelproof gallery`: write a split as a website."""
 
 import argparse
 from pathlib import Path
 
 from levelproof.pipeline.cli.command import add_split
 
-DOES = "write a split as a site that browsers open from the disk"
+SUMMARY = "write a split as a website that browsers open from disk"
 EXAMPLE = "levelproof gallery data/128k/s -o gallery/"
-MOST = 100_000  # levels, if the command does not say
+MAX_LEVELS = 100_000  # default
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
-    out = "folder to write; a gallery that is there is replaced (default: gallery)"
+    out = "folder to write; replaces an existing gallery (default: gallery)"
     parser.add_argument("-o", "--out", type=Path, default=Path("gallery"), help=out)
-    parser.add_argument("--where", metavar="SQL", help="show only levels for which this condition on columns holds")
-    most = f"show at most so many levels, spread evenly over their ids (default: {MOST})"
-    parser.add_argument("--levels", type=int, default=MOST, metavar="COUNT", help=most)
+    parser.add_argument("--where", metavar="SQL", help="show only levels that meet this condition on columns")
+    most = f"maximum number of levels to show, evenly spaced by id (default: {MAX_LEVELS})"
+    parser.add_argument("--levels", type=int, default=MAX_LEVELS, metavar="COUNT", help=most)
 
 
 def run(arguments: argparse.Namespace) -> None:

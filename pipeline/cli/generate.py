@@ -1,4 +1,4 @@
-"""`levelproof generate`: levels and their experts."""
+"""`levelproof generate`: make levels and their experts."""
 
 import argparse
 import shutil
@@ -6,16 +6,16 @@ import shutil
 from levelproof.pipeline.cli.command import listed
 from levelproof.pipeline.errors import Exit
 
-DOES = "make levels and their experts"
+SUMMARY = "make levels and their experts"
 EXAMPLE = """\
 levelproof generate                                 64 small levels into data
-levelproof generate size=m levels=1k budget=1M      more, larger, for longer
+levelproof generate size=m levels=1k budget=1M      more and larger ones, longer
 levelproof generate distribution=vehicles out=cars  other levels
 levelproof generate level_files=mine                levels of your own
 levelproof generate stop.rule=budget expert.width=128    other experts"""
-INDENT = 24  # where meanings start
-# What people change; `levelproof settings` has the others
-OFTEN = (
+INDENT = 24  # column at which meanings start
+# Settings that `generate --help` lists; `levelproof settings` lists all
+COMMON = (
     "size",
     "distribution",
     "levels",
@@ -47,11 +47,11 @@ def run(arguments: argparse.Namespace) -> Exit:
 
 
 def _help(parser: argparse.ArgumentParser) -> str:
-    """argparse's help, with the settings that people change before the examples: on one screen."""
+    """Return argparse's help with the common settings before the examples; fits on one screen."""
     from levelproof.configs.meanings import every_setting
 
     settings = {setting.name: setting for setting in every_setting()}
-    entries = ((settings[name].word, settings[name].text) for name in OFTEN)
-    often = "\n".join(listed(entries, shutil.get_terminal_size().columns, INDENT))
-    parser.epilog = f"settings and their defaults (all of them: levelproof settings):\n{often}\n\n{parser.epilog}"
+    entries = ((settings[name].word, settings[name].text) for name in COMMON)
+    common = "\n".join(listed(entries, shutil.get_terminal_size().columns, INDENT))
+    parser.epilog = f"settings and their defaults (all of them: levelproof settings):\n{common}\n\n{parser.epilog}"
     return argparse.ArgumentParser.format_help(parser)

@@ -1,14 +1,14 @@
-"""`levelproof import`: another program's trajectories as a split."""
+"""`levelproof import`: make a split of another program's trajectories."""
 
 import argparse
 from pathlib import Path
 
 from levelproof.pipeline.errors import Exit
 
-DOES = "make a split of trajectories in Kinetix' own layout"
+SUMMARY = "make a split of trajectories in Kinetix' format"
 EXAMPLE = "levelproof import kinetix/1M/s -o data/1M/s"
-FOLDER = "a zarr v2 group of trajectories, such as one of the released data or of export --format kinetix"
-OUT = "the split to make or to go on with: FOLDER/BUDGET/SIZE, the budget being what experts there could use"
+FOLDER = "a zarr v2 group of trajectories, as in the released data or from export --format kinetix"
+OUT = "the split to make or continue: FOLDER/BUDGET/SIZE, where BUDGET is what the imported experts could use"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

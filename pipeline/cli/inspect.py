@@ -1,20 +1,20 @@
-"""`levelproof inspect`: what is in a split."""
+"""`levelproof inspect`: show the contents of a split."""
 
 import argparse
 from pathlib import Path
 
 from levelproof.pipeline.cli.command import add_json, add_split
 
-DOES = "show what is in a split"
+SUMMARY = "show the contents of a split"
 EXAMPLE = """\
 levelproof inspect data/128k/s --where "label = 'solved' AND steps_to_goal < 64"
 levelproof inspect data/128k/s --columns level_id,env_steps --sort "env_steps DESC" --limit 20
 levelproof inspect data/128k/s --plot split.svg"""
-WHERE = "count only rows for which this condition on the manifest's columns holds"
+WHERE = "count only rows that meet this condition on the manifest's columns"
 AGAINST = "look for the same levels in another split, a level file, or a folder of them (may be repeated)"
-COLUMNS = "columns of the rows to show, with commas between (default: a few on the screen, else all)"
-SORT = "order of the rows: a column or an SQL expression, with DESC the largest first (default: level_id)"
-LIMIT = "rows, and pairs of duplicates, to show (default: 10; of --csv all)"
+COLUMNS = "comma-separated columns to show (default: a few on screen, else all)"
+SORT = "column or SQL expression to sort by; append DESC for largest first (default: level_id)"
+LIMIT = "number of rows, and of duplicate pairs, to show (default: 10; with --csv all)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,10 +24,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--columns", metavar="NAMES", help=COLUMNS)
     parser.add_argument("--sort", metavar="SQL", help=SORT)
     parser.add_argument("--limit", "--rows", type=int, metavar="COUNT", help=LIMIT)
-    instead = parser.add_mutually_exclusive_group()
-    add_json(instead)
-    instead.add_argument("--csv", action="store_true", help="print the rows alone, as CSV")
-    instead.add_argument("--plot", type=Path, metavar="FILE", help="draw histograms and learning curves: .svg or .png")
+    output = parser.add_mutually_exclusive_group()
+    add_json(output)
+    output.add_argument("--csv", action="store_true", help="print only the rows, as CSV")
+    output.add_argument("--plot", type=Path, metavar="FILE", help="draw histograms and learning curves: .svg or .png")
 
 
 def run(arguments: argparse.Namespace) -> None:

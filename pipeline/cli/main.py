@@ -1,6 +1,6 @@
-"""The command `levelproof`. Jobs take Hydra overrides, questions take the path of a split.
+"""The command `levelproof`. Jobs take Hydra overrides; other commands take the path of a split.
 
-Imports nothing heavy before it knows the command: `levelproof --help` has to answer at once.
+Imports nothing heavy before it knows the command, so that `levelproof --help` answers at once.
 """
 
 import argparse
@@ -21,12 +21,12 @@ NAMES = (
     "generate regenerate settings sample inspect columns plan diff show gallery play export import_ card status verify "
     "seal"
 )
-WRITTEN = ("out", "plot")  # what is written on this machine
+OUTPUTS = ("out", "plot")  # arguments whose paths must be on this machine
 COMMANDS = [import_module(f"levelproof.pipeline.cli.{name}") for name in NAMES.split()]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; its exit code, whoever reads what it prints."""
+    """Run one command; return its exit code, even if the reader of its output goes away."""
     with outlets():
         return _run(argv)
 
@@ -37,41 +37,42 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         if unknown:
             raise UserError(_no_option(unknown[0], takes_settings=bool({"settings", "words"} & vars(arguments).keys())))
-        _look_at_paths(arguments)
+        _check_paths(arguments)
         code = int(arguments.run(arguments) or Exit.DONE)
         if sys.stdout:
-            sys.stdout.flush()  # here, where a full disk is an error
+            sys.stdout.flush()  # now, so that a full disk is reported as an error
         return code
     except (LevelproofError, ConfigError) as error:
         if arguments.debug:
             raise
-        return _refuse(str(error), getattr(error, "exit_code", Exit.INPUT))
+        return _report(str(error), getattr(error, "exit_code", Exit.INPUT))
     except KeyboardInterrupt:
         return Exit.INTERRUPTED
     except Exception as error:
         if arguments.debug:
             raise
-        what = str(error).strip().splitlines()
-        return _refuse(
-            f"{type(error).__name__}: {what[0] if what else 'no message'} (--debug shows where)", Exit.FAILED
+        lines = str(error).strip().splitlines()
+        return _report(
+            f"{type(error).__name__}: {lines[0] if lines else 'no message'} (--debug shows where)", Exit.FAILED
         )
 
 
 def _no_option(word: str, takes_settings: bool) -> str:
-    """A sentence for a word that the command does not take."""
-    how = "write settings as NAME=VALUE, as in size=m" if takes_settings else "--help lists those that there are"
-    return f"There is no option {word}: {how}."
+    """Return the error for an argument that the command does not have."""
+    advice = "write settings as NAME=VALUE, as in size=m" if takes_settings else "--help lists the options"
+    return f"There is no option {word}: {advice}."
 
 
-def _look_at_paths(arguments: argparse.Namespace) -> None:
-    """Raises UserError for one that stands for a URL of another kind than can be used there."""
+def _check_paths(arguments: argparse.Namespace) -> None:
+    """Raise UserError for a path that is a URL of an unsupported kind, or that must be local."""
     for name, value in vars(arguments).items():
         for path in value if isinstance(value, list) else [value]:
             if isinstance(path, Path):
-                (require_here if name in WRITTEN else require_known)(path)
+                (require_here if name in OUTPUTS else require_known)(path)
 
 
-def _refuse(sentence: str, code: int) -> int:
+def _report(sentence: str, code: int) -> int:
+    """Print an error to stderr; return the exit code."""
     end = "" if sentence.endswith((".", ")")) else "."
     print(f"Error: {readable(sentence)}{end}", file=sys.stderr)
     return code
@@ -80,7 +81,7 @@ def _refuse(sentence: str, code: int) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="levelproof",
-        description="Make physics levels, train an expert on each, and keep what provably solves them.",
+        description="Make physics levels, train an expert on each, and keep the actions that provably solve them.",
         epilog=f"Start with: levelproof generate\n{EXITS}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -89,9 +90,9 @@ def _parser() -> argparse.ArgumentParser:
     for command in COMMANDS:
         examples = "\n  ".join(["examples:", *command.EXAMPLE.splitlines()])
         added = commands.add_parser(
-            command.__name__.rpartition(".")[2].rstrip("_"),  # `import` is a word of Python
-            help=command.DOES,
-            description=f"{command.DOES[0].upper()}{command.DOES[1:]}.",
+            command.__name__.rpartition(".")[2].rstrip("_"),  # `import` is a keyword
+            help=command.SUMMARY,
+            description=f"{command.SUMMARY[0].upper()}{command.SUMMARY[1:]}.",
             epilog=f"{examples}\n{EXITS}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )

@@ -1,16 +1,16 @@
-"""`levelproof plan`: what a job would take."""
+"""`levelproof plan`: estimate the cost of a job."""
 
 import argparse
 
 from levelproof.pipeline.cli.command import add_json
 
-DOES = "tell what a job would take: hours, bytes, files, solved levels"
+SUMMARY = "estimate the hours, bytes, files and solved levels of a job"
 EXAMPLE = """levelproof plan size=s levels=6M budget=256k
 levelproof plan size=m levels=1M budget=1M workers=64"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("settings", nargs="*", metavar="NAME=VALUE", help="settings, as of generate")
+    parser.add_argument("settings", nargs="*", metavar="NAME=VALUE", help="settings as for generate")
     add_json(parser)
 
 

@@ -1,9 +1,9 @@
-"""`levelproof play`: a person takes the controls, edits the level, and has an expert trained for it."""
+"""`levelproof play`: control and edit a level in a browser, and train an expert for it."""
 
 import argparse
 from pathlib import Path
 
-DOES = "play, edit and solve a level by hand, in a browser"
+SUMMARY = "play, edit and solve a level by hand, in a browser"
 EXAMPLE = """levelproof play data/128k/s 7
 levelproof play level.json
 levelproof play --size l"""
@@ -12,10 +12,10 @@ levelproof play --size l"""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = "folder of a split, or a level file, such as level.json (default: an empty level)"
     parser.add_argument("source", type=Path, nargs="?", metavar="SOURCE", help=source)
-    parser.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help="a level of the split")
-    parser.add_argument("--size", default="m", help="of an empty level (default: m)")
+    parser.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help="id of a level of the split")
+    parser.add_argument("--size", default="m", help="size of an empty level (default: m)")
     parser.add_argument("--budget", default="256k", help="env steps of an expert (default: 256k)")
-    parser.add_argument("--port", type=int, default=8777, help="to listen on, 0: any (default: 8777)")
+    parser.add_argument("--port", type=int, default=8777, help="port to listen on; 0: any (default: 8777)")
     parser.add_argument("--no-browser", action="store_true", help="do not open the page")
 
 

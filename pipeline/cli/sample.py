@@ -1,15 +1,17 @@
-"""`levelproof sample`: a sheet of random levels."""
+"""`levelproof sample`: draw a sheet of random levels."""
 
 import argparse
 
 from levelproof.pipeline.cli.command import add_out
 
-DOES = "draw random levels, before anything is trained"
+SUMMARY = "draw random levels without training experts"
 EXAMPLE = "levelproof sample size=m distribution=clutter -o sheet.png"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("settings", nargs="*", metavar="NAME=VALUE", help="as for generate, but levels=15 by default")
+    parser.add_argument(
+        "settings", nargs="*", metavar="NAME=VALUE", help="settings as for generate, but levels=15 by default"
+    )
     add_out(parser, "sheet.png")
 
 

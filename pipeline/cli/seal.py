@@ -1,21 +1,19 @@
-"""`levelproof seal`: few large files for many small ones."""
+"""`levelproof seal`: merge many small files into few large ones."""
 
 import argparse
 
 from levelproof.pipeline.cli.command import add_split
 
-DOES = "merge a split's many small files into few large ones"
+SUMMARY = "merge a split's many small files into few large ones"
 EXAMPLE = """levelproof seal data/128k/s
 levelproof seal data/128k/s --density witness --key-every 16"""
-ROWS = "rows of a sealed fragment, about (default: 100,000)"
+ROWS = "approximate number of rows per sealed fragment (default: 100,000)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
     parser.add_argument("--rows", type=int, metavar="N", help=ROWS)
-    parser.add_argument(
-        "--density", choices=("full", "resume", "witness"), help="how much of each record is stored then"
-    )
+    parser.add_argument("--density", choices=("full", "resume", "witness"), help="how much of each record to store")
     every = "env steps between key frames of --density witness (default: 32)"
     parser.add_argument("--key-every", type=int, metavar="K", help=every)
 
@@ -29,6 +27,6 @@ def run(arguments: argparse.Namespace) -> None:
 
     every = arguments.key_every
     if every is not None and arguments.density != "witness":
-        raise UserError("--key-every is of key frames, which only --density witness has: give both, or neither.")
+        raise UserError("--key-every sets key frames, which only --density witness has: give both or neither.")
     every = KEY_EVERY if every is None else every
     seal_split(arguments.split, arguments.rows, Console(stderr=True), arguments.density, every)

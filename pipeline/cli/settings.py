@@ -1,4 +1,4 @@
-"""`levelproof settings`: every setting with its meaning, unit and default."""
+"""`levelproof settings`: list settings with their meanings, units and defaults."""
 
 import argparse
 import json
@@ -14,9 +14,9 @@ from levelproof.pipeline.errors import UserError
 if TYPE_CHECKING:
     from levelproof.configs.meanings import Setting
 
-DOES = "list settings with their meanings, units and defaults"
+SUMMARY = "list settings with their meanings, units and defaults"
 EXAMPLE = "levelproof settings thruster"
-INDENT = 34  # where meanings start
+INDENT = 34  # column at which meanings start
 INTRODUCTION = """# Settings
 
 Every setting of `levelproof generate`, with its default, as one types it: `levelproof generate size=m budget=64k`. \
@@ -27,10 +27,10 @@ fields of the dataclasses.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("word", nargs="?", default="", metavar="WORD", help="only settings that have this word")
-    shape = parser.add_mutually_exclusive_group()
-    add_json(shape)
-    shape.add_argument("--markdown", action="store_true", help="print the page docs/settings.md")
+    parser.add_argument("word", nargs="?", default="", metavar="WORD", help="only settings that contain this word")
+    output = parser.add_mutually_exclusive_group()
+    add_json(output)
+    output.add_argument("--markdown", action="store_true", help="print the page docs/settings.md")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -39,7 +39,9 @@ def run(arguments: argparse.Namespace) -> None:
     has_word = lambda text: arguments.word.lower() in text.lower()
     found = [setting for setting in every_setting() if has_word(f"{setting.word} {setting.text} {setting.group}")]
     if not found:
-        raise UserError(f"No setting has the word {arguments.word!r}: levelproof settings, without a word, lists all.")
+        raise UserError(
+            f"No setting contains the word {arguments.word!r}: levelproof settings, without a word, lists all."
+        )
     if arguments.json:
         print(json.dumps([asdict(setting) for setting in found], indent=2))
     elif arguments.markdown:
@@ -49,14 +51,14 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def as_text(settings: Iterable["Setting"], columns: int) -> str:
-    """The settings in two columns, group after group."""
+    """Format settings as text in two columns, by group."""
     groups = groupby(settings, lambda setting: setting.group)
     lines = lambda members: listed(((setting.word, setting.text) for setting in members), columns, INDENT)
     return "\n\n".join("\n".join([group, *lines(members)]) for group, members in groups)
 
 
 def as_markdown(settings: Iterable["Setting"]) -> str:
-    """The page docs/settings.md."""
+    """Return the page docs/settings.md."""
     parts = [INTRODUCTION]
     for group, members in groupby(settings, lambda setting: setting.group):
         lines = [f"| `{setting.word}` | {setting.text} |" for setting in members]

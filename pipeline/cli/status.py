@@ -1,4 +1,4 @@
-"""`levelproof status`: how far a split is."""
+"""`levelproof status`: show the progress of a split."""
 
 import argparse
 import sys
@@ -6,7 +6,7 @@ from functools import partial
 
 from levelproof.pipeline.cli.command import add_json, add_split
 
-DOES = "tell how far a split is"
+SUMMARY = "show the progress of a split"
 EXAMPLE = """levelproof status data/128k/s
 levelproof status data/128k/s --watch"""
 
@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
     add_json(parser)
     parser.add_argument(
-        "--watch", action="store_true", help="go on until no run is at work; with --json, a line a look"
+        "--watch", action="store_true", help="refresh until no run is active; with --json, one line per refresh"
     )
 
 

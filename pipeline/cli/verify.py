@@ -1,11 +1,11 @@
-"""`levelproof verify`: whether a split is what it says, and what is not made again."""
+"""`levelproof verify`: check a split, and repair it."""
 
 import argparse
 
 from levelproof.pipeline.cli.command import add_json, add_split
 from levelproof.pipeline.errors import Exit
 
-DOES = "hold every byte of a split against its checksum, make every level again, replay every witness"
+SUMMARY = "check every byte of a split, regenerate every level, replay every witness"
 EXAMPLE = """\
 levelproof verify data/128k/s
 levelproof verify data/128k/s --repair"""
@@ -13,13 +13,13 @@ levelproof verify data/128k/s --repair"""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
-    how = parser.add_mutually_exclusive_group()
-    add_json(how)
-    how.add_argument(
+    mode = parser.add_mutually_exclusive_group()
+    add_json(mode)
+    mode.add_argument(
         "--repair",
         nargs="*",
         metavar="NAME=VALUE",
-        help="make again what is damaged or missing, and nothing else; settings: executor, workers, unit and "
+        help="remake what is damaged or missing, and nothing else; settings: executor, workers, unit and "
         "device, as for generate",
     )
 

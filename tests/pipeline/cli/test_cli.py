@@ -1,4 +1,4 @@
-"""The command as people meet it: help, errors, questions. How it starts and ends through a process of its own."""
+"""The command line: help, errors and answers. Start and exit are tested in a separate process."""
 
 import json
 import os
@@ -25,7 +25,7 @@ COMMANDS = [command.__name__.rpartition(".")[2].rstrip("_") for command in main.
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a real, tiny split `data/5k/s`. Not to be changed."""
+    """A folder with a real, tiny split `data/5k/s`, which tests must not change."""
     folder = tmp_path_factory.mktemp("made")
     done = here(["generate", *TINY, "executor=inline"], folder)
     assert done.returncode == 0, done.stderr
@@ -35,7 +35,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def split(made: Path, tmp_path: Path) -> Path:
-    """A copy of it that may be damaged."""
+    """A copy of the split, which tests may damage."""
     shutil.copytree(made / "data", tmp_path / "data")
     return tmp_path / "data/5k/s"
 
@@ -46,12 +46,12 @@ def solved_level(split: Path) -> int:
 
 
 def cpu_seconds() -> float:
-    """Of all processes that have ended: what else the machine does plays no part."""
+    """Return the CPU time of all ended child processes, s; other load on the machine does not affect it."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
-def test_help_answers_at_once_and_names_every_command(tmp_path: Path) -> None:
+def test_help_answers_at_once_and_lists_every_command(tmp_path: Path) -> None:
     before = cpu_seconds()
     done = run(["--help"], tmp_path)
     assert cpu_seconds() - before < 0.5, "it imports more than it needs"
@@ -66,7 +66,7 @@ def test_every_command_has_help_with_an_example(tmp_path: Path, command: str) ->
     assert re.search(rf"examples?:\s+levelproof {command} ", done.stdout)
 
 
-def test_version(tmp_path: Path) -> None:
+def test_version_prints_the_version(tmp_path: Path) -> None:
     assert run(["--version"], tmp_path).stdout.startswith("levelproof ")
 
 
@@ -84,45 +84,45 @@ def test_version(tmp_path: Path) -> None:
         (["64"], ["NAME=VALUE"]),
     ],
 )
-def test_a_wrong_setting_is_refused_in_one_sentence(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+def test_generate_rejects_a_wrong_setting_in_one_sentence(
+    tmp_path: Path, arguments: list[str], words: list[str]
+) -> None:
     assert_refused(here(["generate", *arguments], tmp_path), 2, *words)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("arguments", [[], ["generat"], ["inspect"], ["show"], ["inspect", "x", "--rows", "a"]])
-def test_a_command_that_is_none_gets_the_usage(tmp_path: Path, arguments: list[str]) -> None:
+def test_invalid_command_prints_the_usage(tmp_path: Path, arguments: list[str]) -> None:
     done = run(arguments, tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("usage: levelproof")
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("arguments", "message"),
     [
         (["generate", "--size", "m"], "There is no option --size: write settings as NAME=VALUE, as in size=m"),
-        (["inspect", "x", "--were", "a"], "There is no option --were: --help lists those that there are"),
+        (["inspect", "x", "--were", "a"], "There is no option --were: --help lists the options"),
         (["generate", "out=gcs://bucket/x"], "gcs:/bucket/x/128k/s looks like a URL"),
         (["status", "ftp://host/split"], "ftp:/host/split looks like a URL"),
         (["show", "x", "7", "-o", "s3://bucket/level.gif"], "Nothing can be written to s3://bucket/level.gif here"),
         (["inspect", "x", "--plot", "gs://bucket/plot.svg"], "Nothing can be written to gs://bucket/plot.svg here"),
     ],
 )
-def test_what_looks_like_an_option_or_a_url_is_not_taken_for_a_folder(
-    tmp_path: Path, words: list[str], told: str
-) -> None:
-    assert_refused(here(words, tmp_path), 2, told)
+def test_unknown_options_and_urls_are_not_taken_for_folders(tmp_path: Path, arguments: list[str], message: str) -> None:
+    assert_refused(here(arguments, tmp_path), 2, message)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-def test_a_folder_of_splits_is_told_from_a_split(made: Path) -> None:
+def test_inspect_rejects_a_folder_of_splits(made: Path) -> None:
     for above in ("data", "."):
         assert_refused(here(["inspect", above], made), 2, f"{above} is no split", "name one of them, such as")
 
 
 @pytest.mark.slow
-def test_a_later_command_forgets_nothing_that_is_there(split: Path) -> None:
-    """What it does not ask for is missed, too, once it is lost."""
+def test_later_command_keeps_earlier_levels_wanted(split: Path) -> None:
+    """Levels that the later command did not request count as missing once they are lost."""
     folder = split.parent.parent.parent
     words = [word for word in TINY if not word.startswith("levels=")]
     assert here(["generate", *words, "levels=1", "executor=inline"], folder).returncode == 0
@@ -135,17 +135,17 @@ def test_a_later_command_forgets_nothing_that_is_there(split: Path) -> None:
 
 
 @pytest.mark.parametrize("command", [["inspect"], ["status"], ["verify"]])
-def test_a_split_that_is_not_there_is_named(tmp_path: Path, command: list[str]) -> None:
+def test_commands_name_a_missing_split(tmp_path: Path, command: list[str]) -> None:
     assert_refused(here([*command, "data/1k/s"], tmp_path), 2, "no split at data/1k/s")
 
 
-def test_an_out_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+def test_generate_names_an_unwritable_output_folder(tmp_path: Path) -> None:
     (tmp_path / "data").write_text("a file in the way")
     assert_refused(here(["generate", *TINY], tmp_path), 2, "Cannot write to data/5k/s", "out=NAME")
 
 
 @pytest.mark.skipif(os.getuid() == 0, reason="root may write anywhere")
-def test_an_out_without_permission_is_named(tmp_path: Path) -> None:
+def test_generate_names_an_output_folder_without_permission(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir(mode=0o500)
     assert_refused(here(["generate", *TINY], tmp_path), 2, "Cannot write to data/5k/s", "Permission denied")
 
@@ -157,7 +157,7 @@ def test_debug_shows_the_traceback(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_run_says_that_all_is_there(made: Path) -> None:
+def test_generate_does_nothing_when_all_levels_exist(made: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.suffix in (".parquet", ".zarr")}
     done = here(["generate", *TINY, "executor=inline"], made)
     assert done.returncode == 0
@@ -167,14 +167,14 @@ def test_a_second_run_says_that_all_is_there(made: Path) -> None:
 
 
 @pytest.mark.slow
-def test_another_configuration_names_what_differs(made: Path) -> None:
+def test_generate_names_the_settings_that_differ(made: Path) -> None:
     done = here(["generate", *TINY, "expert.width=64", "expert.clip=0.1"], made)
     assert_refused(done, 2, "data/5k/s", "expert.clip was 0.2, now 0.1; expert.width was 32, now 64", "out=NAME")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [["generate", *TINY], ["inspect", "data/5k/s"], ["status", "data/5k/s"]])
-def test_a_damaged_fragment_is_named(split: Path, command: list[str]) -> None:
+def test_commands_name_a_damaged_fragment(split: Path, command: list[str]) -> None:
     fragment_paths(split)[1].write_bytes(b"PAR1 and then nothing")
     done = here(command, split.parents[2])
     assert_refused(done, 1, "000000000001-000000000001.parquet is damaged", "verify data/5k/s --repair")
@@ -182,7 +182,7 @@ def test_a_damaged_fragment_is_named(split: Path, command: list[str]) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_a_deleted_fragment_is_made_again_with_the_same_rows(split: Path) -> None:
+def test_generate_remakes_a_deleted_fragment_with_the_same_rows(split: Path) -> None:
     before = lasting(split)
     fragment_paths(split)[1].unlink()
     done = here(["generate", *TINY, "executor=inline"], split.parents[2])
@@ -192,7 +192,7 @@ def test_a_deleted_fragment_is_made_again_with_the_same_rows(split: Path) -> Non
 
 
 @pytest.mark.slow
-def test_verify_passes_what_is_whole_and_names_what_is_not(split: Path) -> None:
+def test_verify_passes_a_sound_split_and_names_a_damaged_shard(split: Path) -> None:
     done = here(["verify", "data/5k/s", "--json"], split.parents[2])
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
@@ -209,7 +209,7 @@ def test_verify_passes_what_is_whole_and_names_what_is_not(split: Path) -> None:
 
 
 @pytest.mark.slow
-def test_inspect_tells_what_is_there(made: Path) -> None:
+def test_inspect_shows_the_contents_of_a_split(made: Path) -> None:
     manifest = read_manifest(made / "data/5k/s")
     done = here(["inspect", "data/5k/s"], made)
     assert done.returncode == 0, done.stderr
@@ -223,7 +223,7 @@ def test_inspect_tells_what_is_there(made: Path) -> None:
 
 
 @pytest.mark.slow
-def test_inspect_takes_a_condition_and_refuses_what_is_none(made: Path) -> None:
+def test_inspect_takes_a_condition_and_rejects_an_invalid_one(made: Path) -> None:
     facts = json.loads(
         here(["inspect", "data/5k/s", "--json", "--where", "level_id >= 2 -- the last two"], made).stdout
     )
@@ -235,7 +235,7 @@ def test_inspect_takes_a_condition_and_refuses_what_is_none(made: Path) -> None:
 
 
 @pytest.mark.slow
-def test_status_tells_how_far_it_is(split: Path) -> None:
+def test_status_shows_the_progress_of_a_split(split: Path) -> None:
     facts = json.loads(here(["status", "data/5k/s", "--json"], split.parents[2]).stdout)
     assert (facts["wanted"], facts["done"], facts["running"], facts["quarantined"]) == (4, 4, False, [])
     fragment_paths(split)[0].unlink()
@@ -253,9 +253,9 @@ def test_show_draws_a_witness(made: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(tmp_path: Path) -> None:
-    """A limit on the size of files stands in for a full disk: both refuse in the middle of a write."""
-    limit = 8_000  # bytes; the note of the job is shorter, experts, which come next, are longer
+def test_full_disk_stops_generate_with_one_sentence_and_no_partial_files(tmp_path: Path) -> None:
+    """A file size limit replaces the full disk: with both, a write fails partway."""
+    limit = 8_000  # bytes; more than the job note, less than the experts, which are written next
     command = ["generate", "levels=4", "unit=4", "budget=5k", "keep_experts=true", "executor=inline"]
 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -273,8 +273,8 @@ def test_a_full_disk_stops_the_run_with_a_sentence_and_leaves_nothing_half(tmp_p
 
 
 @pytest.mark.slow
-def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every attempt fails; the command says so and ends with 3."""
+def test_generate_gives_up_a_failing_unit_and_notes_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every attempt fails; the command reports it and exits with code 3."""
 
     def broken(*_: object) -> NoReturn:
         raise ZeroDivisionError("a bug")
@@ -290,7 +290,9 @@ def test_a_unit_that_fails_is_given_up_with_its_reason(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-def test_a_note_goes_when_other_units_commit_its_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quarantine_note_is_deleted_when_other_units_commit_its_levels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def broken(*_: object) -> NoReturn:
         raise ZeroDivisionError("a bug")
 
@@ -306,7 +308,7 @@ def test_a_note_goes_when_other_units_commit_its_levels(tmp_path: Path, monkeypa
 
 
 @pytest.mark.slow
-def test_a_closed_pipe_is_no_error(made: Path) -> None:
+def test_closed_pipe_is_not_an_error(made: Path) -> None:
     command = f"{sys.executable} -m levelproof inspect data/5k/s --json | head -c 1"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
@@ -316,7 +318,7 @@ def test_a_closed_pipe_is_no_error(made: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_a_pipe_that_is_closed_before_little_is_written_is_no_error(tmp_path: Path) -> None:
+def test_pipe_closed_before_a_short_output_is_not_an_error(tmp_path: Path) -> None:
     command = f"{sys.executable} -m levelproof columns steps | true; exit ${{PIPESTATUS[0]}}"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
@@ -326,7 +328,7 @@ def test_a_pipe_that_is_closed_before_little_is_written_is_no_error(tmp_path: Pa
 
 
 def answers(split: Path) -> dict[str, object]:
-    """What commands say of a split, but for the bytes that it takes."""
+    """Return what commands report about a split, except its size in bytes."""
     folder, name, level = split.parents[2], "data/5k/s", str(solved_level(split))
     facts = json.loads(here(["inspect", name, "--where", "level_id < 4", "--json"], folder).stdout)
     rows = [row | {"shard": bool(row["shard"]), "row": None} for row in facts.pop("rows")]
@@ -338,9 +340,7 @@ def answers(split: Path) -> dict[str, object]:
 
 
 @pytest.mark.slow
-def test_commands_say_the_same_of_a_split_that_is_sealed_and_it_grows(
-    split: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sealed_split_gives_the_same_answers_and_grows(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, before = split.parents[2], answers(split)
     done = here(["seal", "data/5k/s", "--rows", "3"], folder)
     assert "merged 4 fragments into 2; it has 4 levels in 2 fragments now" in done.stdout, done.stderr
@@ -356,7 +356,7 @@ def test_commands_say_the_same_of_a_split_that_is_sealed_and_it_grows(
     assert verified.returncode == 0, verified.stdout
 
 
-def test_what_cannot_be_sealed_is_refused(tmp_path: Path, split: Path) -> None:
+def test_seal_rejects_invalid_arguments_and_damaged_splits(tmp_path: Path, split: Path) -> None:
     assert_refused(here(["seal", "data/1k/s"], tmp_path), 2, "no split at data/1k/s")
     assert_refused(here(["seal", "data/5k/s", "--rows", "0"], tmp_path), 2, "--rows a number from 1")
     assert_refused(here(["seal", "data/5k/s", "--key-every", "16"], tmp_path), 2, "only --density witness has")

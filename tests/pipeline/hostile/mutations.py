@@ -1,4 +1,4 @@
-"""Inputs that nobody made on purpose, and some that somebody might: good ones, changed by a seeded generator."""
+"""Mutations of valid inputs by a seeded generator: accidental damage, and some deliberate attacks."""
 
 import copy
 import json
@@ -7,7 +7,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-DEEP = 100_000
+DEPTH = 100_000
 NUMBERS = (
     *(0, 1, -1, 2, 127, 255, 256, 2**31 - 1, 2**31, 2**32, 2**40, 2**63 - 1, 2**63, -(2**63), 10**30, 10**400),
     *(0.5, -0.0, 1e-320, 1e300, float("nan"), float("inf"), float("-inf")),
@@ -19,30 +19,30 @@ WORDS = (
 BYTES = (b"", b"\0", b"\xff" * 4, b"\xff" * 8, b"\x7f\xff\xff\xff", b"\0" * 64, b"PAR1", b"PK\x03\x04", b"../")
 
 
-def changed_bytes(data: bytes, random: Random) -> bytes:
-    """The same with bits flipped, cut off, spliced, or with numbers in it that are too large."""
-    found = bytearray(data)
+def mutate_bytes(data: bytes, random: Random) -> bytes:
+    """Flip bits, truncate, splice, or insert huge numbers."""
+    result = bytearray(data)
     for _ in range(random.choice((1, 1, 1, 2, 5, 20))):
-        at = random.randrange(len(found) + 1)
+        at = random.randrange(len(result) + 1)
         match random.randrange(7):
-            case 0 | 1 if found:
-                found[min(at, len(found) - 1)] ^= 1 << random.randrange(8)
-            case 2 if found:
-                found[min(at, len(found) - 1)] = random.randrange(256)
+            case 0 | 1 if result:
+                result[min(at, len(result) - 1)] ^= 1 << random.randrange(8)
+            case 2 if result:
+                result[min(at, len(result) - 1)] = random.randrange(256)
             case 3:
-                del found[at:]
+                del result[at:]
             case 4:
-                del found[at : at + random.choice((1, 4, 8, 100))]
+                del result[at : at + random.choice((1, 4, 8, 100))]
             case 5:
-                found[at:at] = random.choice(BYTES)
+                result[at:at] = random.choice(BYTES)
             case 6:
-                other, length = random.randrange(len(found) + 1), random.choice((1, 4, 8, 16, 64))
-                found[at : at + length] = found[other : other + length]
-    return bytes(found)
+                other, length = random.randrange(len(result) + 1), random.choice((1, 4, 8, 16, 64))
+                result[at : at + length] = result[other : other + length]
+    return bytes(result)
 
 
-def changed_word(word: str, random: Random) -> str:
-    """Text that is still some text."""
+def mutate_word(word: str, random: Random) -> str:
+    """Change a string into another string."""
     at = random.randrange(len(word) + 1)
     match random.randrange(4):
         case 0:
@@ -59,7 +59,8 @@ def changed_word(word: str, random: Random) -> str:
             )
 
 
-def odd_value(random: Random) -> Any:
+def random_value(random: Random) -> Any:
+    """Return an unexpected JSON value."""
     return random.choice(
         (
             *(None, True, False, [], {}, [[]], {"": []}, [None] * 100, list(range(70)), [[[[[[[[7]]]]]]]]),
@@ -68,8 +69,8 @@ def odd_value(random: Random) -> Any:
     )
 
 
-def changed_document(document: Any, random: Random) -> Any:
-    """JSON's types, with some values of other types, too large, missing, twice or exchanged."""
+def mutate_document(document: Any, random: Random) -> Any:
+    """Change a JSON document: retype, enlarge, drop, repeat or exchange values."""
     whole = [copy.deepcopy(document)]
     for _ in range(random.choice((1, 1, 1, 2, 4))):
         parent, key = _somewhere(whole, random)
@@ -77,23 +78,23 @@ def changed_document(document: Any, random: Random) -> Any:
             case 0 if parent is not whole:
                 del parent[key]
             case 1 if parent is not whole:
-                other, place = _somewhere(whole, random)
-                parent[key] = copy.deepcopy(other[place]) if place in other or isinstance(other, list) else None
+                other, index = _somewhere(whole, random)
+                parent[key] = copy.deepcopy(other[index]) if index in other or isinstance(other, list) else None
             case 2 if isinstance(parent, dict):
-                parent[changed_word(str(key), random)] = parent.pop(key)
+                parent[mutate_word(str(key), random)] = parent.pop(key)
             case 3 if isinstance(parent, list) and parent is not whole:
                 parent[key:key] = [parent[key]] * random.choice((1, 2, 100))
             case 4 if isinstance(parent[key], str):
-                parent[key] = changed_word(parent[key], random)
+                parent[key] = mutate_word(parent[key], random)
             case 4 if isinstance(parent[key], int | float):
                 parent[key] = parent[key] + random.choice((1, -1, 0.5)) if abs(parent[key]) < 2**60 else 0
             case _:
-                parent[key] = odd_value(random)
+                parent[key] = random_value(random)
     return whole[0]
 
 
 def _somewhere(whole: list[Any], random: Random) -> tuple[Any, Any]:
-    """A container within, and a key of it that is there."""
+    """Return a random container within a document, and an existing key of it."""
     parent, key = whole, 0
     while isinstance(parent[key], dict | list) and parent[key] and random.random() < 0.85:
         parent = parent[key]
@@ -101,18 +102,18 @@ def _somewhere(whole: list[Any], random: Random) -> tuple[Any, Any]:
     return parent, key
 
 
-def changed_json(document: Any, random: Random) -> bytes:
-    """A file of JSON: mostly such a document, sometimes no JSON any more."""
+def mutate_json(document: Any, random: Random) -> bytes:
+    """Encode a mutated document as JSON; sometimes break the syntax."""
     if random.random() < 0.03:
-        opened = random.choice((b"[", b'{"a":', b"[[[{" * 3))
-        return opened * (DEEP // len(opened))
+        opening = random.choice((b"[", b'{"a":', b"[[[{" * 3))
+        return opening * (DEPTH // len(opening))
     if random.random() < 0.15:
-        return changed_bytes(json.dumps(document).encode(), random)
-    return json.dumps(changed_document(document, random)).encode()
+        return mutate_bytes(json.dumps(document).encode(), random)
+    return json.dumps(mutate_document(document, random)).encode()
 
 
 def put(path: Path, data: bytes, random: Random) -> None:
-    """The file with these bytes; rarely a link, a pipe, a folder, a hole or nothing in its place."""
+    """Write a file; rarely make a link, a pipe, a folder, a sparse file or nothing instead."""
     match random.randrange(100):
         case 0:
             path.symlink_to("/etc/passwd")
@@ -132,6 +133,7 @@ def put(path: Path, data: bytes, random: Random) -> None:
 
 
 def remove(path: Path) -> None:
+    """Remove whatever `put` made."""
     if path.is_dir() and not path.is_symlink():
         path.rmdir()
     else:

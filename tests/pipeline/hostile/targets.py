@@ -1,6 +1,6 @@
-"""Every reader, with good input to change: each target writes one changed input, reads it, and looks at what is read.
+"""Fuzzing targets, one per reader: each writes one mutated input, reads it, and checks what it read.
 
-What is wrong with an input is told by `Refused`; whatever else is raised is a finding.
+Readers reject inputs with the exceptions in `Refused`; any other exception is a finding.
 """
 
 import json
@@ -60,12 +60,12 @@ from levelproof.pipeline.store.pieces import PieceCache
 from levelproof.pipeline.store.schema import CONFIG_KEY, HASH_KEY, Encoding
 from levelproof.pipeline.store.shard import Shard, write_shard
 from tests.pipeline.hostile.mutations import (
-    changed_bytes,
-    changed_document,
-    changed_json,
-    changed_word,
-    odd_value,
+    mutate_bytes,
+    mutate_document,
+    mutate_json,
+    mutate_word,
     put,
+    random_value,
     remove,
 )
 from tests.pipeline.made import made_job, made_split, played_split
@@ -73,24 +73,24 @@ from tests.pipeline.read.kinetix.folder import GOLDEN
 
 Target = Callable[[Random], None]
 Refused = (LevelproofError, LevelFileError, ConfigError, FormatError, NoteError)
-ENDS = (FormatError, NoteError)  # the ends of sentences
+ENDS = (FormatError, NoteError)  # whose messages are ends of sentences
 
 
 def require_possible(arrays: dict[str, np.ndarray], size: Any) -> None:
-    """What engines and pictures look up is there, and flags are flags."""
+    """Check that indices are in range and flags are 0 or 1."""
     check_numbers({name: np.moveaxis(x, -1, 0) for name, x in arrays.items()}, size)
     for name, values in arrays.items():
         assert values.dtype != bool or not (np.ascontiguousarray(values).view(np.uint8) > 1).any(), name
 
 
 def level_files(folder: Path) -> Target:
-    """And a link or a pipe in their place."""
+    """Level files, and links or pipes in their place."""
     level = jax.tree.map(np.asarray, sample_levels(np.array([3], np.int32), size_of("s")))
     document, path = to_document(LevelFile(level, TaskParams())), folder / "level.json"
 
     def target(random: Random) -> None:
         remove(path)
-        put(path, changed_json(document, random), random)
+        put(path, mutate_json(document, random), random)
         found = read_level_file(path)
         require_possible(arrays_of(found.level, "level/"), found.level.size)
         assert all(np.isfinite(x).all() for x in arrays_of(found.level).values())
@@ -102,7 +102,7 @@ def level_files(folder: Path) -> Target:
 
 
 def kinetix_folders(folder: Path) -> Target:
-    """Trajectories of the reference: descriptions, chunks, and what is in these."""
+    """Folders of the reference: metadata, chunks, and values in chunks."""
     source = GOLDEN / "s"
     chunks = {file.relative_to(source): file.read_bytes() for file in source.rglob("*") if file.is_file()}
     raw = {name: BLOSC.decode(data) for name, data in chunks.items() if not name.name.startswith(".")}
@@ -123,19 +123,19 @@ def kinetix_folders(folder: Path) -> Target:
             path, data = folder / "theirs" / name, chunks[name]
             path.unlink()
             if name.name.startswith("."):
-                put(path, changed_json(json.loads(data), random), random)
+                put(path, mutate_json(json.loads(data), random), random)
             elif random.random() < 0.5:
-                put(path, changed_bytes(data, random), random)
+                put(path, mutate_bytes(data, random), random)
             else:
-                inside = bytearray(raw[name])
+                decoded = bytearray(raw[name])
                 for _ in range(random.choice((1, 3, 50))):
-                    inside[random.randrange(min(len(inside), 3000))] = random.randrange(256)
-                put(path, blosc.compress(bytes(inside), b"zstd", 1, 0), random)
+                    decoded[random.randrange(min(len(decoded), 3000))] = random.randrange(256)
+                put(path, blosc.compress(bytes(decoded), b"zstd", 1, 0), random)
         opened = open_folder(folder / "theirs")
         for array in [array for array in opened.arrays if array.path.name in {name.parts[0] for name in names}]:
             found = read_trajectories(array, 0, min(array.rows, 3))
-            good = [i for i, what in enumerate(found.wrong) if not what]
-            level = jax.tree.map(lambda x: x[..., good], found.level)  # noqa: B023
+            valid = [i for i, reason in enumerate(found.wrong) if not reason]
+            level = jax.tree.map(lambda x: x[..., valid], found.level)  # noqa: B023
             require_possible(arrays_of(level, "level/"), opened.size)
             assert all(np.isfinite(x).all() for x in arrays_of(level).values())
 
@@ -146,7 +146,7 @@ SHARD = "shards/000000000000-000000000001-0123abcd.zarr"
 
 
 def shards(folder: Path, density: str) -> Target:
-    """Descriptions, files of chunks, and chunks whose checksums are right."""
+    """Shards: metadata, chunk files, and chunks with valid checksums."""
     source = played_split(folder / "played")
     (name,) = (path.name for path in (source / "shards").iterdir())
     rows = Shard(source / "shards" / name).read([0, 1])
@@ -161,10 +161,10 @@ def shards(folder: Path, density: str) -> Target:
         name = random.choice(sorted(files))
         try:
             remove(path / name)
-            changed = changed_file(name.name, files[name], random)
+            changed = mutate_file(name.name, files[name], random)
             put(path / name, changed, random)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that the engine differs
+                warnings.simplefilter("ignore")  # about a differing engine
                 shard = Shard(path)
                 wanted = stored if random.random() < 0.9 else fields
                 found = shard.read(range(min(2, len(shard.level_ids))), wanted)
@@ -177,15 +177,15 @@ def shards(folder: Path, density: str) -> Target:
     return target
 
 
-def changed_file(name: str, data: bytes, random: Random) -> bytes:
-    """Of a shard."""
+def mutate_file(name: str, data: bytes, random: Random) -> bytes:
+    """Change a file of a shard."""
     if name == "zarr.json":
-        return changed_json(json.loads(data), random)
+        return mutate_json(json.loads(data), random)
     if random.random() < 0.3:
-        return changed_bytes(data, random)
+        return mutate_bytes(data, random)
     index = np.frombuffer(data[-36:-4], "<u8").reshape(2, 2).copy()
     chunks = [data[first : first + length] for first, length in index.tolist()]
-    if random.random() < 0.4:  # the index lies
+    if random.random() < 0.4:  # a false index
         index.reshape(-1)[random.randrange(4)] = random.choice(
             (0, 1, len(data), 2**32, 2**63, 2**64 - 1, len(chunks[0]))
         )
@@ -194,22 +194,22 @@ def changed_file(name: str, data: bytes, random: Random) -> bytes:
         i = random.randrange(2)
         chunk = chunks[i][:-4]
         if random.random() < 0.3:
-            chunk = changed_bytes(chunk, random)
+            chunk = mutate_bytes(chunk, random)
         else:
-            inside = bytearray(blosc.decompress(chunk))
+            decoded = bytearray(blosc.decompress(chunk))
             for _ in range(random.choice((1, 3, 100))):
-                inside[random.randrange(len(inside))] = random.choice((0, 1, 2, 7, 127, 255))
-            chunk = blosc.compress(bytes(inside), b"zstd", 1, random.choice((0, 1)), typesize=random.choice((1, 4)))
+                decoded[random.randrange(len(decoded))] = random.choice((0, 1, 2, 7, 127, 255))
+            chunk = blosc.compress(bytes(decoded), b"zstd", 1, random.choice((0, 1)), typesize=random.choice((1, 4)))
         chunks[i] = chunk + google_crc32c.value(chunk).to_bytes(4, "little")
-        index[:, 1] = [len(of) for of in chunks]
+        index[:, 1] = [len(chunk) for chunk in chunks]
         index[:, 0] = [0, len(chunks[0])]
         body = b"".join(chunks)
-    told = index.tobytes()
-    return body + told + google_crc32c.value(told).to_bytes(4, "little")
+    footer = index.tobytes()
+    return body + footer + google_crc32c.value(footer).to_bytes(4, "little")
 
 
 def fragments(folder: Path) -> Target:
-    """Footers, pages, metadata and rows of the manifest; checksums of pages are right, or not looked at."""
+    """Fragments: footers, pages, metadata and rows; page checksums are valid, or not verified."""
     split = made_split(folder, [[Label.SOLVED, Label.UNSOLVED, Label.SOLVED]])
     (path,) = fragment_paths(split)
     data, table = path.read_bytes(), pq.read_table(path)
@@ -219,14 +219,14 @@ def fragments(folder: Path) -> Target:
     pq.write_table(long, in_groups, row_group_size=7, write_page_checksum=True)
     bodies = [data, in_groups.getvalue()]
 
-    def written(random: Random) -> bytes:
+    def mutated(random: Random) -> bytes:
         match random.randrange(8):
             case 0 | 1:
-                return changed_bytes(random.choice(bodies), random)
+                return mutate_bytes(random.choice(bodies), random)
             case 2 | 3:  # the footer
                 body = random.choice(bodies)
                 start = len(body) - 8 - int.from_bytes(body[-8:-4], "little")
-                footer = changed_bytes(body[start:-8], random)
+                footer = mutate_bytes(body[start:-8], random)
                 return body[:start] + footer + len(footer).to_bytes(4, "little") + b"PAR1"
             case 4:  # pages
                 body = bytearray(random.choice(bodies))
@@ -239,9 +239,9 @@ def fragments(folder: Path) -> Target:
                 about = dict(metadata)
                 key = random.choice([key for key in about if not key.startswith(b"ARROW")])
                 try:
-                    about[key] = changed_json(json.loads(about[key]), random)[:2_000_000]
+                    about[key] = mutate_json(json.loads(about[key]), random)[:2_000_000]
                 except ValueError:
-                    about[key] = changed_bytes(about[key], random)
+                    about[key] = mutate_bytes(about[key], random)
                 if key == CONFIG_KEY and random.random() < 0.5:
                     about[HASH_KEY] = _hash_like(about[CONFIG_KEY])
                 changed = table.replace_schema_metadata(about)
@@ -249,7 +249,7 @@ def fragments(folder: Path) -> Target:
                 i = random.randrange(table.num_columns)
                 field = table.schema.field(i)
                 values = table.column(i).to_pylist()
-                values[random.randrange(3)] = odd_value(random)
+                values[random.randrange(3)] = random_value(random)
                 try:
                     column = pa.array(values, field.type)
                 except Exception:
@@ -258,13 +258,13 @@ def fragments(folder: Path) -> Target:
         sink = BytesIO()
         try:
             pq.write_table(changed, sink, write_page_checksum=random.random() < 0.5)
-        except pa.ArrowException:  # what Arrow does not write
-            return changed_bytes(data, random)
+        except pa.ArrowException:  # Arrow cannot write this table
+            return mutate_bytes(data, random)
         return sink.getvalue()
 
     def target(random: Random) -> None:
         remove(path)
-        put(path, written(random), random)
+        put(path, mutated(random), random)
         checked = {**bounds.CAREFULLY, "page_checksum_verification": random.random() < 0.3}
         with patch.object(bounds, "CAREFULLY", checked):
             if path.is_symlink() or not path.is_file():
@@ -290,7 +290,7 @@ def _hash_like(config: bytes) -> bytes:
 
 
 def notes(folder: Path) -> Target:
-    """`job.json`, and names in the folders of a split."""
+    """Job notes, and file names in the folders of a split."""
     note_job(folder, made_job(), ["levelproof", "generate"], [(0, 7), (9, 9)])
     document, path = json.loads((folder / JOB).read_text()), folder / JOB
     names = [".000000000000-000000000001-0123abcd.begun", "000000000000-000000000001.parquet"]
@@ -299,18 +299,18 @@ def notes(folder: Path) -> Target:
     def target(random: Random) -> None:
         marked = folder / MANIFEST / "mark"
         with suppress(OSError, ValueError):
-            marked = folder / MANIFEST / changed_word(random.choice(names), random).replace("/", "_")
+            marked = folder / MANIFEST / mutate_word(random.choice(names), random).replace("/", "_")
             put(marked, b"", random)
         try:
-            for of in (FRAGMENT, BEGUN, DATA):
-                for entry in entries(folder, MANIFEST, of, os.DirEntry.is_file):
+            for pattern in (FRAGMENT, BEGUN, DATA):
+                for entry in entries(folder, MANIFEST, pattern, os.DirEntry.is_file):
                     assert not entry.is_symlink()
                     assert entry.is_file()
         finally:
             with suppress(OSError, ValueError):
                 remove(marked)
         remove(path)
-        put(path, changed_json(document, random), random)
+        put(path, mutate_json(document, random), random)
         if not path.exists():
             return
         note = read_note(folder)
@@ -321,13 +321,13 @@ def notes(folder: Path) -> Target:
 
 
 def origins(folder: Path) -> Target:
-    """The `file` of a row."""
+    """Origins: the `file` of a row."""
     shutil.copytree(GOLDEN / "s", folder / "theirs")
 
     def target(random: Random) -> None:
-        file = changed_word(f"{folder}/theirs/{random.choice(('first', 'second'))}#1", random)
+        file = mutate_word(f"{folder}/theirs/{random.choice(('first', 'second'))}#1", random)
         if random.random() < 0.5:
-            file = changed_word(file, random)
+            file = mutate_word(file, random)
         found = place_of(file)
         if found is not None:
             assert str(found) == file
@@ -338,7 +338,7 @@ def origins(folder: Path) -> Target:
 
 
 def checkpoints(folder: Path) -> Target:
-    """Experts: archives, the arrays in them, and their headers."""
+    """Checkpoints of experts: archives, their arrays, and headers."""
     job = made_job("data", "expert.width=8", "expert.environments=24", "expert.attempts=8")
     ids, path, good = np.arange(2, dtype=np.int32), folder / "experts.npz", folder / "good.npz"
     levels = sample_levels(ids, size_of("s"), job.distribution)
@@ -349,23 +349,25 @@ def checkpoints(folder: Path) -> Target:
     with np.load(good) as file:
         arrays = {name: file[name] for name in file.files}
 
-    def written(random: Random) -> bytes:
+    def mutated(random: Random) -> bytes:
         if random.random() < 0.4:
-            return changed_bytes(data, random)
+            return mutate_bytes(data, random)
         name, sink = random.choice([*arrays, "level_id", "curve"]), BytesIO()
         if random.random() < 0.5:
             with zipfile.ZipFile(sink, "w", random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
-                for of, values in arrays.items():
+                for member, values in arrays.items():
                     part = BytesIO()
                     np.save(part, values)
                     raw = part.getvalue()
-                    archive.writestr(f"{of}.npy", changed_bytes(raw[:300], random) + raw[300:] if of == name else raw)
+                    archive.writestr(
+                        f"{member}.npy", mutate_bytes(raw[:300], random) + raw[300:] if member == name else raw
+                    )
             return sink.getvalue()
         changed = {
             0: lambda x: x.astype(np.float64),
             1: lambda x: x.reshape(-1),
             2: lambda x: x[:1],
-            3: lambda x: np.array(odd_value(random), dtype=object),
+            3: lambda x: np.array(random_value(random), dtype=object),
             4: lambda x: np.full(x.shape, random.choice((-1, 2**31 - 1, 127))).astype(x.dtype),
             5: lambda x: np.array(7),
         }[random.randrange(6)]
@@ -376,7 +378,7 @@ def checkpoints(folder: Path) -> Target:
 
     def target(random: Random) -> None:
         remove(path)
-        put(path, written(random), random)
+        put(path, mutated(random), random)
         for level_id, kept in load_experts(path, job).items():
             assert type(level_id) is int
             assert 0 <= level_id <= MAX_LEVEL_ID
@@ -386,26 +388,26 @@ def checkpoints(folder: Path) -> Target:
 
 
 def listings(folder: Path) -> Target:
-    """What a web server and the hub say there is."""
+    """Listings by a web server and the hub."""
     hub_files = [
         {"type": "file", "oid": "0123", "size": 77, "path": "1M/s/manifest/000000000000-000000000001.parquet"},
         {"type": "directory", "oid": "0124", "size": 0, "path": "1M/s/manifest"},
     ]
     index = b"000000000000-000000000001.parquet\n000000000002-000000000003.parquet\nindex.txt\n"
 
-    class Given:
+    class FakeResponse:
         def __init__(self, data: bytes) -> None:
             self._data = data
             self.headers: dict[str, str] = {}
 
-        def __enter__(self) -> "Given":
+        def __enter__(self) -> "FakeResponse":
             return self
 
         def __exit__(self, *_: object) -> None:
-            """Nothing is open."""
+            """Nothing to close."""
 
-        def read(self, most: int = -1) -> bytes:
-            return self._data if most < 0 else self._data[:most]
+        def read(self, size: int = -1) -> bytes:
+            return self._data if size < 0 else self._data[:size]
 
         def stream(self, **_: object) -> list[bytes]:
             return [self._data]
@@ -415,13 +417,13 @@ def listings(folder: Path) -> Target:
 
     def target(random: Random) -> None:
         if random.random() < 0.5:
-            data = changed_json(hub_files, random)
-            with patch.object(hub, "urlopen", lambda *_, **__: Given(data)), patch.object(hub, "PAUSE", 0.0):
+            data = mutate_json(hub_files, random)
+            with patch.object(hub, "urlopen", lambda *_, **__: FakeResponse(data)), patch.object(hub, "PAUSE", 0.0):
                 for path, about in remote.stored_in(Path("hf://datasets/me/levels/1M/s/manifest")).items():
                     assert ".." not in path.parts
                     assert type(about.size) is int
             return
-        data = changed_bytes(index, random)
+        data = mutate_bytes(index, random)
         with patch.object(remote, "ask", lambda *_: data):
             there = Path("https://host/1M/s")
             for path in entries(there, MANIFEST, FRAGMENT, os.DirEntry.is_file):
@@ -431,7 +433,7 @@ def listings(folder: Path) -> Target:
 
 
 def pieces(folder: Path) -> Target:
-    """What lies in the cache."""
+    """Pieces in the cache of remote reads."""
     cache, piece = PieceCache(folder / "pieces", 10**9), bytes(range(256)) * 4
     cache.put("name-0", piece)
     path = folder / "pieces/name-0"
@@ -439,7 +441,7 @@ def pieces(folder: Path) -> Target:
 
     def target(random: Random) -> None:
         remove(path)
-        put(path, changed_bytes(data, random), random)
+        put(path, mutate_bytes(data, random), random)
         cache._checked.clear()
         found = cache.read("name-0", 3, 700)
         assert found is None or found == piece[3:700]
@@ -448,7 +450,7 @@ def pieces(folder: Path) -> Target:
 
 
 def overrides(folder: Path) -> Target:
-    """Settings as they are typed, and as a split records them."""
+    """Settings as typed, and as recorded in a split."""
     document = plain(made_job())
     words = ["levels=64", "budget=11.5M", "expert.width=128", "distribution.joints=0.5", "out=my data", "size=3-1-0-7"]
 
@@ -456,19 +458,19 @@ def overrides(folder: Path) -> Target:
         word = random.choice(words)
         match random.randrange(20):
             case 0:
-                job = compose_job([changed_word(word, random)])
+                job = compose_job([mutate_word(word, random)])
                 assert typed(JobConfig, plain(job)) == job
             case 1 | 2 | 3 | 4:
-                _parsed(changed_word(word, random)).value()
+                _parsed(mutate_word(word, random)).value()
             case 5 | 6 | 7:
-                assert parse_count(changed_word("11.5M", random), "levels") > 0
+                assert parse_count(mutate_word("11.5M", random), "levels") > 0
             case 8 | 9:
                 try:
-                    size_of(changed_word("8-8-8-4", random))
+                    size_of(mutate_word("8-8-8-4", random))
                 except ValueError as error:
                     raise ConfigError(f"{error}.") from None
             case _:
-                job = typed(JobConfig, changed_document(document, random))
+                job = typed(JobConfig, mutate_document(document, random))
                 assert len(job.hash) > 7
 
     return target
