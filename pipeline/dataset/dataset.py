@@ -99,7 +99,7 @@ class Dataset:
 
     @property
     def manifest(self) -> pa.Table:
-        """Manifest rows of the trajectories, by index."""
+        """Manifest rows of the trajectories, a table with one row per index (docs/columns.md)."""
         return self._manifest
 
     @cached_property
@@ -112,6 +112,8 @@ class Dataset:
 
     def __getitem__(self, index: int) -> Batch:
         """Read one trajectory, arrays [256, ...], with all fields and the observation `symbolic_flat`.
+
+        Negative indices count from the end.
 
         Raises:
             IndexError: the trajectory does not exist.
@@ -244,7 +246,10 @@ class Dataset:
 
     @renamed(numbers="indices")
     def levels(self, indices: ArrayLike) -> Level:
-        """Read the levels of trajectories, for `levelproof.make`: numpy arrays, level axis last.
+        """Read the levels of trajectories, for `levelproof.make`: numpy arrays, level axis last, in the given order.
+
+        Args:
+            indices: integer indices of trajectories [level]; a scalar counts as [1].
 
         Raises:
             UserError: an index does not exist.

@@ -34,8 +34,10 @@ def make(
 
     Args:
         levels: levels from which resets draw uniformly; level axis last.
-        action_type: `discrete`, `multi_discrete` or `continuous`.
-        observation_type: `symbolic_flat`, `symbolic_flat_padded`, `symbolic_entity` or `pixels`.
+        action_type: `discrete` (an integer), `multi_discrete` (integers [6]: four motors, two thrusters) or
+            `continuous` (floats [6]: motors in [-1, 1], thrusters in [0, 1]).
+        observation_type: `symbolic_flat` (float32 [feature]), `symbolic_flat_padded`, `symbolic_entity` or `pixels`
+            (`levelproof.levelgen.task.observe`).
         rules: task rules; None: those of the split, or the defaults.
         auto_reset: whether a step that ends an episode returns the first state and observation of the next one.
         final_observation: whether `info["final_observation"]` has the observation before an automatic reset.

@@ -34,7 +34,7 @@ def levels_from(table: pa.Table) -> Level:
             ignores others.
 
     Returns:
-        Numpy arrays, level axis last, in row order: bit for bit the exported levels.
+        Numpy arrays (float32, int32 or bool), level axis last, in row order: bit for bit the exported levels.
 
     Raises:
         UserError: the rows have several sizes, or a column is missing or holds values that no level can have.

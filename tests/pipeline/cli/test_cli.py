@@ -71,7 +71,7 @@ def test_version_prints_the_version(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "expected"),
     [
         (["size=xl"], ["size is 'xl'", "choose one of s, m, l"]),
         (["budget=0"], ["budget is '0'", "at least 1"]),
@@ -85,9 +85,9 @@ def test_version_prints_the_version(tmp_path: Path) -> None:
     ],
 )
 def test_generate_rejects_a_wrong_setting_in_one_sentence(
-    tmp_path: Path, arguments: list[str], words: list[str]
+    tmp_path: Path, arguments: list[str], expected: list[str]
 ) -> None:
-    assert_refused(here(["generate", *arguments], tmp_path), 2, *words)
+    assert_refused(here(["generate", *arguments], tmp_path), 2, *expected)
     assert not list(tmp_path.iterdir())
 
 
@@ -124,8 +124,8 @@ def test_inspect_rejects_a_folder_of_splits(made: Path) -> None:
 def test_later_command_keeps_earlier_levels_wanted(split: Path) -> None:
     """Levels that the later command did not request count as missing once they are lost."""
     folder = split.parent.parent.parent
-    words = [word for word in TINY if not word.startswith("levels=")]
-    assert here(["generate", *words, "levels=1", "executor=inline"], folder).returncode == 0
+    settings = [setting for setting in TINY if not setting.startswith("levels=")]
+    assert here(["generate", *settings, "levels=1", "executor=inline"], folder).returncode == 0
     assert json.loads(here(["status", "data/5k/s", "--json"], folder).stdout)["wanted"] == 4
     for path in fragment_paths(split)[1:]:
         path.unlink()
@@ -332,8 +332,8 @@ def answers(split: Path) -> dict[str, object]:
     folder, name, level = split.parents[2], "data/5k/s", str(solved_level(split))
     facts = json.loads(here(["inspect", name, "--where", "level_id < 4", "--json"], folder).stdout)
     rows = [row | {"shard": bool(row["shard"]), "row": None} for row in facts.pop("rows")]
-    for words in ["show", name, level, "-o", "level.svg"], ["export", name, level, "-o", "level.json"]:
-        assert here(words, folder).returncode == 0
+    for command in ["show", name, level, "-o", "level.svg"], ["export", name, level, "-o", "level.json"]:
+        assert here(command, folder).returncode == 0
     files = [(folder / file).read_bytes() for file in ("level.svg", "level.json")]
     facts = {name: fact for name, fact in facts.items() if "bytes" not in name}
     return {"facts": facts, "rows": rows, "files": files, "status": here(["status", name], folder).stdout}

@@ -24,10 +24,10 @@ def test_generate_help_fits_on_a_screen(capsys: pytest.CaptureFixture[str]) -> N
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 40
     assert max(map(len, lines)) <= 80
-    words = {setting.name: setting.word for setting in every_setting()}
+    assignments = {setting.name: setting.word for setting in every_setting()}
     assert len(COMMON) == 10
     for name in COMMON:
-        assert any(line.startswith(f"  {words[name]}  ") for line in lines), name
+        assert any(line.startswith(f"  {assignments[name]}  ") for line in lines), name
 
 
 def test_settings_lists_all_with_their_meanings(capsys: pytest.CaptureFixture[str]) -> None:

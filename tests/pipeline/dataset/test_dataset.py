@@ -124,11 +124,11 @@ def test_getitem_observation_equals_the_environments(data: Dataset) -> None:
 @pytest.mark.parametrize("kind", list(ObservationType))
 def test_read_observations_of_all_types_equal_the_environments(data: Dataset, kind: str) -> None:
     env, _ = make(data.levels([0, 2]), observation_type=kind)
-    seen = data.read([0, 2], length=3, first=[9, 30], observation=kind).observation
+    observation = data.read([0, 2], length=3, first=[9, 30], observation=kind).observation
     for step in range(3):
         shown = jax.vmap(env.get_obs)(data.state([0, 2], [9 + step, 30 + step]))
         jax.tree.map(
-            lambda x, y, step=step: np.testing.assert_allclose(x[:, step], y, rtol=1e-6, atol=1e-6), seen, shown
+            lambda x, y, step=step: np.testing.assert_allclose(x[:, step], y, rtol=1e-6, atol=1e-6), observation, shown
         )
 
 

@@ -9,12 +9,6 @@ import pytest
 import levelproof
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.store.manifest import read_manifest
-from tests.pipeline.made import played_split
-
-
-@pytest.fixture(scope="module")
-def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return played_split(tmp_path_factory.mktemp("environment"))
 
 
 def test_make_uses_all_levels_and_the_rules_of_a_split(split: Path) -> None:

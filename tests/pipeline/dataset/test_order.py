@@ -48,13 +48,13 @@ def test_epoch_order_distributes_each_epoch_over_hosts(count: int, batch: int, h
     orders = [EpochOrder(count, batch, seed, host, hosts) for host in range(hosts)]
     assert len({order.batches for order in orders}) == 1
     for epoch in range(2):
-        seen = []
+        items_of_hosts = []
         for order in orders:
             for step in range(order.batches):
                 items, new = order.items(epoch * order.batches + step)
                 assert items.shape == new.shape == (batch,)
-                seen += items[new].tolist()
-        assert sorted(seen) == list(range(count))
+                items_of_hosts += items[new].tolist()
+        assert sorted(items_of_hosts) == list(range(count))
 
 
 def test_epoch_order_without_a_seed_keeps_item_order() -> None:

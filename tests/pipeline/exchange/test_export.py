@@ -23,14 +23,9 @@ from levelproof.pipeline.store.layout import SHARDS
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.shard import Shard
 from tests.levelgen.opened import open_in_reference
-from tests.pipeline.made import PLAYED, made_job, played_split
+from tests.pipeline.made import PLAYED, made_job
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def split(tmp_path_factory) -> Path:
-    return played_split(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")

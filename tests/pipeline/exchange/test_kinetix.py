@@ -83,11 +83,11 @@ def test_export_kinetix_selects_levels_by_where(split: Path, tmp_path: Path) -> 
 def test_export_kinetix_splits_trajectories_into_arrays_and_blocks(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["export", str(split), "--format", "kinetix", "--where", "true", "-o"]
-    assert here([*words, "one"], tmp_path).returncode == 0
+    command = ["export", str(split), "--format", "kinetix", "--where", "true", "-o"]
+    assert here([*command, "one"], tmp_path).returncode == 0
     for target, name, value in ((zarr2, "ROWS", 1), (module, "ROWS", 1), (module, "BLOCK", 2), (module, "ARRAY", 2)):
         monkeypatch.setattr(target, name, value)
-    assert here([*words, "cut"], tmp_path).returncode == 0
+    assert here([*command, "cut"], tmp_path).returncode == 0
     assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == [".zgroup", "000000", "000001"]
     one, cut = (trajectories_in(tmp_path / name) for name in ("one", "cut"))
     assert len(one) == 3
@@ -97,7 +97,7 @@ def test_export_kinetix_splits_trajectories_into_arrays_and_blocks(
 def test_export_kinetix_creates_the_folder_atomically(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["export", str(split), "--format", "kinetix", "-o", "k"]
+    command = ["export", str(split), "--format", "kinetix", "-o", "k"]
     names_before: list[list[str]] = []
 
     def last(folder: Path) -> None:
@@ -106,16 +106,16 @@ def test_export_kinetix_creates_the_folder_atomically(
 
     with monkeypatch.context() as patch:
         patch.setattr(module, "write_group", lambda _: 1 / 0)
-        assert here(words, tmp_path).returncode == 1
+        assert here(command, tmp_path).returncode == 1
     assert not (tmp_path / "k").exists()
     monkeypatch.setattr(module, "write_group", last)
-    assert here(words, tmp_path).returncode == 0
+    assert here(command, tmp_path).returncode == 0
     assert names_before == [[".k."]], "killed before its last step, it leaves no k"
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "k").rglob("*")}
-    assert_refused(here(words, tmp_path), 2, "something at k already", "-o")
+    assert_refused(here(command, tmp_path), 2, "something at k already", "-o")
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "k").rglob("*")}
     (tmp_path / "file").write_text("")
-    assert_refused(here([*words[:-1], "file/k"], tmp_path), 2, "Cannot write file/k")
+    assert_refused(here([*command[:-1], "file/k"], tmp_path), 2, "Cannot write file/k")
 
 
 def test_export_rejects_arguments_of_other_formats(split: Path, tmp_path: Path) -> None:

@@ -15,14 +15,9 @@ from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.layout import MANIFEST
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.schema import CONFIG_KEY
-from tests.pipeline.made import PLAYED, made_job, played_split
+from tests.pipeline.made import PLAYED, made_job
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return played_split(tmp_path_factory.mktemp("data"))
 
 
 def test_export_parquet_keeps_rows_and_worlds(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:

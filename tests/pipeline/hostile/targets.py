@@ -452,16 +452,23 @@ def pieces(folder: Path) -> Target:
 def overrides(folder: Path) -> Target:
     """Settings as typed, and as recorded in a split."""
     document = plain(made_job())
-    words = ["levels=64", "budget=11.5M", "expert.width=128", "distribution.joints=0.5", "out=my data", "size=3-1-0-7"]
+    settings = [
+        "levels=64",
+        "budget=11.5M",
+        "expert.width=128",
+        "distribution.joints=0.5",
+        "out=my data",
+        "size=3-1-0-7",
+    ]
 
     def target(random: Random) -> None:
-        word = random.choice(words)
+        setting = random.choice(settings)
         match random.randrange(20):
             case 0:
-                job = compose_job([mutate_word(word, random)])
+                job = compose_job([mutate_word(setting, random)])
                 assert typed(JobConfig, plain(job)) == job
             case 1 | 2 | 3 | 4:
-                _parsed(mutate_word(word, random)).value()
+                _parsed(mutate_word(setting, random)).value()
             case 5 | 6 | 7:
                 assert parse_count(mutate_word("11.5M", random), "levels") > 0
             case 8 | 9:

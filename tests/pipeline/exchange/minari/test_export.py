@@ -19,16 +19,11 @@ from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.exchange.minari.episodes import ActionKind, encode_actions, episodes_of
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import read_manifest
-from tests.pipeline.made import made_job, played_split
+from tests.pipeline.made import made_job
 
 pytestmark = pytest.mark.slow
 MANY = 16  # levels with ids below this are compared
 EVERY = np.stack(np.unravel_index(np.arange(np.prod(CHOICES)), CHOICES), -1)  # actions that exist
-
-
-@pytest.fixture(scope="module")
-def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return played_split(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")

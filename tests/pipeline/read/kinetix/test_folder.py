@@ -134,9 +134,9 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-@pytest.mark.parametrize(("change", "words"), HOSTILE.values(), ids=HOSTILE)
+@pytest.mark.parametrize(("change", "message"), HOSTILE.values(), ids=HOSTILE)
 def test_open_folder_rejects_hostile_folders_in_one_sentence_and_little_memory(
-    theirs: Path, change: Callable[[Path], object], words: str
+    theirs: Path, change: Callable[[Path], object], message: str
 ) -> None:
     change(theirs)
     tracemalloc.start()
@@ -146,7 +146,7 @@ def test_open_folder_rejects_hostile_folders_in_one_sentence_and_little_memory(
         assert tracemalloc.get_traced_memory()[1] < MAX_MEMORY
     finally:
         tracemalloc.stop()
-    assert words in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 300
 

@@ -23,29 +23,29 @@ STEPS = (0, 5, 40)
 
 @pytest.mark.parametrize("size", SIZES)
 def test_reference_opens_and_draws_kinetix_exports(reference: Path, size: str, tmp_path: Path) -> None:
-    words = [f"size={size}", "levels=24", "budget=5k", "procedure=label", "executor=inline"]
-    assert here(["generate", *words], tmp_path).returncode == 0
+    settings = [f"size={size}", "levels=24", "budget=5k", "procedure=label", "executor=inline"]
+    assert here(["generate", *settings], tmp_path).returncode == 0
     split = tmp_path / "data/5k" / size
     rows = require_manifest(split).table
     rows = rows.filter(rows.column("shard").is_valid()).slice(0, ROWS)
     last = rows.column("level_id")[-1]
     done = here(["export", str(split), "--format", "kinetix", "-o", "k", "--where", f"level_id <= {last}"], tmp_path)
     assert done.returncode == 0, done.stderr
-    out = tmp_path / "seen.npz"
+    out = tmp_path / "theirs.npz"
     arguments = [out, tmp_path / "k", "--size", size, "--rows", rows.num_rows, "--steps", *STEPS]
     oracle.run_script(reference, "reader", arguments, "open an export with the reference")
     with np.load(out) as file:
-        seen = dict(file)
+        theirs = dict(file)
 
     fields = read_rows(split, rows)
     level, record = tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/")
     ours = trajectories_of(level, record)
-    frames = seen.pop("frame")
-    assert seen.pop("mask").all()
-    assert set(seen) == set(dtype_of(SIZES[size]).names or ())
-    for name, theirs in seen.items():
-        assert theirs.dtype == ours.dtype[name].base, name
-        assert theirs.tobytes() == ours[name][:, :, 0].tobytes(), name
+    frames = theirs.pop("frame")
+    assert theirs.pop("mask").all()
+    assert set(theirs) == set(dtype_of(SIZES[size]).names or ())
+    for name, values in theirs.items():
+        assert values.dtype == ours.dtype[name].base, name
+        assert values.tobytes() == ours[name][:, :, 0].tobytes(), name
 
     draw = jax.jit(lambda level, state: pixels(level, state).image)
     for i in range(rows.num_rows):
