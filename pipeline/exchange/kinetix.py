@@ -8,7 +8,7 @@ from levelproof.levelgen.level import Level, size_of
 from levelproof.pipeline.read.kinetix.records import dtype_of, trajectories_of
 from levelproof.pipeline.read.kinetix.zarr2 import ROWS, write_array, write_chunk, write_group
 from levelproof.pipeline.read.rows import read_rows
-from levelproof.pipeline.read.select import SOLVED, witnessed
+from levelproof.pipeline.read.select import SOLVED, select_witnessed
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.fields import tree_of
@@ -28,7 +28,7 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
         UserError: the split does not exist, the condition is invalid, no level qualifies, or `out` exists.
         Failure: the split is damaged.
     """
-    rows = witnessed(split, where or SOLVED)
+    rows = select_witnessed(split, where or SOLVED)
     prepare_jax()
     count = rows.num_rows
     with new_folder(out) as folder:

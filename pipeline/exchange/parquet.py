@@ -17,7 +17,7 @@ from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.tables import columns_for
 from levelproof.pipeline.read.levels import levels_of
-from levelproof.pipeline.read.pace import Pace
+from levelproof.pipeline.read.pace import ProgressBar
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.created import new_folder
@@ -61,12 +61,12 @@ def export_parquet(split: Path, where: str | None, out: Path) -> None:
 
 def _groups(split: Path, ids: np.ndarray) -> Iterator[pa.Table]:
     """Yield tables of rows and worlds of these levels, GROUP rows each."""
-    with Pace("levels", len(ids), Console(stderr=True)) as pace:
+    with ProgressBar("levels", len(ids), Console(stderr=True)) as progress:
         for first in range(0, len(ids), GROUP):
             manifest, group = require_manifest(split, level_ids=ids[first : first + GROUP]), []
             for rows in (manifest.table.slice(block, CHUNK) for block in range(0, manifest.table.num_rows, CHUNK)):
                 group.append(with_worlds(manifest, rows))
-                pace.advance(rows.num_rows)
+                progress.advance(rows.num_rows)
             yield pa.concat_tables(group)
 
 

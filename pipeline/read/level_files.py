@@ -50,7 +50,7 @@ def levels_below(folder: Path, job: JobConfig) -> Listing:
     listing = Listing()
     for path in paths:
         try:
-            origin = _usable(path.absolute(), job)
+            origin = _origin_of(path.absolute(), job)
         except LevelFileError as error:
             listing.refused.append(str(error))
             continue
@@ -66,13 +66,13 @@ def levels_below(folder: Path, job: JobConfig) -> Listing:
     return listing
 
 
-def _usable(path: Path, job: JobConfig) -> Origin:
+def _origin_of(path: Path, job: JobConfig) -> Origin:
     """Return the origin of a file's level. Raise LevelFileError if it has none that the job can use."""
     if not can_be_noted(str(path)):
         raise LevelFileError(
             f"Cannot use the level file {path}: its name has characters that terminals cannot show: rename it."
         )
-    file = _level_in(path)
+    file = _read_level(path)
     size = name_of(file.level.size)
     try:
         replace(job, size=size)
@@ -86,7 +86,7 @@ def _usable(path: Path, job: JobConfig) -> Origin:
     return Origin(content_hashes(file.level)[0], str(path), size)
 
 
-def _level_in(path: Path) -> LevelFile:
+def _read_level(path: Path) -> LevelFile:
     """Read the level of a level file, or of a record in a folder of the reference.
 
     Raises:
@@ -96,7 +96,7 @@ def _level_in(path: Path) -> LevelFile:
         return read_level_file(path)
     try:
         folder = open_folder(place.folder)
-        trajectories = read_trajectories(folder.named(place.array), place.row, place.row + 1)
+        trajectories = read_trajectories(folder.array(place.array), place.row, place.row + 1)
     except FormatError as error:
         raise LevelFileError(f"Cannot use the level of {path}: {error}.") from None
     if trajectories.wrong[0]:
@@ -131,7 +131,7 @@ def level_at(origin: Origin) -> Level:
         names = [field.name for field in level_fields(size_of(origin.size))]
         return tree_of(Level, read_row(Path(origin.split), origin._asdict(), names), "level/")
     try:
-        level = _level_in(Path(origin.file)).level
+        level = _read_level(Path(origin.file)).level
     except LevelFileError as error:
         raise LevelUnavailable(
             f"{str(error)[:-1]} on {socket.gethostname()}: put it back, in a folder that all machines share."

@@ -1,4 +1,4 @@
-"""Progress of long reads: a bar on a terminal, elsewhere a line every LINE_EVERY seconds."""
+"""Progress bar for long reads: on a terminal a bar, elsewhere a line every LINE_EVERY seconds."""
 
 import time
 from types import TracebackType
@@ -9,7 +9,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 LINE_EVERY = 30.0  # s between plain lines
 
 
-class Pace:
+class ProgressBar:
     """Progress display of a `with` block; `console` None: no output."""
 
     def __init__(self, what: str, total: int, console: Console | None) -> None:
@@ -19,7 +19,7 @@ class Pace:
         self._bar = Progress(*columns, console=console, transient=True, disable=self._quiet)
         self._task = self._bar.add_task("", total=max(total, 1))
 
-    def __enter__(self) -> "Pace":
+    def __enter__(self) -> "ProgressBar":
         self._bar.start()
         return self
 

@@ -49,7 +49,7 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
     return table.filter(np.isin(table.column("level_id").to_numpy(), chosen))
 
 
-def witnessed(split: Path, where: str) -> pa.Table:
+def select_witnessed(split: Path, where: str) -> pa.Table:
     """Return the rows (EXPORT_COLUMNS) of levels that have a witness and meet the condition, sorted by level id.
 
     Raises:

@@ -64,7 +64,7 @@ class Evidence:
 
         Args:
             rows: manifest rows with `level_id` and COLUMNS.
-            recipe: of the split.
+            recipe: how the split's levels are made and played.
             shards: shards that the rows name; None: unusable, already in `findings`.
             findings: receives the problems.
         """
@@ -88,7 +88,7 @@ class Evidence:
             [(label in WITNESSED) != (name is not None) for label, name in zip(labels, shard, strict=True)],
             lambda i: f"is {labels[i]}, but its shard is {shard[i]}",
         )
-        stored = np.flatnonzero(self._claims())
+        stored = np.flatnonzero(self._check_positions())
         if self.recipe.distribution is None:
             levels = self._load_levels(stored)
         else:
@@ -114,7 +114,7 @@ class Evidence:
             self.findings.add(f"Level {ids[i]} {describe(int(i))}.", [int(ids[i])])
         self.reported[lanes] |= wrong
 
-    def _claims(self) -> Mask:
+    def _check_positions(self) -> Mask:
         """Check positions; return which levels are in a shard at the row that the manifest names."""
         names, rows = self.columns["shard"], self.columns["row"]
         holds: list[int | None] = []
@@ -122,9 +122,8 @@ class Evidence:
             shard = self.shards.get(name)
             ids = shard.level_ids if shard else []
             holds.append(ids[row] if row is not None and 0 <= row < len(ids) else None)
-        self.reported |= [
-            name is not None and self.shards[name] is None for name in names
-        ]  # when their shards were opened
+        # Levels of unusable shards were reported when these were opened
+        self.reported |= [name is not None and self.shards[name] is None for name in names]
         right = np.array(holds, object) == self.ids
         wrong = ~right & [name is not None for name in names]
         self._report(wrong, lambda i: f"should be in row {rows[i]} of {names[i]}, which has level {holds[i]} there")
@@ -194,8 +193,10 @@ class Evidence:
         report(
             unlike & self.same_stack[lanes], lambda i: f"has a witness that does not replay: its {differs[i]} differs"
         )
-        moved = restored_otherwise & self.same_stack[lanes]
-        report(moved, lambda _: "has states that differ from its shard's checksums or key frames")
+        report(
+            restored_otherwise & self.same_stack[lanes],
+            lambda _: "has states that differ from its shard's checksums or key frames",
+        )
         report(~succeeds(done, replayed.goal), lambda _: "has a witness that does not reach the goal when replayed")
         busy = record.action.any((0, 1))
         report(busy & (labels == Label.TRIVIAL), lambda _: "is trivial, but its witness does something")
@@ -217,7 +218,7 @@ class Evidence:
 
     def _read_stored(self, lanes: Lanes, fields: Iterable[str] | None) -> dict[str, np.ndarray]:
         """Read arrays of levels, level axis last. Raise Failure if a shard is damaged."""
-        opened: dict[str, Any] = self.shards  # none is None: `_claims` excludes levels of unusable shards
+        opened: dict[str, Any] = self.shards  # none is None: `_check_positions` excludes levels of unusable shards
         arrays = gather_rows(self.recipe.split, self._positions.take(lanes), fields, lambda _, name, __: opened[name])
         return {name: np.moveaxis(x, 0, -1) for name, x in arrays.items()}
 
@@ -249,7 +250,7 @@ class Evidence:
         self._report(wrong, lambda _: "has a world in its shard that differs from the one its id makes", lanes)
         if not same.all():
             hashes = content_hashes(stored)
-            other = [self.columns["content_hash"][i] != ours for i, ours in zip(lanes, hashes, strict=True)]
+            other = [self.columns["content_hash"][i] != content for i, content in zip(lanes, hashes, strict=True)]
             self._report(other, lambda _: "has a world in its shard that differs from its content hash", lanes)
         for name, values in arrays_of(stored).items():
             ours[name][..., lanes] = values

@@ -28,7 +28,7 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Exit, Failure
 from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.levels import recorded_settings
-from levelproof.pipeline.read.pace import Pace
+from levelproof.pipeline.read.pace import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.bounds import DAMAGE, MAX_ROWS, bounded
 from levelproof.pipeline.store.checksums import digests_of, has_own
@@ -111,13 +111,13 @@ def _examine_once(split: Path, console: Console | None) -> Findings:
     recipe: Recipe | None = None
     named: set[str] = set()  # shards and experts that sound fragments name
     ids = [np.zeros(0, np.int64)]
-    with Pace("levels", sum(map(_rows_in, paths)), console) as pace:
+    with ProgressBar("levels", sum(map(_rows_in, paths)), console) as progress:
         for parts in _groups(paths, findings):
             recipe = recipe or _recipe(split, parts[0][0], findings)
             findings.budget = parts[0][1].column("budget")[0].as_py()
             findings.stored = min(parts[0][0].densities, default="")
             _require_one_configuration(split, parts, findings.config or {})
-            _check_fragments(parts, recipe, findings, pace)
+            _check_fragments(parts, recipe, findings, progress)
             ids += [rows.column("level_id").to_numpy() for _, rows in parts]
             named |= {name for fragment, _ in parts for name in fragment.digests}
     present = np.unique(np.concatenate(ids))
@@ -202,18 +202,18 @@ def _require_one_configuration(split: Path, parts: Sequence[Part], config: dict[
             )
 
 
-def _check_fragments(parts: Sequence[Part], recipe: Recipe, findings: Findings, pace: Pace) -> None:
+def _check_fragments(parts: Sequence[Part], recipe: Recipe, findings: Findings, progress: ProgressBar) -> None:
     """Check the rows of some sound fragments, and the shards and experts that they name."""
     rows = pa.concat_tables([rows for _, rows in parts])
     digests = {name: files for fragment, _ in parts for name, files in fragment.digests.items()}
-    in_shards, in_experts = _named(rows, "shard"), _named(rows, "experts")
+    in_shards, in_experts = _levels_by_name(rows, "shard"), _levels_by_name(rows, "experts")
     shards = {name: _opened(name, recipe, ids, findings) for name, ids in in_shards.items()}
     changed = {name: _changed_files(recipe.split, name, digests.get(name, {})) for name in [*in_shards, *in_experts]}
     findings.changed |= {name for name, files in changed.items() if files}
     for first in range(0, rows.num_rows, CHUNK):
         block = rows.slice(first, CHUNK)
         Evidence(block, recipe, shards, findings).examine()
-        pace.advance(block.num_rows)
+        progress.advance(block.num_rows)
     for name, level_ids in {**in_shards, **in_experts}.items():
         if not changed[name] or shards.get(name, "") is None:  # sound, or already reported
             continue
@@ -226,7 +226,7 @@ def _check_fragments(parts: Sequence[Part], recipe: Recipe, findings: Findings, 
     _note_losses(rows, recipe, findings)
 
 
-def _named(rows: pa.Table, column: str) -> dict[str, set[int]]:
+def _levels_by_name(rows: pa.Table, column: str) -> dict[str, set[int]]:
     """Map the shards or experts that rows name to their levels."""
     named: dict[str, set[int]] = {}
     for level_id, name in zip(rows.column("level_id").to_pylist(), rows.column(column).to_pylist(), strict=True):

@@ -20,7 +20,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.minari.episodes import BLOCK, ActionKind, Episode, episodes_of
 from levelproof.pipeline.read.levels import rules_of
 from levelproof.pipeline.read.rows import read_rows
-from levelproof.pipeline.read.select import SOLVED, witnessed
+from levelproof.pipeline.read.select import SOLVED, select_witnessed
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.fields import tree_of
@@ -48,7 +48,7 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
             of the extra `minari` are not installed.
         Failure: the split is damaged.
     """
-    rows = witnessed(split, where or SOLVED)
+    rows = select_witnessed(split, where or SOLVED)
     rules = rules_of(require_manifest(split, [], [rows.column("level_id")[0].as_py()]))
     budget, size = (rows.column(name)[0].as_py() for name in ("budget", "size"))
     name = size if kind == ActionKind.MULTI_DISCRETE else f"{size}-{kind}"

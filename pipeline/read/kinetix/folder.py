@@ -51,7 +51,7 @@ class Folder:
         """Number of trajectories in all arrays."""
         return sum(array.rows for array in self.arrays)
 
-    def named(self, name: str) -> StoredArray:
+    def array(self, name: str) -> StoredArray:
         """Return an array by name. Raise FormatError if it does not exist."""
         for array in self.arrays:
             if array.path.name == name:

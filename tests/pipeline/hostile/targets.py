@@ -332,7 +332,7 @@ def origins(folder: Path) -> Target:
         if found is not None:
             assert str(found) == file
             opened = open_folder(found.folder)
-            read_trajectories(opened.named(found.array), 0, 1)
+            read_trajectories(opened.array(found.array), 0, 1)
 
     return target
 
