@@ -9,7 +9,7 @@ from levelproof.pipeline.errors import Exit
 SUMMARY = "make levels and their experts"
 EXAMPLE = """\
 levelproof generate                                 64 small levels into data
-levelproof generate size=m levels=1k budget=1M      more and larger ones, longer
+levelproof generate size=m levels=1k budget=1M      more levels, more training
 levelproof generate distribution=vehicles out=cars  other levels
 levelproof generate level_files=mine                levels of your own
 levelproof generate stop.rule=budget expert.width=128    other experts"""

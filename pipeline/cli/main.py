@@ -81,7 +81,7 @@ def _report(sentence: str, code: int) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="levelproof",
-        description="Make physics levels, train an expert on each, and keep the actions that provably solve them.",
+        description="Make physics levels, train an expert on each, and keep its verified solutions.",
         epilog=f"Start with: levelproof generate\n{EXITS}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
