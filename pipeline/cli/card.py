@@ -21,10 +21,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from levelproof.pipeline.look.card import Wishes, card
+    from levelproof.pipeline.look.card import CardOptions, card
     from levelproof.pipeline.store.remote import require_folder
 
     for split in arguments.splits:
         require_folder(split, "write its card")
-    wishes = Wishes(arguments.license, arguments.name, arguments.repo, arguments.code)
+    wishes = CardOptions(arguments.license, arguments.name, arguments.repo, arguments.code)
     card(arguments.splits, arguments.out, wishes)

@@ -33,10 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     import sys
 
-    from levelproof.pipeline.look.rows import Asked, write_csv
+    from levelproof.pipeline.look.rows import RowQuery, write_csv
 
     columns = [name.strip() for name in arguments.columns.split(",")] if arguments.columns else None
-    asked = Asked(arguments.where, columns, arguments.sort, arguments.limit)
+    asked = RowQuery(arguments.where, columns, arguments.sort, arguments.limit)
     if arguments.csv:
         return write_csv(arguments.split, asked, sys.stdout)
     if arguments.plot:

@@ -1,1 +1,1 @@
-"""Splits looked at: counts, rows, pictures."""
+"""Inspection of splits: counts, rows, pictures."""

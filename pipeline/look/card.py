@@ -1,7 +1,7 @@
 """The README of a dataset for the Hugging Face hub, with figures and a preview beside it.
 
-The hub's viewer shows the manifests, a subset for each split, and first of all the preview. What is said of a split is
-from its manifest; a person is asked only for what no program can decide, the licence.
+The hub's viewer opens with the preview; each split's manifest is a subset. Facts about a split come from its manifest;
+only the licence must be chosen by a person.
 """
 
 import io
@@ -23,7 +23,7 @@ from levelproof.levelgen.pictures.raster import sheet, write_png
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.figures import draw_panels, draw_shares
 from levelproof.pipeline.look.preview import preview
-from levelproof.pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, SplitFacts, Wishes, readme
+from levelproof.pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, CardOptions, SplitFacts, readme
 from levelproof.pipeline.read.levels import distribution_of, writing_to
 from levelproof.pipeline.store.layout import SHARDS
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
@@ -31,17 +31,17 @@ from levelproof.pipeline.store.shard import stored_bytes
 from levelproof.pipeline.version import __version__
 
 README = "README.md"
-ASKED = ("label", "steps_to_goal", "content_hash", "shard", "budget", "versions", "device")
+COLUMNS_READ = ("label", "steps_to_goal", "content_hash", "shard", "budget", "versions", "device")
 SAMPLE = 200  # levels of a split in the preview
 SHEET_LEVELS, COLUMNS = 12, 4
 BINS = 32
 
 
-def card(splits: Sequence[Path], out: Path | None, wishes: Wishes) -> None:
-    """Write the card of a dataset of these splits, and tell so and what comes next.
+def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None:
+    """Write the card of a dataset of these splits; print its path and the upload command.
 
     Raises:
-        UserError: a split is not there or not below the file's folder, or the file is there and somebody else's.
+        UserError: a split is missing or not below the file's folder, or the file exists and is not a card.
         Failure: a split is damaged.
     """
     out = out or splits[0].absolute().parent.parent / README
@@ -49,38 +49,38 @@ def card(splits: Sequence[Path], out: Path | None, wishes: Wishes) -> None:
     _require_ours(out)
     _require_no_links([out])
     paths = [_below(folder, split) for split in splits]
-    manifests = [require_manifest(split, ASKED, compact=True) for split in splits]
+    manifests = [require_manifest(split, COLUMNS_READ, compact=True) for split in splits]
     facts = [_facts(path, manifest) for path, manifest in zip(paths, manifests, strict=True)]
     with writing_to(out):
         for name in (PREVIEW, FIGURES):
             (folder / name).mkdir(parents=True, exist_ok=True)
             _require_no_links([folder / name, *(folder / name).iterdir()])
         tables = [preview(manifest, SAMPLE) for manifest in manifests]
-        for of, table in zip(facts, tables, strict=True):
-            pq.write_table(table, folder / PREVIEW / f"{of.subset}.parquet", row_group_size=100)
+        for split_facts, table in zip(facts, tables, strict=True):
+            pq.write_table(table, folder / PREVIEW / f"{split_facts.subset}.parquet", row_group_size=100)
         figures = _draw(folder, facts, tables)
-        name = wishes.name or (wishes.repo or folder.name).rpartition("/")[2]
-        out.write_text(readme(name, facts, wishes, figures, __version__), encoding="utf-8")
+        name = options.name or (options.repo or folder.name).rpartition("/")[2]
+        out.write_text(readme(name, facts, options, figures, __version__), encoding="utf-8")
     print(f"{out}: the card of {', '.join(paths)}, with {PREVIEW}/ and {FIGURES}/ beside it.")
-    if not wishes.license:
+    if not options.license:
         print("It names no licence: choose one with --license, such as cc-by-4.0 or mit.")
     excluded = '--exclude "*.lock" --exclude "*/job.json" --exclude "*/events/*" --exclude "*/.*"'
-    print(f"Next:  hf upload {wishes.repo or 'USER/NAME'} {shlex.quote(str(folder))} . --repo-type dataset {excluded}")
+    print(f"Next:  hf upload {options.repo or 'USER/NAME'} {shlex.quote(str(folder))} . --repo-type dataset {excluded}")
 
 
 def _require_ours(out: Path) -> None:
     if out.exists() and not (out.is_file() and MARK in out.read_text(encoding="utf-8", errors="replace")):
-        raise UserError(f"{out} is there already, and `levelproof card` did not write it: name another file with -o.")
+        raise UserError(f"{out} exists, but `levelproof card` did not write it: name another file with -o.")
 
 
 def _require_no_links(paths: Iterable[Path]) -> None:
-    """Refuse to write through links: whoever made the dataset may have made them, too."""
+    """Refuse to write through links: the dataset, and thus its links, may be untrusted."""
     if links := [path for path in paths if path.is_symlink()]:
-        raise UserError(f"{links[0]} is a link: remove it, and run the same command again.")
+        raise UserError(f"{links[0]} is a link: remove it, then run the same command again.")
 
 
 def _below(folder: Path, split: Path) -> str:
-    """A split's path below the folder of the card, which has to have all that it describes."""
+    """Path of a split relative to the card's folder, which must contain every split."""
     path = split.absolute().resolve()
     if folder not in path.parents:
         raise UserError(f"The split {split} is not below {folder}: put all splits of a dataset into one folder.")
@@ -103,7 +103,7 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
         budget=table.column("budget")[0].as_py(),
         distribution=_distribution(manifest),
         config_hash=manifest.config_hash or "",
-        stored_as=", ".join(sorted(set[str]().union(*(of.densities for of in manifest.counting)))),
+        stored_as=", ".join(sorted(set[str]().union(*(fragment.densities for fragment in manifest.counting)))),
         made_with=_made_with(table),
     )
 
@@ -113,11 +113,11 @@ def _distribution(manifest: Manifest) -> str:
     if distribution is None:
         return "imported" if (manifest.config or {})["distribution"] == FROM_RECORDS else "level files"
     name, short = identified(distribution)
-    return f"random, `{name}`" if name else f"random, of a distribution of its own (`{short}`)"
+    return f"random, `{name}`" if name else f"random, custom distribution (`{short}`)"
 
 
 def _made_with(table: pa.Table) -> list[str]:
-    """Each stack, the commonest first."""
+    """Describe each stack of versions and device, most frequent first."""
     query = "SELECT versions, device FROM stacks GROUP BY ALL ORDER BY count(*) DESC, device"
     with duckdb.connect() as connection:
         connection.register("stacks", table.select(["versions", "device"]))
@@ -129,20 +129,20 @@ def _made_with(table: pa.Table) -> list[str]:
 
 
 def _draw(folder: Path, facts: Sequence[SplitFacts], tables: Sequence[pa.Table]) -> list[str]:
-    """Those figures that there is something for."""
+    """Draw the figures that have data; return their paths."""
     drawn = []
     rows = (table.select(["label", "goal"]).to_pylist() for table in tables)
-    goals = [[row["goal"] for row in of if row["label"] == Label.SOLVED] for of in rows]
+    goals = [[row["goal"] for row in split_rows if row["label"] == Label.SOLVED] for split_rows in rows]
     each = -(-SHEET_LEVELS // len(goals))
-    if chosen := list(chain(*(of[:each] for of in goals)))[:SHEET_LEVELS]:
+    if chosen := list(chain(*(pictures[:each] for pictures in goals)))[:SHEET_LEVELS]:
         pictures = [Image.open(io.BytesIO(goal["bytes"])) for goal in chosen]
         write_png(sheet(pictures, COLUMNS), folder / SHEET)
         drawn.append(SHEET)
-    if shares := {of.path: of.solved for of in facts if of.solved}:
-        draw_shares(shares, "Solved, of the levels that were trained or searched for", folder / RATES)
+    if shares := {split.path: split.solved for split in facts if split.solved}:
+        draw_shares(shares, "Share solved of the levels that were trained or searched", folder / RATES)
         drawn.append(RATES)
-    if steps := {of.path: of.steps_to_goal for of in facts if len(of.steps_to_goal)}:
-        title = f"Steps to the goal of solved levels (bins of {RECORD_STEPS // BINS})"
+    if steps := {split.path: split.steps_to_goal for split in facts if len(split.steps_to_goal)}:
+        title = f"Steps to goal of solved levels (bins of {RECORD_STEPS // BINS})"
         draw_panels(steps, {}, BINS, title, folder / STEPS, RECORD_STEPS)
         drawn.append(STEPS)
     return drawn

@@ -1,4 +1,4 @@
-"""What the levels of a manifest cost: seconds of cores or GPUs by what they were for, and those of a solved level."""
+"""Cost of a manifest's levels: core-seconds or GPU-seconds by stage, in total and per solved level."""
 
 from typing import Any
 
@@ -11,16 +11,16 @@ from levelproof.experts.labels import Label
 from levelproof.experts.steps import Seconds
 from levelproof.pipeline.words import number
 
-READ = ("label", "device", "seconds")  # columns that this is from
+READ = ("label", "device", "seconds")  # manifest columns that cost_of needs
 
 
 def cost_of(rows: pa.Table) -> dict[str, Any] | None:
-    """Of rows with READ, as JSON's types; None: nobody has counted.
+    """Total the cost of rows with the columns READ, as JSON types; None if no row has seconds.
 
-    What a solved level cost is everything, the levels that were not solved included, divided by those that were.
+    `per_solved` divides the seconds of all rows, unsolved ones included, by the number of solved levels.
     """
     rows = rows.select(READ)
-    if rows.column("seconds").null_count:  # nearly never, and copies of millions of rows take memory
+    if rows.column("seconds").null_count:  # rare; copying millions of rows takes memory
         rows = rows.filter(pc.is_valid(rows.column("seconds")))  # pyright: ignore[reportAttributeAccessIssue]
     if not rows.num_rows:
         return None
@@ -37,13 +37,13 @@ def cost_of(rows: pa.Table) -> dict[str, Any] | None:
 
 
 def seconds_of(rows: pa.Table) -> Float[np.ndarray, " row"]:
-    """Of each row, all stages; NaN: nobody has counted."""
+    """Sum each row's seconds over all stages; NaN if none were recorded."""
     stages = [pc.struct_field(rows.column("seconds"), stage).to_numpy() for stage in Seconds._fields]  # pyright: ignore[reportAttributeAccessIssue]
     return np.stack(stages).astype(np.float64).sum(0)
 
 
-def cost_told(cost: dict[str, Any]) -> str:
-    """In words, after `cost: `."""
+def describe_cost(cost: dict[str, Any]) -> str:
+    """Describe a cost in words, to follow `cost: `."""
     total, each = sum(cost["seconds"].values()), cost["per_solved"]
     shares = ", ".join(f"{part / total:.0%} {stage}" for stage, part in cost["seconds"].items() if total)
     solved = "" if each is None else f", {number(each)} a solved level"

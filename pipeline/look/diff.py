@@ -1,6 +1,6 @@
-"""The same levels in two splits, made with two budgets or procedures: which were solved where, and at what cost.
+"""Comparison of the same levels in two splits: which each split solved, and at what cost.
 
-By the manifests alone; reads no shard's data.
+Reads the manifests only, no shards. The splits may differ in budget or procedure.
 """
 
 import json
@@ -29,10 +29,10 @@ LABELS = [label.value for label in Label]
 
 
 def diff(one: Path, other: Path, where: str | None, rows: int, as_json: bool) -> None:
-    """Print how two splits of the same levels differ; `where` is a condition on the first one's rows.
+    """Print how two splits of the same levels differ; `where` is a condition on rows of the first.
 
     Raises:
-        UserError: no split, a condition that DuckDB cannot use, or splits of different levels.
+        UserError: a split is missing, DuckDB rejects the condition, or the splits have different levels.
         Failure: a fragment is damaged.
     """
     facts = compare(one, other, where, rows)
@@ -44,68 +44,69 @@ def diff(one: Path, other: Path, where: str | None, rows: int, as_json: bool) ->
 
 
 def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) -> dict[str, Any]:
-    """The facts that `diff` prints, as JSON's types."""
-    asked = (one, columns_in(where)), (other, ())
-    manifests = [require_manifest(split, [*READ, *columns], compact=True) for split, columns in asked]
+    """Collect the facts that `diff` prints, as JSON types."""
+    reads = (one, columns_in(where)), (other, ())
+    manifests = [require_manifest(split, [*READ, *columns], compact=True) for split, columns in reads]
     chosen = select(manifests[0].table, where)
     left, right = _common(chosen, manifests[1].table, (one, other))
-    solved, tried = np.stack([_labelled(of, WITNESSED) for of in (left, right)]), _labelled(left, TRAINED)
+    solved, tried = np.stack([_labelled(rows, WITNESSED) for rows in (left, right)]), _labelled(left, TRAINED)
     tried |= _labelled(right, TRAINED)
     only = [solved[i] & ~solved[1 - i] for i in range(2)]
-    ids, spent = left["level_id"].to_numpy(), [_spent(of) for of in (left, right)]
-    totals, gained = [sum(of.values()) for of in spent], int(only[1].sum() - only[0].sum())
-    prices = [cost.cost_of(of) for of in (left, right)]
-    seconds = [sum(of["seconds"].values()) if of else 0.0 for of in prices]
-    counts = [[int(part.sum()) for part in (of & tried, tried)] for of in solved]
+    ids, spent = left["level_id"].to_numpy(), [_spent(side) for side in (left, right)]
+    totals, gained = [sum(steps.values()) for steps in spent], int(only[1].sum() - only[0].sum())
+    costs = [cost.cost_of(side) for side in (left, right)]
+    seconds = [sum(side["seconds"].values()) if side else 0.0 for side in costs]
+    counts = [[int(mask.sum()) for mask in (side & tried, tried)] for side in solved]
     return {
         "splits": [as_typed(one), as_typed(other)],
-        "settings": differences(*(manifest.config or {} for manifest in manifests)),  # that decide results
+        "settings": differences(*(manifest.config or {} for manifest in manifests)),  # that decide results and differ
         "levels": left.num_rows,
         "alone": [
             chosen.num_rows - left.num_rows,
             manifests[1].table.num_rows - left.num_rows if where is None else None,
         ],
-        "solved": [{"solved": of, "tried": tried} for of, tried in counts],
+        "solved": [{"solved": hits, "tried": tries} for hits, tries in counts],
         "both": int((solved[0] & solved[1]).sum()),
         "neither": int((~solved[0] & ~solved[1] & tried).sum()),
-        "only": [int(of.sum()) for of in only],
-        "p": exact_p(*(int(of.sum()) for of in only)),
-        "only_rows": [ids[of][: max(rows, 0)].tolist() for of in only],
-        "labels": _moves(left, right),
+        "only": [int(mask.sum()) for mask in only],
+        "p": exact_p(*(int(mask.sum()) for mask in only)),
+        "only_rows": [ids[mask][: max(rows, 0)].tolist() for mask in only],
+        "labels": _label_changes(left, right),
         "env_steps": spent,
         "env_steps_for_one_more": (totals[1] - totals[0]) / gained if gained else None,
-        "cost": prices,
-        "seconds_for_one_more": (seconds[1] - seconds[0]) / gained if gained and all(prices) else None,
+        "cost": costs,
+        "seconds_for_one_more": (seconds[1] - seconds[0]) / gained if gained and all(costs) else None,
         "steps_to_goal": _paired(left, right, solved[0] & solved[1]),
     }
 
 
 def exact_p(fewer: int, more: int) -> float:
-    """Two-sided p of so many and so many of paired outcomes, by exact binomial: a fair coin decides each (McNemar)."""
+    """Two-sided p-value of McNemar's exact test, which treats each discordant pair as a fair coin flip."""
     few, flips = min(fewer, more), fewer + more
     heads = np.arange(1, few + 1)
-    chances = np.cumsum(np.log((flips - heads + 1) / heads))  # of 1, 2, ... heads, as logarithms of those of none
-    return float(min(1.0, 2 * np.exp(np.concatenate([[0.0], chances]) - flips * np.log(2)).sum()))
+    ratios = np.cumsum(np.log((flips - heads + 1) / heads))  # log of P(k heads) / P(0 heads), k = 1, 2, ...
+    return float(min(1.0, 2 * np.exp(np.concatenate([[0.0], ratios]) - flips * np.log(2)).sum()))
 
 
 def _common(one: pa.Table, other: pa.Table, splits: tuple[Path, Path]) -> tuple[pa.Table, pa.Table]:
-    """The rows of the levels that both have, side by side.
+    """Select the rows of levels that are in both tables, in the same order.
+
+    A level's content hash may differ between stacks, whose bits differ; half of its signature still matches.
 
     Raises:
-        UserError: there is none, or one is another level there. Of one level, the hash may be another on another
-            stack, where bits differ; a half of the signature is the same.
+        UserError: no level is in both, or an id names different levels.
     """
     _, here, there = np.intersect1d(one["level_id"].to_numpy(), other["level_id"].to_numpy(), True, True)
     sides = "{} and {}".format(*splits)
     if not len(here):
-        raise UserError(f"No level is in {sides} both: give two splits of the same levels.")
+        raise UserError(f"{sides} have no level in common: give two splits of the same levels.")
     left, right = one.take(here), other.take(there)
     unlike = np.flatnonzero(pc.not_equal(left["content_hash"], right["content_hash"]))  # pyright: ignore[reportAttributeAccessIssue]
-    for place in unlike.tolist():
-        if not set(left["signature"][place].as_py()) & set(right["signature"][place].as_py()):
+    for index in unlike.tolist():
+        if not set(left["signature"][index].as_py()) & set(right["signature"][index].as_py()):
             raise UserError(
-                f"Level {left['level_id'][place]} is not the same in {sides}: "
-                "give two splits with one size and one distribution."
+                f"Level {left['level_id'][index]} differs between {sides}: "
+                "give two splits of one size and one distribution."
             )
     return left, right
 
@@ -119,29 +120,29 @@ def _spent(rows: pa.Table) -> dict[str, int]:
     return {name: int(rows[name].to_numpy().sum()) for name in SPENT}
 
 
-def _moves(left: pa.Table, right: pa.Table) -> dict[str, dict[str, int]]:
-    """How many levels have which label there, by the label they have here."""
-    places = [np.array([LABELS.index(word) for word in of["label"].to_pylist()]) for of in (left, right)]
+def _label_changes(left: pa.Table, right: pa.Table) -> dict[str, dict[str, int]]:
+    """Count levels by their label in `left`, then by their label in `right`."""
+    codes = [np.array([LABELS.index(word) for word in side["label"].to_pylist()]) for side in (left, right)]
     counts = np.zeros((len(LABELS), len(LABELS)), int)
-    np.add.at(counts, (places[0], places[1]), 1)
+    np.add.at(counts, (codes[0], codes[1]), 1)
     return {
-        label: {to: int(count) for to, count in zip(LABELS, row, strict=True) if count}
+        label: {other: int(count) for other, count in zip(LABELS, row, strict=True) if count}
         for label, row in zip(LABELS, counts, strict=True)
         if row.any()
     }
 
 
 def _paired(left: pa.Table, right: pa.Table, both: np.ndarray) -> dict[str, Any] | None:
-    """Steps to the goal of the levels that both solve; the sign test tells whether one side's are shorter."""
-    steps = np.stack([of["steps_to_goal"].to_numpy()[both] for of in (left, right)]).astype(float)
+    """Compare steps to the goal of levels that both splits solve, with the p-value of a sign test."""
+    steps = np.stack([side["steps_to_goal"].to_numpy()[both] for side in (left, right)]).astype(float)
     steps = steps[:, ~np.isnan(steps).any(0)]
     if not steps.size:
         return None
     shorter, longer = int((steps[1] < steps[0]).sum()), int((steps[1] > steps[0]).sum())
-    quantiles = [np.quantile(of, QUANTILES, method="nearest").tolist() for of in steps]
+    quantiles = [np.quantile(side, QUANTILES, method="nearest").tolist() for side in steps]
     return {
         "levels": steps.shape[1],
-        "quantiles": [dict(zip((f"{q:.0%}" for q in QUANTILES), of, strict=True)) for of in quantiles],
+        "quantiles": [dict(zip((f"{q:.0%}" for q in QUANTILES), side, strict=True)) for side in quantiles],
         "shorter": shorter,
         "longer": longer,
         "p": exact_p(shorter, longer),
@@ -154,21 +155,21 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     table = Table("", one, other, "difference", box=None, pad_edge=False, padding=(0, 3, 0, 0))
     for column in table.columns[1:]:
         column.justify = "right"
-    shares = [f"{of['solved'] / of['tried']:.1%}" if of["tried"] else "-" for of in facts["solved"]]
+    shares = [f"{side['solved'] / side['tried']:.1%}" if side["tried"] else "-" for side in facts["solved"]]
     gained = facts["only"][1] - facts["only"][0]
-    table.add_row("levels solved", *(f"{of['solved']:,}" for of in facts["solved"]), f"{gained:+,}")
+    table.add_row("levels solved", *(f"{side['solved']:,}" for side in facts["solved"]), f"{gained:+,}")
     table.add_row("of undecided levels", *shares, f"p {_p(facts['p'])}")
-    table.add_row("solved only there", *(f"{count:,}" for count in facts["only"]), "")
+    table.add_row("solved by this split only", *(f"{count:,}" for count in facts["only"]), "")
     for name in SPENT:
-        here, there = (of[name] for of in facts["env_steps"])
+        here, there = (side[name] for side in facts["env_steps"])
         if here or there:
             table.add_row(name.replace("_", " "), f"{here:,}", f"{there:,}", f"{there - here:+,}")
     if all(facts["cost"]):
-        here, there = (sum(of["seconds"].values()) for of in facts["cost"])
+        here, there = (sum(side["seconds"].values()) for side in facts["cost"])
         table.add_row(f"{facts['cost'][0]['of']}-seconds", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
     if steps := facts["steps_to_goal"]:
         for quantile in steps["quantiles"][0]:
-            here, there = (of[quantile] for of in steps["quantiles"])
+            here, there = (side[quantile] for side in steps["quantiles"])
             name = "median" if quantile == "50%" else quantile
             table.add_row(f"steps to goal, {name}", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
     console.print(table)
@@ -181,7 +182,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     say(f"Settings that differ: {told(facts['settings']) or 'none'}.")
     for name, unit in (("env_steps", "env steps"), ("seconds", "seconds")):
         if (more := facts[f"{name}_for_one_more"]) is not None:
-            say(f"{more * gained:+,.0f} {unit} for {gained:+,} solved levels: {number(more)} for each one more.")
+            say(f"{more * gained:+,.0f} {unit} for {gained:+,} solved levels: {number(more)} per extra level.")
     if steps:
         say(
             f"Of {steps['levels']:,} levels that both solve, {steps['shorter']:,} take fewer steps in {other} and "

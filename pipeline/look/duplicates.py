@@ -1,7 +1,7 @@
-"""Levels that are there twice: within a split, in another split, or among level files.
+"""Duplicate levels: within a split, in another split, or among level files.
 
-By the manifest's columns `content_hash` (the same content) and `signature` (nearly the same): docs/levels.md.
-DuckDB groups and joins, and each level is told with one partner only, so a split of many copies stays small to tell.
+Levels with equal `content_hash` are the same; levels that share half of a `signature` are near (docs/levels.md).
+DuckDB groups and joins. Each level is reported with one partner only, so a split of many copies has a short report.
 """
 
 from collections.abc import Sequence
@@ -19,12 +19,14 @@ from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.manifest import require_manifest
 
 COMPARED = ("content_hash", "signature")
-# The few that share a half of a signature; the same content has the same signature. Grouping hashes of 8 bytes takes a
-# tenth of the time and the memory that grouping strings takes.
+# Candidates share half of a signature; equal content has equal signatures. Grouping 8-byte hashes takes a tenth of the
+# time and memory of grouping strings.
 HALVES = ("signature[1]", "signature[2]")
-CONTENT = "content"  # the number of a content hash
+CONTENT = "content"  # column of 64-bit hashes of `content_hash`
 NUMBERS = (CONTENT, *HALVES)
-FACTORS = np.random.default_rng(0).integers(0, 2**63, 64, np.uint64) * 2 + 1  # of the words of a text; odd
+FACTORS = (
+    np.random.default_rng(0).integers(0, 2**63, 64, np.uint64) * 2 + 1
+)  # one odd multiplier per 8-byte word of a string
 ALIKE_WITHIN = "CREATE TABLE alike AS SELECT * FROM levels WHERE " + " OR ".join(
     f"hash({half}) IN (SELECT hash({half}) AS half FROM levels GROUP BY half HAVING count(*) > 1)" for half in HALVES
 )
@@ -44,55 +46,57 @@ NEAR = """
     SELECT name, min(partner) AS partner FROM ours JOIN firsts USING (half, which) GROUP BY name
 """
 
-Found = dict[str, dict[str, Any]]  # same, near -> levels (how many), pairs (the first: a level and its partner)
+Duplicates = dict[str, dict[str, Any]]  # same, near -> levels (count), pairs (first few: a level and its partner)
 
 
-def compared(manifest_table: pa.Table) -> pa.Table:
-    """What is compared of a manifest's rows; a level's name is its id."""
+def comparison_table(manifest_table: pa.Table) -> pa.Table:
+    """Select the compared columns of a manifest's rows; the level id becomes the name."""
     return manifest_table.select(["level_id", *COMPARED]).rename_columns(["name", *COMPARED])
 
 
-def compared_of(split: Path, level_ids: np.ndarray) -> pa.Table:
-    """The same of these levels of a split."""
-    return compared(require_manifest(split, COMPARED, level_ids).table)
+def comparison_of_levels(split: Path, level_ids: np.ndarray) -> pa.Table:
+    """Read the compared columns of these levels of a split."""
+    return comparison_table(require_manifest(split, COMPARED, level_ids).table)
 
 
-def in_numbers(rows: pa.Table, asked: Sequence[str]) -> pa.Table:
-    """Rows of a manifest with numbers in the place of what is compared, which stays where it is asked for, too."""
+def hash_identities(rows: pa.Table, kept: Sequence[str]) -> pa.Table:
+    """Add 64-bit hashes of the compared columns; drop those columns unless they are in `kept`."""
     half = lambda i: pc.list_element(rows["signature"], i)  # pyright: ignore[reportAttributeAccessIssue]
-    numbers = {CONTENT: _numbers(rows["content_hash"])} | {name: _numbers(half(i)) for i, name in enumerate(HALVES)}
+    numbers = {CONTENT: hash_strings(rows["content_hash"])} | {
+        name: hash_strings(half(i)) for i, name in enumerate(HALVES)
+    }
     for name, values in numbers.items():
         rows = rows.append_column(name, pa.array(values))
-    return rows.drop_columns([name for name in COMPARED if name not in asked])
+    return rows.drop_columns([name for name in COMPARED if name not in kept])
 
 
-def perhaps_alike(levels: pa.Table) -> pa.Table:
-    """What is compared, of those of these levels (`in_numbers`) that share a half of a signature.
+def find_candidates(levels: pa.Table) -> pa.Table:
+    """Select the levels (from `hash_identities`) that share half of a signature with another, for comparison.
 
-    Two of 6 million levels have by chance one number for two contents once in a million splits.
+    In one of a million splits of 6 million levels, two contents have the same 64-bit hash by chance.
     """
-    with ThreadPoolExecutor() as threads:  # they sort, which takes the time
-        shared = list(threads.map(_shared, (levels[name].to_numpy() for name in HALVES)))
+    with ThreadPoolExecutor() as threads:  # sorting dominates the time
+        shared = list(threads.map(_repeated, (levels[name].to_numpy() for name in HALVES)))
     alike = levels.select(["level_id", *NUMBERS]).filter(shared[0] | shared[1])
     halves = np.stack([alike[name].to_numpy() for name in HALVES], 1)
     signature = pa.FixedSizeListArray.from_arrays(pa.array(halves.reshape(-1)), len(HALVES)).cast(pa.list_(pa.int64()))
     return pa.table({"name": alike["level_id"], "content_hash": alike[CONTENT], "signature": signature})
 
 
-def _shared(values: np.ndarray) -> np.ndarray:
-    """Which of them are there more than once."""
-    ordered = np.sort(values)  # not `argsort`, which takes four times as long
+def _repeated(values: np.ndarray) -> np.ndarray:
+    """Mask of the values that occur more than once."""
+    ordered = np.sort(values)  # `argsort` would take four times as long
     twice = ordered[1:][ordered[1:] == ordered[:-1]]
     found = pc.is_in(pa.array(values), pa.array(twice))  # pyright: ignore[reportAttributeAccessIssue]
     return found.to_numpy(zero_copy_only=False)
 
 
-def _numbers(texts: pa.ChunkedArray) -> np.ndarray:
-    """A number of 64 bits for each text, by its bytes."""
-    array = pa.concat_arrays([pa.array([], pa.string()), *texts.chunks])
+def hash_strings(strings: pa.ChunkedArray) -> np.ndarray:
+    """Hash the bytes of each string to 64 bits: the dot product of its words with FACTORS, plus its length."""
+    array = pa.concat_arrays([pa.array([], pa.string()), *strings.chunks])
     widths = pc.binary_length(array).to_numpy()  # pyright: ignore[reportAttributeAccessIssue]
     numbers = np.zeros(len(array), np.uint64)
-    for width in np.unique(widths).tolist():  # nearly always there is one
+    for width in np.unique(widths).tolist():  # nearly always a single width
         mine = np.flatnonzero(widths == width)
         of_width = array if len(mine) == len(array) else array.take(pa.array(mine))
         padded = np.zeros((len(mine), -(-width // 8) * 8), np.uint8)
@@ -102,48 +106,50 @@ def _numbers(texts: pa.ChunkedArray) -> np.ndarray:
     return numbers.view(np.int64)
 
 
-def compared_in(source: Path) -> pa.Table:
-    """The same of the levels of a split, of a level file, or of all level files below a folder, named by their paths.
+def comparison_of_source(source: Path) -> pa.Table:
+    """Read the compared columns of a split, a level file, or all level files below a folder (named by path).
 
     Raises:
-        UserError: there is nothing of that kind, or a level file cannot be used.
+        UserError: the source has neither, or a level file is invalid.
         Failure: a fragment is damaged.
     """
     if source.is_file():
         return _of_files([source])
     if not source.is_dir() or (source / "manifest").is_dir():
-        return compared(require_manifest(source, COMPARED).table)
+        return comparison_table(require_manifest(source, COMPARED).table)
     if not (files := sorted(source.rglob("*.json"))):
-        raise UserError(f"There is neither a split nor a level file in {source}: give a folder that has one.")
+        raise UserError(f"{source} has neither a split nor a level file: give a folder that has one.")
     return _of_files(files)
 
 
-def within(levels: pa.Table, shown: int) -> Found:
-    """Levels with an earlier one of the same content; contents that an earlier one is nearly the same as."""
+def within(levels: pa.Table, shown: int) -> Duplicates:
+    """Find levels with the same content as an earlier one, and distinct contents near an earlier one."""
     with duckdb.connect() as connection:
         connection.register("levels", levels)
         connection.execute(ALIKE_WITHIN)
         queries = {"same": SAME.format(theirs="alike"), "near": NEAR.format(ours=FIRST, theirs=FIRST)}
-        return {name: _pairs(connection, f"FROM ({of}) WHERE partner < name", shown) for name, of in queries.items()}
+        return {
+            name: _pairs(connection, f"FROM ({query}) WHERE partner < name", shown) for name, query in queries.items()
+        }
 
 
-def between(levels: pa.Table, others: pa.Table, shown: int) -> Found:
-    """Levels with one of the same content among the others; the rest of them with one that is nearly the same."""
+def between(levels: pa.Table, others: pa.Table, shown: int) -> Duplicates:
+    """Find levels with the same content as one of the others and, among the rest, levels near one of them."""
     with duckdb.connect() as connection:
         connection.register("levels", levels)
         connection.register("others", others)
         connection.execute(ALIKE_BETWEEN.format(alike="alike", levels="levels", others="others"))
         connection.execute(ALIKE_BETWEEN.format(alike="there", levels="others", others="alike"))
         queries = {"same": SAME.format(theirs="there"), "near": NEAR.format(ours=OTHERS, theirs="FROM there")}
-        return {name: _pairs(connection, of, shown) for name, of in queries.items()}
+        return {name: _pairs(connection, query, shown) for name, query in queries.items()}
 
 
-def told(found: Found) -> str:
-    """In words: how many, and the first of them."""
+def describe(found: Duplicates) -> str:
+    """Describe in words: counts, and the first pair of each kind."""
     words = []
-    for kind, of in found.items():
-        example = " (such as {} and {})".format(*of["pairs"][0]) if of["pairs"] else ""
-        words.append(f"{of['levels']:,} {kind}{example}")
+    for kind, entry in found.items():
+        example = " (such as {} and {})".format(*entry["pairs"][0]) if entry["pairs"] else ""
+        words.append(f"{entry['levels']:,} {kind}{example}")
     return ", ".join(words)
 
 
@@ -156,7 +162,7 @@ def _pairs(connection: duckdb.DuckDBPyConnection, query: str, shown: int) -> dic
 
 def _of_files(files: list[Path]) -> pa.Table:
     from levelproof.levelgen.identity.content import (
-        content_hashes,  # here, so that a question about a split need not wait for JAX
+        content_hashes,  # imported here, so that comparing splits need not wait for JAX
     )
     from levelproof.levelgen.identity.signature import signatures
     from levelproof.pipeline.read.levels import level_file

@@ -1,4 +1,4 @@
-"""What `inspect` found, in words: a screen that is as wide as the terminal."""
+"""Facts of `inspect` in words, wrapped to the terminal's width."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -8,19 +8,19 @@ from rich.console import Console
 from rich.table import Table
 
 from levelproof.pipeline.look import cost, duplicates
-from levelproof.pipeline.look.things import THINGS
+from levelproof.pipeline.look.things import ENTITIES
 
-NAMES = 33  # letters of a line before its text
-REASONS = 4  # of each label; the rest is counted
+NAMES = 33  # characters; column where the text of a line begins
+REASONS = 4  # shown per label; the rest are only counted
 STEPS = {"scout_steps": "scouts", "search_steps": "search", "env_steps": "training", "evaluation_steps": "evaluation"}
 
 
 def print_facts(facts: Mapping[str, Any], shown: Sequence[str], console: Console) -> None:
-    """The facts of `survey`, then the rows' columns that are shown."""
+    """Print the facts of `survey`, then the `shown` columns of its rows."""
     for name, texts in _lines(facts).items():
         for i, text in enumerate(texts if isinstance(texts, list) else [texts]):
             line = f"{(name + ':') * (not i):{NAMES - 1}} {text}"
-            if console.is_terminal:  # elsewhere a line is a line
+            if console.is_terminal:  # files and pipes get one line per fact
                 line = textwrap.fill(line, console.width, subsequent_indent=" " * NAMES, drop_whitespace=True)
             console.print(line, soft_wrap=True)
     table = Table(*shown, box=None, pad_edge=False, padding=(0, 1, 0, 0))  # fits 80 columns
@@ -33,26 +33,26 @@ def print_facts(facts: Mapping[str, Any], shown: Sequence[str], console: Console
 
 def _lines(facts: Mapping[str, Any]) -> dict[str, str | list[str]]:
     labels = ", ".join(f"{count} {label}" for label, count in facts["labels"].items()) or "none"
-    of, rate, interval = facts["distribution"], facts["solve_rate"], facts["solve_interval"]
+    distribution, rate, interval = facts["distribution"], facts["solve_rate"], facts["solve_interval"]
     lines: dict[str, str | list[str] | None] = {
         "split": facts["split"],
-        "distribution": f"{of['name'] or 'of its own'} ({of['hash']})"
-        if of
-        else "none, levels are of level files or imported",
+        "distribution": f"{distribution['name'] or 'custom'} ({distribution['hash']})"
+        if distribution
+        else "none: levels come from level files or an import",
         "levels": f"{facts['levels']} ({labels})",
         **{f"{label}, because": _reasons(kinds) for label, kinds in facts["reasons"].items()},
         "experts that diverged": str(facts["diverged"]) if facts["diverged"] else None,
         "failed by doing nothing": str(facts["failed_by_noop"]),
         "solved of undecided levels": f"{rate:.1%} ({_interval(interval)})" if rate is not None else None,
-        **_by_things(facts["solved_by"]),
+        **_by_entities(facts["solved_by"]),
         "witnesses": ", ".join(f"{count} {name}" for name, count in facts["witness"].items()) or None,
-        "steps to goal": _told(facts["steps_to_goal"]),
-        "training steps to first success": _told(facts["steps_to_first_success"]),
+        "steps to goal": _list(facts["steps_to_goal"]),
+        "training steps to first success": _list(facts["steps_to_first_success"]),
         "env steps": _steps(facts),
         "training env steps": _training(facts),
-        "cost": cost.cost_told(facts["cost"]) if facts["cost"] else None,
-        "duplicates": duplicates.told(facts["duplicates"]),
-        **{f"duplicates in {other}": duplicates.told(found) for other, found in facts["against"].items()},
+        "cost": cost.describe_cost(facts["cost"]) if facts["cost"] else None,
+        "duplicates": duplicates.describe(facts["duplicates"]),
+        **{f"duplicates in {other}": duplicates.describe(found) for other, found in facts["against"].items()},
         "shards of the split": f"{facts['split_bytes']:,} bytes" if facts["split_bytes"] is not None else None,
         "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
     }
@@ -60,25 +60,25 @@ def _lines(facts: Mapping[str, Any]) -> dict[str, str | list[str]]:
 
 
 def _reasons(kinds: Mapping[str, int]) -> list[str]:
-    """The most frequent, a line each."""
+    """List the most frequent reasons, one per line."""
     shown = [f"{count} {kind}" for kind, count in list(kinds.items())[:REASONS]]
     rest = sum(list(kinds.values())[REASONS:])
     return [*shown, f"{rest} other reasons"] if rest else shown
 
 
-def _by_things(found: Mapping[str, Any] | None) -> dict[str, str | None]:
-    """The share of levels that are solved, by how many of each kind of thing they have."""
+def _by_entities(found: Mapping[str, Any] | None) -> dict[str, str | None]:
+    """Share of levels solved, by the number of each kind of entity they have."""
     if found and found["problem"]:
-        return {"what levels are made of": found["problem"]}
+        return {"solved, by entities": found["problem"]}
     if not found or not found["levels"]:
         return {}
-    sample = f" (of {found['levels']:,} that were looked at)" if found["looked_at"] < found["of"] else ""
-    ends = lambda of: "-".join(f"{100 * end:.0f}" for end in of["interval"])
-    share = lambda of: f"{of['solved'] / of['tried']:.0%} ({ends(of)}) of {of['tried']:,}"
+    sample = f" (of {found['levels']:,} sampled)" if found["looked_at"] < found["of"] else ""
+    ends = lambda share: "-".join(f"{100 * end:.0f}" for end in share["interval"])
+    shown = lambda share: f"{share['solved'] / share['tried']:.0%} ({ends(share)}) of {share['tried']:,}"
     return {
-        f"solved, by {name}": ", ".join(f"{count}: {share(of)}" for count, of in found[name].items())
-        + sample * (name == THINGS[0])
-        for name in THINGS
+        f"solved, by {name}": ", ".join(f"{count}: {shown(share)}" for count, share in found[name].items())
+        + sample * (name == ENTITIES[0])
+        for name in ENTITIES
         if len(found[name]) > 1
     }
 
@@ -88,20 +88,20 @@ def _interval(ends: Sequence[float]) -> str:
 
 
 def _steps(facts: Mapping[str, Any]) -> str:
-    """What they were for."""
+    """Describe env steps by stage."""
     total = sum(facts[name] for name in STEPS)
     parts = [f"{facts[name] / total:.0%} {what}" for name, what in STEPS.items() if facts[name]]
     return f"{total:,} ({', '.join(parts)})" if total else "0"
 
 
 def _training(facts: Mapping[str, Any]) -> str:
-    steps, after, unsolved = (facts[f"env_steps{of}"] for of in ("", "_after_success", "_unsolved"))
+    steps, after, unsolved = (facts[f"env_steps{suffix}"] for suffix in ("", "_after_success", "_unsolved"))
     if not steps:
         return "0"
     return f"{steps:,} ({after / steps:.0%} after a first success, {unsolved / steps:.0%} of levels unsolved)"
 
 
-def _told(quantiles: Mapping[str, float] | None) -> str | None:
+def _list(quantiles: Mapping[str, float] | None) -> str | None:
     return ", ".join(f"{name}: {value:,.0f}" for name, value in quantiles.items()) if quantiles else None
 
 

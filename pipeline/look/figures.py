@@ -1,6 +1,6 @@
-"""Figures of a dataset's card: shares with their intervals, and histograms, drawn as pictures of levels are.
+"""Figures for a dataset's card: shares with intervals, histograms and learning curves.
 
-Lengths are hundreds of pixels, y is upwards. Knows nothing of splits.
+Lengths are in hundreds of pixels; y points up. Knows nothing of splits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,31 +15,31 @@ from levelproof.levelgen.pictures.raster import picture_of, write_png
 from levelproof.levelgen.pictures.shapes import disc, line, rectangle, text, text_width
 from levelproof.levelgen.pictures.style import FONTS, GRID, INK, MUTED, PAPER, ROLE_COLOUR
 
-LETTER, SMALL = 0.16, 0.13  # of words
-ROW = 0.34  # height of a share
+LETTER, SMALL = 0.16, 0.13  # letter heights
+ROW = 0.34  # height of one share's row
 LABEL, AXIS, VALUE = 1.6, 5.0, 1.9  # widths: names, the axis from 0 to 1, values
-PANEL, HIGH, GAP = 2.6, 1.3, 0.35  # a histogram's width and height, and what is between them
-ACROSS = 3  # histograms side by side
-SHARP = 2  # pixels of a picture for each that it has on a page
-DEVIATIONS = 1.96  # of a 95% interval
+PANEL, HIGH, GAP = 2.6, 1.3, 0.35  # a panel's width and height; space between panels
+ACROSS = 3  # panels side by side
+SHARP = 2  # picture pixels per pixel on the page
+DEVIATIONS = 1.96  # standard deviations of a 95% interval
 
 
 class Share(NamedTuple):
-    """So many of so many."""
+    """`hits` out of `of`."""
 
     hits: int
     of: int
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's, 95%."""
+        """Wilson's 95% interval."""
         z2, p = DEVIATIONS**2 / self.of, self.hits / self.of
         middle, half = p + z2 / 2, DEVIATIONS * sqrt((p * (1 - p) + z2 / 4) / self.of)
         return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
 
     @property
     def rounded(self) -> list[float]:
-        """The interval for people and JSON."""
+        """The interval, rounded for people and JSON."""
         return [round(end, 4) for end in self.interval]
 
     def __str__(self) -> str:
@@ -48,7 +48,7 @@ class Share(NamedTuple):
 
 
 def draw_shares(shares: Mapping[str, Share], title: str, path: Path) -> None:
-    """A row for each share: a point, its 95% interval, and both in numbers."""
+    """Draw a row per share: a point, its 95% interval, and both as numbers."""
     top = ROW * len(shares)
     at = lambda share: LABEL + AXIS * share
     parts = [text((0.05, top + 0.55), title, INK, LETTER)]
@@ -74,9 +74,9 @@ def draw_panels(
     path: Path,
     most: int | None = None,
 ) -> None:
-    """A histogram for each name, then shares along updates, a line for each level.
+    """Draw a histogram per entry of `values`, then a panel of learning curves per entry of `curves`.
 
-    Histograms are over the range of their numbers or, where these are whole ones, from 1 to `most`.
+    Histograms span the range of their numbers or, if `most` is given, the integers from 1 to `most`.
     """
     panels = len(values) + len(curves)
     height = -(-panels // ACROSS) * (HIGH + 0.75)
@@ -93,9 +93,9 @@ def draw_panels(
     for (name, lines), (left, low) in zip(curves.items(), corners[len(values) :], strict=True):
         last = max(2, *map(len, lines))
         parts += [line([(left, low + y), (left + PANEL, low + y)], GRID, 0.012) for y in (0, HIGH / 2, HIGH)]
-        for of in lines:
-            updates = np.flatnonzero(~np.isnan(of))
-            points = np.stack([left + PANEL * updates / (last - 1), low + HIGH * of[updates]], -1)
+        for rates in lines:
+            updates = np.flatnonzero(~np.isnan(rates))
+            points = np.stack([left + PANEL * updates / (last - 1), low + HIGH * rates[updates]], -1)
             parts.append(line(points, ROLE_COLOUR[Role.GREEN], 0.012))
         parts.append(text((left, low + HIGH + 0.18), f"{name}: {len(lines):,}", INK, SMALL))
         parts.append(text((left + PANEL, low + HIGH + 0.18), "100%", MUTED, SMALL, ends=True))
@@ -104,7 +104,7 @@ def draw_panels(
 
 
 def _ends(corner: tuple[float, float], first: str, last: str) -> list[str]:
-    """Words below both ends of a panel's axis."""
+    """Label both ends of a panel's axis."""
     left, low = corner
     return [
         text((left, low - 0.14), first, MUTED, SMALL),

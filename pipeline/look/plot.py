@@ -1,4 +1,4 @@
-"""A manifest as a figure: histograms of its numbers, and learning curves."""
+"""Figure of a manifest: histograms of numeric columns, and learning curves."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import pyarrow as pa
 from levelproof.experts.labels import TRAINED, Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.figures import draw_panels
-from levelproof.pipeline.look.rows import Asked
+from levelproof.pipeline.look.rows import RowQuery
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.read.select import columns_in, select
@@ -19,32 +19,33 @@ from levelproof.pipeline.words import many
 KINDS = (".svg", ".png")
 NUMBERS = ("steps_to_goal", "steps_to_first_success", "env_steps", "success_rate", "portability")
 BINS = 32
-CURVES = 100  # levels of a label whose learning curves are drawn, spread evenly
+CURVES = 100  # maximum number of learning curves per label, spread evenly over levels
 
 
-def plot(split: Path, asked: Asked, out: Path) -> None:
-    """Draw the rows that are asked for to `out`, and tell in one line what was drawn.
+def plot(split: Path, query: RowQuery, out: Path) -> None:
+    """Draw the rows that `query` selects to `out`; print one line about the figure.
 
     Raises:
-        UserError: no split, no row that fits, or a file that cannot be written.
+        UserError: no split, no matching row, or the file cannot be written.
         Failure: a fragment is damaged.
     """
     if out.suffix.lower() not in KINDS:
-        raise UserError(f"Cannot draw to {out}: its name has to end in {' or '.join(KINDS)}.")
-    table = select(require_manifest(split, ["label", *NUMBERS, *columns_in(asked.where)]).table, asked.where)
+        raise UserError(f"Cannot draw to {out}: its name must end in {' or '.join(KINDS)}.")
+    table = select(require_manifest(split, ["label", *NUMBERS, *columns_in(query.where)]).table, query.where)
     values = {name.replace("_", " "): table[name].drop_null().to_numpy() for name in NUMBERS}
-    values = {name: of[~np.isnan(of)] for name, of in values.items()}
-    values = {name: of for name, of in values.items() if len(of)}
-    curves = {f"{label} levels, success rate": of for label in sorted(TRAINED) if (of := _curves(split, table, label))}
+    values = {name: column[~np.isnan(column)] for name, column in values.items()}
+    values = {name: column for name, column in values.items() if len(column)}
+    drawn = {label: _curves(split, table, label) for label in sorted(TRAINED)}
+    curves = {f"{label} levels, success rate": rates for label, rates in drawn.items() if rates}
     if not values and not curves:
-        raise UserError(f"There is nothing to draw of {split}: choose other rows with --where.")
+        raise UserError(f"{split} has nothing to draw: choose other rows with --where.")
     with writing_to(out):
         draw_panels(values, curves, BINS, f"{as_typed(split)}: {many(table.num_rows, 'level')}", out)
     print(f"{out}: {', '.join([*values, *curves])}")
 
 
 def _curves(split: Path, table: pa.Table, label: Label) -> list[np.ndarray]:
-    """Success rates per update of some levels of a label; null where no episode ended."""
+    """Read success rates per update of up to CURVES levels of a label; NaN where no episode ended."""
     ids = table["level_id"].to_numpy()[np.array(table["label"].to_pylist()) == label]
     if not len(ids):
         return []

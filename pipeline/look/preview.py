@@ -1,4 +1,4 @@
-"""A sample of a split for the viewer of the Hugging Face hub: rows of the manifest with pictures beside them."""
+"""Sample of a split for the Hugging Face hub's viewer: rows of the manifest with pictures."""
 
 import io
 import json
@@ -22,15 +22,15 @@ from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.shown import shown
 
-PICTURES = ("start", "goal")  # the initial world; the moment that the witness reaches the goal, where there is one
-SHOWN = (  # columns beside them
+PICTURES = ("start", "goal")  # the initial world; the moment the witness reaches the goal, or null
+SHOWN = (  # manifest columns beside the pictures
     "level_id", "label", "label_reason", "witness", "steps_to_goal", "success_rate", "portability", "env_steps",
     "command",
 )  # fmt: skip
 PIXELS = 220  # width of a picture
-BLOCK = 16  # rows whose records are in memory at once
-ACTED = ("done", "goal", "action")
-# What the library `datasets` writes where a column has pictures, and the hub's viewer looks for
+BLOCK = 16  # rows whose records are in memory at a time
+RECORD_FIELDS = ("done", "goal", "action")
+# Image columns as the library `datasets` writes them and the hub's viewer reads them
 IMAGE = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])
 FEATURES = json.dumps({"info": {"features": {name: {"_type": "Image"} for name in PICTURES}}})
 SCHEMA = pa.schema(
@@ -40,10 +40,10 @@ SCHEMA = pa.schema(
 
 
 def preview(manifest: Manifest, count: int) -> pa.Table:
-    """At most so many rows, spread evenly over the manifest's level ids.
+    """Select at most `count` rows, spread evenly over the manifest's level ids, with pictures.
 
     Raises:
-        Failure: a shard is damaged, or a level's file is gone.
+        Failure: a shard is damaged, or a level file is missing.
     """
     ids = manifest.level_ids
     chosen = ids[spread(len(ids), count)]
@@ -57,8 +57,8 @@ def _pictured(manifest: Manifest, rows: pa.Table) -> Iterator[dict[str, Any]]:
     solved, arrays = rows.column("shard").is_valid().to_numpy(), {}
     if solved.any():
         size = size_of(rows.column("size")[0].as_py())
-        names = [of.name for of in table_for(size) if of.name.startswith(("level/", "record/state/"))]
-        arrays = read_rows(manifest.split, rows.filter(solved), [*names, *(f"record/{name}" for name in ACTED)])
+        names = [field.name for field in table_for(size) if field.name.startswith(("level/", "record/state/"))]
+        arrays = read_rows(manifest.split, rows.filter(solved), [*names, *(f"record/{name}" for name in RECORD_FIELDS)])
     level, rules, recorded = levels_of(manifest, rows), rules_of(manifest), 0
     for lane, row in enumerate(rows.to_pylist()):
         scenes = [scene_of(level, level.state, lane, caption=Caption(f"level {row['level_id']}"))]

@@ -1,4 +1,4 @@
-"""Rows of a manifest that somebody asks for: which, in which order, with which columns; on the screen or as CSV."""
+"""Queries on a manifest: which rows, in which order, with which columns; as tables or as CSV."""
 
 import csv
 import json
@@ -15,52 +15,52 @@ from levelproof.pipeline.read.select import TABLE, columns_in, select
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.manifest import require_manifest
 
-BLOCK = 2**14  # rows that are read at once
+BLOCK = 2**14  # rows read at a time
 SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps")
 
 
-class Asked(NamedTuple):
-    """What somebody wants to see of a manifest."""
+class RowQuery(NamedTuple):
+    """Selection of a manifest's rows and columns."""
 
     where: str | None = None  # an SQL condition
-    columns: Sequence[str] | None = None  # by name; None: SHOWN on the screen, all elsewhere
-    sort: str | None = None  # an SQL expression, DESC or not; null comes last; None: by level id
-    limit: int | None = None  # rows; None: a screen's, and all of a CSV
+    columns: Sequence[str] | None = None  # names; None: SHOWN on the screen, all elsewhere
+    sort: str | None = None  # SQL expression, may end in DESC; null comes last; None: by level id
+    limit: int | None = None  # number of rows; None: 10 on the screen, all in CSV
 
     def check(self) -> None:
-        """Raises UserError where a column is none."""
+        """Raise UserError if a column does not exist."""
         for name in self.columns or ():
             if name not in COLUMNS.names:
-                raise UserError(f"There is no column {name!r}: choose of {', '.join(COLUMNS.names)}.")
+                raise UserError(f"There is no column {name!r}: choose from {', '.join(COLUMNS.names)}.")
 
 
-EVERYTHING = Asked()
+ALL_ROWS = RowQuery()
 
 
-def ids_of(table: pa.Table, asked: Asked) -> np.ndarray:
-    """The ids of the rows that are wanted, in their order, of those that fit; with the columns of `asked.sort`.
+def ids_of(table: pa.Table, query: RowQuery) -> np.ndarray:
+    """Sort and limit the level ids of `table`, which has the columns of `query.sort`.
 
     Raises:
-        UserError: DuckDB cannot order by that.
+        UserError: DuckDB cannot sort by that expression.
     """
     ids = table.column("level_id").to_numpy()
-    if asked.sort is not None:
+    if query.sort is not None:
         with duckdb.connect() as connection:
             connection.register(TABLE, table)
             connection.execute("SET enable_external_access = false")
             try:
-                query = f"SELECT level_id FROM {TABLE} ORDER BY {asked.sort}\n NULLS LAST, level_id"
-                ids = connection.sql(query).fetchnumpy()["level_id"]
+                sql = f"SELECT level_id FROM {TABLE} ORDER BY {query.sort}\n NULLS LAST, level_id"
+                ids = connection.sql(sql).fetchnumpy()["level_id"]
             except duckdb.Error as error:
                 reason = str(error).strip().splitlines()[0]
                 raise UserError(
-                    f"Cannot sort by {asked.sort!r} ({reason}): give a column, or such as 'steps_to_goal DESC'."
+                    f"Cannot sort by {query.sort!r} ({reason}): give a column, or one such as 'steps_to_goal DESC'."
                 ) from None
-    return ids if asked.limit is None else ids[: max(asked.limit, 0)]
+    return ids if query.limit is None else ids[: max(query.limit, 0)]
 
 
 def rows_of(split: Path, ids: np.ndarray, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-    """These rows in this order, a block at a time."""
+    """Read the rows of these ids in this order, a block at a time."""
     for first in range(0, len(ids), BLOCK):
         wanted = ids[first : first + BLOCK]
         table = require_manifest(split, columns, np.sort(wanted)).table
@@ -68,20 +68,20 @@ def rows_of(split: Path, ids: np.ndarray, columns: Sequence[str] | None = None) 
         yield table.take(here).select(columns or table.column_names)
 
 
-def write_csv(split: Path, asked: Asked, to: IO[str]) -> None:
-    """The rows as CSV with a line of names; lists and records as JSON, what does not exist as nothing.
+def write_csv(split: Path, query: RowQuery, out: IO[str]) -> None:
+    """Write the rows as CSV under a header; lists and structs are JSON, null is empty.
 
     Raises:
-        UserError: no split, a column that is none, or a condition or an order that DuckDB cannot use.
+        UserError: no split, an unknown column, or DuckDB rejects the condition or the order.
         Failure: a fragment is damaged.
     """
-    asked.check()
+    query.check()
     table = select(
-        require_manifest(split, [*columns_in(asked.where), *columns_in(asked.sort)], compact=True).table, asked.where
+        require_manifest(split, [*columns_in(query.where), *columns_in(query.sort)], compact=True).table, query.where
     )
-    names, writer = list(asked.columns or COLUMNS.names), csv.writer(to, lineterminator="\n")
+    names, writer = list(query.columns or COLUMNS.names), csv.writer(out, lineterminator="\n")
     writer.writerow(names)
-    for block in rows_of(split, ids_of(table, asked), names):
+    for block in rows_of(split, ids_of(table, query), names):
         writer.writerows([_cell(value) for value in row.values()] for row in block.to_pylist())
 
 

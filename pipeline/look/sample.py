@@ -1,4 +1,4 @@
-"""A sheet of sampled levels: what a size and a distribution are like, before anything is trained."""
+"""Sheet of sampled levels, to show a size and a distribution before anything is trained."""
 
 from pathlib import Path
 
@@ -15,34 +15,36 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.runtime import prepare_jax
 
-LEVELS = 15  # unless the command says how many
+LEVELS = 15  # default number of levels
 MAX_LEVELS = 100
 COLUMNS = 5
-PIXELS = 220  # width of one level's picture
+PIXELS = 220  # width of a level's picture
 
 
 def sample(job: JobConfig, out: Path) -> None:
-    """Draw the initial worlds of the job's levels to `out`, and tell so in one line.
+    """Draw the initial worlds of the job's levels to `out`; print one line about the sheet.
 
     Raises:
-        UserError: too many levels, or a file that cannot be written.
+        UserError: too many levels, or the file cannot be written.
     """
     ids = job.level_ids
     if out.suffix.lower() != ".png":
-        raise UserError(f"Cannot draw to {out}: its name has to end in .png.")
+        raise UserError(f"Cannot draw to {out}: its name must end in .png.")
     if len(ids) > MAX_LEVELS:
-        raise UserError(f"levels is {job.levels}: a sheet has room for {MAX_LEVELS}.")
+        raise UserError(f"levels is {job.levels}: a sheet has room for at most {MAX_LEVELS}.")
     prepare_jax()
     page = sheet_of(job)
     with writing_to(out):
         write_png(page, out)
     name, _ = identified(job.distribution)
-    print(f"{out}: levels {ids[0]} to {ids[-1]} of size {job.size}, distribution {name or 'of your own'}")
+    print(f"{out}: levels {ids[0]} to {ids[-1]} of size {job.size}, distribution {name or 'custom'}")
 
 
 def sheet_of(job: JobConfig) -> Image.Image:
-    """The initial worlds of the job's levels, row after row."""
+    """Draw the initial worlds of the job's levels, row by row."""
     levels = jax.tree.map(np.asarray, sample_levels(job.level_ids, size_of(job.size), job.distribution))
     captions = [Caption(f"level {level_id}") for level_id in job.level_ids]
-    pictures = [draw(levels, levels.state, lane, caption=of, pixels=PIXELS) for lane, of in enumerate(captions)]
+    pictures = [
+        draw(levels, levels.state, lane, caption=caption, pixels=PIXELS) for lane, caption in enumerate(captions)
+    ]
     return sheet(pictures, COLUMNS)

@@ -1,4 +1,4 @@
-"""One level as a picture or a film: its witness, or what doing nothing does where it has none."""
+"""One level as a picture or a film: its witness or, if it has none, what doing nothing does."""
 
 import shutil
 import subprocess
@@ -29,47 +29,47 @@ from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
-STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures a second
-LAST_SECONDS = 1.5  # how long a film rests on its last picture
-MAX_FRAME_SKIP = 8  # with which doing nothing is played: a level file's rules may have any
-SHOWN_SECONDS = (0.02, 2.0)  # shortest and longest of a picture; rules may have any time step
-SHEET = (3, 2)  # columns and rows of a still
+STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures/s
+LAST_SECONDS = 1.5  # s that a film rests on its last picture
+MAX_FRAME_SKIP = 8  # above, doing nothing is not played: a level file's rules may have any
+SHOWN_SECONDS = (0.02, 2.0)  # minimum and maximum of a picture: rules may have any time step
+SHEET = (3, 2)  # columns and rows of a .png
 
 
 def show(source: Path, level_id: int | None, out: Path) -> None:
-    """Draw a level of a split, or that of a level file, to `out`, and tell in one line what was drawn.
+    """Draw a level of a split, or of a level file, to `out`; print one line about the picture.
 
-    `.gif`, `.mp4` and `.svg` are films: of the witness's first episode, or of doing nothing where there is no witness.
+    `.gif`, `.mp4` and `.svg` are films of the witness's first episode or, without a witness, of doing nothing.
     `.png` is a sheet of pictures of the witness, or the initial world.
 
     Raises:
-        UserError: no such level, or a file that cannot be read or written.
+        UserError: no such level, or a file cannot be read or written.
         Failure: the split is damaged.
     """
     suffix = out.suffix.lower()
     write = WRITERS.get(suffix)
     if write is None:
-        raise UserError(f"Cannot draw to {out}: its name has to end in {', '.join(WRITERS)}.")
+        raise UserError(f"Cannot draw to {out}: its name must end in {', '.join(WRITERS)}.")
     film = film_of(source, level_id, plays=suffix != ".png")
     with writing_to(out):
         write(film, out)
-    print(f"{out}: {film.told}")
+    print(f"{out}: {film.description}")
 
 
 @dataclass(frozen=True)
 class Film:
-    """Scenes of one level, the time of each, and what they show."""
+    """Scenes of one level, their durations, and a description."""
 
     scenes: Sequence[Scene]
     seconds: Sequence[float]  # how long each is shown
-    told: str
+    description: str
 
 
 def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
-    """What there is to see of a level; `plays`: doing nothing may be a film.
+    """Film of a level's witness; without one, doing nothing if `plays`, else the initial world.
 
     Raises:
-        UserError: no such level, or a file that cannot be read.
+        UserError: no such level, or a file cannot be read.
         Failure: the split is damaged.
     """
     if is_level_file(source):
@@ -78,23 +78,25 @@ def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
         file = level_file(source)
         size = name_of(file.level.size)
         caption = Caption(f"{' '.join(source.stem.split())} · size {size}")
-        told = f"{source.name}, a level of size {size}: a level file has no witness"
-        return _without_witness(file.level, file.rules, caption, told, plays)
+        description = f"{source.name}, a level of size {size}: a level file has no witness"
+        return _without_witness(file.level, file.rules, caption, description, plays)
     if level_id is None:
         raise UserError(f"Which level of {source}? Add its id, such as {require_manifest(source, []).level_ids[0]}.")
     manifest, row = find_level(source, level_id)
     if row["shard"]:
         return witness_film(manifest, row)
     caption = Caption(_title(row), outcome=row["label"], good=False)
-    told = f"level {level_id} of size {row['size']} is {row['label']} ({row['label_reason']}): there is no witness"
-    return _without_witness(levels_of(manifest, manifest.table), rules_of(manifest), caption, told, plays)
+    description = (
+        f"level {level_id} of size {row['size']} is {row['label']} ({row['label_reason']}): there is no witness"
+    )
+    return _without_witness(levels_of(manifest, manifest.table), rules_of(manifest), caption, description, plays)
 
 
 def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
-    """The first episode of a solved level's record.
+    """Film of the first episode of a solved level's record.
 
     Raises:
-        Failure: it does not reach the goal.
+        Failure: the record does not reach the goal.
     """
     arrays = read_row(manifest.split, row)
     return recorded_film(row, arrays, rules_of(manifest))
@@ -103,10 +105,10 @@ def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
 def recorded_film(
     row: dict[str, Any], arrays: dict[str, np.ndarray], rules: TaskParams, every: int = STEPS_A_PICTURE
 ) -> Film:
-    """The same of what a shard has of a row: a scene every so many env steps, and one when the goal is reached.
+    """Film of the first episode of a record: a scene every `every` env steps, and one when the goal is reached.
 
     Raises:
-        Failure: it does not reach the goal.
+        Failure: the record does not reach the goal.
     """
     level, states = tree_of(Level, arrays, "level/"), tree_of(State, arrays, "record/state/")
     done, goal, action = (arrays[f"record/{name}"][..., 0] for name in ("done", "goal", "action"))
@@ -114,29 +116,29 @@ def recorded_film(
         raise Failure("The record of this level does not reach the goal: run `levelproof verify` on its split.")
     steps = int(steps_to_goal(done))
     scenes, seconds = _episode(level, states, action, (steps, GOAL), rules, Caption(_title(row)), every)
-    told = f"solved in {steps} step{'s' if steps > 1 else ''} ({_length(steps, rules)})"
-    return Film(scenes, seconds, f"level {row['level_id']} of size {row['size']}, {told}")
+    description = f"solved in {steps} step{'s' if steps > 1 else ''} ({_length(steps, rules)})"
+    return Film(scenes, seconds, f"level {row['level_id']} of size {row['size']}, {description}")
 
 
-def _without_witness(level: Level, rules: TaskParams, caption: Caption, told: str, plays: bool) -> Film:
-    """What doing nothing does, or the initial world."""
+def _without_witness(level: Level, rules: TaskParams, caption: Caption, description: str, plays: bool) -> Film:
+    """Film of doing nothing, or of the initial world."""
     if not plays or rules.frame_skip > MAX_FRAME_SKIP:
         scene = scene_of(level, level.state, caption=replace(caption, clock="0.0 s"))
-        return Film([scene], [LAST_SECONDS], f"{told}, so this is its initial world")
+        return Film([scene], [LAST_SECONDS], f"{description}, so this is its initial world")
     record, end = do_nothing(level, rules)
     action, caption = np.asarray(record.action)[..., 0], replace(caption, clock="doing nothing · ")
     scenes, seconds = _episode(level, record.state, action, end, rules, caption, STEPS_A_PICTURE)
     how = f"{end[1]} after" if end[1] else "the first"
-    told = f"{told}, so this is what doing nothing does ({how} {_length(end[0], rules)})"
-    return Film(scenes, seconds, told)
+    description = f"{description}, so this is what doing nothing does ({how} {_length(end[0], rules)})"
+    return Film(scenes, seconds, description)
 
 
-End = tuple[int, str]  # length of a first episode, env steps, and what it ends with; "": it goes on
+End = tuple[int, str]  # length of the first episode in env steps; how it ends, "" if it does not
 GOAL, FAIL, LATE, BROKEN = "goal reached", "touched red", "time is up", "world breaks down"
 
 
 def do_nothing(level: Level, rules: TaskParams) -> tuple[Record, End]:
-    """The record of doing nothing."""
+    """Record doing nothing; return the record and how its first episode ends."""
     prepare_jax()
     record = replay(level, np.zeros((RECORD_STEPS, ACTIONS, 1)), replace(rules, dense_reward_scale=0.0))
     if not record.done.any():
@@ -151,7 +153,7 @@ def do_nothing(level: Level, rules: TaskParams) -> tuple[Record, End]:
 def _episode(
     level: Level, states: State, action: np.ndarray, end: End, rules: TaskParams, caption: Caption, every: int
 ) -> tuple[list[Scene], list[float]]:
-    """A scene every so many env steps of a record's first episode, and one of its end; and the time of each."""
+    """Scenes of a record's first episode, every `every` env steps and at its end, and the duration of each."""
     steps, outcome = end
     shown, scenes = [*range(0, steps, every), steps], []
     for step in shown:
@@ -159,7 +161,7 @@ def _episode(
         state = jax.tree.map(lambda x, last=last: x[last], states)
         now = replace(caption, clock=caption.clock + _length(step, rules))
         if step == steps:
-            state = _touch(state, rules)
+            state = _extrapolated(state, rules)
             now = replace(now, outcome=outcome, good=outcome == GOAL) if outcome else now
         scenes.append(scene_of(level, state, action=action[last], caption=now))
     (shortest, longest), second = SHOWN_SECONDS, rules.frame_skip * rules.physics.dt
@@ -172,18 +174,18 @@ def _length(steps: int, rules: TaskParams) -> str:
 
 
 def write_sheet(film: Film, path: Path) -> None:
-    """A few of the film's pictures, the first and the last among them."""
+    """Draw up to six of the film's pictures, including the first and the last."""
     columns, rows = SHEET
     chosen = spread(len(film.scenes), columns * rows)
     write_png(sheet([rasterised(film.scenes[i]) for i in chosen], columns), path)
 
 
 def write_mp4(film: Film, path: Path) -> None:
-    """By the program ffmpeg: the machine's, or the one of the extra `video`.
+    """Encode with ffmpeg: the machine's, or the one of the extra `video`.
 
     Raises:
-        UserError: there is none.
-        Failure: it fails.
+        UserError: there is no ffmpeg.
+        Failure: ffmpeg fails.
     """
     program = shutil.which("ffmpeg") or packaged_ffmpeg()
     if program is None:
@@ -204,7 +206,7 @@ def write_mp4(film: Film, path: Path) -> None:
 
 
 def packaged_ffmpeg() -> str | None:
-    """The ffmpeg that comes with the package imageio-ffmpeg, where it is installed."""
+    """Path of the ffmpeg in the package imageio-ffmpeg, if that is installed."""
     try:
         import imageio_ffmpeg
     except ImportError:
@@ -220,10 +222,11 @@ WRITERS: dict[str, Callable[[Film, Path], object]] = {
 }
 
 
-def _touch(state: State, rules: TaskParams) -> State:
-    """The world about when the goal was touched: records keep states before steps, so speeds lead on from the last.
+def _extrapolated(state: State, rules: TaskParams) -> State:
+    """Extrapolate the last recorded state to the moment when the goal is touched.
 
-    The last of a step's physics steps looks for contacts after the others have moved the bodies.
+    Records keep the state before each env step; its last physics step finds the contact, after the others moved the
+    bodies.
     """
     seconds = (rules.frame_skip - 1) * rules.physics.dt
     return replace(

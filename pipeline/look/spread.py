@@ -1,9 +1,9 @@
-"""Some of many, spread evenly."""
+"""Evenly spread samples of indices."""
 
 import numpy as np
 from jaxtyping import Int
 
 
 def spread(count: int, most: int) -> Int[np.ndarray, " chosen"]:
-    """At most so many of the numbers below `count`, ascending: the first, and the last where there are two."""
+    """Up to `most` evenly spaced indices below `count`, ascending, including the first and, if `most` > 1, the last."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))

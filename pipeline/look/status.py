@@ -1,4 +1,4 @@
-"""How far a split is: what the last command wanted, what is committed, what was given up, whether a run is at work."""
+"""Status of a split: levels requested by the last command, committed and given up, and whether a run is active."""
 
 import json
 from collections.abc import Callable
@@ -17,13 +17,13 @@ from levelproof.pipeline.words import many
 
 
 def status(split: Path, as_json: bool, say: Callable[[str], None]) -> None:
-    """Print how far `split` is; `say` is told what is waited for.
+    """Print how far `split` is; `say` receives a message if checking for a run takes long.
 
     Raises:
-        UserError: there is no split.
+        UserError: no split.
         Failure: a fragment is damaged.
     """
-    facts = look(split, say)
+    facts = read_status(split, say)
     if as_json:
         print(json.dumps(facts, indent=2))
         return
@@ -32,13 +32,13 @@ def status(split: Path, as_json: bool, say: Callable[[str], None]) -> None:
     for note, levels in facts["given_up"].items():
         print(f"Given up: {told_levels(levels)}, for the reason in {as_typed(split / QUARANTINE / note)}")
     if facts["running"]:
-        print("A run is at work now.")
+        print("A run is active.")
     elif facts["done"] < facts["wanted"]:
-        print(f"No run is at work. To go on: {facts['command']}")
+        print(f"No run is active. To resume: {facts['command']}")
 
 
-def look(split: Path, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """The facts that `status` prints."""
+def read_status(split: Path, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Collect the facts that `status` prints."""
     try:
         note = read_note(split)
     except FileNotFoundError:
@@ -57,7 +57,7 @@ def look(split: Path, say: Callable[[str], None] = lambda _: None) -> dict[str, 
         "done": int(done.sum()),
         "labels": dict(sorted(manifest.counts(done).items())),
         "quarantined": [*notes],
-        "given_up": notes,  # levels of each note, first and last id of each run
+        "given_up": notes,  # first and last id of each range of levels, by note
         "running": is_written(split, say),
         "command": note.command,
     }

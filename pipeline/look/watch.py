@@ -1,4 +1,4 @@
-"""How a job goes on, from its split alone: by what its latest run tells there. Knows nothing of workers."""
+"""Live view of a job, from the events that its latest run writes to the split; needs no contact with workers."""
 
 import json
 import sys
@@ -14,7 +14,7 @@ from rich.table import Table
 
 from levelproof.configs.errors import readable
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.look.status import look
+from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.outlet import has_reader
 from levelproof.pipeline.store.events import events_of, runs_in
 from levelproof.pipeline.store.layout import EVENTS
@@ -22,75 +22,77 @@ from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.words import duration, many
 
-EVERY = 2.0  # s between looks
-STALE = 30.0  # s after which a state is no more than the last that was told
-SHOWN = 5  # failures
+INTERVAL = 2.0  # s between refreshes
+STALE = 30.0  # s; a run's state that is older is shown with its age
+SHOWN = 5  # maximum number of failures shown
 STATE = {"levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined", "workers"}
 FAILURE = {"unit", "cause"}
 
 
-def watch(split: Path, as_json: bool, console: Console, every: float = EVERY) -> None:
-    """Show how far a job is, again and again until no run is at work or nobody reads it; with `as_json`, an object a
-    line.
+def watch(split: Path, as_json: bool, console: Console, interval: float = INTERVAL) -> None:
+    """Show a job's progress, refreshed until no run is active or the output has no reader; with `as_json`, one JSON
+    object per line.
 
     Raises:
-        UserError: there is no split, or no run has told anything.
+        UserError: no split, or no run has logged its state.
     """
-    look(split, partial(print, file=sys.stderr))  # that there is a split
+    read_status(split, partial(print, file=sys.stderr))  # raises if there is no split
     if as_json:
-        _follow(split, every, lambda facts: print(json.dumps(facts), flush=True))
+        _follow(split, interval, lambda facts: print(json.dumps(facts), flush=True))
     else:
         with Live(console=console, auto_refresh=False) as live:
-            _follow(split, every, lambda facts: live.update(shown(facts), refresh=True))
+            _follow(split, interval, lambda facts: live.update(progress_table(facts), refresh=True))
 
 
-def _follow(split: Path, every: float, show: Callable[[dict[str, Any]], None]) -> None:
+def _follow(split: Path, interval: float, show: Callable[[dict[str, Any]], None]) -> None:
     while True:
-        facts = now(split)
+        facts = read_progress(split)
         show(facts)
         if not facts["running"] or not has_reader():
             return
-        time.sleep(every)
+        time.sleep(interval)
 
 
-def now(split: Path) -> dict[str, Any]:
-    """The facts that `watch` shows, as JSON's types.
+def read_progress(split: Path) -> dict[str, Any]:
+    """Collect the facts that `watch` shows, as JSON types.
 
     Raises:
-        UserError: no run has told anything.
+        UserError: no run has logged its state.
     """
     running, runs = is_written(split), runs_in(split)
     events = events_of(runs[-1]) if runs else []
     states = [event for event in events if event["event"] in ("progress", "ended") and event.keys() >= STATE]
     if not states:
-        raise UserError(f"No run has told anything in {split / EVENTS} yet: `levelproof status` tells what is there.")
+        raise UserError(
+            f"No run has logged its state in {split / EVENTS} yet: run `levelproof status` for what is committed."
+        )
     state = states[-1]
     failed = [event for event in events if event["event"] in ("failed", "quarantined") and event.keys() >= FAILURE]
     done, solved = state["done"], state["solved"]
     return {
         "split": as_typed(split),
         "running": running and state["event"] != "ended",
-        "age": round(max(0.0, time.time() - state["time"]), 1),  # s since it was told
+        "age": round(max(0.0, time.time() - state["time"]), 1),  # s since the run logged it
         **{name: value for name, value in state.items() if name not in ("time", "event")},
         "solved_share": solved / done if done else None,
-        "failed": [f"{of['unit']}: {of['cause']}" for of in failed[-SHOWN:]],
+        "failed": [f"{event['unit']}: {event['cause']}" for event in failed[-SHOWN:]],
     }
 
 
-def shown(facts: dict[str, Any]) -> Table:
-    """For a terminal."""
+def progress_table(facts: dict[str, Any]) -> Table:
+    """Format the facts for a terminal."""
     table = Table(box=None, show_header=False, pad_edge=False)
     share = "" if facts["solved_share"] is None else f", {facts['solved_share']:.1%} of them solved"
     left = "..." if facts["left"] is None else f"about {duration(facts['left'])} left"
-    stale = f" (told {duration(facts['age'])} ago)" if facts["age"] > STALE else ""
+    stale = f" (logged {duration(facts['age'])} ago)" if facts["age"] > STALE else ""
     lines = {
         "split": facts["split"],
         "levels": f"{facts['done']:,} of {facts['levels']:,} committed{share}",
-        "pace": f"{facts['rate']:,} env steps/s, {left}{stale}" if facts["running"] else "no run is at work",
+        "pace": f"{facts['rate']:,} env steps/s, {left}{stale}" if facts["running"] else "no run is active",
         "failed attempts": f"{facts['failures']}, {many(facts['quarantined'], 'unit')} given up",
         **{
-            f"workers on {host}": f"{of['count']}, the most silent for {duration(of['silent'] + facts['age'])}"
-            for host, of in facts["workers"].items()
+            f"workers on {host}": f"{workers['count']}, longest silent for {duration(workers['silent'] + facts['age'])}"
+            for host, workers in facts["workers"].items()
             if facts["running"]
         },
         **{f"failure {number}": text for number, text in enumerate(facts["failed"], 1)},

@@ -1,1 +1,1 @@
-"""The player: a person takes the controls in a browser, edits the level, and watches an expert train."""
+"""The player: in a browser, control a level by hand, edit it, and watch an expert train."""

@@ -1,4 +1,4 @@
-"""Which level a page begins with, and the time that its server is there."""
+"""The command `play`: find the level to play, and serve the page."""
 
 import json
 import time
@@ -22,10 +22,10 @@ from levelproof.pipeline.runtime import prepare_jax
 
 
 def play(source: Path | None, level_id: int | None, size: str, budget: str, port: int, browser: bool) -> None:
-    """Serve the page until Ctrl-C; `browser`: and open it.
+    """Serve the page until Ctrl-C, and open it if `browser`.
 
     Raises:
-        UserError: no such level, size or budget, a file that cannot be read, or a port that is none or taken.
+        UserError: no such level, size or budget, the file cannot be read, or the port is invalid or taken.
         Failure: the split is damaged.
     """
     prepare_jax()
@@ -37,18 +37,18 @@ def play(source: Path | None, level_id: int | None, size: str, budget: str, port
     file, actions = level_to_play(source, level_id, size)
     with serving(file, actions, procedure, env_steps, port) as server:
         address = f"http://{HOST}:{server.socket.getsockname()[1]}/"
-        print(f"Play at {address} (Ctrl-C ends it)", flush=True)
+        print(f"Play at {address} (Ctrl-C stops the server)", flush=True)
         if browser:
             webbrowser.open(address)
         try:
             while True:
                 time.sleep(3600)
         except KeyboardInterrupt:
-            print("Done. What you saved is where your browser puts downloads.")
+            print("Done. Files that you saved are in your browser's downloads.")
 
 
 def level_to_play(source: Path | None, level_id: int | None, size: str) -> tuple[LevelFile, np.ndarray | None]:
-    """A level, its rules, and the actions [step, 6] of its witness, if it has one."""
+    """Load the level to play with its rules, and the actions [step, 6] of its witness or None."""
     if source is None:
         return empty_file(size), None
     if is_level_file(source):
@@ -57,7 +57,7 @@ def level_to_play(source: Path | None, level_id: int | None, size: str) -> tuple
         file = level_file(source)
         return file, witness_in(json.loads(source.read_bytes()), file)
     if level_id is None:
-        raise UserError(f"Which level of {source}? Add its id, as `levelproof inspect {source}` shows them.")
+        raise UserError(f"Which level of {source}? Add its id: `levelproof inspect {source}` lists them.")
     manifest, row = find_level(source, level_id)
     level = jax.tree.map(np.asarray, levels_of(manifest, manifest.table))
     file = LevelFile(level, rules_of(manifest))

@@ -1,4 +1,4 @@
-"""One person at one level: steps of the engine, edits with undo, the witness of an episode that reaches the goal."""
+"""Session of one page: env steps, edits with undo, and the witness of an episode that reaches the goal."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,39 +23,39 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, world_of
 from levelproof.pipeline.version import __version__
 
-WITNESS = "witness"  # entry of a level file: actions that solve the level, which other programs do not read
-MAX_UNDONE = 200  # edits that can be taken back
-Asked = dict[str, Any]
+WITNESS = "witness"  # entry of a level file with actions that solve the level; other programs ignore it
+MAX_UNDO = 200  # maximum number of edits that can be undone
+Message = dict[str, Any]  # JSON object between page and server
 
 
 class Session:
-    """What a page asks for, by name (`ASKS`). Answers are what JSON takes."""
+    """State of one page's level; answers the requests named in `REQUESTS` with JSON types."""
 
     def __init__(self, file: LevelFile, actions: np.ndarray | None = None) -> None:
-        """`actions`, [step, 6], are a witness that came with the level."""
+        """`actions`, [step, 6], are the level's witness, or None."""
         self._take(file)
         self._witness = actions
-        self._undone: list[Level] = []
-        self._done: list[Level] = []
+        self._redo: list[Level] = []
+        self._undo: list[Level] = []
 
     @property
     def file(self) -> LevelFile:
         return self._file
 
-    def ask(self, asked: Asked) -> Asked:
-        """The answer to `{"ask": name, ...}`; a sentence under `error` where there is none."""
+    def answer(self, request: Message) -> Message:
+        """Answer `{"ask": name, ...}`; if that fails, with a sentence under `error`."""
         try:
-            name = asked.get("ask")
-            if name not in ASKS:
-                raise UserError(f"Nobody can be asked for {name!r}.")
-            return ASKS[name](self, asked)
+            name = request.get("ask")
+            if name not in REQUESTS:
+                raise UserError(f"Unknown request {name!r}: use one of {', '.join(REQUESTS)}.")
+            return REQUESTS[name](self, request)
         except (UserError, EditError, LevelFileError) as error:
             return {"error": str(error)}
         except (KeyError, TypeError, ValueError, IndexError, OverflowError):
-            return {"error": "That is not something to ask for."}
+            return {"error": "The request is malformed."}
 
-    def level(self, _: Asked) -> Asked:
-        """How the level looks at the start, and what there is to change in it."""
+    def level(self, _: Message) -> Message:
+        """Describe the initial world, and what can be edited in it."""
         one, file = one_of(self._file.level), self._file
         bodies, _still = drawn_bodies(one)
         joints, thrusters = np.flatnonzero(one.model.joint_active), np.flatnonzero(one.model.thruster_active)
@@ -71,18 +71,18 @@ class Session:
             "seconds": file.rules.frame_skip * file.rules.physics.dt,
             "steps": file.rules.max_timesteps,
             "witness": self._witness is not None,
-            "undo": bool(self._done),
-            "redo": bool(self._undone),
+            "undo": bool(self._undo),
+            "redo": bool(self._redo),
         }
 
-    def restart(self, _: Asked) -> Asked:
-        """The start of an episode."""
+    def restart(self, _: Message) -> Message:
+        """Start a new episode."""
         self._now, self._actions = task.reset(self._file.level), []
         return self._moment()
 
-    def step(self, asked: Asked) -> Asked:
-        """One env step under `action`."""
-        action = _action(asked["action"])
+    def step(self, request: Message) -> Message:
+        """Take one env step under `action`."""
+        action = _action(request["action"])
         self._now, outcome = _advance(self._file.level, self._now, action[:, None], self._file.rules)
         self._actions.append(action)
         done, goal = bool(outcome.done[0]), bool(outcome.goal[0])
@@ -93,75 +93,77 @@ class Session:
             self._now, self._actions = task.reset(self._file.level), []
         return moment
 
-    def edit(self, asked: Asked) -> Asked:
-        """The level after one of `levelgen.edit.EDITS`, called `name`, with the words `with`."""
+    def edit(self, request: Message) -> Message:
+        """Apply the edit `name` of `levelgen.edit.EDITS` with the arguments `with`."""
         before = self._file.level
-        after = EDITS[asked["name"]](before, *asked["with"])
-        from_document(to_document(replace(self._file, level=after)))  # nothing is edited into what no file can hold
-        self._done = [*self._done[1 - MAX_UNDONE :], before]
-        self._undone = []
+        after = EDITS[request["name"]](before, *request["with"])
+        from_document(to_document(replace(self._file, level=after)))  # raises if a level file cannot hold the result
+        self._undo = [*self._undo[1 - MAX_UNDO :], before]
+        self._redo = []
         return self._changed(after)
 
-    def undo(self, _: Asked) -> Asked:
-        """The level before the last edit."""
-        return self._exchanged(self._done, self._undone)
+    def undo(self, _: Message) -> Message:
+        """Undo the last edit."""
+        return self._swap(self._undo, self._redo)
 
-    def redo(self, _: Asked) -> Asked:
-        """The level after the edit that was taken back last."""
-        return self._exchanged(self._undone, self._done)
+    def redo(self, _: Message) -> Message:
+        """Redo the edit that was undone last."""
+        return self._swap(self._redo, self._undo)
 
-    def at(self, asked: Asked) -> Asked:
-        """Numbers of the bodies at a point, the uppermost first."""
-        return {"bodies": bodies_at(self._file.level, float(asked["x"]), float(asked["y"]))}
+    def at(self, request: Message) -> Message:
+        """Indices of the bodies at a point, topmost first."""
+        return {"bodies": bodies_at(self._file.level, float(request["x"]), float(request["y"]))}
 
-    def empty(self, asked: Asked) -> Asked:
-        """A level of a `size` with nothing in it."""
-        file = replace(self._file, level=jax.tree.map(np.asarray, empty_level(size_of(str(asked["size"])), 1)))
+    def empty(self, request: Message) -> Message:
+        """Replace the level by an empty one of `size`."""
+        file = replace(self._file, level=jax.tree.map(np.asarray, empty_level(size_of(str(request["size"])), 1)))
         return self._open(file, None)
 
-    def load(self, asked: Asked) -> Asked:
-        """The level of a level file's `document`."""
-        file = from_document(asked["document"])
-        return self._open(file, witness_in(asked["document"], file))
+    def load(self, request: Message) -> Message:
+        """Open a level file's `document`."""
+        file = from_document(request["document"])
+        return self._open(file, witness_in(request["document"], file))
 
-    def save(self, _: Asked) -> Asked:
-        """The level as a level file's document, with the witness if there is one."""
+    def save(self, _: Message) -> Message:
+        """Convert the level to a level file's document, with its witness if it has one."""
         document = to_document(self._file)
-        return {"document": document if self._witness is None else document | {WITNESS: self._told(self._witness)}}
+        return {
+            "document": document if self._witness is None else document | {WITNESS: self._witness_entry(self._witness)}
+        }
 
-    def play(self, _: Asked) -> Asked:
-        """Every place of the bodies along the witness."""
+    def play(self, _: Message) -> Message:
+        """Film of the witness."""
         if self._witness is None:
-            raise UserError("There is no witness yet: reach the goal, or let an expert be trained.")
+            raise UserError("There is no witness yet: reach the goal, or train an expert.")
         return self.film(self._witness)
 
-    def film(self, actions: np.ndarray) -> Asked:
-        """Where bodies are before each of these actions, and at the end."""
+    def film(self, actions: np.ndarray) -> Message:
+        """Replay actions [step, 6]; return the bodies' places before each and at the end."""
         state = replay(self._file.level, _padded(actions), self._file.rules).state
         position, rotation = (np.asarray(x)[: len(actions) + 1, ..., 0] for x in (state.position, state.rotation))
         return {"places": places_of(self._file.level, position, rotation), "actions": actions.tolist()}
 
     def solve(self, actions: np.ndarray) -> None:
-        """Take over a witness that an expert has found."""
+        """Adopt a witness that an expert found."""
         self._witness = actions
 
-    def _told(self, actions: np.ndarray) -> dict[str, Any]:
+    def _witness_entry(self, actions: np.ndarray) -> dict[str, Any]:
         return {"actions": actions.tolist(), "steps_to_goal": len(actions), "levelproof": __version__}
 
-    def _open(self, file: LevelFile, witness: np.ndarray | None) -> Asked:
+    def _open(self, file: LevelFile, witness: np.ndarray | None) -> Message:
         self._take(file)
-        self._done, self._undone, self._witness = [], [], witness
+        self._undo, self._redo, self._witness = [], [], witness
         return self.level({})
 
-    def _exchanged(self, wanted: list[Level], instead: list[Level]) -> Asked:
-        if not wanted:
+    def _swap(self, source: list[Level], target: list[Level]) -> Message:
+        if not source:
             return self.level({})
-        instead.append(self._file.level)
-        return self._changed(wanted.pop())
+        target.append(self._file.level)
+        return self._changed(source.pop())
 
-    def _changed(self, level: Level) -> Asked:
+    def _changed(self, level: Level) -> Message:
         self._take(replace(self._file, level=level))
-        self._witness = None  # of another level
+        self._witness = None  # it was for the level before the edit
         return self.level({})
 
     def _take(self, file: LevelFile) -> None:
@@ -169,15 +171,15 @@ class Session:
         self._now: TaskState = task.reset(self._file.level)
         self._actions: list[np.ndarray] = []
 
-    def _moment(self) -> Asked:
+    def _moment(self) -> Message:
         position, rotation = (np.asarray(x)[None, ..., 0] for x in (self._now.state.position, self._now.state.rotation))
         (places,) = places_of(self._file.level, position, rotation)
         return {"places": places, "timestep": len(self._actions)}
 
 
-ASKS: dict[str, Callable[[Session, Asked], Asked]] = {
-    ask.__name__: ask
-    for ask in (
+REQUESTS: dict[str, Callable[[Session, Message], Message]] = {
+    method.__name__: method
+    for method in (
         Session.level, Session.restart, Session.step, Session.edit, Session.undo, Session.redo, Session.at,
         Session.empty, Session.load, Session.save, Session.play,
     )
@@ -192,19 +194,19 @@ def _advance(level: Level, now: TaskState, action: Any, rules: TaskParams) -> An
 def places_of(
     level: Level, position: Float[np.ndarray, "time body 2"], rotation: Float[np.ndarray, "time body"]
 ) -> list[list[float]]:
-    """x, y and angle of the drawn bodies of a level, one after the other, at each time."""
+    """List x, y, angle of each drawn body, one after the other, at each time."""
     bodies, _ = drawn_bodies(one_of(level))
-    where = np.concatenate([position, rotation[..., None]], -1)[:, bodies]
-    return np.nan_to_num(where).reshape(len(where), -1).round(4).tolist()
+    places = np.concatenate([position, rotation[..., None]], -1)[:, bodies]
+    return np.nan_to_num(places).reshape(len(places), -1).round(4).tolist()
 
 
 def witness_in(document: Any, file: LevelFile) -> np.ndarray | None:
-    """The actions, [step, 6], that come with a level file; None where there are none, or they do not solve it."""
-    given = document.get(WITNESS)
-    if not isinstance(given, dict) or not isinstance(given.get("actions"), list):
+    """Read the witness [step, 6] of a level file; None if it has none or its actions do not solve the level."""
+    entry = document.get(WITNESS)
+    if not isinstance(entry, dict) or not isinstance(entry.get("actions"), list):
         return None
     try:
-        actions = np.stack([_action(action) for action in given["actions"][:RECORD_STEPS]])
+        actions = np.stack([_action(action) for action in entry["actions"][:RECORD_STEPS]])
     except (ValueError, TypeError, OverflowError):
         return None
     record = replay(file.level, _padded(actions), file.rules)
@@ -212,26 +214,26 @@ def witness_in(document: Any, file: LevelFile) -> np.ndarray | None:
     return actions[: int(steps_to_goal(record.done)[0])] if solves else None
 
 
-def _action(given: Any) -> np.ndarray:
-    """Six entries, each one of its choices."""
-    action = np.array(given, np.int32)
+def _action(value: Any) -> np.ndarray:
+    """Convert to an action [6]; raise ValueError if an entry is not one of its choices."""
+    action = np.array(value, np.int32)
     if action.shape != (ACTIONS,) or (action < 0).any() or (action >= CHOICES).any():
         raise ValueError
     return action
 
 
 def _padded(actions: np.ndarray) -> np.ndarray:
-    """[256, 6, 1], doing nothing afterwards."""
+    """Pad actions [step, 6] to [256, 6, 1] with doing nothing."""
     padded = np.zeros((RECORD_STEPS, ACTIONS, 1), np.int32)
     padded[: len(actions), :, 0] = actions
     return padded
 
 
 def empty_file(size: str) -> LevelFile:
-    """A level of a size with nothing in it, and the usual rules.
+    """An empty level of a size, with the default rules.
 
     Raises:
-        UserError: there is no such size.
+        UserError: no such size.
     """
     try:
         return LevelFile(empty_level(size_of(size), 1), TaskParams())

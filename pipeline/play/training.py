@@ -1,10 +1,9 @@
-"""An expert trained for the one level of a page, told about while it trains."""
+"""Training of an expert for a page's level, with progress messages."""
 
 from collections.abc import Iterator
 from math import isnan
 from threading import Event
 from time import monotonic
-from typing import Any
 
 import jax
 import numpy as np
@@ -16,22 +15,21 @@ from levelproof.experts.procedure import Procedure
 from levelproof.experts.verdict.attempts import attempts
 from levelproof.levelgen.files.level_file import LevelFile
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
-from levelproof.pipeline.play.session import places_of
+from levelproof.pipeline.play.session import Message, places_of
 
-ATTEMPTS = 12  # that a page shows at once
-SHOWN_STEPS = 128  # env steps of each
-BETWEEN = 0.8  # s between attempts that are shown
-Message = dict[str, Any]
+ATTEMPTS = 12  # attempts shown side by side
+SHOWN_STEPS = 128  # env steps shown of each attempt
+ATTEMPT_INTERVAL = 0.8  # minimum s between updates of the attempts
 
 
-def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event) -> Iterator[Message]:
-    """Label a level as `generate` labels level files, and tell how far it is; the last message has the verdict.
+def train_level(file: LevelFile, procedure: Procedure, budget: int, stop: Event) -> Iterator[Message]:
+    """Label a level as `generate` labels level files; yield progress messages, the last with the verdict.
 
     Args:
         file: the level and its rules.
-        procedure: how it is labelled.
-        budget: env steps of its expert.
-        stop: set: end before the label is known.
+        procedure: how levels are labelled.
+        budget: env steps the expert may use.
+        stop: once set, training ends without a verdict.
     """
     yield {"stage": "compiling"}
     pool, shown = Pool(budget, procedure, file.rules), monotonic()
@@ -52,19 +50,19 @@ def trained(file: LevelFile, procedure: Procedure, budget: int, stop: Event) -> 
             "env_steps": run.totals().env_steps,
             "curve": [None if isnan(rate) else rate for rate in curve],
         }
-        if monotonic() - shown > BETWEEN:
+        if monotonic() - shown > ATTEMPT_INTERVAL:
             shown, key = monotonic(), jax.random.key(len(curve))
             ((_, _, paused),) = pool.paused()
             params = paused.expert.begun.training.train_state.params
-            seen = attempts(file.level, params, key, procedure.expert, file.rules, ATTEMPTS, SHOWN_STEPS)
-            seen = jax.device_get(seen)
-            each = [places_of(file.level, seen.position[..., i], seen.rotation[..., i]) for i in range(ATTEMPTS)]
-            yield {"attempts": each, "goals": seen.goal.tolist()}
+            played = attempts(file.level, params, key, procedure.expert, file.rules, ATTEMPTS, SHOWN_STEPS)
+            played = jax.device_get(played)
+            each = [places_of(file.level, played.position[..., i], played.rotation[..., i]) for i in range(ATTEMPTS)]
+            yield {"attempts": each, "goals": played.goal.tolist()}
     yield {"stage": "stopped"}
 
 
 def verdict_of(run: TrainingRun) -> Message:
-    """What a page is told of a label; `witness` are actions [step, 6], or None."""
+    """Finish the run; return the message about its label. `witness` are actions [step, 6], or None."""
     env_steps = run.totals().env_steps
     result = run.finish()
     (verdict,) = result.verdicts

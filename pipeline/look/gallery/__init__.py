@@ -1,1 +1,1 @@
-"""A split as a site of plain files: what is written, and the pages that read it (`site/`)."""
+"""A split as a static site: its data files, and the pages that read them (`site/`)."""

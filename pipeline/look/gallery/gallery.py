@@ -1,8 +1,8 @@
-"""Writes a split as a site that browsers open from the disk: pages that are the same for every split, and data.
+"""Writer of a split as a site that browsers open from disk: pages, the same for every split, and data.
 
-Data are scripts that hand over a value, because pages from the disk may load scripts and nothing else:
-`data/about.js` what the split is, `data/columns/` pages of the manifest, `data/worlds/` the initial worlds of BLOCK
-levels each, `data/levels/` a file a level with its row and what its witness does.
+Data files are scripts that pass a value to the page, because pages opened from disk may load only scripts:
+`data/about.js` describes the split, `data/columns/` has pages of the manifest, `data/worlds/` the initial worlds of
+BLOCK levels per file, `data/levels/` a file per level with its row and its witness's motion.
 """
 
 import json
@@ -22,10 +22,10 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.pictures.palette import palette_css
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look import cost
-from levelproof.pipeline.look.gallery.columns import NOTHING, PAGE, columns_of, page_of
-from levelproof.pipeline.look.gallery.worlds import drawn_bodies, states_of, text_of, world_of
+from levelproof.pipeline.look.gallery.columns import NOTHING, PAGE, encode_columns, encode_page
+from levelproof.pipeline.look.gallery.worlds import drawn_bodies, encode_array, states_of, world_of
 from levelproof.pipeline.look.spread import spread
-from levelproof.pipeline.look.things import THINGS, things_of
+from levelproof.pipeline.look.things import ENTITIES, count_entities
 from levelproof.pipeline.read.levels import levels_of, rules_of
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import columns_in, select
@@ -36,20 +36,19 @@ from levelproof.pipeline.store.shown import shown
 from levelproof.pipeline.words import many
 
 SITE = Path(__file__).parent / "site"
-ABOUT = Path("data") / "about.js"  # what makes a folder a gallery
-BLOCK = 64  # levels whose worlds are a file, and whose records are in memory at once
-FOLDER = 1000  # levels whose files are in one folder
-DIGITS = 6  # of numbers in a level's file
+ABOUT = Path("data") / "about.js"  # a folder with this file is a gallery
+BLOCK = 64  # levels per file of worlds, and records in memory at a time
+FOLDER = 1000  # levels per folder of level files
+DIGITS = 6  # significant digits of fractions in a level's file
 STATES = ("position", "rotation", "velocity", "angular_velocity")
-MOVED = (*(f"record/state/{name}" for name in STATES), "record/action", "record/done", "record/goal")
+MOTION = (*(f"record/state/{name}" for name in STATES), "record/action", "record/done", "record/goal")
 
 
 def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
-    """Write the site, and say where it is and how to open it.
+    """Write the site; print its path and how to open it.
 
     Raises:
-        UserError: no split, no level in it that fits, a folder at `out` that is no gallery, or one that cannot be
-            written.
+        UserError: no split, no matching level, `out` exists and is not a gallery, or it cannot be written.
         Failure: the split is damaged.
     """
     manifest, found = _chosen(split, where, most)
@@ -58,10 +57,10 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
         shutil.copytree(SITE, folder, dirs_exist_ok=True)
         (folder / "palette.css").write_text(palette_css(), encoding="utf-8")
         counted = [_write_block(folder, manifest, first) for first in shown(range(0, count, BLOCK), "levels")]
-        things = {name: np.concatenate([of[name] for of in counted]) for name in THINGS}
-        about, values = columns_of(manifest.table, things | {"seconds": cost.seconds_of(manifest.table)})
+        entities = {name: np.concatenate([counts[name] for counts in counted]) for name in ENTITIES}
+        about, values = encode_columns(manifest.table, entities | {"seconds": cost.seconds_of(manifest.table)})
         for page in range(math.ceil(count / PAGE)):
-            _write(folder, f"columns/{page}", page_of(values, page))
+            _write(folder, f"columns/{page}", encode_page(values, page))
         _write(folder, "about", _about(manifest, found, where, about))
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     spread = f"{count:,} of {many(found, 'level')}, spread evenly over their ids,"
@@ -71,50 +70,50 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
 
 
 def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
-    """The rows to show, and how many there are that fit."""
+    """Read the rows to show; also return the number that match."""
     if most < 1:
         raise UserError(f"levels is {most}: a gallery has at least one.")
     everything = require_manifest(split, columns_in(where), compact=True)
     ids = select(everything.table, where).column("level_id").to_numpy()
     if not len(ids):
-        raise UserError(f"No level of {split} fits {where}: choose others with --where.")
+        raise UserError(f"No level of {split} matches {where}: choose others with --where.")
     return require_manifest(split, level_ids=ids[spread(len(ids), most)]), len(ids)
 
 
 def _write_block(folder: Path, manifest: Manifest, first: int) -> dict[str, np.ndarray]:
-    """The worlds of BLOCK levels, and the file of each; how many things they have."""
+    """Write the worlds of BLOCK levels and a file per level; return the levels' entity counts."""
     rows = manifest.table.slice(first, BLOCK)
     stored = rows.column("shard").is_valid().to_numpy()
     levels = jax.tree.map(np.asarray, levels_of(manifest, rows))
     worlds = [jax.tree.map(lambda x, lane=lane: x[..., lane], levels) for lane in range(rows.num_rows)]
     _write(folder, f"worlds/{first // BLOCK}", [world_of(level) for level in worlds])
-    moved = read_rows(manifest.split, rows.filter(stored), MOVED) if stored.any() else {}
+    motion = read_rows(manifest.split, rows.filter(stored), MOTION) if stored.any() else {}
     rules, lane = rules_of(manifest), 0
     between = (rules.frame_skip - 1) * rules.physics.dt
     for number, row in enumerate(rows.to_pylist()):
-        told: dict[str, Any] = {"row": _plain(row)}
+        value: dict[str, Any] = {"row": _plain(row)}
         if stored[number]:
-            told |= _witness(worlds[number], {name: x[..., lane] for name, x in moved.items()}, between, row)
+            value |= _witness(worlds[number], {name: x[..., lane] for name, x in motion.items()}, between, row)
             lane += 1
-        _write(folder, f"levels/{(first + number) // FOLDER}/{row['level_id']}", told)
-    return things_of(levels)
+        _write(folder, f"levels/{(first + number) // FOLDER}/{row['level_id']}", value)
+    return count_entities(levels)
 
 
-def _witness(level: Level, moved: Mapping[str, np.ndarray], between: float, row: Mapping[str, Any]) -> dict[str, str]:
-    """The first episode of a record: bodies that can move, before each step and when the goal is reached; actions.
+def _witness(level: Level, motion: Mapping[str, np.ndarray], between: float, row: Mapping[str, Any]) -> dict[str, str]:
+    """Encode a record's first episode: states of movable bodies, before each step and at the goal, and actions.
 
-    Records keep states before steps. The last of a step's physics steps looks for contacts after the others have moved
-    the bodies, `between` seconds later.
+    Records keep the state before each env step. Its last physics step finds the contact, `between` seconds later, so
+    the state at the goal is extrapolated.
     """
     done, goal, position, rotation, velocity, spin = (
-        moved[f"record/{name}"] for name in ("done", "goal", *(f"state/{name}" for name in STATES))
+        motion[f"record/{name}"] for name in ("done", "goal", *(f"state/{name}" for name in STATES))
     )
     if not succeeds(done[:, None], goal[:, None])[0]:
         raise Failure(f"The record of level {row['level_id']} does not reach the goal: run `levelproof verify`.")
     steps, (bodies, still) = int(steps_to_goal(done[:, None])[0]), drawn_bodies(level)
     follow = lambda x, v: np.concatenate([x[:steps], x[steps - 1 : steps] + between * v[steps - 1 : steps]])
     states = states_of(follow(position, velocity), follow(rotation, spin), bodies[still:])
-    return {"states": states, "actions": text_of(moved["record/action"][:steps].astype(np.uint8))}
+    return {"states": states, "actions": encode_array(motion["record/action"][:steps].astype(np.uint8))}
 
 
 def _about(manifest: Manifest, found: int, where: str | None, columns: list[dict[str, Any]]) -> dict[str, Any]:
@@ -135,18 +134,18 @@ def _about(manifest: Manifest, found: int, where: str | None, columns: list[dict
 
 
 def _plain(value: Any) -> Any:
-    """A row as JSON can have it, its fractions in DIGITS digits."""
+    """Convert a row to JSON types, with fractions rounded to DIGITS digits and NaN as null."""
     if isinstance(value, dict):
-        return {name: _plain(of) for name, of in value.items()}
+        return {name: _plain(entry) for name, entry in value.items()}
     if isinstance(value, list):
-        return [_plain(of) for of in value]
+        return [_plain(entry) for entry in value]
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
     return value
 
 
 def _write(folder: Path, name: str, value: Any) -> None:
-    """A value as a script that hands it over."""
+    """Write a value as a script that passes it to the page."""
     path = folder / "data" / f"{name}.js"
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)

@@ -241,7 +241,7 @@ def test_status_shows_the_progress_of_a_split(split: Path) -> None:
     fragment_paths(split)[0].unlink()
     text = here(["status", "data/5k/s"], split.parents[2]).stdout
     assert "3 of 4 levels committed" in text
-    assert "To go on: levelproof generate levels=4 unit=1 budget=5k executor=inline" in text
+    assert "To resume: levelproof generate levels=4 unit=1 budget=5k executor=inline" in text
 
 
 @pytest.mark.slow

@@ -8,9 +8,9 @@ from PIL import Image
 
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.look.inspect import inspect, survey
-from levelproof.pipeline.look.rows import Asked
+from levelproof.pipeline.look.rows import RowQuery
 from levelproof.pipeline.look.show import show
-from levelproof.pipeline.look.status import look
+from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.store.columns import OF_THE_RUN
 from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.manifest import read_manifest
@@ -39,7 +39,7 @@ def test_the_manifest_names_size_and_distribution(made: Path, capsys: pytest.Cap
     rows = read_manifest(made / SPLIT).table.to_pylist()
     assert [row["size"] for row in rows] == [SIZE] * 4
     assert rows[0]["command"] == f"levelproof generate size={SIZE} budget=5k distribution=free first_level=5 levels=1"
-    inspect(made / SPLIT, Asked(limit=0), False)
+    inspect(made / SPLIT, RowQuery(limit=0), False)
     name, mark = survey(made / SPLIT)["distribution"].values()
     assert name == "free"
     assert f"free ({mark})" in capsys.readouterr().out
@@ -55,7 +55,7 @@ def test_a_size_without_things_of_a_kind(tmp_path: Path, size: str) -> None:
 
 def test_every_question_is_answered(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     split, level, picture = made / SPLIT, made / "level.json", made / "level.png"
-    facts = look(split)
+    facts = read_status(split)
     assert (facts["wanted"], facts["done"]) == (4, 4)
     findings = examine(split)
     assert findings.witnesses > 0
@@ -105,8 +105,8 @@ def test_sample_draws_a_sheet(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["-o", "sheet.gif"], "has to end in .png"),
-        (["levels=101"], "a sheet has room for 100"),
+        (["-o", "sheet.gif"], "must end in .png"),
+        (["levels=101"], "a sheet has room for at most 100"),
         (["size=7"], "choose one of s, m, l"),
         (["distribution=messy"], "there is no distribution messy"),
         (["levels=1", "-o", "/dev/null/sheet.png"], "Cannot write /dev/null/sheet.png"),

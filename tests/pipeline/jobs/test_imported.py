@@ -13,7 +13,7 @@ from levelproof.experts.witness.witness import replay, succeeds
 from levelproof.levelgen.files.level_file import read_level_file
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.pipeline.jobs import imported as module
-from levelproof.pipeline.look.status import look
+from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.verify.verify import examine
@@ -98,7 +98,7 @@ def test_commands_work_on_it(once: Path, tmp_path: Path) -> None:
     split = once / "data/1M/s"
     rows = rows_of(split)
     unsolved = next(row for row in rows if row["label"] == "unsolved")
-    assert look(split)["done"] == look(split)["wanted"] == ROWS
+    assert read_status(split)["done"] == read_status(split)["wanted"] == ROWS
     assert json.loads(here(["inspect", str(split), "--json"], tmp_path).stdout)["levels"] == ROWS
     assert here(["show", str(split), str(unsolved["level_id"]), "-o", "level.png"], tmp_path).returncode == 0
     assert here(["export", str(split), str(unsolved["level_id"]), "-o", "level.json"], tmp_path).returncode == 0
@@ -159,7 +159,7 @@ def test_a_stopped_import_goes_on(once: Path, tmp_path: Path, monkeypatch: pytes
         done = here(words, tmp_path)
     assert done.returncode == 130
     assert "the same command goes on" in done.stderr
-    assert look(tmp_path / "data/1M/s")["done"] < ROWS == look(tmp_path / "data/1M/s")["wanted"]
+    assert read_status(tmp_path / "data/1M/s")["done"] < ROWS == read_status(tmp_path / "data/1M/s")["wanted"]
     done = here(words, tmp_path)
     assert "1 of 2 units are there already" in done.stderr
     want, got = (rows_of(path / "data/1M/s") for path in (once, tmp_path))
@@ -193,7 +193,7 @@ def test_what_is_no_level_is_left_out_and_told(once: Path, tmp_path: Path) -> No
     assert "#2, its polygon/position has a value that is not a finite 32-bit number." in said[1]
     assert "#3, its model/joint_a has values out of range for this size." in said[2]
     assert [row["level_id"] for row in rows_of(tmp_path / "data/1M/s")] == [0, 5, 6]
-    assert look(tmp_path / "data/1M/s")["wanted"] == ROWS - 4
+    assert read_status(tmp_path / "data/1M/s")["wanted"] == ROWS - 4
     want = [rows_of(once / "data/1M/s")[i]["content_hash"] for i in (0, 5, 6)]
     assert [row["content_hash"] for row in rows_of(tmp_path / "data/1M/s")] == want
 

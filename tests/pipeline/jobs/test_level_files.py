@@ -20,8 +20,8 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.jobs.schedule import WorkUnit, plan_units
 from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.look.inspect import survey
-from levelproof.pipeline.look.rows import Asked
-from levelproof.pipeline.look.status import look
+from levelproof.pipeline.look.rows import RowQuery
+from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.read.level_files import LevelUnavailable, level_at, levels_below
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.origins import Origin
@@ -182,11 +182,11 @@ def test_levels_are_regenerated_from_shard_and_file(once: Path, tmp_path: Path) 
 
 def test_questions_are_answered(once: Path, tmp_path: Path) -> None:
     split = once / "data/5k/s"
-    facts = survey(split, Asked("file LIKE '%a.json'"))
+    facts = survey(split, RowQuery("file LIKE '%a.json'"))
     assert (facts["levels"], facts["distribution"]) == (1, None)
     assert here(["inspect", str(split)], tmp_path).stdout.count("level files") == 1
     assert json.loads(here(["inspect", str(split), "--json"], tmp_path).stdout)["levels"] == 2
-    assert look(split)["done"] == look(split)["wanted"] == 2
+    assert read_status(split)["done"] == read_status(split)["wanted"] == 2
     for row in rows_of(split).values():
         done = here(["show", str(split), str(row["level_id"]), "-o", "level.png"], tmp_path)
         assert done.returncode == 0, done.stderr

@@ -16,7 +16,7 @@ from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.look import card as cards
 from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.look.preview import PICTURES, PIXELS, SHOWN
-from levelproof.pipeline.look.readme import SplitFacts, Wishes, readme
+from levelproof.pipeline.look.readme import CardOptions, SplitFacts, readme
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import made_split, played_split
 
@@ -77,7 +77,7 @@ def test_the_page_tells_of_each_split_what_its_manifest_says(dataset: Path) -> N
     assert f"| 128k | random, `kinetix` | `{manifest.config_hash}` | `density=full` | levelproof " in text
     assert "levelproof regenerate manifest=data/128k/s budget=128k out=again" in text
     assert "hf download me/levels" in text
-    assert "cc-by-4.0, chosen by those who publish" in text
+    assert "cc-by-4.0, chosen by the publisher" in text
     figures = re.findall(r"!\[.*\]\((.*)\)", text)
     assert figures == ["figures/solved.png", "figures/solve-rate.png", "figures/steps-to-goal.png"]
     for figure in figures:
@@ -114,7 +114,7 @@ def test_again_overwrites_its_own_card_and_nobody_elses(dataset: Path, tmp_path:
 @pytest.mark.parametrize(("witnesses", "words"), [(0, "n<1K"), (3, "n<1K"), (4, "1K<n<10K"), (6 * 10**6, "1B<n<10B")])
 def test_its_size_is_that_of_its_transitions(witnesses: int, words: str) -> None:
     facts = SplitFacts("1M/s", {"solved": witnesses}, witnesses, witnesses, np.arange(0), 0, 0, "1M", "", "", "", [])
-    header = readme("name", [facts], Wishes(), [], "0.1.0").split("---\n")[1]
+    header = readme("name", [facts], CardOptions(), [], "0.1.0").split("---\n")[1]
     assert yaml.safe_load(header)["size_categories"] == [words]
 
 

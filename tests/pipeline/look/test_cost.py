@@ -4,7 +4,7 @@ import pyarrow as pa
 import pytest
 
 from levelproof.experts.steps import Seconds
-from levelproof.pipeline.look.cost import cost_of, cost_told
+from levelproof.pipeline.look.cost import cost_of, describe_cost
 from levelproof.pipeline.store.columns import COLUMNS
 
 
@@ -20,8 +20,8 @@ def test_a_solved_level_costs_what_the_others_did_too() -> None:
     assert cost is not None
     assert (cost["of"], cost["levels"], cost["per_solved"]) == ("core", 3, pytest.approx(6.0))
     assert cost["seconds"] == Seconds(search=4.0, training=7.0, writing=1.0)._asdict()
-    assert cost_told(cost).startswith("12 core-seconds (0% sampling, 33% search, 58% training")
-    assert cost_told(cost).endswith(", 6 a solved level")
+    assert describe_cost(cost).startswith("12 core-seconds (0% sampling, 33% search, 58% training")
+    assert describe_cost(cost).endswith(", 6 a solved level")
 
 
 def test_where_nobody_counted_or_nothing_is_solved_no_number_is_made_up() -> None:
@@ -29,4 +29,4 @@ def test_where_nobody_counted_or_nothing_is_solved_no_number_is_made_up() -> Non
     cost = cost_of(table(["unsolved"], [Seconds(training=1.0)], "gpu: of some kind"))
     assert cost is not None
     assert (cost["of"], cost["per_solved"]) == ("GPU", None)
-    assert "solved" not in cost_told(cost)
+    assert "solved" not in describe_cost(cost)

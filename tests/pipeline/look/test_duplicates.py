@@ -18,9 +18,9 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
-from levelproof.pipeline.look.duplicates import _numbers, between, compared_in, told, within
+from levelproof.pipeline.look.duplicates import between, comparison_of_source, describe, hash_strings, within
 from levelproof.pipeline.look.inspect import survey
-from levelproof.pipeline.look.rows import Asked
+from levelproof.pipeline.look.rows import RowQuery
 from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.levelgen.opened import handmade_levels
@@ -62,8 +62,8 @@ def test_between_splits_what_is_the_same_is_not_near_as_well() -> None:
 
 
 def test_in_words() -> None:
-    assert told(within(LEVELS, 1)) == "1 same (such as 2 and 0), 2 near (such as 1 and 0)"
-    assert told(within(LEVELS, 0)) == "1 same, 2 near"
+    assert describe(within(LEVELS, 1)) == "1 same (such as 2 and 0), 2 near (such as 1 and 0)"
+    assert describe(within(LEVELS, 0)) == "1 same, 2 near"
 
 
 def test_many_levels_are_compared_at_once() -> None:
@@ -76,10 +76,10 @@ def test_many_levels_are_compared_at_once() -> None:
 
 def test_texts_have_one_number_each() -> None:
     texts = ["", "a", "b", "ab", "a\0", "c1:0123456789abcdef", "c1:0123456789abcdee", "n" * 600, "m" + "n" * 599]
-    alone = [_numbers(pa.chunked_array([[text]]))[0] for text in texts]
+    alone = [hash_strings(pa.chunked_array([[text]]))[0] for text in texts]
     assert len(set(alone)) == len(texts)
-    assert _numbers(pa.chunked_array([texts[:4], texts[4:], texts])).tolist() == [*alone, *alone]
-    assert _numbers(pa.chunked_array([], pa.string())).tolist() == []
+    assert hash_strings(pa.chunked_array([texts[:4], texts[4:], texts])).tolist() == [*alone, *alone]
+    assert hash_strings(pa.chunked_array([], pa.string())).tolist() == []
 
 
 @pytest.fixture(scope="module")
@@ -113,13 +113,13 @@ def test_every_row_has_the_identity_of_its_level(split: Path) -> None:
 
 
 def test_planted_duplicates_are_told(split: Path) -> None:
-    facts = survey(split, Asked(limit=3))
+    facts = survey(split, RowQuery(limit=3))
     assert facts["duplicates"] == {
         "same": {"levels": 1, "pairs": [[COPY, 3]]},
         "near": {"levels": 1, "pairs": [[NUDGED, 5]]},
     }
     assert facts["against"] == {}
-    assert survey(split, Asked("level_id != 3"))["duplicates"]["same"] == NONE
+    assert survey(split, RowQuery("level_id != 3"))["duplicates"]["same"] == NONE
 
 
 @pytest.mark.slow
@@ -147,9 +147,9 @@ def test_the_same_levels_are_found_in_splits_files_and_folders(split: Path, tmp_
 @pytest.mark.slow
 def test_where_there_is_nothing_to_look_in_that_is_said(split: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="neither a split nor a level file"):
-        compared_in(tmp_path)
+        comparison_of_source(tmp_path)
     with pytest.raises(UserError, match="There is no split"):
-        compared_in(tmp_path / "missing")
+        comparison_of_source(tmp_path / "missing")
     (tmp_path / "bad.json").write_text("{}")
     assert_refused(here(["inspect", str(split), "--against", str(tmp_path)], tmp_path), 2, "bad.json")
 
@@ -160,7 +160,7 @@ def handmade(reference: Path) -> Path:
 
 
 def test_no_handmade_level_is_like_another(handmade: Path) -> None:
-    levels = compared_in(handmade)
+    levels = comparison_of_source(handmade)
     assert levels.num_rows == 74
     assert within(levels, 3) == {"same": NONE, "near": NONE}
     assert between(levels, levels, 0)["same"]["levels"] == 74

@@ -17,7 +17,7 @@ from levelproof.pipeline.look.gallery.columns import FLAGS, NOTHING, NUMBERS
 from levelproof.pipeline.look.gallery.gallery import BLOCK, gallery
 from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH, angles
 from levelproof.pipeline.look.reasons import kind_of_reason
-from levelproof.pipeline.look.things import things_of
+from levelproof.pipeline.look.things import count_entities
 from levelproof.pipeline.read.levels import levels_of
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
@@ -62,7 +62,7 @@ def test_columns_are_those_of_the_manifest(site: Path, manifest: Manifest) -> No
         if name in FLAGS:
             found = [None if word is None else word == "yes" for word in found]
         assert found == [kind_of_reason(x) if name == "label_reason" else x for x in table[name].to_pylist()]
-    for name, counts in things_of(levels_of(manifest, table)).items():
+    for name, counts in count_entities(levels_of(manifest, table)).items():
         np.testing.assert_array_equal(numbers(page[name], "<f4"), counts)
 
 
@@ -147,7 +147,7 @@ def test_some_levels(split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith(f"{tmp_path / 'some' / 'index.html'}: 3 of 50 levels, spread evenly over their ids, of ")
     assert second.endswith(f"-m webbrowser {tmp_path / 'some' / 'index.html'}")
-    with pytest.raises(UserError, match=r"No level of .* fits"):
+    with pytest.raises(UserError, match=r"No level of .* matches"):
         gallery(split, tmp_path / "none", "level_id < 0", MOST)
 
 

@@ -26,9 +26,9 @@ from levelproof.pipeline.look.facts import print_facts
 from levelproof.pipeline.look.inspect import inspect, survey
 from levelproof.pipeline.look.plot import plot
 from levelproof.pipeline.look.reasons import kind_of_reason
-from levelproof.pipeline.look.rows import SHOWN, Asked, write_csv
-from levelproof.pipeline.look.shares import solved_by_things
-from levelproof.pipeline.look.things import things_of
+from levelproof.pipeline.look.rows import SHOWN, RowQuery, write_csv
+from levelproof.pipeline.look.shares import solved_by_entities
+from levelproof.pipeline.look.things import count_entities
 from levelproof.pipeline.read import levels as levels_module
 from levelproof.pipeline.read.select import columns_in
 from levelproof.pipeline.store import manifest
@@ -56,7 +56,7 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_what_has_no_number_is_neither_above_nor_below_one(split: Path, condition: str, labels: dict) -> None:
-    assert survey(split, Asked(condition))["labels"] == labels
+    assert survey(split, RowQuery(condition))["labels"] == labels
 
 
 def test_only_the_columns_of_the_question_are_read(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,7 +70,7 @@ def test_only_the_columns_of_the_question_are_read(split: Path, monkeypatch: pyt
         return fragment, table
 
     monkeypatch.setattr(manifest, "read_fragment", counted)
-    facts = survey(split, Asked("env_steps > 0 AND level_id >= 4", limit=2))
+    facts = survey(split, RowQuery("env_steps > 0 AND level_id >= 4", limit=2))
     assert [row["level_id"] for row in facts["rows"]] == [4, 5]
     assert facts["rows"][0].keys() == set(COLUMNS.names)
     assert sorted(read) == [(4, 16)] * 3 + [(4, len(COLUMNS))]
@@ -99,34 +99,34 @@ def test_experts_that_diverged_are_counted(tmp_path: Path, capsys: pytest.Captur
     result = dataclasses.replace(made_result(ids, [Label.UNSOLVED] * 3), verdicts=verdicts)
     commit(job, split, WorkUnit(tuple(ids)), result)
     assert survey(split)["diverged"] == 2
-    assert survey(split, Asked("level_id < 2"))["diverged"] == 1
-    inspect(split, Asked(limit=0), as_json=False)
+    assert survey(split, RowQuery("level_id < 2"))["diverged"] == 1
+    inspect(split, RowQuery(limit=0), as_json=False)
     assert "experts that diverged:           2\n" in capsys.readouterr().out
 
 
 def test_rows_come_as_they_are_asked_for(split: Path) -> None:
-    rows = survey(split, Asked(columns=["label", "level_id"], sort="steps_to_goal DESC", limit=4))["rows"]
+    rows = survey(split, RowQuery(columns=["label", "level_id"], sort="steps_to_goal DESC", limit=4))["rows"]
     assert rows == [
         {"label": label, "level_id": level_id}
         for label, level_id in [("solved", 0), ("solved", 4), ("solved", 8), ("trivial", 1)]  # without a number: last
     ]
     with pytest.raises(UserError, match=r"^Cannot sort by 'no_such' "):
-        survey(split, Asked(sort="no_such"))
-    with pytest.raises(UserError, match=r"^There is no column 'labels': choose of level_id, "):
-        survey(split, Asked(columns=["labels"]))
+        survey(split, RowQuery(sort="no_such"))
+    with pytest.raises(UserError, match=r"^There is no column 'labels': choose from level_id, "):
+        survey(split, RowQuery(columns=["labels"]))
 
 
 def test_rows_as_csv(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of them, block by block; lists and records as JSON."""
     monkeypatch.setattr(rows_module, "BLOCK", 5)
-    write_csv(split, Asked("label != 'trivial'", sort="level_id DESC"), text := io.StringIO())
+    write_csv(split, RowQuery("label != 'trivial'", sort="level_id DESC"), text := io.StringIO())
     read = list(csv.DictReader(text.getvalue().splitlines()))
     assert [int(row["level_id"]) for row in read] == [11, 10, 8, 7, 6, 4, 3, 2, 0]
     assert list(read[0]) == COLUMNS.names
     assert json.loads(read[0]["learning_curve"]) == [None, 0.5]
     assert json.loads(read[0]["versions"])["sampler"] == 1
     assert (read[0]["witness"], read[2]["witness"], read[2]["steps_to_goal"]) == ("", "sampled", "17")
-    write_csv(split, Asked(columns=["row", "label"], limit=1), text := io.StringIO())
+    write_csv(split, RowQuery(columns=["row", "label"], limit=1), text := io.StringIO())
     assert text.getvalue() == "row,label\n0,solved\n"
 
 
@@ -146,10 +146,10 @@ def test_shares_by_what_levels_are_made_of(split: Path, monkeypatch: pytest.Monk
     """Of levels made again from their ids: no shard is read."""
     monkeypatch.setattr(levels_module, "read_rows", None)
     monkeypatch.setattr(shares, "SAMPLED", 8)
-    found = solved_by_things(read_manifest(split, ["label"]), np.arange(12))
+    found = solved_by_entities(read_manifest(split, ["label"]), np.arange(12))
     assert (found["looked_at"], found["of"], found["levels"]) == (8, 12, 4)
     levels = sample_levels(np.arange(12), SIZES["s"])
-    for name, counts in things_of(levels).items():
+    for name, counts in count_entities(levels).items():
         assert set(found[name]) <= {str(count) for count in counts}
         assert sum(of["tried"] for of in found[name].values()) == 4
 
@@ -158,11 +158,11 @@ def test_a_level_file_that_is_gone_leaves_the_other_answers(
     split: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def gone(*_: object) -> None:
-        raise Failure("the file is gone")
+        raise Failure("the file is missing")
 
     monkeypatch.setattr(shares, "levels_of", gone)
-    inspect(split, Asked(limit=0), as_json=False)
-    assert "what levels are made of:         the file is gone\n" in capsys.readouterr().out
+    inspect(split, RowQuery(limit=0), as_json=False)
+    assert "solved, by entities:             the file is missing\n" in capsys.readouterr().out
 
 
 def test_a_terminal_is_not_wider_than_it_is(split: Path) -> None:
@@ -178,7 +178,7 @@ def test_a_terminal_is_not_wider_than_it_is(split: Path) -> None:
 
 @pytest.mark.parametrize("name", ["split.svg", "split.png"])
 def test_a_plot(split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-    plot(split, Asked(), tmp_path / name)
+    plot(split, RowQuery(), tmp_path / name)
     told = capsys.readouterr().out
     assert told.startswith(f"{tmp_path / name}: steps to goal, ")
     assert "solved levels, success rate" in told
@@ -187,7 +187,7 @@ def test_a_plot(split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
     else:
         with Image.open(tmp_path / name) as picture:
             assert picture.width > 1000
-    with pytest.raises(UserError, match=r"has to end in \.svg or \.png"):
-        plot(split, Asked(), tmp_path / "split.pdf")
+    with pytest.raises(UserError, match=r"must end in \.svg or \.png"):
+        plot(split, RowQuery(), tmp_path / "split.pdf")
     with pytest.raises(UserError, match="nothing to draw"):
-        plot(split, Asked("level_id < 0"), tmp_path / name)
+        plot(split, RowQuery("level_id < 0"), tmp_path / name)

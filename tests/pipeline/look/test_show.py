@@ -100,8 +100,8 @@ class TestDoingNothing:
             write_level_file(LevelFile(level, rules), tmp_path / "level.json")
             film = film_of(tmp_path / "level.json", None)
             assert len(film.scenes) <= RECORD_STEPS
-            assert ("so this is its initial world" in film.told) == (rules.frame_skip > 2)
-        assert "what doing nothing does (the first 8.5 s)" in film.told
+            assert ("so this is its initial world" in film.description) == (rules.frame_skip > 2)
+        assert "what doing nothing does (the first 8.5 s)" in film.description
 
     def test_a_world_that_breaks_down_ends(self) -> None:
         level = sample_levels(jnp.array([ends_late()]), SIZES["s"])
@@ -135,7 +135,7 @@ def test_a_level_that_is_not_there(split, tmp_path, level_id) -> None:
 
 @pytest.mark.parametrize("name", ["level.jpg", "level", "level.gif.txt"])
 def test_a_suffix_that_nobody_draws(split, tmp_path, name) -> None:
-    with pytest.raises(UserError, match=r"has to end in \.gif, \.png, \.mp4, \.svg\.$"):
+    with pytest.raises(UserError, match=r"must end in \.gif, \.png, \.mp4, \.svg\.$"):
         show(split, 0, tmp_path / name)
     assert not (tmp_path / name).exists()
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from levelproof.experts.labels import Label
-from levelproof.pipeline.look.status import look
+from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.store.layout import JOB
 from tests.pipeline.made import made_split
 
@@ -14,7 +14,7 @@ from tests.pipeline.made import made_split
 def test_what_is_committed_of_what_is_wanted(tmp_path: Path) -> None:
     split = made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED, Label.TRIVIAL], [Label.SOLVED, Label.SOLVED]])
     (split / JOB).write_text(json.dumps({"command": "levelproof generate", "level_ids": [[1, 3], [9, 9]]}))
-    facts = look(split)
+    facts = read_status(split)
     assert (facts["wanted"], facts["done"]) == (4, 3)
     assert facts["labels"] == {"solved": 1, "trivial": 1, "unsolved": 1}
 
@@ -23,4 +23,4 @@ def test_what_is_committed_of_what_is_wanted(tmp_path: Path) -> None:
 def test_a_damaged_note_is_named(tmp_path: Path, level_ids: str) -> None:
     (tmp_path / JOB).write_text(f'{{"command": "", "level_ids": {level_ids}}}')
     with pytest.raises(Exception, match=r"job.json is damaged: run `levelproof generate` for this split again\.$"):
-        look(tmp_path)
+        read_status(tmp_path)

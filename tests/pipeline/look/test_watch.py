@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from levelproof.experts.labels import Label
-from levelproof.pipeline.look.watch import now, shown, watch
+from levelproof.pipeline.look.watch import progress_table, read_progress, watch
 from levelproof.pipeline.store.events import new_run, tell
 from levelproof.pipeline.store.locks import only_writer
 from tests.pace import patience
@@ -36,7 +36,7 @@ def test_each_look_is_a_line_until_the_run_ends(split: Path, capsys: pytest.Capt
     timer = threading.Timer(patience(0.5), lambda: tell(run, [failed, state("ended", done=8)]))
     with only_writer(split, print):
         timer.start()
-        watch(split, True, Console(), every=0.1)
+        watch(split, True, Console(), interval=0.1)
     facts = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [of["running"] for of in facts] == [True] * (len(facts) - 1) + [False]
     assert len(facts) > 1
@@ -46,17 +46,17 @@ def test_each_look_is_a_line_until_the_run_ends(split: Path, capsys: pytest.Capt
 
 def test_a_run_that_died_is_not_at_work_and_a_silent_one_is_told(split: Path) -> None:
     tell(new_run(split), [state("progress", age=600.0)])
-    assert not now(split)["running"]
+    assert not read_progress(split)["running"]
     with only_writer(split, print):
-        facts = now(split)
+        facts = read_progress(split)
         assert facts["running"]
         console = Console(width=200)
         with console.capture() as captured:
-            console.print(shown(facts))
+            console.print(progress_table(facts))
     text = captured.get()
     assert "4 of 8 committed, 75.0% of them solved" in text
-    assert "told 10 min ago" in text
-    assert "2, the most silent for 10 min" in text
+    assert "logged 10 min ago" in text
+    assert "2, longest silent for 10 min" in text
 
 
 def test_a_cause_is_told_as_it_is_and_no_terminal_obeys_it(split: Path) -> None:
@@ -69,6 +69,6 @@ def test_a_cause_is_told_as_it_is_and_no_terminal_obeys_it(split: Path) -> None:
 
 
 def test_where_nothing_is_told_a_sentence_says_so(split: Path) -> None:
-    assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has told anything")
+    assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has logged its state")
     tell(new_run(split), [{"time": 1.0, "event": "progress"}])  # damaged
-    assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has told anything")
+    assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has logged its state")

@@ -105,7 +105,7 @@ def test_edits_are_made_taken_back_and_refused(page: ClientConnection) -> None:
 
 @pytest.mark.campaign
 def test_an_expert_is_trained_while_the_page_looks_on(page: ClientConnection, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "BETWEEN", 0.0)
+    monkeypatch.setattr(training, "ATTEMPT_INTERVAL", 0.0)
     assert "error" not in ask(page, "train")
     told, end = [], time.monotonic() + patience(ANSWER_SECONDS)
     while not told or told[-1].get("stage") not in ("done", "failed"):
