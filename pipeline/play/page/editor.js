@@ -1,20 +1,20 @@
-// Edits with the pointer and with buttons; the server makes them, so that a level is always one that the engine takes.
+// Edits by pointer and buttons. The server applies them, so that the level is always valid for the engine.
 "use strict";
 
 (function () {
   const { metresOf } = window.levelproof;
   const at = (id) => document.getElementById(id);
-  const NEAR = 0.14; // m, from a joint or thruster that a click means
-  const TURN = Math.PI / 12; // rad, of a click
-  const GROW = 1.15; // times as large by a click
+  const NEAR = 0.14; // m; a click this near selects a joint or thruster
+  const TURN = Math.PI / 12; // rad per click
+  const GROW = 1.15; // factor per click
   const TOOLS = {
-    select: ["Select", "Click a body, joint or thruster. Drag a body to move it, with all that is joined to it."],
-    rectangle: ["Rectangle", "Click where its centre should be."],
-    triangle: ["Triangle", "Click where its centre should be."],
-    circle: ["Circle", "Click where its centre should be."],
+    select: ["Select", "Click a body, joint or thruster. Drag a body to move it with everything joined to it."],
+    rectangle: ["Rectangle", "Click where the centre should be."],
+    triangle: ["Triangle", "Click where the centre should be."],
+    circle: ["Circle", "Click where the centre should be."],
     joint: ["Motor joint", "Click where two bodies overlap."],
     fixed: ["Fixed joint", "Click where two bodies overlap."],
-    thruster: ["Thruster", "Press on a body, drag to where it should push, and let go."],
+    thruster: ["Thruster", "Press on a body, drag in the direction of the push, and release."],
   };
 
   class Editor {
@@ -31,12 +31,12 @@
       this.take("select");
     }
 
-    button(words, deed, attributes = {}) {
+    button(words, action, attributes = {}) {
       const button = document.createElement("button");
       button.type = "button";
       button.textContent = words;
       for (const [name, value] of Object.entries(attributes)) button.setAttribute(name, value);
-      button.addEventListener("click", deed);
+      button.addEventListener("click", action);
       return button;
     }
 
@@ -46,18 +46,18 @@
       at("hint").textContent = TOOLS[tool][1];
     }
 
-    // A level as the server describes it, after an edit or from a file.
+    // Show a level as the server describes it, after an edit or from a file.
     open(level) {
       this.level = level;
       at("undo").disabled = !level.undo;
       at("redo").disabled = !level.redo;
       if (this.stage.selected && !this.stage.pointOf(this.stage.selected)) this.stage.selected = null;
-      this.tell();
+      this.describeSelection();
     }
 
-    async change(ask, words) {
+    async change(name, fields) {
       try {
-        this.changed(await this.link.ask(ask, words));
+        this.changed(await this.link.ask(name, fields));
         levelproof.problem("");
       } catch (error) {
         levelproof.problem(error.message);
@@ -65,14 +65,14 @@
       }
     }
 
-    edit(name, ...words) {
-      return this.change("edit", { name, with: words });
+    edit(name, ...values) {
+      return this.change("edit", { name, with: values });
     }
 
     async down(event) {
       const [x, y] = metresOf(this.stage.canvas, event);
       this.stage.canvas.setPointerCapture(event.pointerId);
-      this.stage.show(this.stage.world.start, null); // edits are of the start
+      this.stage.show(this.stage.world.start, null); // edits apply to the initial world
       if (this.tool === "thruster") this.drag = { from: [x, y] };
       else if (this.tool === "joint" || this.tool === "fixed") await this.edit("add_joint", x, y, this.tool === "fixed");
       else if (this.tool !== "select") {
@@ -81,11 +81,11 @@
       } else await this.pick(x, y);
     }
 
-    // Selects what is at a point: a joint or thruster that is near, else the uppermost body.
+    // Select a joint or thruster near a point, else the topmost body there.
     async pick(x, y) {
       for (const kind of ["thruster", "joint"]) {
-        const things = kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters;
-        for (let index = 0; index < things.length; index++) {
+        const entities = kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters;
+        for (let index = 0; index < entities.length; index++) {
           const point = this.stage.pointOf({ kind, index });
           if (Math.hypot(point[0] - x, point[1] - y) < NEAR) return this.select({ kind, index });
         }
@@ -120,18 +120,18 @@
       else if (far && drag.index !== undefined) await this.edit("move", this.level.bodies[drag.index], drag.start[0] + dx, drag.start[1] + dy);
     }
 
-    select(thing) {
-      this.stage.selected = thing;
+    select(entity) {
+      this.stage.selected = entity;
       this.stage.draw();
-      this.tell();
+      this.describeSelection();
     }
 
-    // The selected thing, and buttons for what can be done with it.
-    tell() {
-      const thing = this.stage.selected;
-      at("selected").hidden = !thing;
-      if (!thing) return;
-      const { kind, index } = thing;
+    // Show what is selected, and buttons for its edits.
+    describeSelection() {
+      const entity = this.stage.selected;
+      at("selected").hidden = !entity;
+      if (!entity) return;
+      const { kind, index } = entity;
       const number = this.level[{ body: "bodies", joint: "joints", thruster: "thrusters" }[kind]][index];
       const remove = this.button("Delete", () => { this.stage.selected = null; this.edit("delete", kind, number); });
       if (kind !== "body") {
@@ -158,8 +158,8 @@
 
     key(event) {
       if (/^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
-      const undoes = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z";
-      if (undoes) this.change(event.shiftKey ? "redo" : "undo");
+      const isUndo = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z";
+      if (isUndo) this.change(event.shiftKey ? "redo" : "undo");
       else if (event.key === "Delete" && this.stage.selected) [...at("deeds").children].at(-1).click();
       else return;
       event.preventDefault();

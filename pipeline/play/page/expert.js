@@ -1,4 +1,4 @@
-// An expert in training: how far it is, its learning curve, and attempts of it as it is now.
+// An expert in training: its progress, learning curve, and current attempts.
 "use strict";
 
 (function () {
@@ -6,11 +6,11 @@
   const at = (id) => document.getElementById(id);
   const STAGES = {
     compiling: "Loading the programs of this size; the first time takes a minute",
-    searching: "Random play and a search look for a first success",
+    searching: "Random play and a search try for a first success",
     training: "The expert trains",
     stopped: "Stopped",
   };
-  const SMALL = 160; // pixels of an attempt
+  const SMALL = 160; // px; side of an attempt's picture
 
   class Expert {
     constructor(link, stage, solved) {
@@ -38,8 +38,8 @@
       if (running) at("learning").hidden = at("attempts").hidden = true;
     }
 
-    // What the server tells of the training.
-    told(message) {
+    // Show a progress message of the server.
+    update(message) {
       if (message.attempts) return this.attempts(message);
       const { stage } = message;
       const steps = message.env_steps === undefined ? "" : `: ${message.env_steps.toLocaleString("en")} env steps`;

@@ -1,25 +1,25 @@
-// The websocket to the engine: questions with answers, and what is told without a question.
+// The websocket to the server: requests with answers, and progress of training without a request.
 "use strict";
 
 (function () {
   class Link {
-    constructor(told) {
+    constructor(progress) {
       this.waiting = new Map();
-      this.asked = 0;
+      this.requests = 0;
       this.socket = new WebSocket(`ws://${location.host}/socket`);
       this.ready = new Promise((resolve, reject) => {
         this.socket.addEventListener("open", resolve);
-        this.socket.addEventListener("error", () => reject(new Error("The engine cannot be reached.")));
+        this.socket.addEventListener("error", () => reject(new Error("Cannot reach the engine.")));
       });
       this.socket.addEventListener("close", () => {
-        const gone = new Error("The engine has ended: run `levelproof play` again and reload this page.");
-        for (const { reject } of this.waiting.values()) reject(gone);
+        const closed = new Error("The engine has stopped: run `levelproof play` again and reload this page.");
+        for (const { reject } of this.waiting.values()) reject(closed);
         this.waiting.clear();
-        levelproof.problem(gone.message);
+        levelproof.problem(closed.message);
       });
       this.socket.addEventListener("message", (event) => {
         const message = JSON.parse(event.data);
-        if (message.training) return told(message.training);
+        if (message.training) return progress(message.training);
         const waiting = this.waiting.get(message.id);
         this.waiting.delete(message.id);
         if (message.error) waiting.reject(new Error(message.error));
@@ -27,11 +27,11 @@
       });
     }
 
-    // The answer to a question; an Error with a sentence where there is none.
-    async ask(name, words = {}) {
+    // Send a request and return its answer; throw an Error if the server reports one.
+    async ask(name, fields = {}) {
       await this.ready;
-      const id = ++this.asked;
-      this.socket.send(JSON.stringify({ ask: name, id, ...words }));
+      const id = ++this.requests;
+      this.socket.send(JSON.stringify({ ask: name, id, ...fields }));
       return new Promise((resolve, reject) => this.waiting.set(id, { resolve, reject }));
     }
   }

@@ -1,13 +1,13 @@
-// Puts the page together.
+// Entry point: connects the parts of the page.
 "use strict";
 
 (function () {
   const { Link, Stage, Player, Editor, Expert } = window.levelproof;
   const at = (id) => document.getElementById(id);
   const stage = new Stage(at("stage"));
-  const link = new Link((message) => expert.told(message));
+  const link = new Link((message) => expert.update(message));
 
-  // Every part sees a level that is new or has changed.
+  // Show a new or changed level in every part.
   function opened(level) {
     stage.open(level);
     player.open(level);
@@ -21,25 +21,25 @@
     player.film(film);
   });
 
-  async function asked(name, words) {
+  async function open(name, fields) {
     try {
-      opened(await link.ask(name, words));
+      opened(await link.ask(name, fields));
       levelproof.problem("");
     } catch (error) {
       levelproof.problem(error.message);
     }
   }
 
-  async function saved(witness) {
+  async function save(witness) {
     try {
       const { document: level } = await link.ask("save");
       if (!witness) delete level.witness;
-      const link_ = Object.assign(document.createElement("a"), {
+      const anchor = Object.assign(document.createElement("a"), {
         href: URL.createObjectURL(new Blob([JSON.stringify(level)], { type: "application/json" })),
         download: witness ? "witness.json" : "level.json",
       });
-      link_.click();
-      setTimeout(() => URL.revokeObjectURL(link_.href), 10000);
+      anchor.click();
+      setTimeout(() => URL.revokeObjectURL(anchor.href), 10000);
     } catch (error) {
       levelproof.problem(error.message);
     }
@@ -49,18 +49,18 @@
     const [file] = event.target.files;
     if (!file) return;
     try {
-      await asked("load", { document: JSON.parse(await file.text()) });
+      await open("load", { document: JSON.parse(await file.text()) });
     } catch {
-      levelproof.problem(`${file.name} is no level file: it is not JSON.`);
+      levelproof.problem(`${file.name} is not a level file: it is not JSON.`);
     }
     event.target.value = "";
   });
   at("new").addEventListener("change", async () => {
-    if (at("new").value) await asked("empty", { size: at("new").value });
+    if (at("new").value) await open("empty", { size: at("new").value });
     at("new").value = "";
   });
-  at("save").addEventListener("click", () => saved(false));
-  at("save-witness").addEventListener("click", () => saved(true));
+  at("save").addEventListener("click", () => save(false));
+  at("save-witness").addEventListener("click", () => save(true));
 
   link.ask("level").then((level) => {
     at("new").replaceChildren(new Option("…", ""), ...level.sizes.map((size) => new Option(`size ${size}`, size)));

@@ -1,10 +1,10 @@
-// Hands on the controls: keys and pads to actions, env steps of the engine at their own pace, slower if wished.
+// Manual control: keys and pads set actions; the engine takes env steps in real time, or slower.
 "use strict";
 
 (function () {
   const { liveEntries, entryName } = window.levelproof;
   const at = (id) => document.getElementById(id);
-  // As in the reference's editor, and letters for the motors that it has no keys for: entry of the action, its value.
+  // Key: [entry of the action, value]; as in the reference's editor, plus letters for the motors it has no keys for.
   const KEYS = {
     ArrowLeft: [0, 1], ArrowRight: [0, 2], ArrowUp: [1, 1], ArrowDown: [1, 2],
     a: [2, 1], d: [2, 2], w: [3, 1], s: [3, 2], 1: [4, 1], 2: [5, 1],
@@ -33,23 +33,23 @@
       at("watch").disabled = at("save-witness").disabled = !level.witness;
     }
 
-    // A button for each key that something obeys.
+    // Show a button for each key that an actuator obeys.
     pads() {
       const live = liveEntries(this.stage.world);
       const keys = Object.entries(KEYS).filter(([, [entry]]) => live.includes(entry)).sort((a, b) => a[1][0] - b[1][0]);
       this.buttons = new Map();
       at("pads").replaceChildren(...keys.map(([key, [entry, value]]) => {
         const button = document.createElement("button");
-        const does = entry < 4 ? ["", "forward", "back"][value] : "on";
+        const effect = entry < 4 ? ["", "forward", "back"][value] : "on";
         button.type = "button";
         button.style.setProperty("--colour", `var(--binding-${entry})`);
-        button.textContent = `${NAMES[key] || key} ${entryName(entry)} ${does}`;
+        button.textContent = `${NAMES[key] || key} ${entryName(entry)} ${effect}`;
         button.addEventListener("pointerdown", (event) => { button.setPointerCapture(event.pointerId); this.press(key); });
         for (const end of ["pointerup", "pointercancel"]) button.addEventListener(end, () => this.release(key));
         this.buttons.set(key, button);
         return button;
       }));
-      if (!keys.length) at("pads").textContent = "Nothing acts in this level: give it a motor or a thruster.";
+      if (!keys.length) at("pads").textContent = "Nothing acts in this level: add a motor or a thruster.";
     }
 
     key(event, down) {
@@ -124,7 +124,7 @@
     end(moment) {
       this.play(false);
       this.ended = true;
-      const over = moment.timestep >= this.level.steps ? "The time is over." : "Green has touched red.";
+      const over = moment.timestep >= this.level.steps ? "Time is up." : "Green touched red.";
       this.say(moment.goal ? `Solved in ${moment.timestep} steps: save it below.` : over, moment.goal);
       if (moment.goal) at("watch").disabled = at("save-witness").disabled = false;
     }
@@ -138,7 +138,7 @@
       this.say("");
     }
 
-    // The witness, step by step.
+    // Play the witness.
     async watch() {
       this.film(await this.link.ask("play"));
     }

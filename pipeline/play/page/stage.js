@@ -1,4 +1,4 @@
-// The canvas: the world as it is now, and what is selected.
+// The canvas: the current world, and what is selected.
 "use strict";
 
 (function () {
@@ -19,7 +19,7 @@
       });
     }
 
-    // Shows a level as the server describes it.
+    // Show a level as the server describes it.
     open(level) {
       this.level = level;
       this.world = worldOf(level.world);
@@ -51,12 +51,12 @@
       context.setLineDash([]);
     }
 
-    // Where a body, a joint or a thruster is, m; `index` counts what is drawn.
+    // Position of a body, joint or thruster, m; `index` is in drawing order.
     pointOf({ kind, index }) {
       const places = this.places || this.world.start;
       if (kind === "body") return index < this.world.bodies.length ? [places[3 * index], places[3 * index + 1]] : null;
-      const thing = (kind === "joint" ? this.world.joints : this.world.thrusters)[index];
-      return thing ? attached(places, thing.body, thing.anchor || thing.position) : null;
+      const entity = (kind === "joint" ? this.world.joints : this.world.thrusters)[index];
+      return entity ? attached(places, entity.body, entity.anchor || entity.position) : null;
     }
   }
 

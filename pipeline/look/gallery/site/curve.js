@@ -1,11 +1,11 @@
-// A learning curve: the success rate of training per update, null where no episode ended.
+// Learning curve: success rate of training per update, null if no episode ended.
 "use strict";
 
 (function () {
-  const [LEFT, RIGHT, TOP, BOTTOM] = [30, 314, 8, 102]; // of the view box 0 0 320 120
-  const MAX_DOTS = 60;
+  const [LEFT, RIGHT, TOP, BOTTOM] = [30, 314, 8, 102]; // within the view box 0 0 320 120
+  const MAX_DOTS = 60; // with more points, only the line is drawn
 
-  // Draws rates into an <svg> within a <figure>, which is hidden where there is no curve.
+  // Draw rates into an <svg> in a <figure>; hide the figure if there is no curve.
   function drawCurve(svg, rates) {
     const known = rates.map((rate, update) => [update, rate]).filter(([, rate]) => rate !== null);
     const figure = svg.closest("figure");

@@ -1,24 +1,24 @@
-// What the gallery knows: data come as scripts that hand over a value, because pages that are opened from the disk may
-// load scripts and nothing else. Knows nothing of how anything looks.
+// Data of the gallery. Data files are scripts that pass a value to `arrived`, because pages opened from disk may load
+// only scripts. Knows nothing of presentation.
 "use strict";
 
 (function () {
   const { bytesOf, worldOf } = window.levelproof;
-  const BLOCKS = 128; // of worlds that are kept
+  const BLOCKS = 128; // maximum number of blocks of worlds kept
   const waiting = new Map(); // name: {promise, resolve, reject}
 
   // Called by every data file.
   window.levelproof.arrived = function (name, value) {
-    const asked = waiting.get(name);
-    if (asked) asked.resolve(value);
+    const pending = waiting.get(name);
+    if (pending) pending.resolve(value);
   };
 
-  // The value of a data file. Rejects where there is none.
+  // Load the value of a data file; reject if there is none.
   function load(name) {
     if (waiting.has(name)) return waiting.get(name).promise;
-    const asked = {};
-    asked.promise = new Promise((resolve, reject) => Object.assign(asked, { resolve, reject }));
-    waiting.set(name, asked);
+    const pending = {};
+    pending.promise = new Promise((resolve, reject) => Object.assign(pending, { resolve, reject }));
+    waiting.set(name, pending);
     const script = document.createElement("script");
     script.src = `data/${name}.js`;
     const ended = () => {
@@ -27,24 +27,24 @@
     };
     script.onload = () => {
       ended();
-      asked.reject(new Error(`data/${name}.js has something else`)); // nothing, if it has arrived
+      pending.reject(new Error(`data/${name}.js has other data`)); // no effect if the value has arrived
     };
     script.onerror = () => {
       ended();
-      asked.reject(new Error(`data/${name}.js cannot be read`));
+      pending.reject(new Error(`data/${name}.js cannot be read`));
     };
     document.head.append(script);
-    return asked.promise;
+    return pending.promise;
   }
 
-  // The manifest's columns, which come page by page: `rows` of them are there. Numbers are NaN where there is none,
-  // words are places in the column's list.
+  // The manifest's columns, loaded page by page; `rows` have arrived. Missing numbers are NaN; words are indices into
+  // the column's list.
   class Columns {
     constructor(about) {
       this.about = about;
       this.rows = 0;
       this.values = {};
-      this.numbers = new Map(); // level id: number of its row
+      this.numbers = new Map(); // level id: row index
       for (const { name, words, bits } of about.columns) {
         const Kind = words ? Uint16Array : bits === 64 ? Float64Array : Float32Array;
         this.values[name] = new Kind(about.levels);
@@ -70,23 +70,23 @@
     }
   }
 
-  // Worlds by the number of their rows, in blocks; the blocks that were asked for last are kept.
+  // Worlds by row, in blocks; the most recently used blocks are kept.
   class Worlds {
     constructor(about) {
       this.about = about;
-      this.blocks = new Map(); // number: texts
+      this.blocks = new Map(); // block index: base64 strings
     }
 
     has(row) {
       return this.blocks.has(Math.floor(row / this.about.block));
     }
 
-    // The world, if its block is there; else null.
+    // The world if its block is loaded, else null.
     now(row) {
       const number = Math.floor(row / this.about.block);
       const block = this.blocks.get(number);
       if (!block) return null;
-      this.blocks.delete(number); // the last that was asked for goes to the end
+      this.blocks.delete(number); // move to the end: most recently used
       this.blocks.set(number, block);
       return worldOf(block[row % this.about.block]);
     }

@@ -1,27 +1,28 @@
-// Draws a world into a canvas as levelgen/pictures/scene.py draws it into a picture: bodies by role, those that cannot
-// move hatched; a ring is a revolute joint, a crossed square a fixed one; a motor's ring has its binding's colour and
-// an arrow while it runs, a thruster is a nozzle with a flame while it fires.
+// Draws a world on a canvas like levelgen/pictures/scene.py: bodies by role, immovable ones hatched; a ring is a
+// revolute joint, a crossed square a fixed one; a motor's ring has its binding's colour, and an arrow while it runs; a
+// thruster is a nozzle, with a flame while it fires.
 //
-// Knows nothing of where worlds come from. Lengths are metres, y is upwards, angles are radians. Colours are those of
-// palette.css. A world is {still, bodies, joints, thrusters, start}; places are [x, y, angle] of one body after the
-// other; an action is six numbers: four motors (0 off, 1 forward, 2 back), two thrusters (0 off, 1 on).
+// Knows nothing of where worlds come from. Lengths in metres, y up, angles in radians; colours from palette.css. A
+// world is {still, bodies, joints, thrusters, start}; its first `still` bodies are immovable. Places are x, y, angle of
+// one body after the other. An action is six numbers: 4 motors (0 off, 1 forward, 2 back), 2 thrusters (0 off, 1 on).
 "use strict";
 window.levelproof = window.levelproof || {};
 
 (function () {
-  const SIDE = 5; // m, of the world
-  const BORDER = 0.08; // m, of the walls that show
-  const VIEW = SIDE + 2 * BORDER; // m, of a picture: it is square
-  const PIXELS = 1200; // most, of a canvas
-  const EDGE = 0.022; // m, width of the line around a shape
-  const LENGTH = 1 / 2000; // m, what lengths are counted in
-  const ANGLE = 1 / 10000; // rad
-  const MOTORS = 4; // entries of an action; thrusters follow
+  const SIDE = 5; // m; side of the world
+  const BORDER = 0.08; // m; visible part of the walls
+  const VIEW = SIDE + 2 * BORDER; // m; side of the square picture
+  const PIXELS = 1200; // maximum side of a canvas
+  const EDGE = 0.022; // m; width of an outline
+  const LENGTH = 1 / 2000; // m; unit of encoded lengths
+  const ANGLE = 1 / 10000; // rad; unit of encoded angles
+  const MOTORS = 4; // first entries of an action; thrusters follow
   const ROLES = ["plain", "green", "blue", "red"];
   const NOZZLE = [[0.06, 0.045], [0.06, -0.045], [-0.12, -0.1], [-0.12, 0.1]];
-  const FLAMES = [1.0, 0.6]; // lengths of the tongues
+  const FLAMES = [1.0, 0.6]; // relative lengths of a flame's tongues
   const TURN = 2 * Math.PI;
 
+  // Decode base64.
   function bytesOf(text) {
     const letters = atob(text);
     const bytes = new Uint8Array(letters.length);
@@ -29,7 +30,7 @@ window.levelproof = window.levelproof || {};
     return bytes;
   }
 
-  // The world that a gallery's text means (pipeline/look/gallery/worlds.py).
+  // Decode a world (pipeline/look/gallery/worlds.py).
   function worldOf(text) {
     const numbers = new Int16Array(bytesOf(text).buffer);
     let at = 0;
@@ -58,7 +59,7 @@ window.levelproof = window.levelproof || {};
     };
   }
 
-  // The places of all bodies at each time, from those of the bodies that move.
+  // Decode the places of all bodies at each time; only movable bodies are stored.
   function statesOf(world, text, times) {
     const numbers = new Int16Array(bytesOf(text).buffer);
     const moving = 3 * (world.bodies.length - world.still);
@@ -71,7 +72,7 @@ window.levelproof = window.levelproof || {};
     });
   }
 
-  // Places a part of the way from one time to the next; angles take the short way.
+  // Interpolate places between two times; `part` is from 0 to 1. Angles turn the shorter way.
   function between(before, after, part, into) {
     for (let i = 0; i < before.length; i++) {
       let step = after[i] - before[i];
@@ -81,7 +82,7 @@ window.levelproof = window.levelproof || {};
     return into;
   }
 
-  // Entries of an action that some motor or thruster obeys.
+  // Entries of an action that a motor or thruster obeys.
   function liveEntries(world) {
     const motors = world.joints.filter((joint) => joint.motor && !joint.auto).map((joint) => joint.binding);
     return [...new Set([...motors, ...world.thrusters.map((thruster) => thruster.binding)])].sort((a, b) => a - b);
@@ -96,7 +97,7 @@ window.levelproof = window.levelproof || {};
     return `rgb(${parts.map((part) => Math.round(part * factor)).join(",")})`;
   }
 
-  // The page's colours as they are now: by light or by dark.
+  // The page's current colours, light or dark.
   function coloursOf(element = document.documentElement) {
     const style = getComputedStyle(element);
     const named = (name) => style.getPropertyValue(`--${name}`).trim();
@@ -114,7 +115,7 @@ window.levelproof = window.levelproof || {};
 
   let hatching = null;
 
-  // Diagonal lines over what cannot move.
+  // Pattern of diagonal lines for immovable bodies.
   function hatch(context) {
     if (!hatching) {
       const tile = document.createElement("canvas");
@@ -178,7 +179,7 @@ window.levelproof = window.levelproof || {};
     context.restore();
   }
 
-  // A point of a body's frame in the world.
+  // World coordinates of a point in a body's frame.
   function attached(places, body, [x, y]) {
     const [cos, sin] = [Math.cos(places[3 * body + 2]), Math.sin(places[3 * body + 2])];
     return [places[3 * body] + x * cos - y * sin, places[3 * body + 1] + x * sin + y * cos];
@@ -207,7 +208,7 @@ window.levelproof = window.levelproof || {};
     context.restore();
   }
 
-  // 1: the motor turns body b counterclockwise against body a, -1: clockwise, 0: it is off.
+  // 1: the motor turns body b counterclockwise relative to body a; -1: clockwise; 0: off.
   function turnOf(joint, action) {
     if (!action || !joint.motor) return 0;
     return [0, 1, -1][joint.auto ? 1 : action[joint.binding]] || 0;
@@ -260,7 +261,7 @@ window.levelproof = window.levelproof || {};
     context.stroke();
   }
 
-  // Where bodies that move have been: a line for each, in its role's colour.
+  // Draw the path of each movable body, in its role's colour.
   function drawTrails(context, world, states, until, colours) {
     context.lineWidth = 0.02;
     context.globalAlpha = 0.55;
@@ -273,7 +274,7 @@ window.levelproof = window.levelproof || {};
     context.globalAlpha = 1;
   }
 
-  // A world into a square canvas, all of it. `now`: {places, action, trails: {states, until}}, each of them optional.
+  // Draw the whole world on a square canvas. `now`: {places, action, trails: {states, until}}, each optional.
   function drawWorld(canvas, world, colours, now = {}) {
     const context = canvas.getContext("2d");
     const places = now.places || world.start;
@@ -299,14 +300,14 @@ window.levelproof = window.levelproof || {};
     for (const joint of world.joints) drawJoint(context, joint, places, now.action, colours);
   }
 
-  // Gives a canvas as many pixels as it takes on the screen; whether it is there at all.
+  // Match a canvas's resolution to its size on screen; return whether it is visible.
   function fit(canvas) {
     const pixels = Math.min(PIXELS, Math.round(canvas.clientWidth * devicePixelRatio));
     if (pixels && canvas.width !== pixels) canvas.width = canvas.height = pixels;
     return pixels > 0;
   }
 
-  // A pointer's position in the world that a canvas shows, m.
+  // Position of a pointer in the world that a canvas shows, m.
   function metresOf(canvas, event) {
     const box = canvas.getBoundingClientRect();
     const scale = VIEW / box.width;

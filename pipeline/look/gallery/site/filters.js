@@ -1,22 +1,22 @@
-// Which levels are chosen, and in which order. Knows columns, and nothing of how anything looks.
+// Which levels are chosen, and in which order. Knows columns, and nothing of presentation.
 "use strict";
 
 (function () {
-  const BINS = 36; // of a histogram
+  const BINS = 36; // bins of a histogram
 
-  // Conditions on columns: a set of words, or a range of numbers. A row that fails `failures[row]` of them is chosen
-  // where that is 0; a histogram counts the rows that fail no other condition than its own.
+  // Conditions on columns: a set of words, or a range of numbers. A row fails `failures[row]` conditions and is chosen
+  // if that is 0. A histogram counts the rows that fail at most its own condition.
   class Choice {
     constructor(columns) {
       this.columns = columns;
-      this.conditions = new Map(); // column: Set of places of words, or [low, high]
-      this.fails = new Map(); // column: a 1 for each row that its condition leaves out
+      this.conditions = new Map(); // column: Set of word indices, or [low, high]
+      this.fails = new Map(); // column: 1 for each row that fails its condition, else 0
       this.failures = new Uint8Array(columns.about.levels);
       this.sortedBy = ["level_id", 1]; // column, and 1 ascending or -1 descending
       this.order = null;
     }
 
-    // null: no condition.
+    // Set a column's condition; null removes it.
     set(name, condition) {
       if (condition) this.conditions.set(name, condition);
       else this.conditions.delete(name);
@@ -32,8 +32,8 @@
       this.order = null;
     }
 
-    // More rows have come.
-    grown() {
+    // Apply the conditions to newly loaded rows.
+    rowsAdded() {
       this.order = null;
       for (const name of this.conditions.keys()) this._judge(name);
     }
@@ -60,7 +60,7 @@
       this.fails.set(name, fails);
     }
 
-    // Numbers of the chosen rows in their order; those without a number come last.
+    // Indices of the chosen rows, sorted; NaN comes last.
     rows() {
       const [name, direction] = this.sortedBy;
       if (!this.order) {
@@ -77,7 +77,7 @@
       return this.order.filter((row) => this.failures[row] === 0);
     }
 
-    // How many rows have each word, of those that fail no other condition.
+    // Count the rows of each word among those that fail no other condition.
     counts(name, words) {
       const found = new Uint32Array(words);
       const [values, own] = [this.columns.values[name], this.fails.get(name)];
@@ -87,7 +87,7 @@
       return found;
     }
 
-    // The same for a histogram's bins, and how many rows are in each bin whatever the conditions.
+    // Count the rows in each bin: all of them, and those that fail no other condition.
     histogram(name, bins) {
       const [all, chosen] = [new Uint32Array(bins.count), new Uint32Array(bins.count)];
       const [values, own] = [this.columns.values[name], this.fails.get(name)];
@@ -101,7 +101,7 @@
     }
   }
 
-  // Bins that hold all numbers of a column; null where there are fewer than two different ones.
+  // Bins that cover a column's numbers; null if it has fewer than two distinct ones.
   function binsOf(columns, name) {
     const values = columns.values[name];
     let [low, high, whole] = [Infinity, -Infinity, true];

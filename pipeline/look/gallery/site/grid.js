@@ -1,31 +1,31 @@
-// The grid of drawn levels: only the cells that are on the screen are there, however many levels are chosen.
+// The grid of drawn levels. Only cells on the screen exist, however many levels are chosen.
 "use strict";
 
 (function () {
-  const { made, drawWorld, shown } = window.levelproof;
-  const NARROWEST = 150; // px, of a cell
-  const CAPTION = 34; // px below its picture
-  const BEYOND = 1; // rows above and below the screen that are drawn ahead
-  const BUDGET = 6; // ms of drawing a frame
-  const LOADS = 6; // blocks of worlds that are loaded at once
+  const { create, drawWorld, formatted } = window.levelproof;
+  const NARROWEST = 150; // px; minimum width of a cell
+  const CAPTION = 34; // px; height of the caption below a picture
+  const BEYOND = 1; // rows drawn ahead, above and below the screen
+  const BUDGET = 6; // ms; time to draw per frame
+  const LOADS = 6; // maximum number of blocks loading at a time
 
   class Grid {
     constructor(element, columns, worlds, hrefOf) {
       Object.assign(this, { element, columns, worlds, hrefOf });
       this.rows = new Uint32Array(0);
-      this.cells = new Map(); // place in the grid: cell
+      this.cells = new Map(); // position in the grid: cell
       this.free = [];
-      this.current = 0; // the place that the keyboard is at
+      this.current = 0; // position of the keyboard focus
       this.queue = []; // cells to draw
       this.loading = 0;
-      this.detail = "steps_to_goal"; // the column that captions tell
+      this.detail = "steps_to_goal"; // the column that captions show
       this.colours = levelproof.coloursOf();
       this.asked = false;
       const later = () => this.later();
       addEventListener("scroll", later, { passive: true });
       const resized = new ResizeObserver(later);
       resized.observe(element);
-      resized.observe(document.body); // what is above may fold away
+      resized.observe(document.body); // content above may fold away
       element.addEventListener("keydown", (event) => this.key(event));
       element.addEventListener("focusin", (event) => {
         const cell = event.target.closest(".cell");
@@ -38,7 +38,7 @@
       for (const cell of this.cells.values()) this.release(cell);
       this.cells.clear();
       this.element.querySelector(".nothing")?.remove();
-      if (!rows.length) this.element.append(made("p", { class: "nothing" }, "No level is like that: clear a filter."));
+      if (!rows.length) this.element.append(create("p", { class: "nothing" }, "No level matches: clear a filter."));
       this.layout();
     }
 
@@ -72,7 +72,7 @@
       const last = Math.min(this.rows.length, (Math.ceil((above + innerHeight) / tall) + BEYOND) * across);
       for (const [place, cell] of this.cells) {
         if (place < first || place >= last) {
-          if (cell.element.contains(document.activeElement)) continue; // the keyboard keeps its place
+          if (cell.element.contains(document.activeElement)) continue; // keep the focused cell
           this.release(cell);
           this.cells.delete(place);
         }
@@ -84,10 +84,10 @@
     }
 
     cell() {
-      const canvas = made("canvas", { "aria-hidden": "true" });
-      const [dot, name, detail] = [made("i", { class: "dot" }), made("span"), made("span")];
-      const link = made("a", {}, canvas, made("p", { "aria-hidden": "true" }, dot, name, detail));
-      const element = made("div", { class: "cell", role: "listitem" }, link);
+      const canvas = create("canvas", { "aria-hidden": "true" });
+      const [dot, name, detail] = [create("i", { class: "dot" }), create("span"), create("span")];
+      const link = create("a", {}, canvas, create("p", { "aria-hidden": "true" }, dot, name, detail));
+      const element = create("div", { class: "cell", role: "listitem" }, link);
       const cell = { element, link, canvas, dot, name, detail };
       element.place = 0;
       this.element.append(element);
@@ -107,7 +107,7 @@
       const label = this.columns.word("label", row);
       const value = this.columns.values[this.detail][row];
       const unit = this.detail === "steps_to_goal" ? ` step${value === 1 ? "" : "s"}` : "";
-      const detail = Number.isNaN(value) ? label : shown(value) + unit;
+      const detail = Number.isNaN(value) ? label : formatted(value) + unit;
       cell.row = row;
       cell.element.place = place;
       cell.element.hidden = false;
@@ -139,7 +139,7 @@
       this.later();
     }
 
-    // Draws what is wanted and still on the screen, as long as a frame has time.
+    // Draw queued cells that are still on the screen, until the frame's time is up.
     draw() {
       const until = performance.now() + BUDGET;
       const left = [];
@@ -164,7 +164,7 @@
       this.loading++;
       const block = (of) => Math.floor(of / this.columns.about.block);
       this.worlds.get(row).catch((error) => {
-        levelproof.tell(error.message);
+        levelproof.report(error.message);
         this.queue = this.queue.filter((wanted) => block(wanted.row) !== block(row));
       }).finally(() => {
         this.loading--;

@@ -1,10 +1,10 @@
-// The page of one level: its witness played from its states, how it was learned, why it has its label.
+// The page of one level: its witness played from stored states, its learning curve, the reason for its label.
 "use strict";
 
 (function () {
-  const { load, made, spoken, shown, statesOf, between, bytesOf, liveEntries, entryName, drawWorld } = window.levelproof;
-  const ENTRIES = 6; // of an action
-  const REST = 0.8; // s that the last picture stays before the witness begins again
+  const { load, create, readable, formatted, statesOf, between, bytesOf, liveEntries, entryName, drawWorld } = window.levelproof;
+  const ENTRIES = 6; // entries of an action
+  const REST = 0.8; // s; pause on the last picture before the witness restarts
   const at = (id) => document.getElementById(id);
 
   class LevelPage {
@@ -22,30 +22,30 @@
       new ResizeObserver(() => this.fit()).observe(at("stage"));
     }
 
-    // Shows the level of a row; null: none, nothing plays on.
+    // Show the level of a row; null closes the page.
     async open(row) {
       this.play(false);
       Object.assign(this, { row, film: null, world: null });
       if (row === null) return;
       const id = this.columns.values.level_id[row];
-      const [world, told] = await Promise.all([this.worlds.get(row), load(`levels/${Math.floor(row / this.columns.about.folder)}/${id}`)]);
-      if (this.row !== row) return; // another one was opened meanwhile
+      const [world, data] = await Promise.all([this.worlds.get(row), load(`levels/${Math.floor(row / this.columns.about.folder)}/${id}`)]);
+      if (this.row !== row) return; // another level was opened while this one loaded
       this.world = world;
-      if (told.states) {
-        const actions = bytesOf(told.actions);
+      if (data.states) {
+        const actions = bytesOf(data.actions);
         const steps = actions.length / ENTRIES;
         const action = (step) => actions.subarray(ENTRIES * step, ENTRIES * (step + 1));
-        this.film = { steps, action, states: statesOf(world, told.states, steps + 1) };
+        this.film = { steps, action, states: statesOf(world, data.states, steps + 1) };
         this.now = new Float32Array(world.start.length);
       }
       this.time = 0;
-      this.tell(told.row);
+      this.describe(data.row);
       this.fit();
       if (this.film && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.play(true);
     }
 
-    tell(row) {
-      const badge = made("span", { class: "badge" }, made("i", { class: "dot", "data-label": row.label }), row.label);
+    describe(row) {
+      const badge = create("span", { class: "badge" }, create("i", { class: "dot", "data-label": row.label }), row.label);
       at("title").replaceChildren(`Level ${row.level_id}`, badge);
       document.title = `Level ${row.level_id} · levelproof gallery`;
       const reason = row.label_reason;
@@ -55,21 +55,21 @@
       at("controls").hidden = !this.film;
       at("scrub").max = this.film ? this.film.steps : 0;
       this.keys = liveEntries(this.world).map((entry) => {
-        const element = made("span", { class: "key", style: `--colour: var(--binding-${entry})` });
+        const element = create("span", { class: "key", style: `--colour: var(--binding-${entry})` });
         return { entry, element, motor: entry < 4 };
       });
       at("keys").replaceChildren(...this.keys.map((key) => key.element));
       levelproof.drawCurve(at("curve"), row.learning_curve);
       const value = (of) => {
         if (of === null) return "–";
-        if (typeof of === "number") return shown(of);
+        if (typeof of === "number") return formatted(of);
         if (typeof of === "boolean") return of ? "yes" : "no";
         return Array.isArray(of) ? of.join(" ") : typeof of === "object" ? Object.entries(of).map(([name, x]) => `${name} ${value(x)}`).join(", ") : of;
       };
-      const told = Object.entries(row).filter(([name]) => !["label_reason", "command", "learning_curve"].includes(name));
-      at("row").replaceChildren(...told.flatMap(([name, of]) => [made("dt", {}, spoken(name)), made("dd", {}, name === "level_id" ? String(of) : value(of))]));
+      const entries = Object.entries(row).filter(([name]) => !["label_reason", "command", "learning_curve"].includes(name));
+      at("row").replaceChildren(...entries.flatMap(([name, of]) => [create("dt", {}, readable(name)), create("dd", {}, name === "level_id" ? String(of) : value(of))]));
       const known = this.film ? `its witness reaches the goal in ${this.film.steps} steps` : "there is no witness, so this is its initial world";
-      at("stage").setAttribute("aria-label", `Level ${row.level_id}, ${row.label}: ${known}. ${described(this.world)}`);
+      at("stage").setAttribute("aria-label", `Level ${row.level_id}, ${row.label}: ${known}. ${worldInWords(this.world)}`);
     }
 
     recolour() {
@@ -137,7 +137,7 @@
       try {
         await navigator.clipboard.writeText(words);
       } catch {
-        getSelection().selectAllChildren(at(from)); // a page from the disk may not be let
+        getSelection().selectAllChildren(at(from)); // browsers may deny pages from disk the clipboard
         document.execCommand("copy");
       }
       at(button).textContent = "Copied";
@@ -163,8 +163,8 @@
     }
   }
 
-  // A world in words, for who does not see it.
-  function described(world) {
+  // Describe a world in words, for screen readers.
+  function worldInWords(world) {
     const bodies = world.bodies.slice(4);
     const count = (words, of) => (of ? [`${of} ${words}${of > 1 ? "s" : ""}`] : []);
     const roles = ["green", "blue", "red", "plain"].flatMap((role) =>

@@ -1,14 +1,14 @@
-// Brings the parts together. What is shown is in the address: `#level=7`, or conditions and an order, as in
-// `#label=solved&steps_to_goal=3..40&sort=-env_steps`.
+// Entry point: connects the parts. The address says what the page shows: `#level=7`, or conditions and an order such
+// as `#label=solved&steps_to_goal=3..40&sort=-env_steps`.
 "use strict";
 
 (async function () {
-  const { load, Columns, Worlds, Choice, Panel, Grid, LevelPage, made, spoken } = window.levelproof;
+  const { load, Columns, Worlds, Choice, Panel, Grid, LevelPage, create, readable } = window.levelproof;
   const at = (id) => document.getElementById(id);
   let columns, worlds, choice, panel, grid, page, rows, scrolled = 0, overview = "";
 
-  // Says that something is wrong; "": nothing is.
-  levelproof.tell = (problem) => { at("problem").textContent = problem; };
+  // Show a problem; "" clears it.
+  levelproof.report = (problem) => { at("problem").textContent = problem; };
 
   const hrefOf = (row) => `#level=${columns.values.level_id[row]}`;
 
@@ -16,7 +16,7 @@
     return columns.about.columns.find((column) => column.name === name)?.words;
   }
 
-  // What is chosen, as the address has it.
+  // Encode the conditions and the order as an address.
   function addressOf() {
     const parts = [...choice.conditions].map(([name, condition]) => {
       const value = condition instanceof Set ? [...condition].map((place) => wordsOf(name)[place]) : [condition.join("..")];
@@ -27,7 +27,7 @@
     return `#${parts.join("&")}`;
   }
 
-  // The opposite: words and columns that are none are passed over.
+  // Decode an address into conditions and an order; ignore unknown words and columns.
   function choose(address) {
     choice.clear();
     choice.sort("level_id", 1);
@@ -45,7 +45,7 @@
     }
   }
 
-  function look() {
+  function refresh() {
     rows = choice.rows();
     const [name, direction] = choice.sortedBy;
     const { levels, found } = columns.about;
@@ -56,21 +56,21 @@
     at("sort").value = name;
     at("direction").textContent = direction < 0 ? "↓" : "↑";
     at("direction").setAttribute("aria-pressed", String(direction < 0));
-    panel.look();
+    panel.refresh();
     grid.show(rows, name === "level_id" ? "steps_to_goal" : name);
   }
 
   function changed() {
     overview = addressOf();
     history.replaceState(null, "", overview);
-    look();
+    refresh();
   }
 
-  // Shows what the address says.
+  // Show what the address names.
   function follow() {
     const address = location.hash || "#";
     const id = address.match(/^#level=(-?\d+)$/);
-    levelproof.tell("");
+    levelproof.report("");
     if (!id) {
       page.open(null);
       [at("overview").hidden, at("level").hidden] = [false, true];
@@ -78,17 +78,17 @@
       if (address !== overview) {
         overview = address;
         choose(address);
-        look();
+        refresh();
       } else grid.layout();
       scrollTo(0, scrolled);
       return;
     }
     const row = columns.numbers.get(Number(id[1]));
     if (row === undefined) {
-      if (columns.rows < columns.about.levels) return; // it may be on a page to come
+      if (columns.rows < columns.about.levels) return; // it may be on a page that is still loading
       history.replaceState(null, "", overview || "#");
       follow();
-      levelproof.tell(`There is no level ${id[1]} in this gallery.`);
+      levelproof.report(`There is no level ${id[1]} in this gallery.`);
       return;
     }
     if (!at("overview").hidden) scrolled = scrollY;
@@ -100,7 +100,7 @@
       else at(name).removeAttribute("href");
     }
     scrollTo(0, 0);
-    page.open(row).then(() => at("level").focus({ preventScroll: true }), (error) => levelproof.tell(error.message));
+    page.open(row).then(() => at("level").focus({ preventScroll: true }), (error) => levelproof.report(error.message));
   }
 
   function listen() {
@@ -116,7 +116,7 @@
       event.preventDefault();
       const id = at("level-id").value.trim();
       if (/^-?\d+$/.test(id) && columns.numbers.has(Number(id))) location.hash = `level=${Number(id)}`;
-      else levelproof.tell(id ? `There is no level ${id} in this gallery.` : "Type the id of a level.");
+      else levelproof.report(id ? `There is no level ${id} in this gallery.` : "Type the id of a level.");
     });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
       grid.recolour();
@@ -134,24 +134,24 @@
     at("split").textContent = about.split;
     at("facts").textContent = [`configuration ${about.config_hash}`, ...(about.where ? [`where ${about.where}`] : [])].join(" · ");
     const sorts = about.columns.filter((column) => !column.words).map((column) => column.name);
-    at("sort").append(...sorts.map((name) => made("option", { value: name }, name === "level_id" ? "level id" : spoken(name))));
+    at("sort").append(...sorts.map((name) => create("option", { value: name }, name === "level_id" ? "level id" : readable(name))));
     if (innerWidth <= 820) at("panel").open = false;
     listen();
     for (let number = 0; columns.rows < about.levels; number++) {
       columns.add(await load(`columns/${number}`));
-      choice.grown();
-      panel.grown();
+      choice.rowsAdded();
+      panel.rowsAdded();
       if (number === 0) {
         if (!/^#level=/.test(location.hash)) [overview, at("overview").hidden] = [location.hash || "#", false];
         choose(overview);
       }
-      look();
+      refresh();
       if (number === 0 || (at("overview").hidden && at("level").hidden)) follow();
     }
     if (at("overview").hidden && at("level").hidden) follow();
     performance.mark("all columns are there");
   } catch (error) {
-    levelproof.tell(`${error.message}: write the gallery again with levelproof gallery.`);
+    levelproof.report(`${error.message}: write the gallery again with levelproof gallery.`);
     throw error;
   }
 })();

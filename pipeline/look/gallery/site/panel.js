@@ -1,15 +1,15 @@
-// The filters beside the grid: words as buttons, numbers as histograms that are brushed. Each tells the choice what is
-// wanted and is told to look again.
+// The filters beside the grid: buttons for words, histograms to brush for numbers. A filter sets its condition in the
+// choice and is refreshed after every change.
 "use strict";
 
 (function () {
   const { binsOf } = window.levelproof;
   const FIRST = ["steps_to_goal", "env_steps", "success_rate", "portability", "bodies", "joints", "motors", "thrusters"];
-  const [FEW, SHORT] = [8, 24]; // words that are buttons, and their letters; more are a list
-  const [WIDE, HIGH] = [320, 46]; // of a histogram's drawing
+  const [FEW, SHORT] = [8, 24]; // maximum number of words, and of their letters, for buttons; else a list
+  const [WIDE, HIGH] = [320, 46]; // size of a histogram's view box
   const SVG = "http://www.w3.org/2000/svg";
 
-  function made(tag, attributes = {}, ...inside) {
+  function create(tag, attributes = {}, ...inside) {
     const element = attributes.svg ? document.createElementNS(SVG, tag) : document.createElement(tag);
     for (const [name, value] of Object.entries(attributes)) {
       if (name === "svg" || value === undefined) continue;
@@ -20,9 +20,9 @@
     return element;
   }
 
-  const spoken = (name) => name.replaceAll("_", " ");
+  const readable = (name) => name.replaceAll("_", " ");
 
-  function shown(value) {
+  function formatted(value) {
     if (Number.isInteger(value)) return value.toLocaleString("en");
     return Number(value.toPrecision(3)).toString();
   }
@@ -30,18 +30,18 @@
   class Words {
     constructor(column, choice, changed) {
       Object.assign(this, { column, choice, changed });
-      const heading = made("h3", {}, spoken(column.name));
+      const heading = create("h3", {}, readable(column.name));
       if (column.words.length <= FEW && column.words.every((word) => word.length <= SHORT)) {
         this.buttons = column.words.map((word, place) =>
-          made("button", { type: "button", "aria-pressed": "false", click: () => this.toggle(place) },
-            ...(column.name === "label" ? [made("i", { class: "dot", "data-label": word })] : []), word, made("span")));
-        this.element = made("div", { class: "filter", role: "group", "aria-label": spoken(column.name) }, heading,
-          made("div", { class: "chips" }, ...this.buttons));
+          create("button", { type: "button", "aria-pressed": "false", click: () => this.toggle(place) },
+            ...(column.name === "label" ? [create("i", { class: "dot", "data-label": word })] : []), word, create("span")));
+        this.element = create("div", { class: "filter", role: "group", "aria-label": readable(column.name) }, heading,
+          create("div", { class: "chips" }, ...this.buttons));
       } else {
-        this.select = made("select", { "aria-label": spoken(column.name), change: () => this.pick() },
-          made("option", { value: "" }, "any"),
-          ...column.words.map((word, place) => made("option", { value: place }, word)));
-        this.element = made("div", { class: "filter" }, heading, this.select);
+        this.select = create("select", { "aria-label": readable(column.name), change: () => this.pick() },
+          create("option", { value: "" }, "any"),
+          ...column.words.map((word, place) => create("option", { value: place }, word)));
+        this.element = create("div", { class: "filter" }, heading, this.select);
       }
     }
 
@@ -57,7 +57,7 @@
       this.changed();
     }
 
-    look() {
+    refresh() {
       const chosen = this.choice.conditions.get(this.column.name);
       if (this.select) {
         this.select.value = chosen ? String([...chosen][0]) : "";
@@ -74,21 +74,21 @@
   class Histogram {
     constructor(name, choice, changed) {
       Object.assign(this, { name, choice, changed, bins: null });
-      const path = (of) => made("path", { svg: true, class: of });
+      const path = (of) => create("path", { svg: true, class: of });
       [this.all, this.chosen] = [path("all"), path("chosen")];
-      this.brush = made("rect", { svg: true, class: "brush", y: 0, height: HIGH });
-      this.drawing = made("svg", {
+      this.brush = create("rect", { svg: true, class: "brush", y: 0, height: HIGH });
+      this.drawing = create("svg", {
         svg: true, viewBox: `0 0 ${WIDE} ${HIGH}`, preserveAspectRatio: "none", role: "img",
         pointerdown: (event) => this.begin(event), pointermove: (event) => this.drag(event), pointerup: () => this.end(),
       }, this.all, this.brush, this.chosen);
-      this.clear = made("button", { type: "button", "aria-label": `Clear ${spoken(name)}`, click: () => this.choose(null) }, "clear");
+      this.clear = create("button", { type: "button", "aria-label": `Clear ${readable(name)}`, click: () => this.choose(null) }, "clear");
       this.inputs = ["at least", "at most"].map((words) =>
-        made("input", { type: "number", step: "any", "aria-label": `${spoken(name)}, ${words}`, change: () => this.typed() }));
-      this.element = made("div", { class: "filter histogram" }, made("h3", {}, spoken(name), this.clear), this.drawing,
-        made("div", { class: "ends" }, ...this.inputs));
+        create("input", { type: "number", step: "any", "aria-label": `${readable(name)}, ${words}`, change: () => this.typed() }));
+      this.element = create("div", { class: "filter histogram" }, create("h3", {}, readable(name), this.clear), this.drawing,
+        create("div", { class: "ends" }, ...this.inputs));
     }
 
-    // The bin under a pointer.
+    // Bin under the pointer.
     binAt(event) {
       const { left, width } = this.drawing.getBoundingClientRect();
       const bin = Math.floor(((event.clientX - left) / width) * this.bins.count);
@@ -111,7 +111,7 @@
       this.choose(this.range(Math.min(this.from, to), Math.max(this.from, to)));
     }
 
-    // A click chooses one bin, or ends what was chosen.
+    // A click chooses one bin, or clears the range.
     end() {
       if (this.from !== undefined && !this.moved) this.choose(this.wasChosen ? null : this.range(this.from, this.from));
       this.from = undefined;
@@ -134,7 +134,7 @@
       this.changed();
     }
 
-    look() {
+    refresh() {
       this.element.hidden = !this.bins;
       if (!this.bins) return;
       const { low, high, count, width } = this.bins;
@@ -157,11 +157,11 @@
       this.brush.setAttribute("width", range ? Math.max(2, at(range[1] + (this.bins.whole ? 1 : 0)) - at(range[0])) : 0);
       this.clear.hidden = !range;
       [low, high].forEach((end, i) => {
-        this.inputs[i].placeholder = shown(end);
+        this.inputs[i].placeholder = formatted(end);
         this.inputs[i].value = range ? Number(range[i].toPrecision(6)) : "";
       });
       const total = chosen.reduce((sum, of) => sum + of, 0);
-      this.drawing.setAttribute("aria-label", `Histogram of ${spoken(this.name)}: ${total} levels between ${shown(low)} and ${shown(high)}`);
+      this.drawing.setAttribute("aria-label", `Histogram of ${readable(this.name)}: ${total} levels between ${formatted(low)} and ${formatted(high)}`);
     }
   }
 
@@ -169,7 +169,7 @@
     constructor(columns, choice, changed) {
       Object.assign(this, { columns, choice });
       const worded = columns.about.columns.filter((column) => column.words);
-      const flag = (column) => column.words.every((word) => word === "yes" || word === "no");
+      const isFlag = (column) => column.words.every((word) => word === "yes" || word === "no");
       const words = worded.map((column) => ({ column, filter: new Words(column, choice, changed) }));
       const named = columns.about.columns.filter((column) => !column.words && column.name !== "level_id").map((column) => column.name);
       const histograms = [...FIRST.filter((name) => named.includes(name)), ...named.filter((name) => !FIRST.includes(name))]
@@ -178,25 +178,25 @@
       this.filters = [...words.map((of) => of.filter), ...histograms];
       const at = (id) => document.getElementById(id);
       this.more = at("more").parentElement;
-      this.more.addEventListener("toggle", () => this.look());
-      at("words").append(...words.filter((of) => !flag(of.column)).map((of) => of.filter.element));
+      this.more.addEventListener("toggle", () => this.refresh());
+      at("words").append(...words.filter((of) => !isFlag(of.column)).map((of) => of.filter.element));
       at("histograms").append(...histograms.filter((of) => FIRST.includes(of.name)).map((of) => of.element));
-      at("more").append(...words.filter((of) => flag(of.column) && of.column.words.length > 1).map((of) => of.filter.element),
+      at("more").append(...words.filter((of) => isFlag(of.column) && of.column.words.length > 1).map((of) => of.filter.element),
         ...histograms.filter((of) => !FIRST.includes(of.name)).map((of) => of.element));
     }
 
-    // More rows have come.
-    grown() {
+    // Update the bins for newly loaded rows.
+    rowsAdded() {
       for (const histogram of this.histograms) histogram.bins = binsOf(this.columns, histogram.name);
     }
 
-    // Those that are folded away look when they are unfolded.
-    look() {
+    // Refresh visible filters; folded ones refresh when they are unfolded.
+    refresh() {
       for (const filter of this.filters) {
-        if (this.more.open || !this.more.contains(filter.element)) filter.look();
+        if (this.more.open || !this.more.contains(filter.element)) filter.refresh();
       }
     }
   }
 
-  Object.assign(window.levelproof, { Panel, made, spoken, shown });
+  Object.assign(window.levelproof, { Panel, create, readable, formatted });
 })();
