@@ -1,4 +1,4 @@
-"""A dataset's card: its header, its numbers, its figures and its preview."""
+"""Dataset cards: header, numbers, figures and preview."""
 
 import io
 import re
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a split that was played, one of which nothing was solved, and their card."""
+    """A folder with a split of replayed levels, a split with nothing solved, and their card."""
     folder = tmp_path_factory.mktemp("rigid-levels")
     splits = [played_split(folder), made_split(folder, [[Label.UNSOLVED] * 2, [Label.UNSOLVED]], "budget=64k")]
     with pytest.MonkeyPatch.context() as patch:
@@ -38,24 +38,24 @@ def header_of(readme: Path) -> dict[str, Any]:
     return yaml.safe_load(readme.read_text().split("---\n")[1])
 
 
-def test_the_header_leads_the_viewer_to_preview_and_manifests(dataset: Path) -> None:
+def test_header_lists_preview_and_manifests(dataset: Path) -> None:
     header = header_of(dataset / "README.md")
     assert (header["license"], header["pretty_name"]) == ("cc-by-4.0", "levels")
     assert (header["task_categories"], header["size_categories"]) == (["reinforcement-learning"], ["1K<n<10K"])
     first, *others = header["configs"]
     assert (first["config_name"], first["default"]) == ("preview", True)
-    assert [of["config_name"] for of in others] == ["128k-s", "64k-s"]
+    assert [config["config_name"] for config in others] == ["128k-s", "64k-s"]
     for config in header["configs"]:
         assert re.fullmatch(r"[\w-]+", config["config_name"])
-        for of in config["data_files"]:
-            assert re.fullmatch(r"\w+", of["split"])
-            files = sorted(dataset.glob(of["path"]))
+        for entry in config["data_files"]:
+            assert re.fullmatch(r"\w+", entry["split"])
+            files = sorted(dataset.glob(entry["path"]))
             assert files
             assert all(pq.read_metadata(file).num_rows for file in files)
     assert len(list(dataset.glob(others[1]["data_files"][0]["path"]))) == 2
 
 
-def test_the_preview_has_pictures_where_the_viewer_looks_for_them(dataset: Path) -> None:
+def test_preview_has_pictures_in_the_hubs_format(dataset: Path) -> None:
     table = pq.read_table(dataset / "preview/128k-s.parquet")
     assert table.column_names == [*PICTURES, *SHOWN]
     assert b'"_type": "Image"' in table.schema.metadata[b"huggingface"]
@@ -68,7 +68,7 @@ def test_the_preview_has_pictures_where_the_viewer_looks_for_them(dataset: Path)
     assert [row["goal"] for row in pq.read_table(dataset / "preview/64k-s.parquet").to_pylist()] == [None] * 3
 
 
-def test_the_page_tells_of_each_split_what_its_manifest_says(dataset: Path) -> None:
+def test_card_states_the_facts_of_each_manifest(dataset: Path) -> None:
     text, manifest = (dataset / "README.md").read_text(), read_manifest(dataset / "128k/s")
     solved = int((manifest.labels == "solved").sum())
     assert f"| `128k/s` | 64 | 64 | {solved} | {256 * solved:,} |" in text
@@ -83,17 +83,17 @@ def test_the_page_tells_of_each_split_what_its_manifest_says(dataset: Path) -> N
     for figure in figures:
         colours = Image.open(dataset / figure).convert("RGB").getcolors(1 << 24)
         assert colours
-        assert len(colours) > 10, "it shows something"
+        assert len(colours) > 10, f"{figure} is blank"
 
 
-def test_again_overwrites_its_own_card_and_nobody_elses(dataset: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+def test_card_overwrites_only_cards(dataset: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(cards, "SAMPLE", 2)
     split = dataset / "64k/s"
     out = dataset / "OTHER.md"
     assert main(["card", str(split), "-o", str(out)]) == 0
     assert main(["card", str(split), "-o", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert "It names no licence: choose one with --license" in told
+    output = capsys.readouterr().out
+    assert "It names no licence: choose one with --license" in output
     assert "license" not in header_of(out)
     assert "None has been chosen yet" in out.read_text()
     assert re.findall(r"!\[.*\]\((.*)\)", out.read_text()) == ["figures/solve-rate.png"]
@@ -112,20 +112,22 @@ def test_again_overwrites_its_own_card_and_nobody_elses(dataset: Path, tmp_path:
 
 
 @pytest.mark.parametrize(("witnesses", "words"), [(0, "n<1K"), (3, "n<1K"), (4, "1K<n<10K"), (6 * 10**6, "1B<n<10B")])
-def test_its_size_is_that_of_its_transitions(witnesses: int, words: str) -> None:
+def test_size_category_counts_transitions(witnesses: int, words: str) -> None:
     facts = SplitFacts("1M/s", {"solved": witnesses}, witnesses, witnesses, np.arange(0), 0, 0, "1M", "", "", "", [])
     header = readme("name", [facts], CardOptions(), [], "0.1.0").split("---\n")[1]
     assert yaml.safe_load(header)["size_categories"] == [words]
 
 
-def test_intervals_are_wilsons() -> None:
+def test_share_interval_is_wilsons() -> None:
     assert np.allclose(Share(81, 263).interval, (0.2552, 0.3662), atol=1e-4)  # Newcombe, 1998
     assert Share(0, 10).interval == pytest.approx((0.0, 0.2775), abs=1e-4)
     assert Share(10, 10).interval == pytest.approx((0.7225, 1.0), abs=1e-4)
 
 
 @pytest.mark.campaign
-def test_the_hub_s_own_libraries_read_it(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hub_libraries_load_the_card_and_the_data(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     datasets, hub = (pytest.importorskip(name) for name in ("datasets", "huggingface_hub"))
     cache = str(tmp_path / "cache")
     shown = datasets.load_dataset(str(dataset), cache_dir=cache)  # the default subset
@@ -140,8 +142,8 @@ def test_the_hub_s_own_libraries_read_it(dataset: Path, tmp_path: Path, monkeypa
 
 
 @pytest.mark.campaign
-def test_the_page_s_python_runs(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As its reader has the data: below `data`, in a folder of his own."""
+def test_python_in_the_card_runs(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The data are below `data/`, where the card's commands put them."""
     (tmp_path / "data").symlink_to(dataset)
     monkeypatch.chdir(tmp_path)
     (block,) = re.findall(r"^```python\n(.*?)^```", (dataset / "README.md").read_text(), re.DOTALL | re.MULTILINE)
@@ -151,7 +153,7 @@ def test_the_page_s_python_runs(dataset: Path, tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("name", ["README.md", "preview", "preview/128k-s.parquet", "figures/solved.svg"])
-def test_a_card_is_not_written_through_links(tmp_path: Path, name: str) -> None:
+def test_card_refuses_to_write_through_links(tmp_path: Path, name: str) -> None:
     split = made_split(tmp_path / "levels", [[Label.UNSOLVED]])
     mine = tmp_path / "mine"
     mine.mkdir() if name == "preview" else mine.write_text("mine")

@@ -1,4 +1,4 @@
-"""What a manifest's levels cost, and a solved one."""
+"""Cost of a manifest's levels, in total and per solved level."""
 
 import pyarrow as pa
 import pytest
@@ -9,12 +9,12 @@ from levelproof.pipeline.store.columns import COLUMNS
 
 
 def table(labels: list[str], seconds: list[Seconds | None], device: str = "cpu: of some kind") -> pa.Table:
-    spent = [None if of is None else of._asdict() for of in seconds]
+    spent = [None if entry is None else entry._asdict() for entry in seconds]
     columns = {"label": labels, "device": [device] * len(labels), "seconds": spent}
     return pa.table({name: pa.array(values, COLUMNS.field(name).type) for name, values in columns.items()})
 
 
-def test_a_solved_level_costs_what_the_others_did_too() -> None:
+def test_cost_per_solved_level_includes_unsolved_levels() -> None:
     spent = [Seconds(training=6.0), Seconds(training=1.0, writing=1.0), None, Seconds(search=4.0)]
     cost = cost_of(table(["unsolved", "solved", "solved", "solved"], spent))
     assert cost is not None
@@ -24,7 +24,7 @@ def test_a_solved_level_costs_what_the_others_did_too() -> None:
     assert describe_cost(cost).endswith(", 6 a solved level")
 
 
-def test_where_nobody_counted_or_nothing_is_solved_no_number_is_made_up() -> None:
+def test_cost_omits_what_was_not_measured_or_solved() -> None:
     assert cost_of(table(["solved"], [None])) is None
     cost = cost_of(table(["unsolved"], [Seconds(training=1.0)], "gpu: of some kind"))
     assert cost is not None

@@ -1,4 +1,4 @@
-"""Levels that are there twice are found: in a split, between splits, and among level files."""
+"""Duplicate levels: in a split, between splits, and among level files."""
 
 import dataclasses
 import json
@@ -30,11 +30,11 @@ from tests.pipeline.made import made_job, made_result
 
 NONE = {"levels": 0, "pairs": []}
 COUNT = 12
-COPY, NUDGED = 9, 10  # levels of the split: 9 is level 3 renumbered, 10 is level 5 with a body elsewhere
+COPY, NUDGED = 9, 10  # level 9 is level 3 renumbered; level 10 is level 5 with one body displaced
 
 
 def table(*rows: tuple[int | str, str, str, str]) -> pa.Table:
-    """Of names, content hashes and both halves of the signature."""
+    """A table of names, content hashes and both halves of the signature."""
     names, contents, *halves = zip(*rows, strict=True)
     return pa.table({"name": names, "content_hash": contents, "signature": list(zip(*halves, strict=True))})
 
@@ -42,16 +42,16 @@ def table(*rows: tuple[int | str, str, str, str]) -> pa.Table:
 LEVELS = table((0, "a", "x", "p"), (1, "b", "x", "q"), (2, "a", "x", "p"), (3, "c", "y", "q"), (4, "d", "z", "r"))
 
 
-def test_each_level_is_told_with_the_first_it_is_like() -> None:
+def test_within_pairs_each_level_with_its_first_duplicate() -> None:
     assert within(LEVELS, 10) == {
         "same": {"levels": 1, "pairs": [[2, 0]]},
-        "near": {"levels": 2, "pairs": [[1, 0], [3, 1]]},  # by one half each; contents count, not levels
+        "near": {"levels": 2, "pairs": [[1, 0], [3, 1]]},  # one half each; near counts contents, not levels
     }
     assert within(LEVELS.slice(3), 10) == {"same": NONE, "near": NONE}
     assert within(LEVELS.slice(0, 0), 10) == {"same": NONE, "near": NONE}
 
 
-def test_between_splits_what_is_the_same_is_not_near_as_well() -> None:
+def test_between_counts_same_levels_only_as_same() -> None:
     others = table(("file b", "a", "x", "p"), ("file a", "a", "x", "p"), ("file c", "e", "x", "r"))
     assert between(LEVELS, others, 10) == {
         "same": {"levels": 2, "pairs": [[0, "file a"], [2, "file a"]]},
@@ -61,20 +61,20 @@ def test_between_splits_what_is_the_same_is_not_near_as_well() -> None:
     assert between(LEVELS, others.slice(0, 0), 10) == {"same": NONE, "near": NONE}
 
 
-def test_in_words() -> None:
+def test_describe_names_an_example() -> None:
     assert describe(within(LEVELS, 1)) == "1 same (such as 2 and 0), 2 near (such as 1 and 0)"
     assert describe(within(LEVELS, 0)) == "1 same, 2 near"
 
 
-def test_many_levels_are_compared_at_once() -> None:
-    """100,000 levels of which each third is there twice."""
+def test_within_handles_100_000_levels() -> None:
+    """Every third level is a copy of the one before."""
     contents = [str(i - i % 3 // 2) for i in range(100_000)]
     many = table(*((i, contents[i], f"x{contents[i]}", f"y{contents[i]}") for i in range(100_000)))
     found = within(many, 2)
     assert found == {"same": {"levels": 33_333, "pairs": [[2, 1], [5, 4]]}, "near": NONE}
 
 
-def test_texts_have_one_number_each() -> None:
+def test_hash_strings_depends_on_the_string_alone() -> None:
     texts = ["", "a", "b", "ab", "a\0", "c1:0123456789abcdef", "c1:0123456789abcdee", "n" * 600, "m" + "n" * 599]
     alone = [hash_strings(pa.chunked_array([[text]]))[0] for text in texts]
     assert len(set(alone)) == len(texts)
@@ -84,7 +84,7 @@ def test_texts_have_one_number_each() -> None:
 
 @pytest.fixture(scope="module")
 def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A real split of real levels, two of them planted; what is stored beside them is made up."""
+    """A split of sampled levels and two planted duplicates; labels and records are invented."""
     rng = np.random.default_rng(0)
     levels = [one("s", i) for i in range(COUNT)]
     levels[COPY] = renumbered(levels[3], rng)
@@ -104,7 +104,7 @@ def committed(folder: Path, levels: list[Level]) -> Path:
     return path
 
 
-def test_every_row_has_the_identity_of_its_level(split: Path) -> None:
+def test_commit_writes_each_levels_hash_and_signature(split: Path) -> None:
     for row in require_manifest(split).table.to_pylist():
         if row["level_id"] not in (COPY, NUDGED):
             level = one("s", row["level_id"])
@@ -112,7 +112,7 @@ def test_every_row_has_the_identity_of_its_level(split: Path) -> None:
             assert [row["signature"]] == signatures(level)
 
 
-def test_planted_duplicates_are_told(split: Path) -> None:
+def test_survey_finds_planted_duplicates(split: Path) -> None:
     facts = survey(split, RowQuery(limit=3))
     assert facts["duplicates"] == {
         "same": {"levels": 1, "pairs": [[COPY, 3]]},
@@ -123,29 +123,28 @@ def test_planted_duplicates_are_told(split: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_levels_are_found_in_splits_files_and_folders(split: Path, tmp_path: Path) -> None:
-    """By the command, as people ask."""
+def test_inspect_finds_duplicates_in_splits_files_and_folders(split: Path, tmp_path: Path) -> None:
     other, folder = committed(tmp_path / "other", [one("s", 40), one("s", 3)]), tmp_path / "handmade"
     (folder / "deep").mkdir(parents=True)
     seven = folder / "deep" / "seven.json"
     write_level_file(LevelFile(one("s", 7), TaskParams()), seven)
     write_level_file(LevelFile(one("m", 7), TaskParams()), folder / "other.json")
-    words = [word for path in (other, folder, seven) for word in ("--against", str(path))]
-    facts = json.loads(here(["inspect", str(split), *words, "--json", "--rows", "0"], tmp_path).stdout)
+    arguments = [word for path in (other, folder, seven) for word in ("--against", str(path))]
+    facts = json.loads(here(["inspect", str(split), *arguments, "--json", "--rows", "0"], tmp_path).stdout)
     assert facts["duplicates"]["same"] == {"levels": 1, "pairs": []}
-    facts = json.loads(here(["inspect", str(split), *words, "--json"], tmp_path).stdout)
+    facts = json.loads(here(["inspect", str(split), *arguments, "--json"], tmp_path).stdout)
     assert facts["against"] == {
         str(other): {"same": {"levels": 2, "pairs": [[3, 1], [COPY, 1]]}, "near": NONE},
         str(folder): {"same": {"levels": 1, "pairs": [[7, str(seven)]]}, "near": NONE},
         str(seven): {"same": {"levels": 1, "pairs": [[7, str(seven)]]}, "near": NONE},
     }
-    shown = here(["inspect", str(split), *words], tmp_path).stdout
+    shown = here(["inspect", str(split), *arguments], tmp_path).stdout
     assert "1 same (such as 9 and 3), 1 near (such as 10 and 5)" in shown
     assert f"duplicates in {other}: 2 same (such as 3 and 1), 0 near" in shown
 
 
 @pytest.mark.slow
-def test_where_there_is_nothing_to_look_in_that_is_said(split: Path, tmp_path: Path) -> None:
+def test_comparison_refuses_sources_without_levels(split: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="neither a split nor a level file"):
         comparison_of_source(tmp_path)
     with pytest.raises(UserError, match="There is no split"):
@@ -159,15 +158,15 @@ def handmade(reference: Path) -> Path:
     return handmade_levels(reference)
 
 
-def test_no_handmade_level_is_like_another(handmade: Path) -> None:
+def test_handmade_levels_have_no_duplicates(handmade: Path) -> None:
     levels = comparison_of_source(handmade)
     assert levels.num_rows == 74
     assert within(levels, 3) == {"same": NONE, "near": NONE}
     assert between(levels, levels, 0)["same"]["levels"] == 74
 
 
-def test_every_handmade_level_is_known_in_another_order(handmade: Path) -> None:
-    """Two of them, the walkers, have legs that are exact copies of each other at one place."""
+def test_content_hash_ignores_order_in_handmade_levels(handmade: Path) -> None:
+    """Two of them, the walkers, have legs that are exact copies in one position."""
     rng = np.random.default_rng(0)
     for path in sorted(handmade.rglob("*.json")):
         level = read_level_file(path).level
@@ -177,7 +176,7 @@ def test_every_handmade_level_is_known_in_another_order(handmade: Path) -> None:
             assert content_hashes(level) == known, (path.name, change.__name__)
 
 
-def test_a_split_has_no_handmade_level_until_one_is_planted(handmade: Path, split: Path, tmp_path: Path) -> None:
+def test_survey_finds_a_planted_handmade_level(handmade: Path, split: Path, tmp_path: Path) -> None:
     assert survey(split, against=[handmade])["against"][str(handmade)] == {"same": NONE, "near": NONE}
     known = next(iter(sorted(handmade.glob("s/*.json"))))
     planted = renumbered(read_level_file(known).level, np.random.default_rng(0))

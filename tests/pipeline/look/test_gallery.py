@@ -1,4 +1,4 @@
-"""What a gallery's files say is what the split says: rows, worlds and states."""
+"""Gallery files agree with the split: rows, worlds and states."""
 
 import json
 from base64 import b64decode
@@ -36,8 +36,8 @@ def site(split: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def told(site: Path, name: str) -> Any:
-    """What a data file hands over."""
+def data(site: Path, name: str) -> Any:
+    """Read the value of a data file."""
     before, after = f'levelproof.arrived("{name}",', ");\n"
     text = (site / "data" / f"{name}.js").read_text()
     assert text.startswith(before)
@@ -49,8 +49,8 @@ def numbers(text: str, kind: str) -> np.ndarray:
     return np.frombuffer(b64decode(text), kind)
 
 
-def test_columns_are_those_of_the_manifest(site: Path, manifest: Manifest) -> None:
-    about, page, table = told(site, "about"), told(site, "columns/0"), manifest.table
+def test_gallery_columns_equal_the_manifests(site: Path, manifest: Manifest) -> None:
+    about, page, table = data(site, "about"), data(site, "columns/0"), manifest.table
     assert about["levels"] == about["found"] == PLAYED
     columns = {column["name"]: column for column in about["columns"]}
     for name in NUMBERS:
@@ -66,10 +66,10 @@ def test_columns_are_those_of_the_manifest(site: Path, manifest: Manifest) -> No
         np.testing.assert_array_equal(numbers(page[name], "<f4"), counts)
 
 
-def test_a_level_has_its_row_and_where_its_witness_goes(site: Path, manifest: Manifest) -> None:
-    worlds = told(site, "worlds/0")
+def test_level_file_has_its_row_and_witness_states(site: Path, manifest: Manifest) -> None:
+    worlds = data(site, "worlds/0")
     for number, row in enumerate(manifest.table.to_pylist()):
-        page = told(site, f"levels/0/{row['level_id']}")
+        page = data(site, f"levels/0/{row['level_id']}")
         assert page["row"]["command"] == row["command"]
         assert page["row"]["learning_curve"] == [None, 0.5]
         assert ("states" in page) == bool(row["shard"])
@@ -92,10 +92,10 @@ def moving_bodies(arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.flatnonzero(arrays["level/model/active"][:, 0] & (arrays["level/model/inverse_mass"][:, 0] != 0))
 
 
-def test_the_last_state_is_where_green_and_blue_touch(split: Path, manifest: Manifest, site: Path) -> None:
-    """Records end before the step that reaches the goal; the film does not."""
+def test_last_state_is_where_green_touches_blue(split: Path, manifest: Manifest, site: Path) -> None:
+    """A record ends before the step that reaches the goal; the film extrapolates it."""
     row = next(row for row in manifest.table.to_pylist() if row["shard"])
-    states = numbers(told(site, f"levels/0/{row['level_id']}")["states"], "<i2")
+    states = numbers(data(site, f"levels/0/{row['level_id']}")["states"], "<i2")
     arrays = read_row(split, row)
     last, moving = int(steps_to_goal(arrays["record/done"])[0]) - 1, moving_bodies(arrays)
     position, velocity = (arrays[f"record/state/{name}"][last, moving, :, 0] for name in ("position", "velocity"))
@@ -103,9 +103,9 @@ def test_the_last_state_is_where_green_and_blue_touch(split: Path, manifest: Man
     np.testing.assert_allclose(found, position + velocity / 60, atol=LENGTH)
 
 
-def test_worlds_hold_every_body(site: Path, manifest: Manifest) -> None:
+def test_world_has_every_body_joint_and_thruster(site: Path, manifest: Manifest) -> None:
     levels = jax.tree.map(np.asarray, levels_of(manifest, manifest.table))
-    for lane, text in enumerate(told(site, "worlds/0")):
+    for lane, text in enumerate(data(site, "worlds/0")):
         world = numbers(text, "<i2").tolist()
         count, _, joints, thrusters = (world.pop(0) for _ in range(4))
         model = jax.tree.map(lambda x, lane=lane: x[..., lane], levels.model)
@@ -117,20 +117,20 @@ def test_worlds_hold_every_body(site: Path, manifest: Manifest) -> None:
             found.append((role, corners, round(x * LENGTH, 2), round(y * LENGTH, 2), len(shape)))
         polygons = levels.size.polygons
         corners = [model.n_vertices[body] if body < polygons else 0 for body in range(levels.size.bodies)]
-        there = np.flatnonzero(model.active)
-        places = levels.state.position[..., lane]
-        assert sorted(of[:2] for of in found) == sorted((levels.role[body, lane], corners[body]) for body in there)
-        assert sorted(of[2] for of in found) == pytest.approx(sorted(places[there, 0]), abs=0.01)
+        active = np.flatnonzero(model.active)
+        positions = levels.state.position[..., lane]
+        assert sorted(body[:2] for body in found) == sorted((levels.role[body, lane], corners[body]) for body in active)
+        assert sorted(body[2] for body in found) == pytest.approx(sorted(positions[active, 0]), abs=0.01)
         assert len(world) == 5 * joints + 5 * thrusters
 
 
-def test_angles_come_within_a_turn() -> None:
+def test_angles_wrap_to_one_turn() -> None:
     turned = np.array([0.0, 3.0, -3.0, 50.0, -50.0, np.pi, 1e6])
     np.testing.assert_allclose(np.exp(1j * angles(turned) * ANGLE), np.exp(1j * turned), atol=ANGLE)
 
 
-def test_the_pages_ask_nobody_else(site: Path) -> None:
-    """No address of another host, and no colour beside those of pictures."""
+def test_pages_load_nothing_from_other_hosts(site: Path) -> None:
+    """Nor define colours that are not in palette.css."""
     for path in [*site.glob("*.js"), *site.glob("*.html"), *site.glob("*.css")]:
         text = path.read_text().replace("http://www.w3.org/2000/svg", "")
         assert "http" not in text
@@ -139,11 +139,13 @@ def test_the_pages_ask_nobody_else(site: Path) -> None:
     assert "--green: rgb(62, 176, 92);" in (site / "palette.css").read_text()
 
 
-def test_some_levels(split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gallery_shows_a_sample_of_matching_levels(
+    split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     gallery(split, tmp_path / "some", "level_id >= 10 AND level_id < 60", 3)
-    about = told(tmp_path / "some", "about")
+    about = data(tmp_path / "some", "about")
     assert (about["levels"], about["found"], about["where"]) == (3, 50, "level_id >= 10 AND level_id < 60")
-    assert numbers(told(tmp_path / "some", "columns/0")["level_id"], "<f4").tolist() == [10, 34, 59]
+    assert numbers(data(tmp_path / "some", "columns/0")["level_id"], "<f4").tolist() == [10, 34, 59]
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith(f"{tmp_path / 'some' / 'index.html'}: 3 of 50 levels, spread evenly over their ids, of ")
     assert second.endswith(f"-m webbrowser {tmp_path / 'some' / 'index.html'}")
@@ -151,9 +153,7 @@ def test_some_levels(split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         gallery(split, tmp_path / "none", "level_id < 0", MOST)
 
 
-def test_a_gallery_makes_way_for_the_next_and_nothing_else_does(
-    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gallery_replaces_only_galleries(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "gallery"
     out.mkdir()
     (out / "notes.txt").write_text("mine")
@@ -165,20 +165,20 @@ def test_a_gallery_makes_way_for_the_next_and_nothing_else_does(
     gallery(split, out, None, 1)
     (out / "old").write_text("")
     gallery(split, out, None, 2)
-    assert told(out, "about")["levels"] == 2
+    assert data(out, "about")["levels"] == 2
     assert not (out / "old").exists()
 
-    def dies(_: object) -> str:
+    def fail(_: object) -> str:
         raise Failure("the shard is damaged")
 
-    monkeypatch.setattr(module, "world_of", dies)
+    monkeypatch.setattr(module, "world_of", fail)
     with pytest.raises(Failure):
         gallery(split, out, None, MOST)
-    assert told(out, "about")["levels"] == 2  # as it was
+    assert data(out, "about")["levels"] == 2  # unchanged
     assert [path.name for path in tmp_path.iterdir()] == ["gallery"]
 
 
-def test_levels_are_read_block_by_block(
+def test_gallery_reads_levels_block_by_block(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, manifest: Manifest
 ) -> None:
     read: list[int] = []

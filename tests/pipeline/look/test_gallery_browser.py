@@ -1,4 +1,4 @@
-"""The gallery in a real browser: what people see, press and read."""
+"""The gallery in a real browser."""
 
 import os
 import re
@@ -24,9 +24,9 @@ DEMANDED = "LEVELPROOF_TEST_BROWSER"
 DESKTOP, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
 STATES = """async (id) => {
     const { load, worldOf, statesOf, bytesOf } = levelproof;
-    const [worlds, told] = [await load("worlds/0"), await load(`levels/0/${id}`)];
-    const steps = bytesOf(told.actions).length / 6;
-    return statesOf(worldOf(worlds[id]), told.states, steps + 1).map((places) => Array.from(places));
+    const [worlds, data] = [await load("worlds/0"), await load(`levels/0/${id}`)];
+    const steps = bytesOf(data.actions).length / 6;
+    return statesOf(worldOf(worlds[id]), data.states, steps + 1).map((places) => Array.from(places));
 }"""
 COLOURED = """(canvas) => {
     const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
@@ -35,8 +35,9 @@ COLOURED = """(canvas) => {
     return [...seen];
 }"""
 UNNAMED = """() => [...document.querySelectorAll("button, input, select, a, [role=img]")]
-    .filter((of) => of.checkVisibility() && !(of.ariaLabel || of.textContent.trim() || of.labels?.length))
-    .map((of) => of.outerHTML)"""
+    .filter((element) => element.checkVisibility())
+    .filter((element) => !(element.ariaLabel || element.textContent.trim() || element.labels?.length))
+    .map((element) => element.outerHTML)"""
 
 pytestmark = pytest.mark.campaign
 
@@ -50,7 +51,7 @@ def address(split: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """Start Chromium; skip where there is none, or fail there with LEVELPROOF_TEST_BROWSER=1."""
+    """Start Chromium; without one, skip, or fail if LEVELPROOF_TEST_BROWSER=1."""
     try:
         with browser() as opened:
             yield opened
@@ -62,16 +63,17 @@ def chromium() -> Iterator[Any]:
 
 @pytest.fixture
 def page(chromium: Any) -> Iterator[Any]:
-    """A page that must not complain, nor ask another host for anything."""
+    """A page that must log no errors and make no requests to other hosts."""
     context = chromium.new_context(viewport=DESKTOP, reduced_motion="reduce")
-    opened, said = patient(context.new_page()), list[str]()
-    opened.on("console", lambda message: said.append(message.text))
-    opened.on("pageerror", lambda error: said.append(str(error)))
+    opened, messages = patient(context.new_page()), list[str]()
+    opened.on("console", lambda message: messages.append(message.text))
+    opened.on("pageerror", lambda error: messages.append(str(error)))
     opened.on(
-        "request", lambda request: said.append(request.url) if not request.url.startswith(("file:", "data:")) else None
+        "request",
+        lambda request: messages.append(request.url) if not request.url.startswith(("file:", "data:")) else None,
     )
     yield opened
-    assert said == []
+    assert messages == []
     context.close()
 
 
@@ -85,7 +87,7 @@ def rows(split: Path) -> list[dict[str, Any]]:
     return require_manifest(split).table.to_pylist()
 
 
-def drawn(page: Any) -> None:
+def wait_until_drawn(page: Any) -> None:
     page.wait_for_function("performance.getEntriesByName('levels are drawn').length > 0")
 
 
@@ -93,20 +95,20 @@ def solved(split: Path) -> int:
     return next(int(row["level_id"]) for row in rows(split) if row["shard"])
 
 
-def test_levels_are_drawn(page: Any, address: str) -> None:
+def test_grid_draws_visible_levels(page: Any, address: str) -> None:
     page.goto(address)
-    drawn(page)
+    wait_until_drawn(page)
     assert page.locator("#count").inner_text() == f"{PLAYED} levels"
     cells = page.locator(".cell:visible")
-    assert 12 <= cells.count() < PLAYED  # those on the screen alone
+    assert 12 <= cells.count() < PLAYED  # only those on the screen
     seen = {colour for i in range(6) for colour in cells.nth(i).locator("canvas").evaluate(COLOURED)}
     assert {"62,176,92", "58,124,220", "247,247,243"} <= seen  # green, blue, sky
     assert page.evaluate(UNNAMED) == []
 
 
-def test_brushes_words_and_orders_are_in_the_address(page: Any, address: str, split: Path) -> None:
+def test_address_keeps_filters_and_order(page: Any, address: str, split: Path) -> None:
     page.goto(address)
-    drawn(page)
+    wait_until_drawn(page)
     page.get_by_role("button", name=re.compile("^solved")).click()
     count = sum(row["label"] == "solved" for row in rows(split))
     assert page.locator("#count").inner_text() == f"{count} of {PLAYED} levels"
@@ -123,7 +125,7 @@ def test_brushes_words_and_orders_are_in_the_address(page: Any, address: str, sp
     first = page.locator("[aria-posinset='1'] a")
     shown = first.get_attribute("href")
     page.reload()
-    drawn(page)
+    wait_until_drawn(page)
     assert page.locator("#count").inner_text() == f"{brushed} of {PLAYED} levels"
     assert first.get_attribute("href") == shown
     page.locator("#clear").click()
@@ -131,7 +133,7 @@ def test_brushes_words_and_orders_are_in_the_address(page: Any, address: str, sp
     assert first.get_attribute("href") == f"#level={PLAYED - 1}"
 
 
-def test_a_level_plays_what_its_record_has(page: Any, address: str, split: Path) -> None:
+def test_level_page_plays_the_record(page: Any, address: str, split: Path) -> None:
     level_id = solved(split)
     page.goto(f"{address}#level={level_id}")
     page.wait_for_selector("#title:has-text('Level')")
@@ -157,9 +159,9 @@ def test_a_level_plays_what_its_record_has(page: Any, address: str, split: Path)
     assert page.evaluate(UNNAMED) == []
 
 
-def test_search_keyboard_and_the_way_back(page: Any, address: str) -> None:
+def test_search_keyboard_and_back_navigation(page: Any, address: str) -> None:
     page.goto(address)
-    drawn(page)
+    wait_until_drawn(page)
     page.get_by_label("Level id").fill("999")
     page.keyboard.press("Enter")
     assert page.get_by_role("alert").inner_text() == "There is no level 999 in this gallery."
@@ -177,13 +179,13 @@ def test_search_keyboard_and_the_way_back(page: Any, address: str) -> None:
     page.wait_for_selector(f"#title:has-text('Level {PLAYED - 2}')")
     page.keyboard.press("Escape")
     page.wait_for_selector("#overview:visible")
-    assert page.evaluate("scrollY") > 0  # where it was
+    assert page.evaluate("scrollY") > 0  # scroll position restored
     page.goto(f"{address}#level=12345")
     page.wait_for_selector("#problem:has-text('no level 12345')")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_phone_by_day_and_by_night(chromium: Any, address: str, split: Path, scheme: str) -> None:
+def test_pages_fit_a_phone_in_light_and_dark(chromium: Any, address: str, split: Path, scheme: str) -> None:
     context = chromium.new_context(viewport=PHONE, color_scheme=scheme, device_scale_factor=2, has_touch=True)
     page = patient(context.new_page())
     for at in ("", f"#level={solved(split)}"):
@@ -191,7 +193,7 @@ def test_a_phone_by_day_and_by_night(chromium: Any, address: str, split: Path, s
         page.wait_for_selector("#title:has-text('Level')" if at else ".cell:visible")
         assert page.evaluate("document.scrollingElement.scrollWidth") <= PHONE["width"]
     page.goto(address)
-    drawn(page)
+    wait_until_drawn(page)
     page.get_by_text("Filters", exact=True).click()
     assert page.get_by_role("button", name=re.compile("^solved")).is_visible()
     page.get_by_text("Filters", exact=True).click()
@@ -201,9 +203,9 @@ def test_a_phone_by_day_and_by_night(chromium: Any, address: str, split: Path, s
     context.close()
 
 
-def test_the_docs_example_opens_where_it_lies(page: Any) -> None:
+def test_docs_example_opens_from_disk(page: Any) -> None:
     page.goto((ROOT / "docs/example/index.html").as_uri())
-    drawn(page)
+    wait_until_drawn(page)
     assert page.locator("#count").inner_text() == "64 levels"
     page.goto((ROOT / "docs/example/index.html").as_uri() + "#level=7")
     page.wait_for_selector("#title:has-text('Level 7')")
@@ -211,7 +213,7 @@ def test_the_docs_example_opens_where_it_lies(page: Any) -> None:
     assert page.locator("#clock").inner_text().startswith("step 24 of 24 · ")
 
 
-def test_a_damaged_file_is_told(chromium: Any, tmp_path: Path, split: Path) -> None:
+def test_page_reports_a_damaged_file(chromium: Any, tmp_path: Path, split: Path) -> None:
     gallery(split, tmp_path / "gallery", None, PLAYED)
     (tmp_path / "gallery/data/columns/0.js").write_text("levelproof.nothing = 1;\n")
     page = chromium.new_page()

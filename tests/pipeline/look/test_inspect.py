@@ -1,4 +1,4 @@
-"""Questions about a manifest: what a condition chooses, and that nothing more is read than it takes."""
+"""Queries on a manifest: what a condition selects, and which columns and rows are read."""
 
 import csv
 import dataclasses
@@ -55,12 +55,12 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("learning_curve[1] > 0.4", {}),
     ],
 )
-def test_what_has_no_number_is_neither_above_nor_below_one(split: Path, condition: str, labels: dict) -> None:
+def test_condition_excludes_rows_without_a_value(split: Path, condition: str, labels: dict) -> None:
     assert survey(split, RowQuery(condition))["labels"] == labels
 
 
-def test_only_the_columns_of_the_question_are_read(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And of the few rows that are shown, the fragments that have them."""
+def test_survey_reads_only_needed_columns(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For the rows shown, it reads only their fragments."""
     read: list[tuple[int, int]] = []
 
     def counted(path: Path, columns: Sequence[str], *how: Any) -> tuple[Fragment, pa.Table]:
@@ -86,11 +86,11 @@ def test_only_the_columns_of_the_question_are_read(split: Path, monkeypatch: pyt
         ("env_steps = (SELECT max(x) FROM manifest AS m(x))", COLUMNS.names),
     ],
 )
-def test_columns_of_a_condition(where: str | None, columns: list[str]) -> None:
+def test_columns_in_lists_the_columns_of_a_condition(where: str | None, columns: list[str]) -> None:
     assert columns_in(where) == columns
 
 
-def test_experts_that_diverged_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_survey_counts_diverged_experts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     job, ids = made_job(str(tmp_path), "levels=3"), [0, 1, 2]
     split = split_path(job.out, job.budget, job.size)
     split.mkdir(parents=True)
@@ -104,11 +104,11 @@ def test_experts_that_diverged_are_counted(tmp_path: Path, capsys: pytest.Captur
     assert "experts that diverged:           2\n" in capsys.readouterr().out
 
 
-def test_rows_come_as_they_are_asked_for(split: Path) -> None:
+def test_survey_sorts_and_limits_rows(split: Path) -> None:
     rows = survey(split, RowQuery(columns=["label", "level_id"], sort="steps_to_goal DESC", limit=4))["rows"]
     assert rows == [
         {"label": label, "level_id": level_id}
-        for label, level_id in [("solved", 0), ("solved", 4), ("solved", 8), ("trivial", 1)]  # without a number: last
+        for label, level_id in [("solved", 0), ("solved", 4), ("solved", 8), ("trivial", 1)]  # null comes last
     ]
     with pytest.raises(UserError, match=r"^Cannot sort by 'no_such' "):
         survey(split, RowQuery(sort="no_such"))
@@ -116,8 +116,8 @@ def test_rows_come_as_they_are_asked_for(split: Path) -> None:
         survey(split, RowQuery(columns=["labels"]))
 
 
-def test_rows_as_csv(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All of them, block by block; lists and records as JSON."""
+def test_write_csv_writes_all_rows(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Block by block; lists and structs are JSON."""
     monkeypatch.setattr(rows_module, "BLOCK", 5)
     write_csv(split, RowQuery("label != 'trivial'", sort="level_id DESC"), text := io.StringIO())
     read = list(csv.DictReader(text.getvalue().splitlines()))
@@ -130,11 +130,11 @@ def test_rows_as_csv(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert text.getvalue() == "row,label\n0,solved\n"
 
 
-def test_reasons_witnesses_and_what_steps_were_for(split: Path) -> None:
+def test_survey_counts_reasons_witnesses_and_steps(split: Path) -> None:
     facts = survey(split)
     assert facts["reasons"] == {label: {"made for a test": 3} for label in LABELS}
     assert facts["witness"] == {"sampled": 3}
-    assert [facts[f"{of}_steps"] for of in ("env", "scout", "search", "evaluation")] == [12 * 4096, 0, 0, 0]
+    assert [facts[f"{stage}_steps"] for stage in ("env", "scout", "search", "evaluation")] == [12 * 4096, 0, 0, 0]
     low, high = facts["solve_interval"]
     assert 0.15 < low < facts["solve_rate"] == 0.5 < high < 0.85
     assert kind_of_reason("doing nothing reaches the goal in 12 env steps, or 1,024") == (
@@ -142,8 +142,8 @@ def test_reasons_witnesses_and_what_steps_were_for(split: Path) -> None:
     )
 
 
-def test_shares_by_what_levels_are_made_of(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of levels made again from their ids: no shard is read."""
+def test_solved_by_entities_resamples_levels_from_ids(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No shard is read."""
     monkeypatch.setattr(levels_module, "read_rows", None)
     monkeypatch.setattr(shares, "SAMPLED", 8)
     found = solved_by_entities(read_manifest(split, ["label"]), np.arange(12))
@@ -151,21 +151,21 @@ def test_shares_by_what_levels_are_made_of(split: Path, monkeypatch: pytest.Monk
     levels = sample_levels(np.arange(12), SIZES["s"])
     for name, counts in count_entities(levels).items():
         assert set(found[name]) <= {str(count) for count in counts}
-        assert sum(of["tried"] for of in found[name].values()) == 4
+        assert sum(share["tried"] for share in found[name].values()) == 4
 
 
-def test_a_level_file_that_is_gone_leaves_the_other_answers(
+def test_inspect_reports_the_rest_without_a_level_file(
     split: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def gone(*_: object) -> None:
+    def missing(*_: object) -> None:
         raise Failure("the file is missing")
 
-    monkeypatch.setattr(shares, "levels_of", gone)
+    monkeypatch.setattr(shares, "levels_of", missing)
     inspect(split, RowQuery(limit=0), as_json=False)
     assert "solved, by entities:             the file is missing\n" in capsys.readouterr().out
 
 
-def test_a_terminal_is_not_wider_than_it_is(split: Path) -> None:
+def test_print_facts_wraps_to_the_terminal(split: Path) -> None:
     facts = survey(split)
     facts["reasons"]["solved"] = {"a reason of many words " * 9: 3}
     narrow = Console(file=io.StringIO(), width=70, force_terminal=True, highlight=False, color_system=None)
@@ -177,11 +177,13 @@ def test_a_terminal_is_not_wider_than_it_is(split: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["split.svg", "split.png"])
-def test_a_plot(split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+def test_plot_draws_histograms_and_curves(
+    split: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
     plot(split, RowQuery(), tmp_path / name)
-    told = capsys.readouterr().out
-    assert told.startswith(f"{tmp_path / name}: steps to goal, ")
-    assert "solved levels, success rate" in told
+    output = capsys.readouterr().out
+    assert output.startswith(f"{tmp_path / name}: steps to goal, ")
+    assert "solved levels, success rate" in output
     if name.endswith("svg"):
         assert f"{split}: 12 levels" in (tmp_path / name).read_text()
     else:

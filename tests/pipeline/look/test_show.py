@@ -1,4 +1,4 @@
-"""Pictures of a real split: levels that solve themselves, replayed and committed as a work unit does."""
+"""Pictures and films of a real split, whose levels solve themselves, replayed and committed like a work unit."""
 
 import re
 import sys
@@ -30,20 +30,20 @@ pytestmark = pytest.mark.slow
 
 
 def level_with(split: Path, label: str) -> int:
-    """The level with that label whose shown episode is longest."""
+    """Id of the last level with that label."""
     rows = [row for row in require_manifest(split).table.to_pylist() if row["label"] == label]
     return int(rows[-1]["level_id"])
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".PNG", ".png", ".svg"])
-def test_a_witness_is_drawn(split, tmp_path, capsys, suffix) -> None:
+def test_show_draws_a_witness(split, tmp_path, capsys, suffix) -> None:
     level_id, out = level_with(split, "solved"), tmp_path / "new" / f"level{suffix}"
     show(split, level_id, out)
-    told = capsys.readouterr().out
-    assert told.startswith(str(out))
-    assert f"level {level_id} of size s, solved in " in told
-    assert told.count("\n") == 1
-    steps = int(re.search(r"solved in (\d+) step", told)[1])  # type: ignore[index]
+    output = capsys.readouterr().out
+    assert output.startswith(str(out))
+    assert f"level {level_id} of size s, solved in " in output
+    assert output.count("\n") == 1
+    steps = int(re.search(r"solved in (\d+) step", output)[1])  # type: ignore[index]
     if suffix == ".svg":
         assert out.read_text().startswith("<svg ")
         assert f'dur="{steps / 30 + 1.5:.3f}'.rstrip("0") in out.read_text()
@@ -60,16 +60,16 @@ def test_a_witness_is_drawn(split, tmp_path, capsys, suffix) -> None:
             assert seconds == pytest.approx(steps / 30 + 1.5, rel=0.15)
 
 
-def test_an_unsolved_level_shows_its_beginning_and_says_so(split, tmp_path, capsys) -> None:
+def test_show_draws_the_initial_world_without_a_witness(split, tmp_path, capsys) -> None:
     level_id = level_with(split, "unsolved")
     show(split, level_id, tmp_path / "level.png")
-    assert f"level {level_id} of size s is unsolved" in (told := capsys.readouterr().out)
-    assert "there is no witness, so this is its initial world" in told
+    assert f"level {level_id} of size s is unsolved" in (output := capsys.readouterr().out)
+    assert "there is no witness, so this is its initial world" in output
     with Image.open(tmp_path / "level.png") as picture:
         assert picture.size[0] == 480
 
 
-def test_an_unsolved_level_plays_doing_nothing_and_says_so(split, tmp_path, capsys) -> None:
+def test_show_films_doing_nothing_without_a_witness(split, tmp_path, capsys) -> None:
     show(split, level_with(split, "unsolved"), tmp_path / "level.svg")
     assert "there is no witness, so this is what doing nothing does (" in capsys.readouterr().out
     assert (tmp_path / "level.svg").read_text().count("doing nothing · ") > 10
@@ -78,7 +78,7 @@ def test_an_unsolved_level_plays_doing_nothing_and_says_so(split, tmp_path, caps
 class TestDoingNothing:
     RULES = TaskParams()
 
-    def test_it_is_the_tasks_episode(self) -> None:
+    def test_do_nothing_ends_like_the_task(self) -> None:
         levels = sample_levels(jnp.arange(16), SIZES["s"])
         act = jax.jit(lambda now: advance(levels, now, jnp.zeros((6, 16), jnp.int32), self.RULES))
         after, ends = reset(levels), {}
@@ -94,7 +94,7 @@ class TestDoingNothing:
             kinds.add(end)
         assert kinds == {"goal reached", "touched red", "time is up"}
 
-    def test_no_rules_make_it_long(self, tmp_path: Path) -> None:
+    def test_film_is_short_under_any_rules(self, tmp_path: Path) -> None:
         level = jax.tree.map(np.asarray, sample_levels(jnp.array([ends_late()]), SIZES["s"]))
         for rules in (TaskParams(frame_skip=10**6, max_timesteps=10**6), TaskParams(max_timesteps=10**6)):
             write_level_file(LevelFile(level, rules), tmp_path / "level.json")
@@ -103,67 +103,67 @@ class TestDoingNothing:
             assert ("so this is its initial world" in film.description) == (rules.frame_skip > 2)
         assert "what doing nothing does (the first 8.5 s)" in film.description
 
-    def test_a_world_that_breaks_down_ends(self) -> None:
+    def test_do_nothing_ends_when_the_world_breaks_down(self) -> None:
         level = sample_levels(jnp.array([ends_late()]), SIZES["s"])
         model = replace(level.model, gravity=level.model.gravity * np.nan)
         assert do_nothing(replace(level, model=model), self.RULES)[1] == (1, "world breaks down")
 
 
 def ends_late() -> int:
-    """A level of s where doing nothing lasts until the time is up."""
+    """Id of a level of size s in which doing nothing lasts until time is up."""
     levels = sample_levels(jnp.arange(64), SIZES["s"])
     facts = examine(levels, TaskParams(), 256)
     return int(np.flatnonzero(~facts.reaches & ~facts.fails)[0])
 
 
-def test_the_drawing_of_a_level_made_again_is_that_of_its_shard(split, tmp_path) -> None:
-    """The first picture of a witness is the level that its id rebuilds."""
+def test_film_starts_with_the_resampled_level(split, tmp_path) -> None:
+    """The first picture of a witness equals the level sampled from its id."""
     manifest, row = find_level(split, level_with(split, "solved"))
     film = witness_film(manifest, row)
     again = sample_levels(jnp.array([row["level_id"]], jnp.int32), SIZES["s"], made_job().distribution)
     world = (0, 40, 480, 480)
     bare = draw(again, again.state, action=np.zeros(6, np.int32)).crop(world)
     ours = rasterised(film.scenes[0]).crop(world)
-    assert (np.asarray(bare) != np.asarray(ours)).any(-1).mean() < 0.02  # but for actuators at work
+    assert (np.asarray(bare) != np.asarray(ours)).any(-1).mean() < 0.02  # except running actuators
 
 
 @pytest.mark.parametrize("level_id", [PLAYED, -1, 10**9])
-def test_a_level_that_is_not_there(split, tmp_path, level_id) -> None:
+def test_show_refuses_an_unknown_level(split, tmp_path, level_id) -> None:
     with pytest.raises(UserError, match=rf"^There is no level {level_id} in .*64 levels, from 0 to 63\.$"):
         show(split, level_id, tmp_path / "level.gif")
 
 
 @pytest.mark.parametrize("name", ["level.jpg", "level", "level.gif.txt"])
-def test_a_suffix_that_nobody_draws(split, tmp_path, name) -> None:
+def test_show_refuses_an_unknown_suffix(split, tmp_path, name) -> None:
     with pytest.raises(UserError, match=r"must end in \.gif, \.png, \.mp4, \.svg\.$"):
         show(split, 0, tmp_path / name)
     assert not (tmp_path / name).exists()
 
 
-def test_a_split_that_is_not_there(tmp_path) -> None:
+def test_show_refuses_a_missing_split(tmp_path) -> None:
     with pytest.raises(UserError, match="There is no split at"):
         show(tmp_path / "nothing", 0, tmp_path / "level.gif")
 
 
-def test_a_file_that_cannot_be_written(split, tmp_path) -> None:
+def test_show_refuses_an_unwritable_file(split, tmp_path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"^Cannot write .*: choose another file with -o"):
         show(split, 0, tmp_path / "file" / "level.gif")
 
 
-def test_a_film_as_mp4(split, tmp_path) -> None:
+def test_show_writes_mp4(split, tmp_path) -> None:
     show(split, level_with(split, "solved"), tmp_path / "level.mp4")
     assert (tmp_path / "level.mp4").read_bytes()[4:8] == b"ftyp"
 
 
-def test_mp4_needs_ffmpeg(split, tmp_path, monkeypatch) -> None:
+def test_show_mp4_needs_ffmpeg(split, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(UserError, match="ffmpeg"):
         show(split, level_with(split, "solved"), tmp_path / "other.mp4")
 
 
-def test_a_record_that_does_not_reach_the_goal_is_refused(split, monkeypatch) -> None:
+def test_witness_film_refuses_a_record_without_success(split, monkeypatch) -> None:
     monkeypatch.setattr(show_module, "succeeds", lambda done, goal: succeeds(done, ~goal))
     with pytest.raises(Failure, match="does not reach the goal"):
         witness_film(*find_level(split, level_with(split, "solved")))

@@ -1,4 +1,4 @@
-"""How far a split is, whatever runs of ids were wanted."""
+"""Status of a split, for any requested ranges of ids."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from levelproof.pipeline.store.layout import JOB
 from tests.pipeline.made import made_split
 
 
-def test_what_is_committed_of_what_is_wanted(tmp_path: Path) -> None:
+def test_read_status_counts_committed_of_requested_levels(tmp_path: Path) -> None:
     split = made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED, Label.TRIVIAL], [Label.SOLVED, Label.SOLVED]])
     (split / JOB).write_text(json.dumps({"command": "levelproof generate", "level_ids": [[1, 3], [9, 9]]}))
     facts = read_status(split)
@@ -20,7 +20,7 @@ def test_what_is_committed_of_what_is_wanted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("level_ids", ["[[0]]", "[[0, 1e99]]", '[["a", "b"]]', "7", "[[0, 99999999999999999999]]"])
-def test_a_damaged_note_is_named(tmp_path: Path, level_ids: str) -> None:
+def test_read_status_names_a_damaged_note(tmp_path: Path, level_ids: str) -> None:
     (tmp_path / JOB).write_text(f'{{"command": "", "level_ids": {level_ids}}}')
     with pytest.raises(Exception, match=r"job.json is damaged: run `levelproof generate` for this split again\.$"):
         read_status(tmp_path)

@@ -1,4 +1,4 @@
-"""A run is watched from its split alone, until it ends."""
+"""Watching a run through its split, until it ends."""
 
 import json
 import threading
@@ -29,7 +29,7 @@ def state(event: str, age: float = 0.0, **changes: object) -> dict:
     return {"time": time.time() - age, "event": event, "workers": workers, **STATE, **changes}
 
 
-def test_each_look_is_a_line_until_the_run_ends(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_watch_prints_a_line_per_refresh_until_the_run_ends(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = new_run(split)
     failed = {"time": time.time(), "event": "failed", "unit": "0-1", "cause": "of this one"}
     tell(run, [failed, state("progress")])
@@ -38,13 +38,13 @@ def test_each_look_is_a_line_until_the_run_ends(split: Path, capsys: pytest.Capt
         timer.start()
         watch(split, True, Console(), interval=0.1)
     facts = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [of["running"] for of in facts] == [True] * (len(facts) - 1) + [False]
+    assert [state["running"] for state in facts] == [True] * (len(facts) - 1) + [False]
     assert len(facts) > 1
     assert (facts[0]["solved_share"], facts[0]["failed"], facts[0]["rate"]) == (0.75, ["0-1: of this one"], 12)
     assert facts[-1]["done"] == 8
 
 
-def test_a_run_that_died_is_not_at_work_and_a_silent_one_is_told(split: Path) -> None:
+def test_watch_tells_dead_runs_from_silent_ones(split: Path) -> None:
     tell(new_run(split), [state("progress", age=600.0)])
     assert not read_progress(split)["running"]
     with only_writer(split, print):
@@ -59,7 +59,7 @@ def test_a_run_that_died_is_not_at_work_and_a_silent_one_is_told(split: Path) ->
     assert "2, longest silent for 10 min" in text
 
 
-def test_a_cause_is_told_as_it_is_and_no_terminal_obeys_it(split: Path) -> None:
+def test_watch_prints_causes_without_control_characters(split: Path) -> None:
     failed = {"time": 1.0, "event": "failed", "unit": "0-1", "cause": "KeyError: [b] of [/a]\x1b[2J"}
     damaged = {"time": 1.0, "event": "failed"}
     tell(new_run(split), [failed, damaged, state("ended")])
@@ -68,7 +68,7 @@ def test_a_cause_is_told_as_it_is_and_no_terminal_obeys_it(split: Path) -> None:
     assert "0-1: KeyError: [b] of [/a]?[2J" in done.stdout
 
 
-def test_where_nothing_is_told_a_sentence_says_so(split: Path) -> None:
+def test_watch_refuses_a_split_without_events(split: Path) -> None:
     assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has logged its state")
     tell(new_run(split), [{"time": 1.0, "event": "progress"}])  # damaged
     assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has logged its state")

@@ -1,4 +1,4 @@
-"""A page at play: it asks a real server over a websocket, and the engine answers."""
+"""The server of `play` over a real websocket, with the real engine."""
 
 import json
 import time
@@ -27,13 +27,13 @@ from tests.experts.small import untouched
 from tests.pace import patience
 from tests.pipeline.command import assert_refused, here
 
-ANSWER_SECONDS = 120  # limit of an answer from the page's server
+ANSWER_SECONDS = 120  # s; limit for an answer
 QUICK = replace(untouched(StopConfig()), scout=ScoutConfig(rounds=4))
 
 
 @pytest.fixture(scope="module")
 def address(split: Path) -> Iterator[str]:
-    """Of a server that plays a level with a witness."""
+    """Address of a server whose level has a witness."""
     rows = require_manifest(split).table.to_pylist()
     solved = next(row for row in rows if row["shard"])
     file, actions = level_to_play(split, solved["level_id"], "m")
@@ -48,14 +48,14 @@ def page(address: str) -> Iterator[ClientConnection]:
         yield connection
 
 
-def ask(page: ClientConnection, question: str, /, **words: Any) -> dict[str, Any]:
-    page.send(json.dumps({"ask": question, "id": 1, **words}))
+def ask(page: ClientConnection, request: str, /, **fields: Any) -> dict[str, Any]:
+    page.send(json.dumps({"ask": request, "id": 1, **fields}))
     while "training" in (answer := json.loads(page.recv(patience(ANSWER_SECONDS)))):
         pass
     return answer
 
 
-def test_steps_of_the_page_are_those_of_the_engine(page: ClientConnection) -> None:
+def test_step_requests_reproduce_the_film(page: ClientConnection) -> None:
     film = ask(page, "play")
     assert ask(page, "restart")["places"] == film["places"][0]
     for step, action in enumerate(film["actions"], 1):
@@ -65,10 +65,10 @@ def test_steps_of_the_page_are_those_of_the_engine(page: ClientConnection) -> No
             assert not moment["done"]
     assert moment["goal"]
     assert moment["timestep"] == len(film["actions"])
-    assert ask(page, "step", action=[0] * 6)["timestep"] == 1  # the next episode
+    assert ask(page, "step", action=[0] * 6)["timestep"] == 1  # a new episode
 
 
-def test_a_saved_level_brings_its_witness_and_is_a_level_file(page: ClientConnection, tmp_path: Path) -> None:
+def test_save_writes_a_level_file_with_its_witness(page: ClientConnection, tmp_path: Path) -> None:
     document = ask(page, "save")["document"]
     path = tmp_path / "witness.json"
     path.write_text(json.dumps(document))
@@ -79,11 +79,11 @@ def test_a_saved_level_brings_its_witness_and_is_a_level_file(page: ClientConnec
     padded[: len(actions), :, 0] = actions
     record = replay(file.level, padded, file.rules)
     assert succeeds(record.done[: len(actions)], record.goal[: len(actions)])[0]
-    document["witness"]["actions"] = [[0] * 6] * 3  # which do not solve it
+    document["witness"]["actions"] = [[0] * 6] * 3  # these do not solve the level
     assert ask(page, "load", document=document)["witness"] is False
 
 
-def test_edits_are_made_taken_back_and_refused(page: ClientConnection) -> None:
+def test_edits_are_applied_undone_and_refused(page: ClientConnection) -> None:
     ask(page, "empty", size="m")
     level = ask(page, "edit", name="add_body", **{"with": ["circle", 1.0, 2.0]})
     body = ask(page, "at", x=1.0, y=2.0)["bodies"][0]
@@ -95,35 +95,35 @@ def test_edits_are_made_taken_back_and_refused(page: ClientConnection) -> None:
     assert from_document(ask(page, "save")["document"]).level.role[body] == 0
     assert ask(page, "redo")["undo"]
     assert from_document(ask(page, "save")["document"]).level.role[body] == 1
-    for name, words in (("delete", ["body", 0]), ("move", [body, 1e9, 0]), ("resize", [body, float("nan")])):
-        assert ask(page, "edit", name=name, **{"with": words})["error"].endswith(".")
-    for nonsense in ({"ask": "__init__"}, {"ask": "edit"}, {"ask": "step", "action": [9] * 6}, {"ask": ["step"]}, {}):
-        page.send(json.dumps(nonsense))
+    for name, values in (("delete", ["body", 0]), ("move", [body, 1e9, 0]), ("resize", [body, float("nan")])):
+        assert ask(page, "edit", name=name, **{"with": values})["error"].endswith(".")
+    for malformed in ({"ask": "__init__"}, {"ask": "edit"}, {"ask": "step", "action": [9] * 6}, {"ask": ["step"]}, {}):
+        page.send(json.dumps(malformed))
         assert json.loads(page.recv(patience(ANSWER_SECONDS)))["error"].endswith(".")
     assert ask(page, "load", document={"env_state": 1})["error"]
 
 
 @pytest.mark.campaign
-def test_an_expert_is_trained_while_the_page_looks_on(page: ClientConnection, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_train_request_streams_progress(page: ClientConnection, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "ATTEMPT_INTERVAL", 0.0)
     assert "error" not in ask(page, "train")
-    told, end = [], time.monotonic() + patience(ANSWER_SECONDS)
-    while not told or told[-1].get("stage") not in ("done", "failed"):
+    messages, end = [], time.monotonic() + patience(ANSWER_SECONDS)
+    while not messages or messages[-1].get("stage") not in ("done", "failed"):
         assert time.monotonic() < end
         message = json.loads(page.recv(patience(ANSWER_SECONDS)))
-        told.append(message["training"])
-    assert told[-1]["label"] == "solved", told[-1]
-    assert any("curve" in message for message in told)
-    seen = [message for message in told if "attempts" in message]
-    assert all(len(of["attempts"]) == len(of["goals"]) == training.ATTEMPTS for of in seen)
-    assert seen
-    start, drawn = ask(page, "restart")["places"], np.array(seen[0]["attempts"])
+        messages.append(message["training"])
+    assert messages[-1]["label"] == "solved", messages[-1]
+    assert any("curve" in message for message in messages)
+    updates = [message for message in messages if "attempts" in message]
+    assert all(len(update["attempts"]) == len(update["goals"]) == training.ATTEMPTS for update in updates)
+    assert updates
+    start, drawn = ask(page, "restart")["places"], np.array(updates[0]["attempts"])
     assert drawn.shape == (training.ATTEMPTS, training.SHOWN_STEPS, len(start))
-    film = told[-1]["film"]
+    film = messages[-1]["film"]
     assert ask(page, "play")["actions"] == film["actions"]
 
 
-def test_only_its_own_page_may_ask(address: str) -> None:
+def test_server_refuses_other_origins_and_hosts(address: str) -> None:
     with pytest.raises(InvalidStatus, match="403"):
         connect(f"{address.replace('http', 'ws')}/socket", origin="http://example.com")  # pyright: ignore[reportArgumentType]
     for path, host in (("/", "example.com"), ("/../session.py", ""), ("/nothing", "")):
@@ -134,7 +134,7 @@ def test_only_its_own_page_may_ask(address: str) -> None:
         assert urllib.request.urlopen(address + path).read()
 
 
-def test_what_cannot_be_played_is_one_sentence(split: Path, tmp_path: Path, address: str) -> None:
+def test_play_refuses_unplayable_arguments(split: Path, tmp_path: Path, address: str) -> None:
     assert_refused(here(["play", str(tmp_path / "none.json")], tmp_path), 2, "none.json")
     assert_refused(here(["play", str(split)], tmp_path), 2, "Add its id")
     assert_refused(here(["play", "--size", "giant"], tmp_path), 2, "giant")

@@ -1,4 +1,4 @@
-"""`levelproof play` in a real browser: a level is built by hand, edited, and played until green touches blue."""
+"""`levelproof play` in a real browser."""
 
 import json
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from tests.pipeline.play.test_play import QUICK
 
 __all__ = ["chromium"]  # a fixture
 pytestmark = pytest.mark.campaign
-VIEW, BORDER, TOP = 5.16, 0.08, 5.08  # m, of the canvas
+VIEW, BORDER, TOP = 5.16, 0.08, 5.08  # m; the canvas shows -BORDER to TOP
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def page(chromium: Any) -> Iterator[Any]:
 
 
 def click(page: Any, x: float, y: float) -> None:
-    """At a point of the world, m."""
+    """Click at a point of the world, m."""
     box = page.locator("#stage").bounding_box()
     scale = box["width"] / VIEW
     page.mouse.click(box["x"] + (x + BORDER) * scale, box["y"] + (TOP - y) * scale)
@@ -44,16 +44,16 @@ def button(page: Any, name: str, role: str = "button") -> None:
 
 
 def place(page: Any, shape: str, x: float, y: float, role: str) -> None:
-    """A body with a role."""
+    """Add a body with a role."""
     button(page, shape, "radio")
     click(page, x, y)
-    page.wait_for_selector("[data-tool=select][aria-checked=true]")  # which it goes back to
+    page.wait_for_selector("[data-tool=select][aria-checked=true]")  # the page returns to this tool
     click(page, x, y)
     button(page, role)
     page.wait_for_function(f"document.querySelector('#what').textContent.toLowerCase().startsWith('{role}')")
 
 
-def test_a_level_is_built_edited_played_and_saved(page: Any, tmp_path: Path) -> None:
+def test_page_builds_edits_plays_and_saves_a_level(page: Any, tmp_path: Path) -> None:
     place(page, "Circle", 1.0, 0.7, "green")
     place(page, "Rectangle", 4.0, 0.7, "blue")
     button(page, "Fix it")
@@ -91,7 +91,7 @@ def test_a_level_is_built_edited_played_and_saved(page: Any, tmp_path: Path) -> 
     assert page.locator("#watch").is_enabled()
 
 
-def test_an_expert_trains_in_sight(page: Any, tmp_path: Path) -> None:
+def test_page_shows_training_to_its_end(page: Any, tmp_path: Path) -> None:
     place(page, "Circle", 1.0, 0.7, "green")
     place(page, "Rectangle", 4.0, 0.7, "blue")
     button(page, "Thruster", "radio")
@@ -103,7 +103,7 @@ def test_an_expert_trains_in_sight(page: Any, tmp_path: Path) -> None:
     assert page.locator("#learning").is_hidden() == (page.locator("#curve path").count() == 0)
 
 
-def test_a_learning_curve_is_seen(page: Any) -> None:
+def test_page_shows_a_learning_curve(page: Any) -> None:
     rates = "levelproof.drawCurve(document.querySelector('#curve'), [null, 0.25, null, 0.5])"
     assert page.locator("#curve").is_hidden()
     page.evaluate(rates)
