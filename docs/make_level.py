@@ -1,4 +1,4 @@
-"""Draws docs/concepts-level.svg: a level with a name on each thing that it is made of.
+"""Draw docs/concepts-level.svg: a level with its parts labelled.
 
 python docs/make_level.py
 """
@@ -20,8 +20,8 @@ from levelproof.pipeline.runtime import prepare_jax
 
 DRAWING = Path(__file__).with_name("concepts-level.svg")
 ACTION = np.array([1, 0, 0, 0, 1, 0])
-LETTERS = 0.15  # m
-BODIES = (  # shape, centre, times as large, role
+LETTER = 0.15  # m; height of a label's letters
+BODIES = (  # shape, centre in m, scale factor, role
     ("rectangle", (1.45, 1.05), 1.7, Role.GREEN),
     ("circle", (1.2, 0.72), 1.1, Role.PLAIN),
     ("circle", (1.7, 0.72), 1.1, Role.PLAIN),
@@ -29,7 +29,7 @@ BODIES = (  # shape, centre, times as large, role
     ("rectangle", (4.2, 1.35), 1.6, Role.PLAIN),
     ("triangle", (3.0, 0.7), 1.2, Role.RED),
 )
-NAMES: tuple[tuple[str, Point, Point, Point], ...] = (  # words, where they begin, a line to what they name
+LABELS: tuple[tuple[str, Point, Point, Point], ...] = (  # text, its position, start and end of the line to the part
     ("thruster: pushes along its nozzle", (0.25, 2.15), (0.9, 2.05), (1.08, 1.2)),
     ("green: has to touch blue", (2.05, 1.78), (2.0, 1.74), (1.7, 1.4)),
     ("motor", (2.06, 1.1), (2.02, 1.05), (1.77, 0.83)),
@@ -55,11 +55,11 @@ def main() -> None:
     prepare_jax()
     one = level()
     scene = scene_of(one, one.state, action=ACTION, caption=Caption("a level, under an action"))
-    names = "".join(
-        line([start, end], INK, 0.012) + text(place, words, INK, LETTERS) for words, place, start, end in NAMES
+    labels = "".join(
+        line([start, end], INK, 0.012) + text(position, words, INK, LETTER) for words, position, start, end in LABELS
     )
-    named = replace(scene, title="A level and what it is made of", parts=(*scene.parts, Part(names)))
-    DRAWING.write_text(svg_of([named], [1.0]), encoding="utf-8")
+    labelled = replace(scene, title="A level and what it is made of", parts=(*scene.parts, Part(labels)))
+    DRAWING.write_text(svg_of([labelled], [1.0]), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Takes the pictures of pages: docs/gallery.png and gallery-level.png of a gallery, play.png of `levelproof play`.
+"""Take the screenshots docs/gallery.png, docs/gallery-level.png and docs/play.png of the gallery and the player.
 
 levelproof generate size=l levels=96 budget=64k
 levelproof gallery data/64k/l -o gallery
@@ -16,8 +16,8 @@ from levelproof.pipeline.runtime import prepare_jax
 
 VIEW = {"width": 1180, "height": 700}
 FOLDER = Path(__file__).parent
-BODY = (0.63, 0.56)  # of the world's width and height: where level 76 has a body to select
-MIDDLE = 0.4  # of an episode: what the pictures show
+BODY = (0.63, 0.56)  # fractions of the canvas; a body of level 76 to select
+MIDDLE = 0.4  # fraction of the episode that gallery-level.png shows
 
 
 def main(site: Path, split: Path, level_id: int) -> None:

@@ -1,4 +1,4 @@
-"""Draws docs/solved-SIZE.png: the first levels of a split that were solved, each when its witness reaches the goal.
+"""Draw docs/solved-SIZE.png: the first solved levels of a split, each when its witness reaches the goal.
 
 levelproof generate size=s levels=96 budget=64k
 python docs/make_sheets.py data/64k/s
@@ -13,7 +13,7 @@ from levelproof.pipeline.look.show import film_of
 from levelproof.pipeline.store.manifest import read_manifest
 
 LEVELS, COLUMNS = 10, 5
-PIXELS = 220  # width of one level's picture
+PIXELS = 220  # width of a level's picture
 
 
 def main(split: Path) -> None:

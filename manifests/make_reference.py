@@ -1,5 +1,6 @@
-"""Writes a split's manifest as one file, and its levels' initial worlds, into this folder, and its gallery's data into
-docs/example/, whose pages are links to the program's. See README.md here.
+"""Write a split's manifest and initial worlds to this folder, and its gallery's data to docs/example/.
+
+The pages of docs/example/ are links to the gallery's own. See README.md here.
 
 python manifests/make_reference.py data/128k/s
 """

@@ -1,6 +1,6 @@
 #!/bin/bash
-# One size of levels a task, each on the cores of one machine: sbatch docs/examples/slurm-array.sh
-# A task that is preempted or out of time is queued again, and the same command goes on.
+# One size of levels per task, each on the cores of one machine: sbatch docs/examples/slurm-array.sh
+# A task that is preempted or out of time is requeued, and the same command resumes.
 #SBATCH --job-name=levelproof
 #SBATCH --array=0-2
 #SBATCH --nodes=1

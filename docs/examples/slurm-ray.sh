@@ -1,5 +1,5 @@
 #!/bin/bash
-# Ray in one allocation of several machines, and one job on all of them: sbatch docs/examples/slurm-ray.sh
+# Ray on several machines of one allocation, and one job on all of them: sbatch docs/examples/slurm-ray.sh
 #SBATCH --job-name=levelproof
 #SBATCH --nodes=4
 #SBATCH --ntasks-per-node=1
@@ -19,7 +19,7 @@ start "$head" --head --port=6379
 until ray status > /dev/null 2>&1; do sleep 1; done
 for host in "${hosts[@]:1}"; do start "$host" --address="$RAY_ADDRESS"; done
 
-# Only the command hears of the end (B: above), while its workers still live to commit what is decided
+# B: above signals only this script, which stops the command; its workers live on to commit decided levels
 levelproof generate size=s levels=6M budget=256k checkpoint=10min out=data &
 job=$!
 trap 'kill -TERM "$job"; wait "$job"; scontrol requeue "$SLURM_JOB_ID"; exit 0' TERM

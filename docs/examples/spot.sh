@@ -1,6 +1,6 @@
 #!/bin/bash
-# On a machine that may go at any time, or on the next one with the same disk: the same command until nothing is left.
-# Exit codes: 0 done, 3 done but for units that failed repeatedly, 2 the command has to change; after others, again.
+# On a preemptible machine, or its successor with the same disk: repeat the same command until nothing is left.
+# Exit codes: 0 done, 3 done except for units that failed repeatedly, 2 fix the command; retry after any other.
 set -u
 while :; do
     levelproof generate size=s levels=6M budget=1M checkpoint=10min out=data &

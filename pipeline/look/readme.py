@@ -205,9 +205,9 @@ def _making(splits: Sequence[SplitFacts]) -> str:
         rows.append(f"| `{split.path}` | {cells} | {'; '.join(split.made_with)} |")
     first = splits[0]
     return (
-        "## How it was made\n\nAs configured, each level was searched for a way to the goal, and a PPO expert of its own "
-        "trained on it for at most the budget's env steps; `witness` in the manifest says what found the way. The "
-        "manifests contain the whole configuration.\n\n" + "\n".join(rows) + "\n\n"
+        "## How it was made\n\nAs configured, each level was searched for a way to the goal, and a PPO expert of its "
+        "own trained on it for at most the budget's env steps; `witness` in the manifest says what found the way. "
+        "The manifests contain the whole configuration.\n\n" + "\n".join(rows) + "\n\n"
         "To remake the levels and their experts, or to check every byte and every witness:\n\n"
         f"    levelproof regenerate manifest=data/{first.path} budget={first.budget} out=again\n"
         f"    levelproof verify data/{first.path}"
