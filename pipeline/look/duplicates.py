@@ -24,9 +24,8 @@ COMPARED = ("content_hash", "signature")
 HALVES = ("signature[1]", "signature[2]")
 CONTENT = "content"  # column of 64-bit hashes of `content_hash`
 NUMBERS = (CONTENT, *HALVES)
-FACTORS = (
-    np.random.default_rng(0).integers(0, 2**63, 64, np.uint64) * 2 + 1
-)  # one odd multiplier per 8-byte word of a string
+# One odd multiplier per 8-byte word of a string
+FACTORS = np.random.default_rng(0).integers(0, 2**63, 64, np.uint64) * 2 + 1
 ALIKE_WITHIN = "CREATE TABLE alike AS SELECT * FROM levels WHERE " + " OR ".join(
     f"hash({half}) IN (SELECT hash({half}) AS half FROM levels GROUP BY half HAVING count(*) > 1)" for half in HALVES
 )
@@ -161,9 +160,8 @@ def _pairs(connection: duckdb.DuckDBPyConnection, query: str, shown: int) -> dic
 
 
 def _of_files(files: list[Path]) -> pa.Table:
-    from levelproof.levelgen.identity.content import (
-        content_hashes,  # imported here, so that comparing splits need not wait for JAX
-    )
+    # Imported here, so that comparing splits need not wait for JAX
+    from levelproof.levelgen.identity.content import content_hashes
     from levelproof.levelgen.identity.signature import signatures
     from levelproof.pipeline.read.levels import level_file
 

@@ -52,7 +52,7 @@ def _lines(facts: Mapping[str, Any]) -> dict[str, str | list[str]]:
         "training env steps": _training(facts),
         "cost": cost.describe_cost(facts["cost"]) if facts["cost"] else None,
         "duplicates": duplicates.describe(facts["duplicates"]),
-        **{f"duplicates in {other}": duplicates.describe(found) for other, found in facts["against"].items()},
+        **{f"duplicates in {other}": duplicates.describe(pairs) for other, pairs in facts["against"].items()},
         "shards of the split": f"{facts['split_bytes']:,} bytes" if facts["split_bytes"] is not None else None,
         "bytes per transition": f"{facts['bytes_per_transition']:.1f}" if facts["bytes_per_transition"] else None,
     }
@@ -66,20 +66,20 @@ def _reasons(kinds: Mapping[str, int]) -> list[str]:
     return [*shown, f"{rest} other reasons"] if rest else shown
 
 
-def _by_entities(found: Mapping[str, Any] | None) -> dict[str, str | None]:
+def _by_entities(shares: Mapping[str, Any] | None) -> dict[str, str | None]:
     """Share of levels solved, by the number of each kind of entity they have."""
-    if found and found["problem"]:
-        return {"solved, by entities": found["problem"]}
-    if not found or not found["levels"]:
+    if shares and shares["problem"]:
+        return {"solved, by entities": shares["problem"]}
+    if not shares or not shares["levels"]:
         return {}
-    sample = f" (of {found['levels']:,} sampled)" if found["looked_at"] < found["of"] else ""
+    sample = f" (of {shares['levels']:,} sampled)" if shares["looked_at"] < shares["of"] else ""
     ends = lambda share: "-".join(f"{100 * end:.0f}" for end in share["interval"])
     shown = lambda share: f"{share['solved'] / share['tried']:.0%} ({ends(share)}) of {share['tried']:,}"
     return {
-        f"solved, by {name}": ", ".join(f"{count}: {shown(share)}" for count, share in found[name].items())
+        f"solved, by {name}": ", ".join(f"{count}: {shown(share)}" for count, share in shares[name].items())
         + sample * (name == ENTITIES[0])
         for name in ENTITIES
-        if len(found[name]) > 1
+        if len(shares[name]) > 1
     }
 
 

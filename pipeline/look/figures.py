@@ -25,16 +25,16 @@ DEVIATIONS = 1.96  # standard deviations of a 95% interval
 
 
 class Share(NamedTuple):
-    """`hits` out of `of`."""
+    """`hits` out of `total`."""
 
     hits: int
-    of: int
+    total: int
 
     @property
     def interval(self) -> tuple[float, float]:
         """Wilson's 95% interval."""
-        z2, p = DEVIATIONS**2 / self.of, self.hits / self.of
-        middle, half = p + z2 / 2, DEVIATIONS * sqrt((p * (1 - p) + z2 / 4) / self.of)
+        z2, p = DEVIATIONS**2 / self.total, self.hits / self.total
+        middle, half = p + z2 / 2, DEVIATIONS * sqrt((p * (1 - p) + z2 / 4) / self.total)
         return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
 
     @property
@@ -44,7 +44,7 @@ class Share(NamedTuple):
 
     def __str__(self) -> str:
         low, high = self.interval
-        return f"{self.hits / self.of:.1%} ({low:.1%} to {high:.1%})"
+        return f"{self.hits / self.total:.1%} ({low:.1%} to {high:.1%})"
 
 
 def draw_shares(shares: Mapping[str, Share], title: str, path: Path) -> None:
@@ -61,7 +61,7 @@ def draw_shares(shares: Mapping[str, Share], title: str, path: Path) -> None:
         low, high = share.interval
         parts.append(text((LABEL - 0.15, y), name, INK, LETTER, ends=True))
         parts.append(line([(at(low), y), (at(high), y)], ROLE_COLOUR[Role.BLUE], 0.05))
-        parts.append(disc((at(share.hits / share.of), y), 0.07, ROLE_COLOUR[Role.BLUE], ROLE_COLOUR[Role.BLUE]))
+        parts.append(disc((at(share.hits / share.total), y), 0.07, ROLE_COLOUR[Role.BLUE], ROLE_COLOUR[Role.BLUE]))
         parts.append(text((LABEL + AXIS + 0.15, y), str(share), INK, SMALL))
     _write(parts, (LABEL + AXIS + VALUE, top + 0.8), path)
 

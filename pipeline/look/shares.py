@@ -34,9 +34,9 @@ def solved_by_entities(manifest: Manifest, ids: np.ndarray) -> dict[str, Any]:
     rows = require_manifest(manifest.split, COLUMNS, ids[:most]).table
     tried = np.isin(rows["label"].to_pylist(), [label.value for label in TRAINED])
     rows = rows.filter(pa.array(tried))
-    found: dict[str, Any] = {"levels": rows.num_rows, "looked_at": most, "of": len(ids), "problem": None}
+    facts: dict[str, Any] = {"levels": rows.num_rows, "looked_at": most, "of": len(ids), "problem": None}
     if not rows.num_rows:
-        return found
+        return facts
     if not read:  # ids suffice: read no shards
         index = rows.schema.get_field_index("shard")
         rows = rows.set_column(index, "shard", pa.nulls(rows.num_rows, pa.string()))
@@ -44,15 +44,15 @@ def solved_by_entities(manifest: Manifest, ids: np.ndarray) -> dict[str, Any]:
     try:
         levels = levels_of(manifest, rows)
     except (Failure, UserError) as error:  # the other facts need only the manifest
-        return found | {"levels": 0, "problem": str(error)}
+        return facts | {"levels": 0, "problem": str(error)}
     for name, counts in count_entities(levels).items():
-        found[name] = {
+        facts[name] = {
             str(count): as_json(Share(int(solved[counts == count].sum()), int((counts == count).sum())))
             for count in np.unique(counts)
         }
-    return found
+    return facts
 
 
 def as_json(share: Share) -> dict[str, Any]:
     """Convert a share to JSON types, with its 95% interval."""
-    return {"solved": share.hits, "tried": share.of, "interval": share.rounded}
+    return {"solved": share.hits, "tried": share.total, "interval": share.rounded}

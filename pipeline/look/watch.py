@@ -30,8 +30,9 @@ FAILURE = {"unit", "cause"}
 
 
 def watch(split: Path, as_json: bool, console: Console, interval: float = INTERVAL) -> None:
-    """Show a job's progress, refreshed until no run is active or the output has no reader; with `as_json`, one JSON
-    object per line.
+    """Show a job's progress, refreshed until no run is active or the output has no reader.
+
+    With `as_json`, print one JSON object per refresh.
 
     Raises:
         UserError: no split, or no run has logged its state.

@@ -51,7 +51,7 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
         UserError: no split, no matching level, `out` exists and is not a gallery, or it cannot be written.
         Failure: the split is damaged.
     """
-    manifest, found = _chosen(split, where, most)
+    manifest, matching = _chosen(split, where, most)
     count = manifest.table.num_rows
     with new_folder(out, replaces=lambda folder: (folder / ABOUT).is_file()) as folder:
         shutil.copytree(SITE, folder, dirs_exist_ok=True)
@@ -61,10 +61,10 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
         about, values = encode_columns(manifest.table, entities | {"seconds": cost.seconds_of(manifest.table)})
         for page in range(math.ceil(count / PAGE)):
             _write(folder, f"columns/{page}", encode_page(values, page))
-        _write(folder, "about", _about(manifest, found, where, about))
+        _write(folder, "about", _about(manifest, matching, where, about))
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    spread = f"{count:,} of {many(found, 'level')}, spread evenly over their ids,"
-    some = many(count, "level") if count == found else spread
+    sample = f"{count:,} of {many(matching, 'level')}, spread evenly over their ids,"
+    some = many(count, "level") if count == matching else sample
     print(f"{out / 'index.html'}: {some} of {as_typed(split)}, {size / 1e6:,.1f} MB. Open it in a browser, or:")
     print(f"{Path(sys.executable).name} -m webbrowser {shlex.quote(str(out / 'index.html'))}")
 
@@ -116,12 +116,12 @@ def _witness(level: Level, motion: Mapping[str, np.ndarray], between: float, row
     return {"states": states, "actions": encode_array(motion["record/action"][:steps].astype(np.uint8))}
 
 
-def _about(manifest: Manifest, found: int, where: str | None, columns: list[dict[str, Any]]) -> dict[str, Any]:
+def _about(manifest: Manifest, matching: int, where: str | None, columns: list[dict[str, Any]]) -> dict[str, Any]:
     rules = rules_of(manifest)
     return {
         "split": as_typed(manifest.split),
         "levels": manifest.table.num_rows,
-        "found": found,
+        "found": matching,
         "where": where,
         "config_hash": manifest.config_hash,
         "step_seconds": rules.frame_skip * rules.physics.dt,

@@ -162,7 +162,7 @@
     load(row) {
       if (this.loading >= LOADS || this.worlds.has(row)) return;
       this.loading++;
-      const block = (of) => Math.floor(of / this.columns.about.block);
+      const block = (index) => Math.floor(index / this.columns.about.block);
       this.worlds.get(row).catch((error) => {
         levelproof.report(error.message);
         this.queue = this.queue.filter((wanted) => block(wanted.row) !== block(row));

@@ -60,14 +60,14 @@
       });
       at("keys").replaceChildren(...this.keys.map((key) => key.element));
       levelproof.drawCurve(at("curve"), row.learning_curve);
-      const value = (of) => {
-        if (of === null) return "–";
-        if (typeof of === "number") return formatted(of);
-        if (typeof of === "boolean") return of ? "yes" : "no";
-        return Array.isArray(of) ? of.join(" ") : typeof of === "object" ? Object.entries(of).map(([name, x]) => `${name} ${value(x)}`).join(", ") : of;
+      const value = (entry) => {
+        if (entry === null) return "–";
+        if (typeof entry === "number") return formatted(entry);
+        if (typeof entry === "boolean") return entry ? "yes" : "no";
+        return Array.isArray(entry) ? entry.join(" ") : typeof entry === "object" ? Object.entries(entry).map(([name, x]) => `${name} ${value(x)}`).join(", ") : entry;
       };
       const entries = Object.entries(row).filter(([name]) => !["label_reason", "command", "learning_curve"].includes(name));
-      at("row").replaceChildren(...entries.flatMap(([name, of]) => [create("dt", {}, readable(name)), create("dd", {}, name === "level_id" ? String(of) : value(of))]));
+      at("row").replaceChildren(...entries.flatMap(([name, entry]) => [create("dt", {}, readable(name)), create("dd", {}, name === "level_id" ? String(entry) : value(entry))]));
       const known = this.film ? `its witness reaches the goal in ${this.film.steps} steps` : "there is no witness, so this is its initial world";
       at("stage").setAttribute("aria-label", `Level ${row.level_id}, ${row.label}: ${known}. ${worldInWords(this.world)}`);
     }
@@ -166,7 +166,7 @@
   // Describe a world in words, for screen readers.
   function worldInWords(world) {
     const bodies = world.bodies.slice(4);
-    const count = (words, of) => (of ? [`${of} ${words}${of > 1 ? "s" : ""}`] : []);
+    const count = (words, total) => (total ? [`${total} ${words}${total > 1 ? "s" : ""}`] : []);
     const roles = ["green", "blue", "red", "plain"].flatMap((role) =>
       count(`${role} body`, bodies.filter((body) => body.role === role).length).map((words) => words.replace("bodys", "bodies")));
     return [...roles, ...count("joint", world.joints.length), ...count("thruster", world.thrusters.length)].join(", ");

@@ -74,7 +74,7 @@
   class Histogram {
     constructor(name, choice, changed) {
       Object.assign(this, { name, choice, changed, bins: null });
-      const path = (of) => create("path", { svg: true, class: of });
+      const path = (name) => create("path", { svg: true, class: name });
       [this.all, this.chosen] = [path("all"), path("chosen")];
       this.brush = create("rect", { svg: true, class: "brush", y: 0, height: HIGH });
       this.drawing = create("svg", {
@@ -141,15 +141,15 @@
       const { all, chosen } = this.choice.histogram(this.name, this.bins);
       const most = Math.max(1, ...all);
       const range = this.choice.conditions.get(this.name);
-      const bars = (counts) => Array.from(counts, (of, bin) => {
+      const bars = (counts) => Array.from(counts, (total, bin) => {
         const [x, next] = [(bin * WIDE) / count, ((bin + 0.86) * WIDE) / count];
-        const tall = of && Math.max(1.2, (HIGH * of) / most);
-        return of ? `M${x.toFixed(1)} ${HIGH}V${(HIGH - tall).toFixed(1)}H${next.toFixed(1)}V${HIGH}Z` : "";
+        const tall = total && Math.max(1.2, (HIGH * total) / most);
+        return total ? `M${x.toFixed(1)} ${HIGH}V${(HIGH - tall).toFixed(1)}H${next.toFixed(1)}V${HIGH}Z` : "";
       }).join("");
       this.all.setAttribute("d", bars(all));
-      const within = chosen.map((of, bin) => {
+      const within = chosen.map((total, bin) => {
         const middle = low + (bin + 0.5) * width;
-        return range && (middle + width / 2 <= range[0] || middle - width / 2 > range[1]) ? 0 : of;
+        return range && (middle + width / 2 <= range[0] || middle - width / 2 > range[1]) ? 0 : total;
       });
       this.chosen.setAttribute("d", bars(within));
       const at = (value) => Math.min(WIDE, Math.max(0, ((value - low) / (count * width)) * WIDE));
@@ -160,7 +160,7 @@
         this.inputs[i].placeholder = formatted(end);
         this.inputs[i].value = range ? Number(range[i].toPrecision(6)) : "";
       });
-      const total = chosen.reduce((sum, of) => sum + of, 0);
+      const total = chosen.reduce((sum, rows) => sum + rows, 0);
       this.drawing.setAttribute("aria-label", `Histogram of ${readable(this.name)}: ${total} levels between ${formatted(low)} and ${formatted(high)}`);
     }
   }
@@ -175,14 +175,14 @@
       const histograms = [...FIRST.filter((name) => named.includes(name)), ...named.filter((name) => !FIRST.includes(name))]
         .map((name) => new Histogram(name, choice, changed));
       this.histograms = histograms;
-      this.filters = [...words.map((of) => of.filter), ...histograms];
+      this.filters = [...words.map(({ filter }) => filter), ...histograms];
       const at = (id) => document.getElementById(id);
       this.more = at("more").parentElement;
       this.more.addEventListener("toggle", () => this.refresh());
-      at("words").append(...words.filter((of) => !isFlag(of.column)).map((of) => of.filter.element));
-      at("histograms").append(...histograms.filter((of) => FIRST.includes(of.name)).map((of) => of.element));
-      at("more").append(...words.filter((of) => isFlag(of.column) && of.column.words.length > 1).map((of) => of.filter.element),
-        ...histograms.filter((of) => !FIRST.includes(of.name)).map((of) => of.element));
+      at("words").append(...words.filter((entry) => !isFlag(entry.column)).map((entry) => entry.filter.element));
+      at("histograms").append(...histograms.filter((entry) => FIRST.includes(entry.name)).map((entry) => entry.element));
+      at("more").append(...words.filter((entry) => isFlag(entry.column) && entry.column.words.length > 1).map((entry) => entry.filter.element),
+        ...histograms.filter((entry) => !FIRST.includes(entry.name)).map((entry) => entry.element));
     }
 
     // Update the bins for newly loaded rows.
