@@ -31,7 +31,7 @@ BODIES = (  # shape, centre in m, scale factor, role
 )
 LABELS: tuple[tuple[str, Point, Point, Point], ...] = (  # text, its position, start and end of the line to the part
     ("thruster: pushes along its nozzle", (0.25, 2.15), (0.9, 2.05), (1.08, 1.2)),
-    ("green: has to touch blue", (2.05, 1.78), (2.0, 1.74), (1.7, 1.4)),
+    ("green: must touch blue", (2.05, 1.78), (2.0, 1.74), (1.7, 1.4)),
     ("motor", (2.06, 1.1), (2.02, 1.05), (1.77, 0.83)),
     ("red: ends the episode", (2.3, 1.4), (3.0, 1.3), (3.0, 1.0)),
     ("blue: the goal", (3.6, 2.85), (4.2, 2.75), (4.3, 2.25)),

@@ -29,7 +29,7 @@
       element.addEventListener("keydown", (event) => this.key(event));
       element.addEventListener("focusin", (event) => {
         const cell = event.target.closest(".cell");
-        if (cell) this.move(cell.place, false);
+        if (cell) this.move(cell.index, false);
       });
     }
 
@@ -70,15 +70,15 @@
       const above = -this.element.getBoundingClientRect().top;
       const first = Math.max(0, (Math.floor(above / tall) - BEYOND) * across);
       const last = Math.min(this.rows.length, (Math.ceil((above + innerHeight) / tall) + BEYOND) * across);
-      for (const [place, cell] of this.cells) {
-        if (place < first || place >= last) {
+      for (const [index, cell] of this.cells) {
+        if (index < first || index >= last) {
           if (cell.element.contains(document.activeElement)) continue; // keep the focused cell
           this.release(cell);
-          this.cells.delete(place);
+          this.cells.delete(index);
         }
       }
-      for (let place = first; place < last; place++) {
-        if (!this.cells.has(place)) this.cells.set(place, this.fill(this.free.pop() || this.cell(), place));
+      for (let index = first; index < last; index++) {
+        if (!this.cells.has(index)) this.cells.set(index, this.fill(this.free.pop() || this.cell(), index));
       }
       this.draw();
     }
@@ -89,7 +89,7 @@
       const link = create("a", {}, canvas, create("p", { "aria-hidden": "true" }, dot, name, detail));
       const element = create("div", { class: "cell", role: "listitem" }, link);
       const cell = { element, link, canvas, dot, name, detail };
-      element.place = 0;
+      element.index = 0;
       this.element.append(element);
       return cell;
     }
@@ -101,23 +101,23 @@
       this.free.push(cell);
     }
 
-    fill(cell, place) {
-      const row = this.rows[place];
+    fill(cell, index) {
+      const row = this.rows[index];
       const id = this.columns.values.level_id[row];
       const label = this.columns.word("label", row);
       const value = this.columns.values[this.detail][row];
       const unit = this.detail === "steps_to_goal" ? ` step${value === 1 ? "" : "s"}` : "";
       const detail = Number.isNaN(value) ? label : formatted(value) + unit;
       cell.row = row;
-      cell.element.place = place;
+      cell.element.index = index;
       cell.element.hidden = false;
       cell.element.style.width = `${this.wide}px`;
       cell.element.style.height = `${this.tall}px`;
-      cell.element.style.transform = `translate(${(place % this.across) * this.wide}px, ${Math.floor(place / this.across) * this.tall}px)`;
-      cell.element.setAttribute("aria-posinset", place + 1);
+      cell.element.style.transform = `translate(${(index % this.across) * this.wide}px, ${Math.floor(index / this.across) * this.tall}px)`;
+      cell.element.setAttribute("aria-posinset", index + 1);
       cell.element.setAttribute("aria-setsize", this.rows.length);
       cell.link.href = this.hrefOf(row);
-      cell.link.tabIndex = place === this.current ? 0 : -1;
+      cell.link.tabIndex = index === this.current ? 0 : -1;
       const steps = this.columns.values.steps_to_goal[row];
       cell.link.setAttribute("aria-label", `Level ${id}, ${label}${Number.isNaN(steps) ? "" : `, ${steps} steps to the goal`}`);
       cell.dot.dataset.label = label;
@@ -172,10 +172,10 @@
       });
     }
 
-    move(place, focuses = true) {
+    move(index, focuses = true) {
       const before = this.cells.get(this.current);
       if (before) before.link.tabIndex = -1;
-      this.current = Math.min(this.rows.length - 1, Math.max(0, place));
+      this.current = Math.min(this.rows.length - 1, Math.max(0, index));
       if (focuses) {
         const top = Math.floor(this.current / this.across) * this.tall + this.element.getBoundingClientRect().top;
         if (top < 0) scrollBy(0, top - 8);

@@ -19,7 +19,7 @@
   // Encode the conditions and the order as an address.
   function addressOf() {
     const parts = [...choice.conditions].map(([name, condition]) => {
-      const value = condition instanceof Set ? [...condition].map((place) => wordsOf(name)[place]) : [condition.join("..")];
+      const value = condition instanceof Set ? [...condition].map((index) => wordsOf(name)[index]) : [condition.join("..")];
       return `${name}=${value.map(encodeURIComponent).join(",")}`;
     });
     const [name, direction] = choice.sortedBy;
@@ -36,8 +36,8 @@
       if (name === "sort" && columns.values[value.replace("-", "")]) choice.sort(value.replace("-", ""), value[0] === "-" ? -1 : 1);
       const words = wordsOf(name);
       if (words) {
-        const places = value.split(",").map((word) => words.indexOf(decodeURIComponent(word))).filter((place) => place >= 0);
-        if (places.length) choice.set(name, new Set(places));
+        const indices = value.split(",").map((word) => words.indexOf(decodeURIComponent(word))).filter((index) => index >= 0);
+        if (indices.length) choice.set(name, new Set(indices));
       } else if (columns.values[name]) {
         const [low, high] = value.split("..").map(Number);
         if (low <= high) choice.set(name, [low, high]);
@@ -94,8 +94,8 @@
     if (!at("overview").hidden) scrolled = scrollY;
     [at("overview").hidden, at("level").hidden] = [true, false];
     at("back").href = overview || "#";
-    const place = rows ? rows.indexOf(row) : -1;
-    for (const [name, other] of [["previous", place - 1], ["next", place < 0 ? -1 : place + 1]]) {
+    const index = rows ? rows.indexOf(row) : -1;
+    for (const [name, other] of [["previous", index - 1], ["next", index < 0 ? -1 : index + 1]]) {
       if (rows && rows[other] !== undefined) at(name).href = hrefOf(rows[other]);
       else at(name).removeAttribute("href");
     }

@@ -32,22 +32,22 @@
       Object.assign(this, { column, choice, changed });
       const heading = create("h3", {}, readable(column.name));
       if (column.words.length <= FEW && column.words.every((word) => word.length <= SHORT)) {
-        this.buttons = column.words.map((word, place) =>
-          create("button", { type: "button", "aria-pressed": "false", click: () => this.toggle(place) },
+        this.buttons = column.words.map((word, index) =>
+          create("button", { type: "button", "aria-pressed": "false", click: () => this.toggle(index) },
             ...(column.name === "label" ? [create("i", { class: "dot", "data-label": word })] : []), word, create("span")));
         this.element = create("div", { class: "filter", role: "group", "aria-label": readable(column.name) }, heading,
           create("div", { class: "chips" }, ...this.buttons));
       } else {
         this.select = create("select", { "aria-label": readable(column.name), change: () => this.pick() },
           create("option", { value: "" }, "any"),
-          ...column.words.map((word, place) => create("option", { value: place }, word)));
+          ...column.words.map((word, index) => create("option", { value: index }, word)));
         this.element = create("div", { class: "filter" }, heading, this.select);
       }
     }
 
-    toggle(place) {
+    toggle(index) {
       const chosen = new Set(this.choice.conditions.get(this.column.name) || []);
-      if (!chosen.delete(place)) chosen.add(place);
+      if (!chosen.delete(index)) chosen.add(index);
       this.choice.set(this.column.name, chosen.size ? chosen : null);
       this.changed();
     }
@@ -64,9 +64,9 @@
         return;
       }
       const counts = this.choice.counts(this.column.name, this.column.words.length);
-      this.buttons.forEach((button, place) => {
-        button.setAttribute("aria-pressed", String(Boolean(chosen && chosen.has(place))));
-        button.lastChild.textContent = counts[place].toLocaleString("en");
+      this.buttons.forEach((button, index) => {
+        button.setAttribute("aria-pressed", String(Boolean(chosen && chosen.has(index))));
+        button.lastChild.textContent = counts[index].toLocaleString("en");
       });
     }
   }
