@@ -23,10 +23,10 @@ class Given(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """The bodies' motion, and the impulses they have not taken up yet."""
+    """The bodies' motion, and the impulses not yet applied to it."""
 
     motion: Float[Ref, "body 5 lane"]  # position x, y (m), velocity x, y (m/s), angular velocity (rad/s)
-    push: Float[Ref, "body 3 lane"]  # sum of impulses x, y (N s), angular (N m s), since the body last yielded to them
+    push: Float[Ref, "body 3 lane"]  # sum of impulses x, y (N s), angular (N m s), since they were last applied
     turn: Float[Ref, "body 2 lane"]  # cosine and sine of the rotation
 
 
@@ -34,11 +34,11 @@ class Outlines(NamedTuple):
     """The polygons' geometry, with x and y in separate rows."""
 
     start: Float[Ref, "2 polygon vertex lane"]  # first vertex of each face, in the polygon's frame
-    edge: Float[Ref, "2 polygon vertex lane"]  # from there to the next
-    along: Float[Ref, "2 polygon vertex lane"]  # the same, of length 1
+    edge: Float[Ref, "2 polygon vertex lane"]  # from that vertex to the next
+    along: Float[Ref, "2 polygon vertex lane"]  # unit vector along the edge
     length: Float[Ref, "polygon vertex lane"]
     support: Float[Ref, "polygon vertex lane"]  # largest projection on the face's normal, from the centre; or FAR
-    vertex: Float[Ref, "2 polygon vertex lane"]  # in the world
+    vertex: Float[Ref, "2 polygon vertex lane"]  # in the world frame
     normal: Float[Ref, "2 polygon vertex lane"]  # outward unit normal of each face, in the world
     box: Float[Ref, "polygon 4 lane"]  # lowest x, y and highest x, y
 
@@ -48,11 +48,11 @@ class Joints(NamedTuple):
 
     acts: Bool[Ref, "joint lane"]  # active, with active bodies, not both immovable
     turns: Bool[Ref, "joint lane"]  # whether an angular impulse applies
-    arms: Float[Ref, "joint 4 lane"]  # from the centre of a to its anchor, of b to its, in the world
+    arms: Float[Ref, "joint 4 lane"]  # from each body's centre to its anchor, in the world: a's x, y, then b's
     masses: Float[Ref, "joint 4 lane"]  # inverse masses of a and b, inverse inertias of a and b
     weight: Float[Ref, "joint lane"]  # share of a's anchor in the joint's point: the heavier body decides
     angle: Float[Ref, "joint lane"]  # angle of b relative to a, from the joint's resting angle, rad
-    angle_bias: Float[Ref, "joint lane"]  # rad/s that the angle asks for
+    angle_bias: Float[Ref, "joint lane"]  # rad/s, angular velocity that corrects the angle
     impulse: Float[Ref, "joint 3 lane"]  # accumulated, x, y (N s) and angular (N m s)
 
 
@@ -82,7 +82,7 @@ class Scratch(NamedTuple):
 
 
 class Block(NamedTuple):
-    """References to everything of a block of lanes."""
+    """References to all data of a block of lanes."""
 
     table: Table  # lookup tables of the size
     given: Given  # the worlds before

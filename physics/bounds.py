@@ -1,4 +1,4 @@
-"""Bounds of settings, checked when a dataclass of them is created."""
+"""Bounds checks for settings; their dataclasses call them on creation."""
 
 from collections.abc import Iterable
 from math import inf, isfinite
@@ -9,10 +9,10 @@ import numpy as np
 
 
 def require(settings: Any, names: Iterable[str], least: float, most: float = inf, above: bool = False) -> None:
-    """Refuse settings that are not finite, below `least` (if `above`: or equal to it) or beyond `most`.
+    """Check that each named setting is finite and within `least` .. `most` (if `above`: and not `least` itself).
 
     Raises:
-        ValueError: one is; the message starts with its name.
+        ValueError: a setting is out of bounds; the message starts with its name.
     """
     for name in names:
         value = getattr(settings, name)

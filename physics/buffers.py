@@ -1,4 +1,4 @@
-"""Buffers with the shapes and dtypes that a type's annotations say, `motion: Float[Ref, "body 5 lane"]`."""
+"""Buffers with the shapes and dtypes of a type's annotations, such as `motion: Float[Ref, "body 5 lane"]`."""
 
 from typing import Any, TypeVar, get_type_hints
 
@@ -12,11 +12,11 @@ from levelproof.physics.types import MAX_VERTICES, Size
 
 T = TypeVar("T")
 DTYPES: dict[Any, str] = {Float: "float32", Int: "int32", Bool: "bool"}
-LANE = "lane"  # the last axis of what differs between lanes
+LANE = "lane"  # last axis of arrays that differ between lanes
 
 
 def axes_of(size: Size) -> dict[str, int]:
-    """Lengths of the axes that annotations name, but for the lanes."""
+    """Return the length of every axis that annotations name, except the lanes."""
     pairs = pairs_of(size)
     return {
         "body": size.bodies,
@@ -35,7 +35,7 @@ def axes_of(size: Size) -> dict[str, int]:
 
 
 def buffers_of(cls: type[T], size: Size) -> T:
-    """A `cls`, a NamedTuple or dataclass of annotated arrays or of such types, with a Buffer for each array."""
+    """Return a `cls`, a (nested) NamedTuple or dataclass of annotated arrays, with a Buffer for each array."""
     axes = axes_of(size)
 
     def buffer(hint: Any) -> Any:
@@ -50,10 +50,10 @@ def buffers_of(cls: type[T], size: Size) -> T:
 
 
 def buffers_like(arrays: Any) -> Any:
-    """The buffers of a tree of arrays that have lanes."""
+    """Return a Buffer for each array of a tree whose arrays all have lanes."""
     return jax.tree.map(lambda x: Buffer(x.shape[:-1], str(x.dtype)), arrays)
 
 
 def zeros_of(cls: type[T], size: Size, lanes: int) -> T:
-    """The same arrays, full of zeros."""
+    """Return a `cls` like `buffers_of`, with arrays of zeros."""
     return jax.tree.map(lambda buffer: jnp.zeros_like(buffer.array(lanes)), buffers_of(cls, size))

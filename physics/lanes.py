@@ -26,7 +26,7 @@ Scalar = Int[Array, ""] | int
 
 
 class Rows(Protocol):
-    """An array, or a reference to one, of which a kernel reads rows."""
+    """An array, or a reference to one, whose rows a kernel reads."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...
@@ -38,7 +38,7 @@ class Rows(Protocol):
 
 
 class Ref(Rows, Protocol):
-    """A reference to an array (`jax.Ref`), of which a kernel reads and writes rows."""
+    """A reference to an array (`jax.Ref`), whose rows a kernel reads and writes."""
 
     def __setitem__(self, index: Any, value: ArrayLike, /) -> None: ...
 
@@ -69,15 +69,15 @@ def pick(
 ) -> tuple[Array, Array]:
     """Gather two of `count` rows by indices that differ by lane: read(a[lane])[..., lane] and the same for b."""
 
-    def look(i, found):
+    def visit(i, picked):
         def choose():
             row = read(i)
-            return tuple(jnp.where(number == i, row, x) for number, x in zip((a, b), found, strict=True))
+            return tuple(jnp.where(index == i, row, x) for index, x in zip((a, b), picked, strict=True))
 
-        return jax.lax.cond(anywhere((a == i) | (b == i)), choose, lambda: found)
+        return jax.lax.cond(anywhere((a == i) | (b == i)), choose, lambda: picked)
 
     first = read(0)
-    return jax.lax.fori_loop(1, count, look, (first, first))
+    return jax.lax.fori_loop(1, count, visit, (first, first))
 
 
 def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]], first: int = 0) -> None:
@@ -87,11 +87,11 @@ def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane
     """
 
     def add(i):
-        here = [number == i for number, _ in changes]
+        hits = [index == i for index, _ in changes]
 
         def change():
-            ref[i] += sum(jnp.where(mine, change, 0.0) for mine, (_, change) in zip(here, changes, strict=True))
+            ref[i] += sum(jnp.where(hit, change, 0.0) for hit, (_, change) in zip(hits, changes, strict=True))
 
-        when(anywhere(functools.reduce(jnp.logical_or, here)), change)
+        when(anywhere(functools.reduce(jnp.logical_or, hits)), change)
 
     each(ref.shape[0], add, first=first)

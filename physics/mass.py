@@ -1,9 +1,9 @@
 """Area and moment of inertia of polygons and circles, per unit of density.
 
-As Jax2D 1.0.1 computes them (`jax2d.engine`: calc_inverse_mass_polygon, calc_inverse_inertia_polygon and their
-likes for circles). It deviates from the textbook in three places, kept because masses are part of its results: the
+Follows Jax2D 1.0.1 (`jax2d.engine`: calc_inverse_mass_polygon, calc_inverse_inertia_polygon and their circle
+counterparts), including its three deviations from the textbook, because masses are part of its results: the
 centroid is the mean of the vertices (exact for triangles and parallelograms), a triangle's inertia counts the
-unused fourth vertex instead of the face back to the first, and a circle has m r^2 / 4, half of a disc's.
+unused fourth vertex instead of the face back to the first, and a circle has m r^2 / 4, half the inertia of a disc.
 """
 
 import math
@@ -18,7 +18,7 @@ Vertices = Float[Array, "polygon vertex 2 lane"]  # the fourth of a triangle is 
 
 
 def polygon_area(vertices: Vertices, n_vertices: Int[Array, "polygon lane"]) -> Float[Array, "polygon lane"]:
-    """m^2, of the fan of triangles around the first vertex."""
+    """Return the area, m^2, as a fan of triangles around the first vertex."""
     area = jnp.zeros(n_vertices.shape)
     for k in range(1, MAX_VERTICES - 1):
         a, b = (vec(vertices[:, i] - vertices[:, 0]) for i in (k, k + 1))
@@ -27,7 +27,10 @@ def polygon_area(vertices: Vertices, n_vertices: Int[Array, "polygon lane"]) -> 
 
 
 def polygon_inertia(vertices: Vertices, n_vertices: Int[Array, "polygon lane"]) -> Float[Array, "polygon lane"]:
-    """m^4, about the origin, which must be the centroid: the triangles from it to each face p-q."""
+    """Return the inertia per density, m^4, about the origin, which must be the centroid.
+
+    Sums triangles (origin, p, q) over the faces p-q; one contributes area / 6 * (p.p + p.q + q.q).
+    """
     inertia = jnp.zeros(n_vertices.shape)
     for k in range(MAX_VERTICES):
         p, q = vec(vertices[:, k]), vec(vertices[:, (k + 1) % MAX_VERTICES])
@@ -37,15 +40,15 @@ def polygon_inertia(vertices: Vertices, n_vertices: Int[Array, "polygon lane"]) 
 
 
 def circle_area(radius: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """m^2."""
+    """Return the area, m^2."""
     return math.pi * radius * radius
 
 
 def circle_inertia(radius: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """m^4, about the centre."""
+    """Return the inertia per density, m^4, about the centre."""
     return math.pi * radius**4 / 4
 
 
 def inverse(mass: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """1 / mass, and 1 for a mass of 0: what has no extent must not divide by it."""
+    """Return 1 / mass, or 1 for a mass of 0: unused rows have no extent and must not divide by 0."""
     return 1 / nonzero(mass)

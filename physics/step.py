@@ -1,7 +1,7 @@
-"""One physics step of every lane: as machine code on a CPU, else as operations of XLA.
+"""One physics step of every lane: machine code on a CPU, XLA operations elsewhere.
 
-All ways come from the one source, `physics.engine.step_block`, a function of references to the arrays of a block of
-lanes; the tests hold them to each other.
+Both come from one source, `physics.engine.step_block`, a function of references to the arrays of a block of lanes;
+tests compare the two.
 """
 
 from functools import cache
@@ -38,14 +38,14 @@ def step(
         motor: control of each joint's motor, in [-1, 1].
         thrust: control of each thruster, in [0, 1].
         params: constants of the engine.
-        seen: whether the contacts are written down; which of them were active, `State.contact_active` tells anyway.
+        seen: whether to return the contacts; `State.contact_active` says in any case which were active.
 
     Returns:
-        The worlds after the step, and the contacts found at its start: a Manifold, or None if they are not `seen`.
+        The worlds after the step, and the contacts found at its start: a Manifold, or None unless `seen`.
 
     Raises:
-        ValueError: an array has another shape than its annotation says for the model's size.
-        TypeError: an array has another dtype.
+        ValueError: an array's shape differs from its annotation for the model's size.
+        TypeError: an array's dtype differs from its annotation.
     """
     given = Given(model, state, motor, thrust)
     if state.position.dtype != jnp.float32:
@@ -57,7 +57,7 @@ def step(
 
 
 def on_all_lanes(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
-    """The step as XLA's own operations, all lanes as one block: slow on a CPU, but anywhere and in any precision."""
+    """Step with XLA operations, all lanes as one block: slow on a CPU, but runs anywhere and in any precision."""
     size, dtype = given.model.size, jax.dtypes.canonicalize_dtype(given.before.position.dtype)
     given, lanes = as_annotated(given, str(dtype))
 
@@ -75,33 +75,33 @@ def on_all_lanes(given: Given, params: Params, seen: bool) -> tuple[State, Any]:
 
 
 def as_machine_code(given: Given, params: Params, seen: bool, stages: tuple[Stage, ...] = STAGES) -> tuple[State, Any]:
-    """The step as machine code for this CPU, block by block of LANES lanes; the last block is filled up.
+    """Step with machine code for this CPU, in blocks of LANES lanes; the last block is padded.
 
-    With fewer `stages`, it takes less time and fills in less: to measure what each costs.
+    With fewer `stages` it takes less time and leaves results unwritten: for measuring what each stage costs.
     """
-    given, lanes = as_annotated(given)  # the kernel reads and writes as far as the annotations say, unchecked
+    given, lanes = as_annotated(given)  # the kernel trusts the annotated shapes and checks no bounds
     with COMPILING:
-        name, filled, scratch_bytes = _compiled(given.model.size, params, seen, buffers_like(given), stages)
+        name, outputs, scratch_bytes = _compiled(given.model.size, params, seen, buffers_like(given), stages)
     missing = -lanes % LANES
-    fill = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge")
-    given = jax.tree.map(fill, given) if missing else given
-    results = [buffer.array(lanes + missing) for buffer in jax.tree.leaves(filled)]
+    pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge")
+    given = jax.tree.map(pad, given) if missing else given
+    results = [buffer.array(lanes + missing) for buffer in jax.tree.leaves(outputs)]
     call = jax.ffi.ffi_call(name, [*results, jax.ShapeDtypeStruct((scratch_bytes,), np.uint8)])
     *results, _ = call(*jax.tree.leaves(given), *table_of(given.model.size, params.faithful_padding))
     results = [x[..., :lanes] for x in results] if missing else results
-    return jax.tree.unflatten(jax.tree.structure(filled), results)
+    return jax.tree.unflatten(jax.tree.structure(outputs), results)
 
 
-def as_annotated(given: Given, number: str = "float32") -> tuple[Given, int]:
+def as_annotated(given: Given, float_dtype: str = "float32") -> tuple[Given, int]:
     """Check each array's shape and dtype against its annotation; return them with equal lanes, and the lane count.
 
     Args:
-        given: what a step reads; one lane broadcasts.
-        number: dtype of the arrays that are annotated as Float.
+        given: inputs of a step; a single lane broadcasts.
+        float_dtype: required dtype of arrays annotated as Float.
 
     Raises:
-        ValueError: an array has another shape.
-        TypeError: an array has another dtype.
+        ValueError: an array's shape differs.
+        TypeError: an array's dtype differs.
     """
     size = given.model.size
     lanes = max(x.shape[-1] if x.shape else 1 for x in jax.tree.leaves(given))
@@ -113,7 +113,7 @@ def as_annotated(given: Given, number: str = "float32") -> tuple[Given, int]:
                 f"{name} has shape {x.shape}, but must be {shape} in worlds of {size}: give arrays of one size, "
                 "with the lanes last"
             )
-        wanted = number if buffer.dtype == "float32" else buffer.dtype
+        wanted = float_dtype if buffer.dtype == "float32" else buffer.dtype
         if (dtype := str(jax.dtypes.canonicalize_dtype(x.dtype))) != wanted:
             raise TypeError(f"{name} is {dtype}, but must be {wanted}: convert it")
         return jnp.broadcast_to(x, shape)
@@ -123,24 +123,24 @@ def as_annotated(given: Given, number: str = "float32") -> tuple[Given, int]:
 
 @cache
 def _compiled(size: Size, params: Params, seen: bool, given: Given, stages: tuple[Stage, ...]) -> tuple[str, Any, int]:
-    """The name of the compiled step for `jax.ffi.ffi_call`, buffers of its results, and bytes of its scratch memory."""
+    """Compile a step; return its name for `jax.ffi.ffi_call`, its results' buffers and its scratch memory in bytes."""
     buffers = block_buffers(size, params, seen, given)
     reads, table, results, scratch = map(jax.tree.leaves, buffers)
     text = lambda: write(trace(buffers, params, stages), [*reads, *table], results, scratch).encode()
-    asked = repr((buffers, params, [(stage.__module__, stage.__qualname__) for stage in stages]))
-    name = register(kept_while_sources_stay(asked, text).decode())
+    request = repr((buffers, params, [(stage.__module__, stage.__qualname__) for stage in stages]))
+    name = register(kept_while_sources_stay(request, text).decode())
     return name, buffers[2], sum(buffer.bytes for buffer in scratch)
 
 
 def block_buffers(size: Size, params: Params, seen: bool, given: Given) -> tuple[Given, Any, Any, Any]:
-    """Of what a block's step is given, of the lookup tables, of its results and of its scratch memory."""
+    """Return the buffers of a block's step: inputs, lookup tables, results, scratch memory."""
     table = jax.tree.map(lambda x: Buffer(x.shape, str(x.dtype), lanes=False), table_of(size, params.faithful_padding))
     results = given.before, buffers_of(Manifold, size) if seen else None
     return given, table, results, buffers_of(Scratch, size)
 
 
 def trace(buffers: tuple[Given, Any, Any, Any], params: Params, stages: tuple[Stage, ...] = STAGES) -> Any:
-    """The step of a block as a jaxpr, of a function of one reference for each leaf of `block_buffers`."""
+    """Trace the step of a block to a jaxpr whose function takes one reference for each leaf of `block_buffers`."""
 
     def kernel(*arrays):
         given, table, (after, contacts), scratch = jax.tree.map(jax.new_ref, arrays)

@@ -1,8 +1,8 @@
 """Sine, cosine and hyperbolic tangent from additions, multiplications and divisions alone.
 
-So that a step gives the same bits on every machine: libraries and compilers round theirs differently.
-Sine and cosine by polynomials of Cephes (S. Moshier, netlib.org/cephes, sinf.c), off by at most 1e-7 up to 8192 rad,
-by 1e-6 up to 1e5 rad; hyperbolic tangent by at most 7 units in the last place.
+This gives a step the same bits on every machine; the functions of libraries and compilers round differently.
+Sine and cosine use the polynomials of Cephes (S. Moshier, netlib.org/cephes, sinf.c); their error is at most 1e-7 up
+to 8192 rad and 1e-6 up to 1e5 rad. The hyperbolic tangent's error is at most 7 units in the last place.
 """
 
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 QUARTER = 1.57079632679489661923  # pi / 2
 # pi / 2 in three parts, the first two exact in float32 with room for a 13-bit multiple (Cody and Waite)
 QUARTER_PARTS = (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8)
-REST_BOUND = 0.8  # rad; a little beyond pi / 4, because `quarters` is rounded from a rounded product
+REST_BOUND = 0.8  # rad; slightly beyond pi / 4, since `quarters` is rounded from an already rounded product
 SINE = (-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1)
 COSINE = (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2)
 
@@ -24,7 +24,7 @@ def _polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
 
 
 def cos_sin(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Cosine and sine of an angle in rad. An angle beyond 1e9 has no digits left: somewhere on the circle."""
+    """Return cosine and sine of an angle, rad. Beyond 1e9 rad a float32 has no digits left; any point may result."""
     quarters = jnp.round(angle * (1 / QUARTER))
     rest = angle
     for part in QUARTER_PARTS:
@@ -56,7 +56,7 @@ TANH_EVEN = (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4
 
 
 def tanh(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Hyperbolic tangent."""
+    """Return the hyperbolic tangent."""
     inside = jnp.clip(x, -TANH_BOUND, TANH_BOUND)
     square = inside * inside
     value = inside * _polynomial(square, TANH_ODD) / _polynomial(square, TANH_EVEN)

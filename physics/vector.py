@@ -1,4 +1,4 @@
-"""2D vectors with the lanes last, and static selection of rows.
+"""2D vectors with the lanes last, and selection of rows.
 
 A vector is a pair (x, y) of arrays, so that every operation stays a dense loop over lanes.
 """
@@ -48,17 +48,17 @@ class Vec(NamedTuple):
 
 
 def spin(angular_velocity: Array, r: Vec) -> Vec:
-    """Velocity of a point at r from the centre of a body that turns."""
+    """Return w x r: the velocity, from rotation alone, of a point at r from a body's centre."""
     return Vec(-angular_velocity * r.y, angular_velocity * r.x)
 
 
 def vec(x: Array) -> Vec:
-    """[..., 2, lane] -> components [..., lane]."""
+    """Split [..., 2, lane] into components [..., lane]."""
     return Vec(x[..., 0, :], x[..., 1, :])
 
 
 def unvec(v: Vec) -> Array:
-    """Components [..., lane] -> [..., 2, lane]."""
+    """Stack components [..., lane] into [..., 2, lane]."""
     return jnp.stack([v.x, v.y], axis=-2)
 
 
@@ -67,12 +67,12 @@ def where(condition: Array, a: Vec, b: Vec) -> Vec:
 
 
 def nonzero(x: Array) -> Array:
-    """x, with 1 in place of 0: a safe divisor (Jax2D `zero_to_one`)."""
+    """Replace 0 by 1, for a safe divisor (Jax2D `zero_to_one`)."""
     return jnp.where(x == 0, jnp.ones_like(x), x)
 
 
 def rows(x: Array, index: Sequence[int]) -> Array:
-    """x[index] along the first axis for a static index, as slices and broadcasts: XLA's CPU gather is slow."""
+    """Return x[index] for a static index, as slices and broadcasts: XLA's CPU gather is slow."""
     if not index:
         return x[:0]
     pieces, start = [], 0
@@ -92,9 +92,9 @@ def rows(x: Array, index: Sequence[int]) -> Array:
     return pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
 
 
-def select(x: Float[Array, "thing *row lane"], number: Int[Array, " lane"]) -> Float[Array, "*row lane"]:
-    """x[number[lane], ..., lane], for a number in bounds. Flat, because XLA would transpose x otherwise."""
-    lanes = max(x.shape[-1], number.shape[-1])  # either may be the same in all lanes
+def select(x: Float[Array, "choice *row lane"], index: Int[Array, " lane"]) -> Float[Array, "*row lane"]:
+    """Return x[index[lane], ..., lane] for an index in bounds. Gathers from flat x, which XLA would else transpose."""
+    lanes = max(x.shape[-1], index.shape[-1])  # either may have a single lane, which broadcasts
     x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
     within = jnp.arange(x[0].size, dtype=jnp.int32).reshape(x.shape[1:])
-    return x.reshape(-1).at[number * x[0].size + within].get(mode="promise_in_bounds")
+    return x.reshape(-1).at[index * x[0].size + within].get(mode="promise_in_bounds")

@@ -1,4 +1,4 @@
-"""The arrays that a kernel reads, writes and works in."""
+"""Shapes of the arrays that a kernel reads, writes and uses as scratch memory."""
 
 import math
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ BYTES = {"float32": 4, "int32": 4, "bool": 1}
 
 @dataclass(frozen=True)
 class Buffer:
-    """An array without its numbers. JAX's trees take it for a leaf, so it stands where an array or a reference will."""
+    """Shape and dtype of an array. It is a leaf to JAX's trees, so it can stand in for an array or a reference."""
 
     shape: tuple[int, ...]  # without the lanes
     dtype: str = "float32"
     lanes: bool = True
 
     def array(self, lanes: int = LANES) -> jax.ShapeDtypeStruct:
-        """The array, with so many lanes if it has any."""
+        """Return the array's shape and dtype for a number of lanes."""
         return jax.ShapeDtypeStruct((*self.shape, lanes) if self.lanes else self.shape, self.dtype)
 
     @property
     def bytes(self) -> int:
-        """Of one block of lanes, in whole cache lines."""
+        """Size for one block of lanes, in whole cache lines."""
         count = math.prod(self.shape) * (LANES if self.lanes else 1)
         return -(-count * BYTES[self.dtype] // ALIGNMENT) * ALIGNMENT

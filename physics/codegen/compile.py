@@ -1,4 +1,4 @@
-"""From a kernel's jaxpr to a name that XLA knows: LLVM module, machine code, registration."""
+"""Compile a kernel's jaxpr: write the LLVM module, make machine code, register it with XLA under a name."""
 
 import ctypes
 import hashlib
@@ -17,23 +17,23 @@ from levelproof.physics.codegen.kept import kept
 from levelproof.physics.codegen.lower import Memory, lower
 from levelproof.physics.codegen.values import INDEX
 
-COMPILING = threading.RLock()  # held while a kernel is made: LLVM and XLA take a name only once in a process
+COMPILING = threading.RLock()  # held while a kernel is compiled: LLVM and XLA accept a name only once in a process
 _libraries: dict[str, binding.ResourceTracker] = {}  # machine code must outlive every executable that calls it
 
 
 def write(
     jaxpr: core.ClosedJaxpr, arguments: Sequence[Buffer], results: Sequence[Buffer], scratch: Sequence[Buffer]
 ) -> str:
-    """A kernel as the text of an LLVM module.
+    """Write a kernel as the text of an LLVM module.
 
     Args:
-        jaxpr: of a function of references: to the arguments, to the results, to scratch memory.
-        arguments: the arrays that XLA hands over; the first has lanes.
-        results: the arrays that the kernel fills; XLA gets one more, the scratch memory, `sum(Buffer.bytes)` of uint8.
-        scratch: what the kernel works in.
+        jaxpr: a function of references to the arguments, the results and scratch memory.
+        arguments: arrays that XLA passes in; the first has lanes.
+        results: arrays that the kernel fills. XLA sees one more result: scratch memory, `sum(Buffer.bytes)` uint8.
+        scratch: arrays that the kernel works in.
 
     Raises:
-        NotImplementedError: the kernel uses what `lower` does not know.
+        NotImplementedError: the kernel uses a feature that `lower` does not support.
     """
     module = ir.Module("levelproof")
     module.triple = binding.get_default_triple()
@@ -43,7 +43,7 @@ def write(
 
 
 def register(text: str) -> str:
-    """Compile what `write` gave, and make it known to XLA; the name by which `jax.ffi.ffi_call` finds it."""
+    """Compile the text from `write` and register it with XLA; return its name for `jax.ffi.ffi_call`."""
     name = "levelproof_" + hashlib.sha256(text.encode()).hexdigest()[:16]
     with COMPILING:
         if name not in _libraries:
@@ -56,7 +56,7 @@ def register(text: str) -> str:
 
 
 def _block(module: ir.Module, jaxpr: core.ClosedJaxpr, buffers: Sequence[Buffer], outside: int) -> ir.Function:
-    """block(stride, pointers ...): the kernel. Rows of the first `outside` arrays are `stride` numbers apart."""
+    """Add the kernel, block(stride, pointers ...). Rows of the first `outside` arrays are `stride` elements apart."""
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [INDEX] + [POINTER] * len(buffers)), "block")
     function.linkage = "internal"
     for pointer in function.args[1:]:
@@ -72,10 +72,10 @@ def _block(module: ir.Module, jaxpr: core.ClosedJaxpr, buffers: Sequence[Buffer]
 
 
 def _object_code(text: str) -> bytes:
-    """Optimised machine code for this CPU."""
+    """Return optimised machine code for this CPU."""
     cpu, features = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
 
-    def optimised() -> bytes:
+    def optimise() -> bytes:
         _initialize()
         module = binding.parse_assembly(text)
         triple = binding.Target.from_default_triple()
@@ -84,21 +84,21 @@ def _object_code(text: str) -> bytes:
         passes.getModulePassManager().run(module, passes)
         return target.emit_object(module)
 
-    return kept("\n".join([llvmlite.__version__, cpu, features, text]), optimised)
+    return kept("\n".join([llvmlite.__version__, cpu, features, text]), optimise)
 
 
 def _initialize() -> None:
-    """Tell LLVM of this machine; again costs nothing."""
+    """Set LLVM up for this machine; repeated calls cost nothing."""
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
 
 
 @cache
 def _jit() -> binding.LLJIT:
-    """LLVM's just-in-time linker (ORC), one for the process.
+    """Return the process's just-in-time linker (LLVM ORC).
 
-    JITLink, the only one that LLVM maintains for AArch64 and macOS; on x86-64 too, so that what the tests run there is
-    what runs elsewhere. RuntimeDyld, llvmlite's default, corrupts memory on AArch64 (llvmlite's issue 1000).
+    It uses JITLink, the only linker that LLVM maintains for AArch64 and macOS; on x86-64 too, so that tests there
+    run the same linker. RuntimeDyld, llvmlite's default, corrupts memory on AArch64 (llvmlite issue 1000).
     """
     _initialize()
     return binding.create_lljit_compiler(use_jit_link=True)

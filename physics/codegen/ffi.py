@@ -1,8 +1,8 @@
-"""A function that XLA calls: the kernel for each block of lanes of the buffers in XLA's call frame.
+"""The handler that XLA calls: it runs the kernel on each block of lanes of the buffers in XLA's call frame.
 
-The structures are those of version 0.3 of XLA's foreign function interface (xla/ffi/api/c_api.h), the one that jaxlib
-0.10.0 to 0.10.2 ship. XLA asks a handler which version it was made for, and refuses others than 0.1 to its own.
-tests/physics/codegen/test_ffi.py compares all of this with the header of the jaxlib that is installed.
+The structures are those of version 0.3 of XLA's foreign function interface (xla/ffi/api/c_api.h), shipped with jaxlib
+0.10.0 to 0.10.2. XLA asks a handler for its version and accepts those from 0.1 to its own.
+tests/physics/codegen/test_ffi.py compares all of this with the header of the installed jaxlib.
 """
 
 import ctypes
@@ -17,7 +17,7 @@ from levelproof.physics.codegen.rounding import settle
 from levelproof.physics.codegen.values import INDEX, STORED, Operand
 
 VERSION_MAJOR, VERSION_MINOR = 0, 3
-METADATA_QUERY = 1  # XLA_FFI_Extension_Metadata: XLA asks which version the handler was made for
+METADATA_QUERY = 1  # XLA_FFI_Extension_Metadata: XLA asks for the handler's version
 
 
 START: dict[str, Any] = {"struct_size": c_size_t, "extension_start": c_void_p}  # how most structures begin
@@ -25,13 +25,13 @@ ARRAY: dict[str, Any] = {**START, "size": c_int64, "types": c_void_p}
 
 
 def _structure(name: str, **fields: Any) -> Any:
-    """A structure of the header, by its name there; its last fields may be left out, where they are not read."""
+    """Declare a structure of the header under its name there; trailing fields that nothing reads may be left out."""
     return type(name, (ctypes.Structure,), {"_fields_": tuple(fields.items())})
 
 
 ExtensionBase = _structure("XLA_FFI_Extension_Base", struct_size=c_size_t, type=c_int, next=c_void_p)
 ApiVersion = _structure("XLA_FFI_Api_Version", **START, major_version=c_int, minor_version=c_int)
-# What XLA wants to know. It hands it over with no traits and no state, which is true of ours: not written
+# What XLA queries. It passes the structure with traits and state unset, which holds for this handler: leave them
 Metadata = _structure("XLA_FFI_Metadata", struct_size=c_size_t, api_version=ApiVersion, traits=c_uint32)
 MetadataExtension = _structure("XLA_FFI_Metadata_Extension", extension_base=ExtensionBase, metadata=c_void_p)
 FrameBuffer = _structure("XLA_FFI_Buffer", **START, dtype=c_int, data=c_void_p, rank=c_int64, dims=c_void_p)
@@ -44,7 +44,7 @@ NULL = ir.Constant(POINTER, None)
 
 
 def _offset(structure: Any, *path: str) -> int:
-    """Bytes from the start of a structure to a field, in a structure in it, and so on."""
+    """Return the offset of a (nested) field from the start of a structure, bytes."""
     total = 0
     for name in path:
         total += getattr(structure, name).offset
@@ -63,9 +63,9 @@ def add_handler(
     results: Sequence[Buffer],
     scratch: Sequence[Buffer],
 ) -> None:
-    """Add `handler(frame)` to the module of the kernel `block`, which it calls as `block(lanes, pointers ...)`.
+    """Add `handler(frame)`, which calls the kernel `block(lanes, pointers ...)` for each block of lanes.
 
-    For each block of lanes of the buffers, of which `compile.write` tells.
+    `compile.write` describes the buffers.
     """
     blocks = _add_blocks(module, block, arguments, results, scratch)
     function = ir.Function(module, ir.FunctionType(POINTER, [POINTER]), "handler")
@@ -85,18 +85,18 @@ def _add_blocks(
     results: Sequence[Buffer],
     scratch: Sequence[Buffer],
 ) -> ir.Function:
-    """Add `blocks(frame)`, which steps all blocks. Never inlined: no arithmetic moves to where the mode is another."""
+    """Add `blocks(frame)`, which steps all blocks. Not inlined, so no arithmetic moves out of the rounding mode."""
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER]), "blocks")
     function.linkage = "internal"
     function.attributes.add("noinline")
     (frame,) = function.args
     b = ir.IRBuilder(function.append_basic_block("entry"))
-    handed = _load(b, frame, _offset(CallFrame, "args", "args"))
-    filled = _load(b, frame, _offset(CallFrame, "rets", "rets"))
+    passed = _load(b, frame, _offset(CallFrame, "args", "args"))
+    returned = _load(b, frame, _offset(CallFrame, "rets", "rets"))
     buffer = lambda array, i: _load(b, array, ctypes.sizeof(c_void_p) * i)
-    data = [_load(b, buffer(handed, i), _offset(FrameBuffer, "data")) for i in range(len(arguments))]
-    data += [_load(b, buffer(filled, i), _offset(FrameBuffer, "data")) for i in range(len(results) + 1)]
-    first = buffer(handed, 0)
+    data = [_load(b, buffer(passed, i), _offset(FrameBuffer, "data")) for i in range(len(arguments))]
+    data += [_load(b, buffer(returned, i), _offset(FrameBuffer, "data")) for i in range(len(results) + 1)]
+    first = buffer(passed, 0)
     last = b.sub(_load(b, first, _offset(FrameBuffer, "rank"), INDEX), INDEX(1))
     dimension = b.gep(_load(b, first, _offset(FrameBuffer, "dims")), [last], source_etype=INDEX)
     lanes = b.load(dimension, typ=INDEX)
@@ -111,7 +111,7 @@ def _add_blocks(
 
 
 def _answer_query(b: ir.IRBuilder, frame: Operand) -> None:
-    """Where XLA asks for the handler's metadata, write down the version and return."""
+    """If XLA queries the handler's metadata, write the version and return."""
     extension = _load(b, frame, _offset(CallFrame, "extension_start"))
     with b.if_then(b.icmp_unsigned("!=", extension, NULL)):
         kind = _load(b, extension, _offset(MetadataExtension, "extension_base", "type"), INT)
@@ -126,7 +126,7 @@ def _answer_query(b: ir.IRBuilder, frame: Operand) -> None:
 def _each_block(
     b: ir.IRBuilder, lanes: Operand, block: ir.Function, outside: list[tuple[Buffer, Any]], workspace: list
 ) -> None:
-    """for lane in range(0, lanes, LANES): block(lanes, pointers from that lane on ...)"""
+    """Emit: for lane in range(0, lanes, LANES): block(lanes, pointers offset by lane ...)."""
     start = b.block
     test, body, done = (b.append_basic_block(name) for name in ("test", "body", "done"))
     b.branch(test)
@@ -135,11 +135,11 @@ def _each_block(
     lane.add_incoming(INDEX(0), start)
     b.cbranch(b.icmp_signed("<", lane, lanes), body, done)
     b.position_at_end(body)
-    here = [
+    at_lane = [
         b.gep(pointer, [lane], source_etype=STORED[buffer.dtype]) if buffer.lanes else pointer
         for buffer, pointer in outside
     ]
-    b.call(block, [lanes, *here, *workspace])
+    b.call(block, [lanes, *at_lane, *workspace])
     lane.add_incoming(b.add(lane, INDEX(LANES)), b.block)
     b.branch(test)
     b.position_at_end(done)

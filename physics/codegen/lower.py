@@ -1,5 +1,8 @@
-"""A kernel's jaxpr as an LLVM function: straight-line code becomes vector operations, `fori_loop`, `while_loop` and
-`cond` become branches, reads and writes of references become loads and stores."""
+"""Lower a kernel's jaxpr to an LLVM function.
+
+Straight-line code becomes vector operations; `fori_loop`, `while_loop` and `cond` become branches; reads and writes
+of references become loads and stores.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,16 +21,16 @@ from levelproof.physics.codegen.values import INDEX, STORED, Operand, Value, arr
 
 @dataclass(frozen=True)
 class Memory:
-    """What a reference refers to: rows of `stride` numbers, the first LANES of which are this block's."""
+    """Memory behind a reference: rows `stride` elements apart, whose first LANES elements are this block's."""
 
     pointer: Operand
     shape: tuple[int, ...]  # without the lanes
     dtype: str
     lanes: bool
-    stride: Operand  # numbers from row to row
+    stride: Operand  # elements from row to row
 
     def at(self, b: ir.IRBuilder, index: Sequence) -> Operand:
-        """Address of a row."""
+        """Emit the address of a row."""
         row = INDEX(0)
         for number, size in zip(index, self.shape, strict=True):
             row = b.add(b.mul(row, INDEX(size)), INDEX(number) if isinstance(number, int) else b.sext(number, INDEX))
@@ -35,37 +38,37 @@ class Memory:
 
 
 def lower(b: ir.IRBuilder, jaxpr: core.ClosedJaxpr, arguments: Sequence[Value | Memory]) -> list[Value]:
-    """Emit a jaxpr; its results."""
+    """Emit a jaxpr; return its results."""
     known: dict[Any, Any] = dict(zip(jaxpr.jaxpr.invars, arguments, strict=True))
-    for constant_of, x in zip(jaxpr.jaxpr.constvars, jaxpr.consts, strict=True):
-        known[constant_of] = _as_said(b, _known(np.asarray(x)), constant_of.aval)
+    for variable, x in zip(jaxpr.jaxpr.constvars, jaxpr.consts, strict=True):
+        known[variable] = _fit_lanes(b, _constants(np.asarray(x)), variable.aval)
 
     def read(x):
         if not isinstance(x, core.Literal):
             return known[x]
         aval: Any = x.aval
-        return _known(np.asarray(x.val, aval.dtype))
+        return _constants(np.asarray(x.val, aval.dtype))
 
     for equation in jaxpr.jaxpr.eqns:
         results = _equation(b, equation, [read(x) for x in equation.invars])
         for x, result in zip(equation.outvars, results, strict=True):
-            known[x] = _as_said(b, result, x.aval)
+            known[x] = _fit_lanes(b, result, x.aval)
     return [read(x) for x in jaxpr.jaxpr.outvars]
 
 
-def _known(x: np.ndarray) -> Value:
-    """Numbers that are known before the kernel runs."""
+def _constants(x: np.ndarray) -> Value:
+    """Turn an array into constants of the kernel."""
     dtype = str(x.dtype)
     return Value(array(x.shape, lambda at: constant(x[at], dtype)), dtype, False)
 
 
-def _as_said(b: ir.IRBuilder, x: Value | Memory, aval: Any) -> Value | Memory:
-    """Lanes where the shape ends in them."""
+def _fit_lanes(b: ir.IRBuilder, x: Value | Memory, aval: Any) -> Value | Memory:
+    """Give x lanes if its shape in the jaxpr ends in them."""
     return primitives.with_lanes(b, x) if isinstance(x, Value) and has_lanes(aval.shape) else x
 
 
 def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
-    """Emit one equation; its results."""
+    """Emit one equation; return its results."""
     name, params = equation.primitive.name, equation.params
     out: Any = equation.outvars[0].aval if equation.outvars else None
     if name == "round" and params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
@@ -114,7 +117,7 @@ def _slice(x: Value, params: dict) -> Value:
 
 
 def _indexed(params: dict, operands: list, first: int = 1) -> tuple[Memory, list]:
-    """The memory that a reference names and, for each axis but the lanes, the row numbers that are meant."""
+    """Return the memory behind a reference and, for each axis except the lanes, the selected row indices."""
     memory = operands[0]
     transforms = jax.tree.unflatten(params["tree"], operands[first:])
     if not transforms:
@@ -129,13 +132,13 @@ def _indexed(params: dict, operands: list, first: int = 1) -> tuple[Memory, list
 
 
 def _axis(index: Any, size: int) -> list[int] | Operand | int:
-    """Row numbers along one axis: a list of them, or one, which may be known only at run time."""
+    """Return the row indices along one axis: a list, or a single index, which may be known only at run time."""
     if hasattr(index, "stride") and isinstance(index.start, int):
         return [index.start + i * index.stride for i in range(index.size)]
     if isinstance(index, Value) and not index.shape:
         number = index.rows[()]
         if not isinstance(number, ir.Constant):
-            return number  # has to be from 0 to size - 1 when it runs
+            return number  # must be within 0 .. size - 1 at run time; nothing checks it
         index = number.constant
     if isinstance(index, int) and -size <= index < size:
         return index % size
@@ -143,7 +146,7 @@ def _axis(index: Any, size: int) -> list[int] | Operand | int:
 
 
 def _rows(axes: list) -> tuple[tuple[int, ...], Callable[[tuple], list]]:
-    """Shape of what is read or written, and the address of each of its rows."""
+    """Return the shape that is read or written, and a function from a position in it to a row's indices."""
     shape = tuple(len(axis) for axis in axes if isinstance(axis, list))
 
     def address(at):
@@ -173,13 +176,13 @@ def _store(b: ir.IRBuilder, memory: Memory, index: list, x: Operand) -> None:
 
 
 def _swap(b: ir.IRBuilder, params: dict, operands: list) -> Value:
-    """Write, and hand on what was there."""
+    """Emit a write; return the previous contents."""
     memory, axes = _indexed(params, operands, 2)
     before = _read(b, memory, axes)
     shape, address = _rows(axes)
     x = primitives.with_lanes(b, operands[1]) if memory.lanes else operands[1]
     if x.lanes != memory.lanes:
-        raise NotImplementedError(f"a kernel writes arrays without lanes number by number, not {LANES} at once")
+        raise NotImplementedError(f"a kernel writes arrays without lanes element by element, not {LANES} at once")
     rows = np.broadcast_to(x.rows, shape)
     for at in np.ndindex(*shape):
         _store(b, memory, address(at), rows[at])
@@ -195,8 +198,8 @@ def _unflat(like: Sequence[Value], flat: Sequence[Operand]) -> list[Value]:
     return [Value(array(v.rows.shape, lambda _: next(rest)), v.dtype, v.lanes) for v in like]
 
 
-def _loop(b: ir.IRBuilder, start: list[Value], go_on, body) -> list[Value]:
-    """while go_on(values): values = body(values)."""
+def _loop(b: ir.IRBuilder, start: list[Value], condition, body) -> list[Value]:
+    """Emit: while condition(values): values = body(values). Return the last values."""
     before, test = b.block, b.append_basic_block("test")
     b.branch(test)
     b.position_at_end(test)
@@ -207,7 +210,7 @@ def _loop(b: ir.IRBuilder, start: list[Value], go_on, body) -> list[Value]:
         phis.append(phi)
     values = _unflat(start, phis)
     enter, leave = b.append_basic_block("body"), b.append_basic_block("done")
-    b.cbranch(go_on(values), enter, leave)
+    b.cbranch(condition(values), enter, leave)
     b.position_at_end(enter)
     for phi, x in zip(phis, _flat(body(values)), strict=True):
         phi.add_incoming(x, b.block)
@@ -219,17 +222,17 @@ def _loop(b: ir.IRBuilder, start: list[Value], go_on, body) -> list[Value]:
 def _while(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list[Value]:
     params = equation.params
     m, n = params["cond_nconsts"], params["body_nconsts"]
-    of_test, of_body, start = operands[:m], operands[m : m + n], operands[m + n :]
+    test_constants, body_constants, start = operands[:m], operands[m : m + n], operands[m + n :]
     test, body = params["cond_jaxpr"], params["body_jaxpr"]
 
-    def go_on(values):
-        return lower(b, test, [*of_test, *values])[0].rows[()]
+    def condition(values):
+        return lower(b, test, [*test_constants, *values])[0].rows[()]
 
-    return _loop(b, start, go_on, lambda values: lower(b, body, [*of_body, *values]))
+    return _loop(b, start, condition, lambda values: lower(b, body, [*body_constants, *values]))
 
 
 def _scan(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list[Value]:
-    """A `fori_loop` of fixed length: a scan that neither reads nor writes sequences."""
+    """Emit a `fori_loop` of fixed length, which is a scan without input or output sequences."""
     params = equation.params
     body, constants = params["jaxpr"], operands[: params["num_consts"]]
     start = operands[params["num_consts"] :]
@@ -246,17 +249,17 @@ def _scan(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list[Valu
 
 
 def _cond(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list[Value]:
-    which, operands = operands[0].rows[()], operands[1:]
+    selector, operands = operands[0].rows[()], operands[1:]
     branches, after = equation.params["branches"], b.append_basic_block("after")
     starts = [b.append_basic_block(f"branch{i}") for i in range(len(branches))]
-    switch = b.switch(which, starts[0])
+    switch = b.switch(selector, starts[0])
     for i, start in enumerate(starts[1:], 1):
         switch.add_case(constant(i, "int32"), start)
     ends = []
     for branch, start in zip(branches, starts, strict=True):
         b.position_at_end(start)
         results = lower(b, branch, operands)
-        values = [_as_said(b, x, v.aval) for x, v in zip(results, equation.outvars, strict=True)]
+        values = [_fit_lanes(b, x, v.aval) for x, v in zip(results, equation.outvars, strict=True)]
         ends.append((b.block, values))
         b.branch(after)
     b.position_at_end(after)
@@ -270,7 +273,7 @@ def _cond(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list[Valu
 
 
 def _call(parameter: str) -> Callable[[ir.IRBuilder, core.JaxprEqn, list], list[Value]]:
-    """What is called, in its place."""
+    """Inline the called jaxpr."""
     return lambda b, equation, operands: lower(b, equation.params[parameter], operands)
 
 

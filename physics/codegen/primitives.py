@@ -1,5 +1,7 @@
-"""What each elementwise or shape-changing JAX primitive is in LLVM. Strict IEEE: nothing is contracted or reordered,
-so that every machine computes the same bits."""
+"""JAX's elementwise and shape-changing primitives in LLVM.
+
+Strict IEEE: nothing is contracted or reordered, so that every machine computes the same bits.
+"""
 
 from collections.abc import Callable
 from functools import reduce
@@ -16,26 +18,26 @@ COMPARE = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 
 
 def _call(name: str) -> Emit:
-    """An LLVM intrinsic from floats to a float."""
+    """Call an LLVM intrinsic from floats to a float."""
 
     def emit(b, *xs):
         kind = xs[0].type
-        whole = f"llvm.{name}.{f'v{LANES}' if isinstance(kind, ir.VectorType) else ''}f32"
-        function = b.module.globals.get(whole)
+        full_name = f"llvm.{name}.{f'v{LANES}' if isinstance(kind, ir.VectorType) else ''}f32"
+        function = b.module.globals.get(full_name)
         if function is None:
-            function = ir.Function(b.module, ir.FunctionType(kind, [x.type for x in xs]), whole)
+            function = ir.Function(b.module, ir.FunctionType(kind, [x.type for x in xs]), full_name)
         return b.call(function, xs)
 
     return emit
 
 
 def _number(x: Operand, number: float) -> ir.Constant:
-    """A constant of the type of x."""
+    """Return a constant of the type of x."""
     return ir.Constant(x.type, [number] * LANES if isinstance(x.type, ir.VectorType) else number)
 
 
 def _extreme(order: str) -> Emit:
-    """max or min of floats: NaN if either is, as XLA's. Of two zeros, y."""
+    """Return max or min of floats: like XLA's, NaN if either is NaN; y if both are zeros of any sign."""
 
     def emit(b, x, y):
         chosen = b.select(b.fcmp_ordered(order, x, y), x, y)  # y if either is NaN
@@ -49,9 +51,9 @@ def _extreme_int(order: str) -> Emit:
 
 
 def _compare(order: str) -> dict[str, Emit]:
-    of_floats = "fcmp_unordered" if order == "!=" else "fcmp_ordered"
+    float_compare = "fcmp_unordered" if order == "!=" else "fcmp_ordered"
     return {
-        FLOAT: lambda b, x, y: getattr(b, of_floats)(order, x, y),
+        FLOAT: lambda b, x, y: getattr(b, float_compare)(order, x, y),
         INT: lambda b, x, y: b.icmp_signed(order, x, y),
         BOOL: lambda b, x, y: b.icmp_unsigned(order, x, y),  # a signed True would be -1
     }
@@ -61,8 +63,8 @@ def _sign(b, x):
     return b.select(b.fcmp_unordered("==", x, _number(x, 0.0)), x, _call("copysign")(b, _number(x, 1.0), x))
 
 
-def _select(b, which, x, y):
-    return b.select(which, y, x)
+def _select(b, condition, x, y):
+    return b.select(condition, y, x)
 
 
 def _bits(name: str) -> dict[str, Emit]:
@@ -93,26 +95,26 @@ ELEMENTWISE: dict[str, dict[str, Emit]] = {
 
 
 def combine(b: ir.IRBuilder, name: str, dtype: str, *xs: Operand) -> Operand:
-    """One elementwise operation on operands of a dtype."""
+    """Emit one elementwise operation on operands of a dtype."""
     if dtype not in ELEMENTWISE[name]:
         raise NotImplementedError(f"a kernel cannot use the primitive {name} of {dtype}")
     return ELEMENTWISE[name][dtype](b, *xs)
 
 
 def elementwise(b: ir.IRBuilder, name: str, operands: list[Value], dtype: str) -> Value:
-    """One operation for each element; axes of length 1, and numbers without axes, apply to all."""
+    """Emit one operation for each element; axes of length 1 and scalars broadcast."""
     if name == "select_n" and operands[0].dtype != BOOL:
         raise NotImplementedError(f"a kernel cannot use the primitive select_n by {operands[0].dtype}")
     lanes = any(x.lanes for x in operands)
-    of = operands[-1].dtype
+    operand_dtype = operands[-1].dtype  # of select_n, the cases, not the selector
     operands = [with_lanes(b, x) for x in operands] if lanes else operands
     shape = np.broadcast_shapes(*(x.rows.shape for x in operands))
     rows = [np.broadcast_to(x.rows, shape) for x in operands]
-    return Value(array(shape, lambda at: combine(b, name, of, *(x[at] for x in rows))), dtype, lanes)
+    return Value(array(shape, lambda at: combine(b, name, operand_dtype, *(x[at] for x in rows))), dtype, lanes)
 
 
 def with_lanes(b: ir.IRBuilder, x: Value) -> Value:
-    """x, its last axis the lanes: one number is put in every lane."""
+    """Give x lanes as its last axis; a scalar is copied to every lane."""
     if x.lanes:
         return x
     rows = x.rows if x.shape else x.rows[None]
@@ -120,7 +122,7 @@ def with_lanes(b: ir.IRBuilder, x: Value) -> Value:
 
 
 def convert(b: ir.IRBuilder, x: Value, dtype: str) -> Value:
-    """Exactly, or to the nearest float."""
+    """Convert between dtypes: exactly, or to the nearest float."""
     if x.dtype == dtype:
         return x
     if dtype == FLOAT:
@@ -129,8 +131,8 @@ def convert(b: ir.IRBuilder, x: Value, dtype: str) -> Value:
         emit = b.zext
     else:
         raise NotImplementedError(f"a kernel cannot convert {x.dtype} to {dtype}")
-    to = llvm_type(dtype, x.lanes)
-    return Value(array(x.rows.shape, lambda at: emit(x.rows[at], to)), dtype, x.lanes)
+    kind = llvm_type(dtype, x.lanes)
+    return Value(array(x.rows.shape, lambda at: emit(x.rows[at], kind)), dtype, x.lanes)
 
 
 def broadcast_in_dim(b: ir.IRBuilder, x: Value, shape: tuple[int, ...], dimensions: tuple[int, ...]) -> Value:
@@ -156,7 +158,7 @@ def reshape(x: Value, shape: tuple[int, ...]) -> Value:
 
 
 def reduction(b: ir.IRBuilder, name: str, x: Value, axes: tuple[int, ...], dtype: str) -> Value:
-    """or, and, max, min over rows, over lanes, or over both."""
+    """Reduce by or, and, max or min over rows, lanes or both."""
     emit = name.removeprefix("reduce_")
     over_lanes = x.lanes and x.rows.ndim in axes
     along = tuple(axis for axis in axes if axis < x.rows.ndim)
@@ -169,7 +171,7 @@ def reduction(b: ir.IRBuilder, name: str, x: Value, axes: tuple[int, ...], dtype
 
 
 def _across(b: ir.IRBuilder, name: str, dtype: str, x: Operand) -> Operand:
-    """One bool from the lanes of a vector of bools."""
+    """Reduce the lanes of a vector of bools to one bool."""
     if dtype != BOOL:
         raise NotImplementedError(f"a kernel cannot use the primitive {name} of {dtype} over lanes")
     word = ir.IntType(LANES)

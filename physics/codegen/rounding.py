@@ -1,7 +1,7 @@
-"""How a processor rounds while a kernel runs: to nearest, with subnormal numbers as zeros.
+"""The processor's floating-point mode while a kernel runs: round to nearest, subnormal numbers as zeros.
 
-XLA sets the same mode on the threads that it computes on; a kernel does not rely on that. Subnormal operands and
-results count as zeros of their sign. What the mode was before is set again afterwards.
+XLA sets the same mode on its compute threads; a kernel does not rely on that. Subnormal operands and results count as
+zeros of their sign. The kernel restores the previous mode when it ends.
 """
 
 from collections.abc import Callable
@@ -11,17 +11,17 @@ from llvmlite import ir
 from levelproof.physics.codegen.values import INDEX, Operand
 
 POINTER, WORD = ir.PointerType(), ir.IntType(32)
-MXCSR = 0x9FC0  # x86: no exceptions, to nearest; flush to zero (bit 15), denormals are zeros (bit 6)
-FPCR = 1 << 24  # AArch64: no exceptions, to nearest; flush to zero
+MXCSR = 0x9FC0  # x86: exceptions masked, to nearest; flush to zero (bit 15), denormals are zeros (bit 6)
+FPCR = 1 << 24  # AArch64: exceptions masked, to nearest; flush to zero
 
 Restore = Callable[[], Operand]
 
 
 def settle(b: ir.IRBuilder) -> Restore:
-    """Emit instructions that set the mode; the function returned emits those that undo it.
+    """Emit instructions that set the mode; return a function that emits those that restore the previous one.
 
     Raises:
-        NotImplementedError: the module is for another processor than x86-64 or AArch64.
+        NotImplementedError: the module is for a processor other than x86-64 or AArch64.
     """
     processor = b.module.triple.split("-")[0]
     if processor not in SETTLED:
@@ -53,5 +53,5 @@ def _declared(b: ir.IRBuilder, name: str, result: ir.Type, *arguments: ir.Type) 
 SETTLED: dict[str, Callable[[ir.IRBuilder], Restore]] = {
     "x86_64": _x86,
     "aarch64": _aarch64,
-    "arm64": _aarch64,  # as macOS says it
+    "arm64": _aarch64,  # as macOS calls it
 }

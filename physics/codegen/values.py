@@ -1,4 +1,4 @@
-"""Arrays of a kernel as LLVM values: one vector for each row of lanes, one scalar for each number without lanes."""
+"""Arrays of a kernel as LLVM values: one vector for each row of lanes, one scalar for each element without lanes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from llvmlite import ir
 
 from levelproof.physics.codegen.buffers import LANES
 
-Operand = Any  # an LLVM value; llvmlite does not say of its own that they have types
+Operand = Any  # an LLVM value; llvmlite's own class declares no `type`
 INDEX = ir.IntType(64)
 ELEMENT = {"float32": ir.FloatType(), "int32": ir.IntType(32), "bool": ir.IntType(1)}  # in registers
 STORED = {**ELEMENT, "bool": ir.IntType(8)}  # in memory
@@ -40,13 +40,13 @@ def llvm_type(dtype: str, lanes: bool) -> ir.Type:
 
 
 def constant(x, dtype: str, lanes: bool = False) -> ir.Constant:
-    """A number, in every lane."""
+    """Return a constant number, in every lane if `lanes`."""
     number = float(x) if dtype == "float32" else int(x)
     return ir.Constant(llvm_type(dtype, lanes), [number] * LANES if lanes else number)
 
 
 def vector(builder: ir.IRBuilder, numbers: Sequence[Operand]) -> Operand:
-    """The numbers of all lanes from scalars: one for all, or one each."""
+    """Emit a vector of lanes from scalars: one for all lanes, or one each."""
     index = ir.IntType(32)
     undefined = ir.Constant(ir.VectorType(numbers[0].type, LANES), ir.Undefined)
     filled = undefined
@@ -58,7 +58,7 @@ def vector(builder: ir.IRBuilder, numbers: Sequence[Operand]) -> Operand:
 
 
 def array(shape: tuple[int, ...], fill) -> np.ndarray:
-    """An object array, each element `fill(index)`."""
+    """Return an object array whose elements are `fill(index)`."""
     out = np.empty(shape, object)
     for index in np.ndindex(*shape):
         out[index] = fill(index)

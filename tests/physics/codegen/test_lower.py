@@ -194,7 +194,7 @@ class TestRefused:
             ("index its lanes", lambda x, n, _: x.__setitem__((0, slice(0, 8)), jnp.zeros(8))),
             ("index 4 rows", lambda x, n, _: x.__setitem__(n[:2], x[:2])),
             ("part of a reference", lambda x, n, _: x.at[1:3].__setitem__(0, x[0])),
-            ("number by number", lambda x, n, _: n.__setitem__(slice(None), (x[0] > 0).astype(jnp.int32))),
+            ("element by element", lambda x, n, _: n.__setitem__(slice(None), (x[0] > 0).astype(jnp.int32))),
         ],
     )
     def test_what_a_kernel_cannot_write(self, name: str, write: Callable) -> None:
