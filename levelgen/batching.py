@@ -1,6 +1,6 @@
-"""Lanes in batches of few sizes: a compiled program serves one number of lanes, and compiling takes seconds.
+"""Batches of lanes in a few fixed sizes: a compiled program serves one lane count, and compiling takes seconds.
 
-A batch that is shorter than its program's is padded with copies of its last lane.
+A batch with fewer lanes than its program is padded with copies of its last lane.
 """
 
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 LANES = 64  # in a batch of replays
-BATCHES = (16, 64, 256)  # levels in a batch: a program for each of these, instead of one for each count
+BATCHES = (16, 64, 256)  # batch sizes, levels: one program for each, instead of one for each count
 LANES_ON_ACCELERATOR = 32_768  # enough to keep it busy
 
 T = TypeVar("T")

@@ -1,7 +1,7 @@
-"""Levels changed by hand: bodies placed, sized, turned, given roles and fixed, joints and thrusters put on them.
+"""Edits of levels by hand: add, move, turn, resize and fix bodies, set roles, attach joints and thrusters.
 
-An edit is a pure function of one level, whose arrays have one lane, to another one. What is joined stays joined: who
-moves or turns a body takes along all that joints hold to it. Masses are those of the sampler's bodies.
+An edit is a pure function from one level, whose arrays have one lane, to another. Joined bodies stay joined: moving or
+turning a body takes along every body that joints hold to it. Masses are computed as in the sampler.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,22 +24,22 @@ SHAPES = {  # corners of a new polygon, in HALF_SIDE, clockwise around their mea
     "triangle": ((0, 4 / 3), (1.2, -2 / 3), (-1.2, -2 / 3)),
 }
 DENSITY = 1.0  # kg/m^2
-SMALLEST, LARGEST = 0.05, 2.0  # m, of a body's reach from its centre
-MOTOR_SPEED, MOTOR_POWER = 1.0, 1.0  # of a new motor, in units of the rules
-THRUSTER_POWER = 1.0  # of a new thruster, in units of the rules
+MIN_REACH, MAX_REACH = 0.05, 2.0  # m, from a body's centre
+MOTOR_SPEED, MOTOR_POWER = 1.0, 1.0  # of a new motor, in units of task.physics
+THRUSTER_POWER = 1.0  # of a new thruster, in units of task.physics
 
 Point = tuple[float, float]  # m
 
 
 class EditError(ValueError):
-    """An edit that the level cannot have: one sentence."""
+    """An edit that the level does not allow; its message is one sentence."""
 
 
 def add_body(level: Level, shape: str, x: float, y: float) -> Level:
-    """A `circle`, `rectangle` or `triangle` with its centre there, plain and free to move."""
+    """Add a `circle`, `rectangle` or `triangle` with its centre at (x, y), plain and free to move."""
     circle = shape == "circle"
     if not circle and shape not in SHAPES:
-        raise EditError(f"There is no shape {shape!r}: take circle, {', '.join(SHAPES)}.")
+        raise EditError(f"Unknown shape {shape!r}: take circle, {', '.join(SHAPES)}.")
 
     def change(one: Level) -> None:
         model, first = one.model, one.size.polygons if circle else FIXED_POLYGONS
@@ -62,40 +62,42 @@ def add_body(level: Level, shape: str, x: float, y: float) -> Level:
 
 
 def move(level: Level, body: int, x: float, y: float) -> Level:
-    """A body's centre there, and what is joined to it along."""
+    """Move a body's centre to (x, y); joined bodies shift equally."""
 
     def change(one: Level) -> None:
-        together = _together(one, body)
-        one.state.position[together] += np.array((x, y), np.float32) - one.state.position[body]
+        group = _movable_group(one, body)
+        one.state.position[group] += np.array((x, y), np.float32) - one.state.position[body]
 
     return _edited(level, change)
 
 
 def turn(level: Level, body: int, angle: float) -> Level:
-    """A body turned by so many radians, and what is joined to it around its centre."""
+    """Turn a body by an angle, rad; joined bodies turn with it, around its centre."""
 
     def change(one: Level) -> None:
-        together = _together(one, body)
+        group = _movable_group(one, body)
         centre = one.state.position[body].copy()
-        one.state.position[together] = centre + turned(one.state.position[together] - centre, angle)
-        one.state.rotation[together] += angle
+        one.state.position[group] = centre + turned(one.state.position[group] - centre, angle)
+        one.state.rotation[group] += angle
 
     return _edited(level, change)
 
 
 def resize(level: Level, body: int, factor: float) -> Level:
-    """A body so many times as large; what is joined to it moves with its joints."""
+    """Scale a body by a factor; joined bodies move with their joints."""
 
     def change(one: Level) -> None:
-        _together(one, body)
+        _movable_group(one, body)
         circle = body - one.size.polygons
         shape = one.model.radius[circle : circle + 1] if circle >= 0 else one.model.vertices[body]
         reach = factor * np.abs(shape).max()
-        if not SMALLEST <= reach <= LARGEST:
-            raise EditError(f"A body reaches from {SMALLEST} to {LARGEST} m from its centre, not {reach:.2f} m.")
+        if not MIN_REACH <= reach <= MAX_REACH:
+            raise EditError(
+                f"The body would reach {reach:.2f} m from its centre: keep it between {MIN_REACH} and {MAX_REACH} m."
+            )
         shape *= factor
-        for anchor, of in _anchors(one):
-            anchor[of == body] *= factor
+        for points, bodies in _anchors(one):
+            points[bodies == body] *= factor
         _weigh(one, body, fixed=not one.model.inverse_mass[body])
         _rejoin(one, body)
 
@@ -103,28 +105,28 @@ def resize(level: Level, body: int, factor: float) -> Level:
 
 
 def set_role(level: Level, body: int, role: int) -> Level:
-    """A body plain, green, blue or red; the scenery's, too."""
+    """Make a body plain, green, blue or red; the scenery allows it, too."""
 
     def change(one: Level) -> None:
-        one.role[_there(one.model.active, body, "body")] = Role(role)
+        one.role[_active(one.model.active, body, "body")] = Role(role)
 
     return _edited(level, change)
 
 
 def fix(level: Level, body: int, fixed: bool) -> Level:
-    """A body that cannot move, or can again."""
+    """Fix a body in place, or free it."""
     return _edited(level, lambda one: _weigh(one, _movable(one, body), fixed))
 
 
 def add_joint(level: Level, x: float, y: float, fixed: bool = False) -> Level:
-    """A joint at a point of two bodies: revolute, with a motor, or fixed."""
+    """Join the two uppermost bodies at a point, by a revolute joint with a motor or by a fixed joint."""
 
     def change(one: Level) -> None:
-        found = [body for body in bodies_at(level, x, y) if body >= FIXED_POLYGONS][:2]
-        if len(found) < 2:
+        ends = [body for body in bodies_at(level, x, y) if body >= FIXED_POLYGONS][:2]
+        if len(ends) < 2:
             raise EditError("A joint holds two bodies together: put it where two of them overlap.")
         model, row = one.model, _free(one.model.joint_active, "joints", level)
-        b, a = found
+        b, a = ends
         model.joint_active[row], model.joint_a[row], model.joint_b[row] = True, a, b
         model.joint_anchor_a[row], model.joint_anchor_b[row] = _inside(one, a, x, y), _inside(one, b, x, y)
         model.joint_fixed[row], model.motor_on[row] = fixed, not fixed
@@ -137,13 +139,13 @@ def add_joint(level: Level, x: float, y: float, fixed: bool = False) -> Level:
 
 
 def add_thruster(level: Level, x: float, y: float, angle: float) -> Level:
-    """A thruster on the uppermost body at a point. It pushes along `angle`, rad, its flame is on the other side."""
+    """Put a thruster on the uppermost body at a point. It pushes along `angle`, rad; its flame is opposite."""
 
     def change(one: Level) -> None:
-        found = [body for body in bodies_at(level, x, y) if body >= FIXED_POLYGONS]
-        if not found:
+        candidates = [body for body in bodies_at(level, x, y) if body >= FIXED_POLYGONS]
+        if not candidates:
             raise EditError("A thruster sits on a body: put it on one.")
-        model, row, body = one.model, _free(one.model.thruster_active, "thrusters", level), found[0]
+        model, row, body = one.model, _free(one.model.thruster_active, "thrusters", level), candidates[0]
         model.thruster_active[row], model.thruster_body[row] = True, body
         model.thruster_position[row] = _inside(one, body, x, y)
         model.thruster_rotation[row] = angle - one.state.rotation[body]
@@ -154,22 +156,22 @@ def add_thruster(level: Level, x: float, y: float, angle: float) -> Level:
 
 
 def bind(level: Level, kind: str, index: int, binding: int) -> Level:
-    """Which entry of an action a `joint`'s motor or a `thruster` obeys."""
+    """Choose the entry of an action that a `joint`'s motor or a `thruster` obeys."""
 
     def change(one: Level) -> None:
-        bindings, most = _OF_KIND[kind][1](one), {"joint": MOTOR_BINDINGS, "thruster": THRUSTER_BINDINGS}[kind]
-        bindings[_there(_OF_KIND[kind][0](one), index, kind)] = binding % most
+        (active, bindings), count = (get(one) for get in _OF_KIND[kind]), _BINDINGS[kind]
+        bindings[_active(active, index, kind)] = binding % count
 
     return _edited(level, change)
 
 
 def delete(level: Level, kind: str, index: int) -> Level:
-    """A `body` gone, with the joints and thrusters on it; or a `joint` or a `thruster`."""
+    """Delete a body with its joints and thrusters, or one joint or thruster."""
 
     def change(one: Level) -> None:
         if kind != "body":
             active = _OF_KIND[kind][0](one)
-            active[_there(active, index, kind)] = False
+            active[_active(active, index, kind)] = False
             return
         model, body = one.model, _movable(one, index)
         model.active[body], one.role[body] = False, Role.PLAIN
@@ -179,7 +181,8 @@ def delete(level: Level, kind: str, index: int) -> Level:
     return _edited(level, change)
 
 
-_OF_KIND: dict[str, tuple[Callable[[Level], Any], Callable[[Level], Any]]] = {
+_BINDINGS = {"joint": MOTOR_BINDINGS, "thruster": THRUSTER_BINDINGS}
+_OF_KIND: dict[str, tuple[Callable[[Level], Any], Callable[[Level], Any]]] = {  # which are active, bindings
     "joint": (lambda one: one.model.joint_active, lambda one: one.motor_binding),
     "thruster": (lambda one: one.model.thruster_active, lambda one: one.thruster_binding),
 }
@@ -189,9 +192,9 @@ EDITS: dict[str, Callable[..., Level]] = {
 
 
 def bodies_at(level: Level, x: float, y: float) -> list[int]:
-    """The bodies that a point lies in, the one that is drawn last first."""
+    """Return the bodies that contain a point, the uppermost (drawn last) first."""
     one = one_of(level)
-    found = []
+    hits = []
     for body in np.flatnonzero(one.model.active).tolist():
         inside = _inside(one, body, x, y)
         circle = body - one.size.polygons
@@ -199,59 +202,60 @@ def bodies_at(level: Level, x: float, y: float) -> list[int]:
             hit = np.hypot(*inside) <= one.model.radius[circle]
         else:
             corners = one.model.vertices[body][: one.model.n_vertices[body]]
-            sides, to = np.roll(corners, -1, 0) - corners, inside - corners
-            hit = (sides[:, 0] * to[:, 1] - sides[:, 1] * to[:, 0] <= 1e-6).all()
+            sides, offset = np.roll(corners, -1, 0) - corners, inside - corners
+            hit = (sides[:, 0] * offset[:, 1] - sides[:, 1] * offset[:, 0] <= 1e-6).all()
         if hit:
-            found.append(body)
-    return sorted(found, key=lambda body: (one.model.inverse_mass[body] != 0, body), reverse=True)
+            hits.append(body)
+    return sorted(hits, key=lambda body: (one.model.inverse_mass[body] != 0, body), reverse=True)
 
 
 def one_of(level: Level) -> Level:
-    """A level of one lane without its axis, as arrays of its own."""
+    """Copy a level of one lane to numpy arrays without the lane axis."""
     return jax.tree.map(lambda x: np.array(x)[..., 0], level)
 
 
 def _edited(level: Level, change: Callable[[Level], None]) -> Level:
-    """The level after `change` has written into its arrays; which bodies may collide is worked out anew."""
+    """Return the level with its arrays modified by `change`; recompute which bodies may collide."""
     one = one_of(level)
     change(one)
     after: Level = jax.tree.map(lambda x: np.asarray(x)[..., None], one)
     bodies = one.state.position[FIXED_POLYGONS:][one.model.active[FIXED_POLYGONS:]]
     if not np.isfinite(after.state.position).all() or np.abs(bodies).max(initial=0) > 2 * WORLD_SIDE:
-        raise EditError("That is too far outside of the world.")
+        raise EditError("That is too far outside the world.")
     return replace(after, model=replace(after.model, collides=np.asarray(separate(after.model))))
 
 
 def _free(active: Any, kind: str, level: Level) -> int:
-    """The first row that is not in use."""
+    """Return the first unused row."""
     if active.all():
         raise EditError(f"Size {name_of(level.size)} has no room for more {kind}: delete one, or take a larger size.")
     return int(active.argmin())
 
 
-def _there(active: Any, index: int, kind: str) -> int:
+def _active(active: Any, index: int, kind: str) -> int:
+    """Return the index if the body, joint or thruster there is active, else raise EditError."""
     if not 0 <= index < len(active) or not active[index]:
         raise EditError(f"There is no {kind} {index}.")
     return index
 
 
 def _movable(one: Level, body: int) -> int:
-    """A body that is there and not scenery."""
-    if _there(one.model.active, body, "body") < FIXED_POLYGONS:
-        raise EditError("That belongs to the scenery, of which only the role can change.")
+    """Return the index of an active body that is not scenery, else raise EditError."""
+    if _active(one.model.active, body, "body") < FIXED_POLYGONS:
+        raise EditError("That belongs to the scenery: only its role can change.")
     return body
 
 
-def _together(one: Level, body: int) -> list[int]:
-    """A body that can be moved, and all that moves with it."""
-    found = _joined(one, _movable(one, body))
-    if min(found) < FIXED_POLYGONS:
-        raise EditError("A joint holds it to the scenery, which stays where it is: delete that joint first.")
-    return found
+def _movable_group(one: Level, body: int) -> list[int]:
+    """Return a body and all bodies that move with it; raise EditError if one of them is scenery."""
+    group = _joined(one, _movable(one, body))
+    if min(group) < FIXED_POLYGONS:
+        raise EditError("A joint holds it to the scenery, which cannot move: delete that joint first.")
+    return group
 
 
 def _weigh(one: Level, body: int, fixed: bool) -> None:
-    """The inverse masses of a body's shape and density."""
+    """Set a body's inverse mass and inertia from its shape and density."""
     circle = body - one.size.polygons
     if circle >= 0:
         radius = one.model.radius[circle]
@@ -264,7 +268,7 @@ def _weigh(one: Level, body: int, fixed: bool) -> None:
 
 
 def _joints(one: Level) -> Iterator[tuple[int, int, Any, Any]]:
-    """Body, other body, and the joint's anchors on them, each active joint both ways round."""
+    """Yield (body, other body, anchor on the body, anchor on the other): every active joint twice, from either end."""
     model = one.model
     for row in np.flatnonzero(model.joint_active):
         ends = (
@@ -276,25 +280,25 @@ def _joints(one: Level) -> Iterator[tuple[int, int, Any, Any]]:
 
 
 def _joined(one: Level, body: int) -> list[int]:
-    """A body and all that joints hold to it, near ones first."""
-    found = [body]
-    for here in found:
-        found += [b for a, b, *_ in _joints(one) if a == here and b not in found]
-    return found
+    """Return a body and all bodies that joints hold to it, directly or not; nearest first."""
+    group = [body]
+    for member in group:  # grows while it is walked
+        group += [b for a, b, *_ in _joints(one) if a == member and b not in group]
+    return group
 
 
 def _rejoin(one: Level, body: int) -> None:
-    """Move what is joined to a body so that the ends of joints meet again."""
-    settled = _joined(one, body)
-    for position, there in enumerate(settled):
+    """Move the bodies joined to a body so that both ends of every joint meet again."""
+    group = _joined(one, body)
+    for rank, member in enumerate(group):
         for a, b, anchor_a, anchor_b in _joints(one):
-            if b == there and a in settled[:position]:
+            if b == member and a in group[:rank]:
                 one.state.position[b] = in_world(one.state, a, anchor_a) - turned(anchor_b, one.state.rotation[b])
                 break
 
 
 def _anchors(one: Level) -> Iterator[tuple[Any, Any]]:
-    """Points in the frames of bodies, and which body each is of."""
+    """Yield arrays of points in body frames, each with the indices of their bodies."""
     model = one.model
     yield model.joint_anchor_a, model.joint_a
     yield model.joint_anchor_b, model.joint_b
@@ -302,5 +306,5 @@ def _anchors(one: Level) -> Iterator[tuple[Any, Any]]:
 
 
 def _inside(one: Level, body: int, x: float, y: float) -> np.ndarray:
-    """A point of the world in the frame of a body."""
+    """Transform a point of the world into a body's frame."""
     return turned(np.array((x, y)) - one.state.position[body], -one.state.rotation[body])

@@ -9,11 +9,11 @@ from levelproof.physics.types import State
 
 
 def turned(points: ArrayLike, angle: Any) -> np.ndarray:
-    """Points (..., 2) turned about the origin by an angle in radians, one for all or one each."""
+    """Rotate points (..., 2) about the origin by an angle, rad: one for all points, or one each."""
     points, cos, sin = np.asarray(points), np.cos(angle), np.sin(angle)
     return np.stack([points[..., 0] * cos - points[..., 1] * sin, points[..., 0] * sin + points[..., 1] * cos], -1)
 
 
 def in_world(state: State, body: Any, points: ArrayLike) -> np.ndarray:
-    """Points (..., 2) in the frame of a body, or each in its own body's, where they are in the world, m."""
+    """Transform points (..., 2) from the frame of a body (one for all, or one each) to the world, m."""
     return np.asarray(state.position)[body] + turned(points, np.asarray(state.rotation)[body])

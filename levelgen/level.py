@@ -20,7 +20,7 @@ SIZES: dict[str, Size] = {
     "m": Size(polygons=6, circles=3, joints=2, thrusters=2),
     "l": Size(polygons=12, circles=4, joints=6, thrusters=2),
 }
-MAX_THINGS = 64  # of a kind in a level; a level file with so many of each has 3 MB
+MAX_PER_KIND = 64  # polygons, circles, joints or thrusters in a level; a level file with 64 of each has 3 MB
 MOTOR_BINDINGS = 4  # entries of an action that motors obey
 THRUSTER_BINDINGS = 2  # entries that thrusters obey
 ACTIONS = MOTOR_BINDINGS + THRUSTER_BINDINGS
@@ -29,7 +29,7 @@ HALF_WORLD = WORLD_SIDE / 2
 
 
 class Role(IntEnum):
-    """What a body is in the goal. The numbers are those of the reference's files."""
+    """A body's part in the goal. The values are those of the reference's files."""
 
     PLAIN = 0
     GREEN = 1
@@ -40,11 +40,11 @@ class Role(IntEnum):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Level:
-    """An immutable initial world, or many: the level axis is the last of every array (`lane`).
+    """One immutable initial world, or many: the level axis is the last of every array (`lane`).
 
-    `model` (what is constant) and `state` (what evolves) are the engine's, the rest is what the task adds.
-    `len(levels)` counts levels; `levels[0]`, `levels[10:20]` and `levels[mask]` choose some. What they give has a level
-    axis too, so that every function of levels takes it. `concatenate_levels` joins.
+    `model` (constant) and `state` (evolving) belong to the engine; the task adds the rest. `len(levels)` counts
+    levels; `levels[0]`, `levels[10:20]` and `levels[mask]` choose some and keep the level axis, so every function of
+    levels accepts the result. `concatenate_levels` joins levels.
     """
 
     model: Model
@@ -52,7 +52,7 @@ class Level:
     role: Int[Array, "body lane"]  # Role
     density: Float[Array, "body lane"]  # kg/m^2
     motor_binding: Int[Array, "joint lane"]  # 0 .. MOTOR_BINDINGS - 1
-    motor_auto: Bool[Array, "joint lane"]  # runs forward whatever the action
+    motor_auto: Bool[Array, "joint lane"]  # runs forward whatever the action is
     thruster_binding: Int[Array, "thruster lane"]  # 0 .. THRUSTER_BINDINGS - 1
 
     @property
@@ -64,21 +64,21 @@ class Level:
         return 0 if 0 in lanes else max(lanes)
 
     def __getitem__(self, index: Any) -> "Level":
-        """Levels by index (negative ones count from the end), slice, list of indices or mask, as numpy arrays.
+        """Choose levels by index (negative: from the end), slice, list of indices or mask, as numpy arrays.
 
         Raises:
             IndexError: there is no such level.
         """
         chosen = np.atleast_1d(np.arange(len(self))[index])
-        of_each = lambda x: np.broadcast_to(x, (*x.shape[:-1], len(self)))  # in numpy: JAX would compile each shape
-        return jax.tree.map(lambda x: of_each(np.asarray(x))[..., chosen], self)
+        expand = lambda x: np.broadcast_to(x, (*x.shape[:-1], len(self)))  # in numpy: JAX would compile each shape
+        return jax.tree.map(lambda x: expand(np.asarray(x))[..., chosen], self)
 
 
 def concatenate_levels(parts: Sequence[Level]) -> Level:
-    """Join levels of one size, such as those of several calls, in their order, as numpy arrays.
+    """Join levels of one size, such as the results of several calls, in order, as numpy arrays.
 
     Raises:
-        ValueError: there are none, or sizes differ.
+        ValueError: there are no levels, or their sizes differ.
     """
     sizes = list(dict.fromkeys(part.size for part in parts))
     if len(sizes) != 1:
@@ -88,12 +88,12 @@ def concatenate_levels(parts: Sequence[Level]) -> Level:
 
 
 def size_of(name: str | Size) -> Size:
-    """The size with this name: one of SIZES, or four numbers as in `8-8-8-4`. A Size is returned as it is.
+    """Return the size with a name: one of SIZES, or four numbers as in `8-8-8-4`. A Size is returned unchanged.
 
     The numbers count polygons (the scenery's four included), circles, joints and thrusters.
 
     Raises:
-        ValueError: it is no name of a size, or not its only one; the message starts with `size`.
+        ValueError: the name is invalid or not the canonical one; the message starts with `size`.
     """
     if isinstance(name, Size):
         return name
@@ -106,13 +106,13 @@ def size_of(name: str | Size) -> Size:
         )
     size = Size(*map(int, name.split("-")))
     if name_of(size) != name:
-        raise ValueError(f"size is {name}: that is {name_of(size)}, so write that")
+        raise ValueError(f"size is {name}: that is {name_of(size)}, write that instead")
     for kind, count in zip(size._fields, size, strict=True):
-        if count > MAX_THINGS:
-            raise ValueError(f"size is {name}: at most {MAX_THINGS} {kind} fit into a level")
+        if count > MAX_PER_KIND:
+            raise ValueError(f"size is {name}: at most {MAX_PER_KIND} {kind} fit into a level")
     return size
 
 
 def name_of(size: Size) -> str:
-    """The name that `size_of` reads."""
+    """Return the canonical name of a size, which `size_of` reads."""
     return next((name for name, known in SIZES.items() if known == size), "-".join(map(str, size)))

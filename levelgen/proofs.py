@@ -1,7 +1,7 @@
-"""What can be said of a level without an expert: how doing nothing ends, and whether actions can change that.
+"""Facts about a level that need no expert: how doing nothing ends, and whether actions can change that.
 
-A level is proved unsolvable where doing nothing does not reach the goal, and no action changes whether it is reached.
-docs/labels.md gives the arguments; every doubt leaves a level unproved.
+A level is proved unsolvable if doing nothing does not reach the goal and no action changes whether it is reached.
+docs/labels.md gives the arguments; any doubt leaves a level unproved.
 """
 
 from dataclasses import astuple, replace
@@ -21,27 +21,27 @@ from levelproof.physics.pairs import pairs_of
 from levelproof.physics.types import Model, Params
 from levelproof.physics.vector import rows
 
-LARGEST = 1e9  # of any quantity: what is multiplied by zero has to be a number, and so do products of two of them
+MAX_QUANTITY = 1e9  # so that a quantity, or a product of two, is finite: infinity times 0 is not 0
 
 
 class Proof(IntEnum):
     """Why no action changes whether the goal is reached."""
 
-    NONE = 0  # it may: nothing is known
+    NONE = 0  # unknown: an action may change it
     NOTHING_ACTS = 1  # no actuator can change any velocity
     GOAL_STANDS = 2  # whether green touches blue is the same at every step
 
 
 class Facts(NamedTuple):
-    """How the first episode of doing nothing ends, and what that decides."""
+    """How the first idle episode ends, and what follows from that."""
 
     reaches: Bool[Array, " lane"]  # green touches blue
-    fails: Bool[Array, " lane"]  # green touches red, without that
+    fails: Bool[Array, " lane"]  # green touches red before it touches blue
     proof: Int[Array, " lane"]  # Proof, of levels that no action solves
 
 
 class Idle(NamedTuple):
-    """Doing nothing, so far. At most one holds, from when it happened on."""
+    """How the first idle episode ended: at most one flag, which stays set; none while it lasts."""
 
     reaches: Bool[Array, " lane"]
     fails: Bool[Array, " lane"]
@@ -51,7 +51,7 @@ class Idle(NamedTuple):
 
 @partial(jax.jit, static_argnames=("rules", "env_steps"))
 def examine(level: Level, rules: TaskParams, env_steps: int) -> Facts:
-    """The facts, from watching `env_steps` env steps; an episode that lasts longer proves nothing."""
+    """Establish the facts by idling for `env_steps` env steps; a longer episode proves nothing."""
     idle = stay_idle(level, rules, env_steps)
     proof = jnp.select(
         [~driven(level).any(0), goal_stands(level, rules.physics)],
@@ -66,62 +66,62 @@ def stay_idle(level: Level, rules: TaskParams, env_steps: int) -> Idle:
     """Do nothing until the first episode ends."""
     lanes = level.role.shape[-1]
     sparse = replace(rules, dense_reward_scale=0.0)
-    nothing = jnp.zeros((ACTIONS, lanes), jnp.int32)
+    idle_action = jnp.zeros((ACTIONS, lanes), jnp.int32)
 
     def act(carry: tuple[TaskState, Idle], _: None) -> tuple[tuple[TaskState, Idle], None]:
         now, so_far = carry
-        after, result = advance(level, now, nothing, sparse)
+        after, result = advance(level, now, idle_action, sparse)
         going = ~(so_far.reaches | so_far.fails | so_far.lasts | so_far.breaks)
         broken, neither = has_nan(after.state), result.reward == 0
-        happened = Idle(
+        ending = Idle(
             reaches=result.goal,
             fails=result.reward < 0,
             lasts=result.done & neither & ~broken,
             breaks=broken & neither,
         )
-        return (after, Idle(*(old | (new & going) for old, new in zip(so_far, happened, strict=True)))), None
+        return (after, Idle(*(old | (new & going) for old, new in zip(so_far, ending, strict=True)))), None
 
     start = reset(level), Idle(*jnp.zeros((len(Idle._fields), lanes), bool))
     return jax.lax.scan(act, start, length=env_steps)[0][1]
 
 
 def driven(level: Level) -> Bool[Array, "body lane"]:
-    """Bodies whose velocity an action can change: ends of a joint whose motor obeys, carriers of a thruster."""
-    model, number = level.model, jnp.arange(level.size.bodies)[:, None]
-    of = lambda index: (index[:, None] == number) & model.active  # [thing, body, lane], one-hot
-    a, b = of(model.joint_a), of(model.joint_b)
+    """Find bodies whose velocity an action can change: ends of a joint whose motor obeys, carriers of a thruster."""
+    model, body = level.model, jnp.arange(level.size.bodies)[:, None]
+    one_hot = lambda index: (index[:, None] == body) & model.active  # [joint or thruster, body, lane]
+    a, b = one_hot(model.joint_a), one_hot(model.joint_b)
     holds = model.joint_active & a.any(1) & b.any(1)
     obeys = holds & ~model.joint_fixed & model.motor_on & ~level.motor_auto & (model.motor_power != 0)
     pushes = model.thruster_active & (model.thruster_power != 0)
-    acts = ((a | b) & obeys[:, None]).any(0) | (of(model.thruster_body) & pushes[:, None]).any(0)
+    acts = ((a | b) & obeys[:, None]).any(0) | (one_hot(model.thruster_body) & pushes[:, None]).any(0)
     return acts & ~immovable(model)
 
 
 def immovable(model: Model) -> Bool[Array, "body lane"]:
-    """Bodies that no impulse moves."""
+    """Find bodies that no impulse moves."""
     return (model.inverse_mass == 0) & (model.inverse_inertia == 0)
 
 
 def goal_stands(level: Level, params: Params) -> Bool[Array, " lane"]:
-    """Every pair of a green and a blue body that may touch is still."""
-    moves, found = ~still(level, params), []
+    """Whether every pair of a green and a blue body that may touch stays still."""
+    moves, moving_goals = ~still(level, params), []
     pairs = pairs_of(level.size)
     for pair in (pairs.polygon, pairs.circle_polygon, pairs.circle):
         a, b = np.array(pair.a, int), np.array(pair.b, int)
         goal = has_roles(level, pair.a, pair.b, Role.GREEN, Role.BLUE) & may_touch(level.model, a, b)
-        found.append((goal & (rows(moves, pair.a) | rows(moves, pair.b))).any(0))
-    return ~jnp.stack(found).any(0)
+        moving_goals.append((goal & (rows(moves, pair.a) | rows(moves, pair.b))).any(0))
+    return ~jnp.stack(moving_goals).any(0)
 
 
 def still(level: Level, params: Params) -> Bool[Array, "body lane"]:
-    """Bodies that stay where they are, whatever happens."""
+    """Find bodies that stay where they are, whatever happens."""
     state = level.state
     rests = (state.velocity == 0).all(1) & (state.angular_velocity == 0)
     return immovable(level.model) & rests & (jnp.abs(state.position) <= params.max_position).all(1)
 
 
 def moderate(level: Level, params: Params) -> Bool[Array, " lane"]:
-    """Whether every number of a level and of the engine is one, and no larger than LARGEST."""
+    """Whether all values of a level and of the engine are finite and at most MAX_QUANTITY."""
     floats = [x for x in jax.tree.leaves((level.model, level.state)) if x.dtype == jnp.float32]
-    small = [(jnp.abs(x) <= LARGEST).all(tuple(range(x.ndim - 1))) for x in floats]
-    return jnp.stack(small).all(0) & all(abs(x) <= LARGEST for x in astuple(params))
+    small = [(jnp.abs(x) <= MAX_QUANTITY).all(tuple(range(x.ndim - 1))) for x in floats]
+    return jnp.stack(small).all(0) & all(abs(x) <= MAX_QUANTITY for x in astuple(params))

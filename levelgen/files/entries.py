@@ -8,7 +8,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from levelproof.levelgen.level import MAX_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Role
+from levelproof.levelgen.level import MAX_PER_KIND, MOTOR_BINDINGS, THRUSTER_BINDINGS, Role
 from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, SOLVER_BATCH, SOLVER_ITERATIONS, Size
 
 LARGEST = 1000.0  # of a quantity of a thing; the engine itself stops bodies at 15 m and 100 m/s
@@ -136,8 +136,8 @@ def entries_of(size: Size) -> dict[str, dict[str, Entry]]:
     return {"polygon": BODY, "circle": BODY, "joint": joint, "thruster": thruster}
 
 
-_OTHERS = dict.fromkeys(("num_circles", "num_joints", "num_thrusters"), Entry(int, 0, MAX_THINGS))
-COUNTS = {"num_polygons": Entry(int, FIXED_POLYGONS, MAX_THINGS), **_OTHERS}
+_OTHERS = dict.fromkeys(("num_circles", "num_joints", "num_thrusters"), Entry(int, 0, MAX_PER_KIND))
+COUNTS = {"num_polygons": Entry(int, FIXED_POLYGONS, MAX_PER_KIND), **_OTHERS}
 STATIC_CONSTANTS = {  # of which this engine has one value
     "max_polygon_vertices": MAX_VERTICES,
     "num_solver_iterations": SOLVER_ITERATIONS,

@@ -1,1 +1,1 @@
-"""The game played in a level: actions, rules, what is seen of it, and the environment for other people's code."""
+"""The game played in a level: actions, rules, observations, and the environments for users' code."""

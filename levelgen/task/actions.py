@@ -1,8 +1,8 @@
-"""What an action does: one entry per binding, each obeyed by every actuator bound to it.
+"""Actions and what they do: one entry per binding, obeyed by every actuator bound to it.
 
 An action is multi-discrete: MOTOR_BINDINGS entries for motors (0 off, 1 forward, 2 backward), then
 THRUSTER_BINDINGS entries for thrusters (0 off, 1 on). Environments take two other kinds, too: discrete (one
-actuator at a time) and continuous. Facts: `kinetix.environment.utils` 3.0.2.
+binding at a time) and continuous. Facts: `kinetix.environment.utils` 3.0.2.
 """
 
 from typing import Any
@@ -16,16 +16,16 @@ from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, THRUSTER_BINDINGS
 MOTOR_CHOICES = 3
 THRUSTER_CHOICES = 2
 CHOICES = (MOTOR_CHOICES,) * MOTOR_BINDINGS + (THRUSTER_CHOICES,) * THRUSTER_BINDINGS  # of each entry
-NOTHING = 2 * MOTOR_BINDINGS  # the discrete action that uses no actuator
+NOTHING = 2 * MOTOR_BINDINGS  # code of the discrete action that uses no actuator
 DISCRETE_ACTIONS = NOTHING + 1 + THRUSTER_BINDINGS
 
 Controls = tuple[Float[Array, "joint lane"], Float[Array, "thruster lane"]]  # motors in [-1, 1], thrusters in [0, 1]
 
 
 def controls(level: Level, action: Int[Array, "6 lane"]) -> Controls:
-    """What the engine's motors (-1, 0 or 1) and thrusters (0 or 1) are told to do.
+    """Convert a multi-discrete action to controls: -1, 0 or 1 for motors, 0 or 1 for thrusters.
 
-    A joint that is `motor_auto` runs forward whatever the action says.
+    A joint with `motor_auto` runs forward whatever the action says.
     """
     forward, backward = action[:MOTOR_BINDINGS] == 1, action[:MOTOR_BINDINGS] >= 2
     motor = forward.astype(jnp.float32) - backward.astype(jnp.float32)
@@ -33,18 +33,18 @@ def controls(level: Level, action: Int[Array, "6 lane"]) -> Controls:
 
 
 def discrete_controls(level: Level, action: Int[Array, " lane"]) -> Controls:
-    """The same for one of DISCRETE_ACTIONS numbers.
+    """Convert a discrete action, a code below DISCRETE_ACTIONS, to controls.
 
-    2k and 2k + 1 run the motors of entry k backward and forward, NOTHING does nothing, and NOTHING + 1 + k fires
+    Codes 2k and 2k + 1 run the motors of entry k backward and forward, NOTHING does nothing, and NOTHING + 1 + k fires
     the thrusters of entry k.
     """
-    one = lambda number: (action == number).astype(jnp.float32)
-    motor = jnp.stack([one(2 * k + 1) - one(2 * k) for k in range(MOTOR_BINDINGS)])
-    return _obeyed(level, motor, jnp.stack([one(NOTHING + 1 + k) for k in range(THRUSTER_BINDINGS)]))
+    is_code = lambda code: (action == code).astype(jnp.float32)
+    motor = jnp.stack([is_code(2 * k + 1) - is_code(2 * k) for k in range(MOTOR_BINDINGS)])
+    return _obeyed(level, motor, jnp.stack([is_code(NOTHING + 1 + k) for k in range(THRUSTER_BINDINGS)]))
 
 
 def continuous_controls(level: Level, action: Float[Array, "6 lane"]) -> Controls:
-    """The same for numbers, clipped to [-1, 1] for motors and to [0, 1] for thrusters."""
+    """Convert a continuous action to controls: clip to [-1, 1] for motors, to [0, 1] for thrusters."""
     return _obeyed(level, jnp.clip(action[:MOTOR_BINDINGS], -1.0, 1.0), jnp.clip(action[MOTOR_BINDINGS:], 0.0, 1.0))
 
 
@@ -56,19 +56,19 @@ def _obeyed(level: Level, motor: Float[Array, "4 lane"], thrust: Float[Array, "2
 def _bound(
     binding: Int[Array, "actuator lane"], entries: Float[Array, "binding lane"]
 ) -> Float[Array, "actuator lane"]:
-    """The entry each actuator is bound to, picked by comparison: a gather per lane is slower."""
+    """Return the entry that each actuator is bound to; by comparison, since a gather per lane is slower."""
     return sum((jnp.where(binding == k, entry, 0.0) for k, entry in enumerate(entries)), jnp.float32(0.0))
 
 
 def action_mask(level: Level) -> Bool[Array, "6 lane"]:
-    """Which entries of an action can have an effect: an active, non-fixed joint or active thruster obeys them.
+    """Find the live entries of an action: those bound to an active, non-fixed joint or an active thruster.
 
-    As the reference counts: a joint whose motor is off or runs by itself still makes its entry live.
+    As in the reference, a joint makes its entry live even if its motor is off or runs by itself.
     """
     model = level.model
     free = model.joint_active & ~model.joint_fixed
     live = [(free & (level.motor_binding == k)).any(0) for k in range(MOTOR_BINDINGS)]
     live += [(model.thruster_active & (level.thruster_binding == k)).any(0) for k in range(THRUSTER_BINDINGS)]
     assert len(live) == ACTIONS
-    stack: Any = np.stack if isinstance(free, np.ndarray) else jnp.stack  # who reads data need not start JAX
+    stack: Any = np.stack if isinstance(free, np.ndarray) else jnp.stack  # numpy for readers without JAX
     return stack(live)

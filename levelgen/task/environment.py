@@ -1,11 +1,11 @@
-"""One environment as users of gymnax and of the reference know it, played on our levels.
+"""One environment with the interface of gymnax and of the reference, played on our levels.
 
 `env.reset(key, params)` and `env.step(key, state, action, params)` are functions of ONE environment, to be mapped
-with `jax.vmap`; the mapped axis becomes the engine's lanes (`levelgen.task.vmapped`). After an end, a step resets: to a
-level drawn from `params.levels`, or to `override_reset_state`.
+with `jax.vmap`; the mapped axis becomes the engine's lanes (`levelgen.task.vmapped`). A step that ends an episode
+resets: to a level drawn from `params.levels`, or to `override_reset_state`.
 
-Which level a reset draws depends on its key, on the number of the episode, and on a tag of its own. So code that hands
-one key to `reset`, to `step` and to the sampling of actions, or the same key to every step, still meets every level.
+The level that a reset draws depends on its key, the episode's number and a tag of its own. So callers that pass one
+key to `reset`, `step` and the sampling of actions, or the same key to every step, still meet every level.
 Facts: `kinetix.environment.env` and `spaces` 3.0.2.
 """
 
@@ -51,7 +51,7 @@ class ActionType(StrEnum):
 
 
 class ObservationType(StrEnum):
-    """What is seen of a state."""
+    """How a state is observed (`levelgen.task.observe`)."""
 
     SYMBOLIC_FLAT = "symbolic_flat"
     SYMBOLIC_FLAT_PADDED = "symbolic_flat_padded"
@@ -62,7 +62,7 @@ class ObservationType(StrEnum):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class EnvParams:
-    """What may change without compiling again: the levels that resets draw from (level axis last, at least one)."""
+    """Parameters that may change without recompiling: the levels that resets draw from (level axis last; not empty)."""
 
     levels: Level
 
@@ -75,15 +75,15 @@ class EnvState:
     level: Level  # its world as it is now
     timestep: Int[Array, ""]  # env steps taken in this episode
     last_distance: Float[Array, ""]  # m, between green and blue; NO_DISTANCE at the start
-    level_index: Int[Array, ""]  # which of `params.levels`; else which of the levels that the state was made from
+    level_index: Int[Array, ""]  # into `params.levels`, or into the levels that `starts` was called with
     episode: Int[Array, ""]  # automatic resets since `reset`
 
     @property
     def now(self) -> TaskState:
         return TaskState(self.level.state, self.timestep, self.last_distance)
 
-    def moved(self, now: TaskState) -> "EnvState":
-        """The same episode at another state of its world."""
+    def with_task_state(self, now: TaskState) -> "EnvState":
+        """Return this episode with another task state."""
         return replace(self, level=replace(self.level, state=now.state), timestep=now.timestep,
                        last_distance=now.last_distance)  # fmt: skip
 
@@ -91,7 +91,7 @@ class EnvState:
     def start(
         level: Level, level_index: Int[Array, " lane"] | int = 0, episode: Int[Array, " lane"] | int = 0
     ) -> "EnvState":
-        """The beginning of an episode."""
+        """Start an episode."""
         now = task.reset(level)
         count = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.int32), now.timestep.shape)
         return EnvState(level, now.timestep, now.last_distance, count(level_index), count(episode))
@@ -103,7 +103,7 @@ CONTROLS: dict[ActionType, Callable[[Level, Array], Controls]] = {
     ActionType.MULTI_DISCRETE: controls,
     ActionType.CONTINUOUS: continuous_controls,
 }
-LOOKS: dict[ObservationType, Callable[..., Any]] = {
+OBSERVE: dict[ObservationType, Callable[..., Any]] = {
     ObservationType.SYMBOLIC_FLAT: symbolic_flat,
     ObservationType.SYMBOLIC_FLAT_PADDED: symbolic_padded,
     ObservationType.SYMBOLIC_ENTITY: entities,
@@ -119,23 +119,23 @@ def make(
     auto_reset: bool = True,
     final_observation: bool = False,
 ) -> tuple["Environment", EnvParams]:
-    """An environment and its default parameters.
+    """Make an environment; return it with its default parameters.
 
     Args:
-        levels: resets draw from these with equal chances; level axis last.
+        levels: resets draw from these uniformly; level axis last.
         action_type: one of ActionType.
         observation_type: one of ObservationType.
-        rules: of the task.
-        auto_reset: whether a step that ends an episode gives the first state of the next one.
-        final_observation: whether `info["final_observation"]` has the observation before an automatic reset, too.
+        rules: rules of the task.
+        auto_reset: whether a step that ends an episode returns the first state of the next one.
+        final_observation: whether to add `info["final_observation"]`, the observation before an automatic reset.
 
     Raises:
-        ValueError: no such type, no level, or `jax_enable_x64` is on.
+        ValueError: a type is unknown, there is no level, or `jax_enable_x64` is on.
     """
     require_32_bits()
-    for kinds, given in (ActionType, action_type), (ObservationType, observation_type):
-        if given not in [*kinds]:
-            raise ValueError(f"there is no {kinds.__name__} {given!r}: choose one of {', '.join(kinds)}")
+    for kinds, name in (ActionType, action_type), (ObservationType, observation_type):
+        if name not in [*kinds]:
+            raise ValueError(f"there is no {kinds.__name__} {name!r}: choose one of {', '.join(kinds)}")
     if not len(levels):
         raise ValueError("there are no levels to reset to: give at least one")
     levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], len(levels))), levels)
@@ -146,9 +146,9 @@ def make(
 
 
 def starts(levels: Level) -> EnvState:
-    """The first state of every level, level axis FIRST: what `vmap` maps over, and `override_reset_state` takes.
+    """Return the first state of every level, level axis FIRST, for `vmap` and `override_reset_state`.
 
-    `level_index` of each says which of these levels it is.
+    Each state's `level_index` is its level's index in `levels`.
     """
     states = EnvState.start(levels, jnp.arange(levels.state.rotation.shape[-1], dtype=jnp.int32))
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), states)
@@ -156,7 +156,7 @@ def starts(levels: Level) -> EnvState:
 
 @dataclass(frozen=True, eq=False)
 class Environment:
-    """Made by `make`. Equal to itself only, so that it can be a static argument."""
+    """An environment, created by `make`. Equal only to itself, so it can be a static argument."""
 
     levels: Level
     action_type: ActionType
@@ -164,7 +164,7 @@ class Environment:
     rules: TaskParams
     auto_reset: bool
     final_observation: bool = False
-    level_ids: Int[np.ndarray, " level"] | None = None  # of `levels`, where they are those of a split
+    level_ids: Int[np.ndarray, " level"] | None = None  # of `levels`, if they come from a split
 
     @property
     def default_params(self) -> EnvParams:
@@ -180,14 +180,14 @@ class Environment:
 
     @property
     def num_actions(self) -> int:
-        """Discrete actions, or entries of an action."""
+        """Number of discrete actions, or of entries of an action."""
         return DISCRETE_ACTIONS if self.action_type == ActionType.DISCRETE else ACTIONS
 
     @partial(jax.jit, static_argnums=0)
     def reset(
         self, key: Key[Array, ""], params: EnvParams | None = None, override_reset_state: EnvState | None = None
     ) -> tuple[Any, EnvState]:
-        """The observation and the state at the start of an episode."""
+        """Start an episode: return its observation and state."""
         return single(self._reset_lanes)(*self._restart(key, params, override_reset_state, 0))
 
     @partial(jax.jit, static_argnums=0)
@@ -206,11 +206,11 @@ class Environment:
 
         Entries of `info`:
             GoalR: whether green touched blue.
-            distance: of green and blue at the end of the step, m.
-            terminated: the task ended the episode, so that nothing follows: a value function learns 0 there.
-            truncated: the time limit ended it: a value function bootstraps from the final observation.
-            level_index: which of `params.levels` the step was taken in (as `EnvState.level_index`).
-            final_observation: what is seen at the end of the step, before any reset; if `make` was asked for it.
+            distance: between green and blue at the end of the step, m.
+            terminated: whether the task ended the episode; the value of the next state is then 0.
+            truncated: whether the time limit ended it; a value function bootstraps from the final observation.
+            level_index: index of the step's level in `params.levels` (as `EnvState.level_index`).
+            final_observation: observation at the end of the step, before any reset; if `make` was asked for it.
         """
         self._check(action)
         if not self.auto_reset:
@@ -219,22 +219,24 @@ class Environment:
         return single(self._step_lanes)(table, index, (override, *_detached(state, action)))
 
     def step_env(self, key: Key[Array, ""], state: EnvState, action: Array, params: EnvParams | None = None) -> Step:
-        """One env step without reset."""
-        del key, params  # the world has no chance in it
+        """Take one env step without reset."""
+        del key, params  # env steps are deterministic
         self._check(action)
         return single(self._step_lanes)((), 0, (None, *_detached(state, action)))
 
     def _check(self, action: Array) -> None:
-        """Raises ValueError for an action of another kind."""
+        """Raise ValueError if the action's shape does not fit the action type."""
         if (shape := jnp.shape(action)) != (wanted := () if self.action_type == ActionType.DISCRETE else (ACTIONS,)):
-            raise ValueError(f"an action has shape {shape}: of action_type={str(self.action_type)!r} it is {wanted}")
+            raise ValueError(
+                f"an action has shape {shape}, but must be {wanted} for action_type={str(self.action_type)!r}"
+            )
 
     def reset_env(self, key: Key[Array, ""], params: EnvParams | None = None) -> tuple[Any, EnvState]:
         return self.reset(key, params)
 
     def get_obs(self, state: EnvState) -> Any:
-        """What is seen of a state."""
-        return single(lambda table, index, state: self._look(state))((), 0, state)
+        """Return the observation of a state."""
+        return single(lambda table, index, state: self._observe(state))((), 0, state)
 
     def action_space(self, params: EnvParams | None = None) -> Space:
         del params
@@ -258,42 +260,48 @@ class Environment:
     def _restart(
         self, key: Key[Array, ""], params: EnvParams | None, override: EnvState | None, episode: Int[Array, ""] | int
     ) -> tuple[Any, Array | int, Any]:
-        """(levels to draw from, the one drawn, a state instead of them): what a reset in lanes needs."""
+        """Return a reset's (levels to draw from, index of the drawn one, state that replaces both, if any)."""
         if override is not None:
             return (), 0, override
         levels = (params or self.default_params).levels
-        return levels, _drawn(key, episode, levels.state.rotation.shape[-1]), None
+        return levels, _draw_level(key, episode, levels.state.rotation.shape[-1]), None
 
     def _reset_lanes(self, levels: Any, index: Int[Array, " lane"], override: EnvState | None) -> tuple[Any, EnvState]:
         state = _first_state(levels, index, 0, override)
-        return self._look(state), state
+        return self._observe(state), state
 
     def _step_lanes(self, levels: Any, index: Int[Array, " lane"], given: tuple[Any, EnvState, Array]) -> Step:
-        """(what `_restart` gives, with the state and the action) to a step; without levels or a state, no reset."""
+        """Take one env step in every lane; reset if there are levels or an override state.
+
+        Args:
+            levels: as `_restart` returns them; () for no reset.
+            index: as `_restart` returns it.
+            given: (override state or None, state, action).
+        """
         override, state, action = given
         driven = CONTROLS[self.action_type](state.level, action)
         now, result, closing, _ = task.advance_driven(state.level, state.now, driven, self.rules)
-        after = state.moved(now)
+        after = state.with_task_state(now)
         info = {"GoalR": result.goal, "distance": closing.distance, "terminated": closing.terminated}
         info |= {"truncated": result.done & ~closing.terminated, "level_index": state.level_index}
         if self.final_observation:
-            info["final_observation"] = self._look(after)
+            info["final_observation"] = self._observe(after)
         if override is not None or isinstance(levels, Level):
             restart = _first_state(levels, index, state.episode + 1, override)
             after = jax.tree.map(lambda fresh, x: jnp.where(result.done, fresh, x), restart, after)
-        return self._look(after), after, result.reward, result.done, info
+        return self._observe(after), after, result.reward, result.done, info
 
-    def _look(self, state: EnvState) -> Any:
-        return LOOKS[self.observation_type](state.level, state.level.state)
+    def _observe(self, state: EnvState) -> Any:
+        return OBSERVE[self.observation_type](state.level, state.level.state)
 
 
 def _detached(*given: Any) -> Any:
-    """Nothing is differentiated through the world."""
+    """Stop gradients: the world is not differentiable."""
     return jax.tree.map(jax.lax.stop_gradient, given)
 
 
-def _drawn(key: Key[Array, ""], episode: Int[Array, ""] | int, count: int) -> Int[Array, ""] | int:
-    """The index of the level that an episode plays. Its key is used for nothing else: see the module's docstring."""
+def _draw_level(key: Key[Array, ""], episode: Int[Array, ""] | int, count: int) -> Int[Array, ""] | int:
+    """Draw the index of an episode's level, from a key that nothing else uses (see the module's docstring)."""
     if count == 1:
         return 0
     bits = jax.random.bits(jax.random.fold_in(key, LEVEL_DRAW + episode))
@@ -308,11 +316,11 @@ def _first_state(
     return EnvState.start(jax.tree.map(lambda x: x[..., index], levels), index, episode)
 
 
-def _space_of_entities(seen: Any, size: Size) -> Dict:
-    """Masks are truth values, numbers of bodies are below their count, the rest is unbounded."""
+def _space_of_entities(observation: Any, size: Size) -> Dict:
+    """Return the space of an EntityObservation: masks are bools, indices below the body count, the rest unbounded."""
 
     def space(x: jax.ShapeDtypeStruct) -> Box:
         bounds = {"b": (0, 1), "i": (0, size.bodies - 1)}.get(x.dtype.kind, (-jnp.inf, jnp.inf))
         return Box(*bounds, x.shape, x.dtype)
 
-    return Dict({name: space(x) for name, x in vars(seen).items()})
+    return Dict({name: space(x) for name, x in vars(observation).items()})

@@ -1,8 +1,8 @@
 """The environment for learners that step many lanes: batch axis last, levels by index into a table.
 
-`jax.vmap(env.step)` carries every lane's level through every step. Here a lane's state is the episode alone, and the
-index of its level; what the level consists of is copied from the table when a lane starts an episode, and only then.
-The learner says which level comes next in each lane, so a step takes no key and draws nothing.
+`jax.vmap(env.step)` carries every lane's level through every step. Here a lane's state is only its episode and its
+level's index; a lane copies the level's arrays from the table only when it starts an episode. The learner chooses the
+next level of each lane, so a step takes no key and draws nothing.
 """
 
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task import rules as task
-from levelproof.levelgen.task.environment import CONTROLS, LOOKS, Environment, EnvParams, ObservationType
+from levelproof.levelgen.task.environment import CONTROLS, OBSERVE, Environment, EnvParams, ObservationType
 from levelproof.levelgen.task.observe.flat import level_features, symbolic_flat
 from levelproof.levelgen.task.rules import TaskState
 
@@ -22,17 +22,17 @@ from levelproof.levelgen.task.rules import TaskState
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class LevelTable:
-    """Levels as lanes take them, level axis last."""
+    """Levels to start episodes in, or the levels that lanes play; level axis last."""
 
-    level: Level  # what is constant: its `state` is None
-    start: TaskState | None  # of an episode in each level; None in what lanes play
-    features: Float[Array, "feature level"]  # what is constant in the symbolic-flat observation; else no rows
+    level: Level  # its constant arrays; `state` is None
+    start: TaskState | None  # first state of an episode in each level; None for levels that lanes play
+    features: Float[Array, "feature level"]  # constant part of the symbolic-flat observation; no rows for others
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class LaneState:
-    """The episodes under way, without what is constant in their levels."""
+    """The episodes under way, without their levels' constant arrays."""
 
     now: TaskState
     level_index: Int[Array, " lane"]  # into the table
@@ -45,25 +45,25 @@ LaneStep = tuple[Any, LaneState, LevelTable, Float[Array, " lane"], Bool[Array, 
 class Lanes:
     """An environment (`levelproof.make`) stepped in lanes: its rules, actions and observations, batch axis last.
 
-    `table` is made once from parameters. `reset` starts episodes, and gives `played`: each lane's own columns of the
-    table, which every `step` takes and returns. `take` gives them for any state.
+    `table` is computed once from parameters. `reset` starts episodes and returns `played`: each lane's own columns of
+    the table, which every `step` takes and returns. `take` returns them for any state.
     """
 
     env: Environment
 
     def table(self, params: EnvParams | None = None) -> LevelTable:
-        """The levels of `params`, and what is computed once from each."""
+        """Build the table of the levels of `params`."""
         level = (params or self.env.default_params).levels
         flat = self.env.observation_type == ObservationType.SYMBOLIC_FLAT
         features = level_features(level) if flat else jnp.zeros((0, len(level)))
         return LevelTable(_constant(level), task.reset(level), features)
 
     def take(self, table: LevelTable, level_index: Int[Array, " lane"]) -> LevelTable:
-        """Columns of the table, one for each lane."""
+        """Return the table's columns at `level_index`, one for each lane."""
         return jax.tree.map(lambda x: x[..., level_index], replace(table, start=None))
 
     def reset(self, table: LevelTable, level_index: Int[Array, " lane"]) -> tuple[Any, LaneState, LevelTable]:
-        """Start an episode in every lane: (observation, state, played)."""
+        """Start an episode in every lane; return (observation, state, played)."""
         played = self.take(table, level_index)
         state = LaneState(jax.tree.map(lambda x: x[..., level_index], table.start), level_index)
         return self.observe(state, played), state, played
@@ -71,16 +71,16 @@ class Lanes:
     def step(
         self, table: LevelTable, played: LevelTable, state: LaneState, action: Array, next_index: Int[Array, " lane"]
     ) -> LaneStep:
-        """Take one env step in every lane: (observation, state, played, reward, done, info).
+        """Take one env step in every lane; return (observation, state, played, reward, done, info).
 
         Args:
             table: all levels.
-            played: each lane's level, as `reset` or the step before gave it.
+            played: each lane's level, as `reset` or the previous step returned it.
             state: the episodes under way.
-            action: of the environment's kind, lanes last: int [lane], int [6, lane] or float [6, lane].
-            next_index: into the table: the level that a lane starts if this step ends its episode.
+            action: actions of the environment's type, lanes last: int [lane], int [6, lane] or float [6, lane].
+            next_index: index in the table of the level that a lane starts if this step ends its episode.
 
-        `info` has the entries of `Environment.step`, lanes last. Nothing is differentiated through the world.
+        `info` has the entries of `Environment.step`, lanes last. No gradient flows through the world.
         """
         env, level = self.env, played.level
         state, action = jax.lax.stop_gradient((state, action))
@@ -97,11 +97,11 @@ class Lanes:
         return self.observe(after, played), after, played, result.reward, result.done, info
 
     def observe(self, state: LaneState, played: LevelTable) -> Any:
-        """What is seen of states, lanes last."""
+        """Return the observation of each lane, lanes last."""
         if self.env.observation_type == ObservationType.SYMBOLIC_FLAT:
             return symbolic_flat(played.level, state.now.state, played.features)
         world = state.now.state
-        return LOOKS[self.env.observation_type](replace(played.level, state=world), world)
+        return OBSERVE[self.env.observation_type](replace(played.level, state=world), world)
 
 
 def _constant(level: Level) -> Level:
@@ -111,18 +111,18 @@ def _constant(level: Level) -> Level:
 def _started(
     table: LevelTable, played: LevelTable, state: LaneState, done: Bool[Array, " lane"]
 ) -> tuple[LaneState, LevelTable]:
-    """Copy the table's columns into the lanes that start an episode, lane by lane: few do in any one step.
+    """Copy the table's columns into the lanes that start an episode, lane by lane: in any one step they are few.
 
-    Selecting among all lanes would read and write every level in every step, which takes as long as the step itself.
+    A select over all lanes would read and write every level in every step, which takes as long as the step itself.
     """
 
     def start_one(carry: tuple) -> tuple:
         waiting, now, played = carry
         lane = jnp.argmax(waiting)
         column = lambda x: jax.lax.dynamic_slice_in_dim(x, state.level_index[lane], 1, -1)
-        into = lambda x, one: jax.lax.dynamic_update_slice_in_dim(x, one, lane, -1)
+        write = lambda x, one: jax.lax.dynamic_update_slice_in_dim(x, one, lane, -1)
         chosen = jax.tree.map(column, table)
-        now, played = jax.tree.map(into, (now, played), (chosen.start, replace(chosen, start=None)))
+        now, played = jax.tree.map(write, (now, played), (chosen.start, replace(chosen, start=None)))
         return waiting.at[lane].set(False), now, played
 
     _, now, played = jax.lax.while_loop(lambda carry: carry[0].any(), start_one, (done, state.now, played))

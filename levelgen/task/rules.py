@@ -50,22 +50,22 @@ class TaskState:
 
 
 class StepResult(NamedTuple):
-    """What one env step gave."""
+    """The result of one env step."""
 
     reward: Float[Array, " lane"]
     done: Bool[Array, " lane"]
     goal: Bool[Array, " lane"]  # ended because green touched blue
 
 
-class Closing(NamedTuple):
-    """How things stood at the end of an env step, before any reset."""
+class StepEnd(NamedTuple):
+    """The end of an env step, before any reset."""
 
-    distance: Float[Array, " lane"]  # of green and blue, m
-    terminated: Bool[Array, " lane"]  # the task ended the episode, not the time limit alone: no value lies beyond
+    distance: Float[Array, " lane"]  # between green and blue, m
+    terminated: Bool[Array, " lane"]  # by the task, not by the time limit alone: the next state's value is 0
 
 
 def reset(level: Level) -> TaskState:
-    """The first state of an episode in every lane."""
+    """Return the first state of an episode in every lane."""
     lanes = level.state.rotation.shape[-1]
     return TaskState(level.state, jnp.zeros(lanes, jnp.int32), jnp.full(lanes, NO_DISTANCE, jnp.float32))
 
@@ -80,7 +80,7 @@ def has_roles(level: Level, a, b, first: Role, second: Role) -> Bool[Array, "pai
 def touches(level: Level, active: Bool[Array, "contact lane"], first: Role, second: Role) -> Bool[Array, " lane"]:
     """Whether bodies of these roles are in contact.
 
-    The first contact point of a polygon pair, or the contact of a circle pair, counts.
+    What counts is the first contact point of a polygon pair, or the contact of a pair with a circle.
     """
     pairs = pairs_of(level.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
@@ -94,7 +94,7 @@ def touches(level: Level, active: Bool[Array, "contact lane"], first: Role, seco
 
 
 def goal_distance(level: Level, state: State) -> Float[Array, " lane"]:
-    """Distance between the centres of green and blue, summed over all such pairs that may touch, m."""
+    """Return the distance between the centres of green and blue, summed over all such pairs that may touch, m."""
     position, pairs = vec(state.position), pairs_of(level.size)
     total = jnp.zeros(state.rotation.shape[-1])
     for pair in (pairs.polygon, pairs.circle_polygon, pairs.circle):
@@ -107,16 +107,16 @@ def goal_distance(level: Level, state: State) -> Float[Array, " lane"]:
 def advance(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
 ) -> tuple[TaskState, StepResult]:
-    """One env step without reset: the next state, and what the step gave."""
+    """Take one env step without reset: return the next state and the step's result."""
     return advance_driven(level, now, controls(level, action), params)[:2]
 
 
 def advance_driven(
     level: Level, now: TaskState, driven: Controls, params: TaskParams, seen: bool = False
-) -> tuple[TaskState, StepResult, Closing, Any]:
-    """The same under controls, whatever kind of action they come from.
+) -> tuple[TaskState, StepResult, StepEnd, Any]:
+    """Take one env step without reset under controls, whatever type of action they come from.
 
-    Also returns how it stood at the end, and the contacts of the last physics step, if `seen`.
+    Returns the next state, the result, the step's end, and the contacts of the last physics step, if `seen`.
     """
     motor, thrust = driven
 
@@ -143,32 +143,32 @@ def advance_driven(
     return (
         after,
         StepResult(reward, done, goal),
-        Closing(distance, terminated),
+        StepEnd(distance, terminated),
         jax.tree.map(lambda x: x[-1], manifolds),
     )
 
 
 def has_nan(state: State) -> Bool[Array, " lane"]:
-    """Whether a lane's world has broken down."""
+    """Whether a lane's world has broken down: a position, angle or velocity is NaN."""
     leaves = (state.position, state.rotation, state.velocity, state.angular_velocity)
     return jnp.stack([jnp.isnan(x).any(tuple(range(x.ndim - 1))) for x in leaves]).any(0)
 
 
 def restart(level: Level, state: TaskState, done: Bool[Array, " lane"]) -> TaskState:
-    """The first state of the level in the lanes that are done."""
+    """Replace the state of the lanes that are done by their level's first state."""
     return jax.tree.map(lambda fresh, x: jnp.where(done, fresh, x), reset(level), state)
 
 
 def step(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams = DEFAULT_RULES
 ) -> tuple[TaskState, StepResult]:
-    """One env step with automatic reset to the same level.
+    """Take one env step with automatic reset to the same level.
 
     Args:
         level: the level of each lane.
         now: the episode under way in each lane.
         action: multi-discrete, one entry per binding (`levelgen.task.actions`).
-        params: rules.
+        params: rules of the task.
     """
     after, result = advance(level, now, action, params)
     return restart(level, after, result.done), result

@@ -1,4 +1,4 @@
-"""Spaces of actions and observations, with the attributes and methods of gymnax's."""
+"""Spaces of actions and observations, with the attributes and methods of gymnax's spaces."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -11,13 +11,13 @@ from jaxtyping import Array, Bool, Key
 
 
 class Box:
-    """An array of numbers between two bounds; whole numbers include both, truth values are False and True."""
+    """Arrays with values between two bounds; integers include both bounds, bools are False and True."""
 
     def __init__(self, low: Any, high: Any, shape: tuple[int, ...], dtype: Any = jnp.float32) -> None:
         self.low, self.high, self.shape, self.dtype = low, high, shape, dtype
 
     def sample(self, key: Key[Array, ""]) -> Array:
-        """A random element: uniform between the bounds; without them, normal or exponential as in Gymnasium."""
+        """Draw an element: uniform between the bounds; without bounds, normal or exponential as in Gymnasium."""
         if jnp.issubdtype(self.dtype, jnp.floating):
             return self._sample_floats(key)
         return jax.random.randint(key, self.shape, self.low, self.high + 1).astype(self.dtype)
@@ -40,7 +40,7 @@ class Box:
 
 
 class Discrete(Box):
-    """0 .. n - 1."""
+    """Integers 0 .. n - 1."""
 
     def __init__(self, n: int) -> None:
         super().__init__(0, n - 1, (), jnp.int32)
@@ -48,7 +48,7 @@ class Discrete(Box):
 
 
 class MultiDiscrete(Box):
-    """Several numbers, each below its own bound; `n` is the sum of the bounds: logits a policy needs."""
+    """Tuples of integers, each below its own bound; `n`, the sum of the bounds, is the number of logits of a policy."""
 
     def __init__(self, bounds: tuple[int, ...]) -> None:
         self.number_of_dims_per_distribution = np.array(bounds, np.int32)
@@ -68,9 +68,9 @@ class Dict:
         return {name: space.sample(one) for one, (name, space) in zip(keys, self.spaces.items(), strict=True)}
 
     def contains(self, x: Any) -> Bool[Array, ""]:
-        """Whether a mapping, or an observation with these names, lies within."""
-        of = x.__getitem__ if isinstance(x, Mapping) else partial(getattr, x)
-        return jnp.stack([space.contains(of(name)) for name, space in self.spaces.items()]).all()
+        """Whether a mapping, or an object with these attributes, lies in the space."""
+        get = x.__getitem__ if isinstance(x, Mapping) else partial(getattr, x)
+        return jnp.stack([space.contains(get(name)) for name, space in self.spaces.items()]).all()
 
 
 Space = Box | Dict

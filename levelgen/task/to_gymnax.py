@@ -1,7 +1,7 @@
-"""The environment as one of gymnax's: an instance of its class, with its spaces. Needs gymnax installed.
+"""The environment as an instance of gymnax's own class, with its spaces. Needs gymnax installed.
 
 Before version 1.0, gymnax's `step` returns (observation, state, reward, done, info); since then, (observation, state,
-reward, terminated, truncated, info). What comes out here is what the installed version returns.
+reward, terminated, truncated, info). The environment here returns what the installed version does.
 """
 
 from dataclasses import replace
@@ -18,10 +18,10 @@ from levelproof.levelgen.task.spaces import Dict, Discrete, MultiDiscrete, Space
 def to_gymnax(env: Environment) -> Any:
     """Wrap an environment in gymnax's own classes, for code that checks for them.
 
-    The result is a `gymnax.environments.environment.Environment`. Its parameters are those of `levelproof.make`, and
-    `override_reset_state` may be given to `reset` and `step`, too. Actions of six entries are a gymnax `Tuple`; `step`
-    takes them as a tuple or as an array. A state alone does not say whether its episode has ended, so there is no
-    `is_terminal` and no `discount`: `step` and `info` tell.
+    The result is a `gymnax.environments.environment.Environment`. Its parameters are those of `levelproof.make`;
+    `reset` and `step` accept `override_reset_state`, too. Actions of six entries are a gymnax `Tuple`; `step`
+    takes them as a tuple or as an array. A state alone does not show whether its episode has ended, so there is no
+    `is_terminal` and no `discount`: use the results of `step` and `info`.
 
     Raises:
         ImportError: gymnax is not installed.
@@ -67,7 +67,7 @@ def to_gymnax(env: Environment) -> Any:
             return inner.reset_env(key, params)
 
         def step_env(self, key: Key[Array, ""], state: EnvState, action: Any, params: EnvParams | None = None) -> tuple:
-            """One env step without reset; as gymnax has it, the fourth is `terminated` since 1.0, before it `done`."""
+            """Take one env step without reset; as in gymnax, the fourth result is `terminated` (before 1.0: `done`)."""
             observation, state, reward, done, info = inner.step_env(key, state, _array(action), params)
             return observation, state, reward, info["terminated"] if splits_done else done, info
 
@@ -99,5 +99,5 @@ def _converted(space: Space) -> Any:
     if isinstance(space, Discrete):
         return spaces.Discrete(space.n)
     box = spaces.Box(space.low, space.high, space.shape, space.dtype)
-    box.sample = space.sample  # gymnax's own gives NaN where there are no bounds
+    box.sample = space.sample  # gymnax's own returns NaN if there are no bounds
     return box

@@ -1,8 +1,8 @@
-"""From lanes to `vmap`: a function of lanes becomes one of a single environment, without losing its speed.
+"""From lanes to `vmap`: turn a function of lanes into a function of a single environment, without losing speed.
 
-What works on all lanes at once (the physics step is one call of machine code) cannot be mapped by JAX over an axis
-of its own. Here `jax.vmap` is told what to do instead: the mapped axis becomes lanes. Mapped again, or mapped around
-a loop, the axes merge into one axis of lanes.
+JAX cannot add a mapped axis to a function that works on all lanes at once (the physics step is one call of machine
+code). A custom rule for `jax.vmap` turns the mapped axis into lanes instead; nested maps, also around a loop, merge
+into one axis of lanes.
 """
 
 from collections.abc import Callable
@@ -17,11 +17,11 @@ OnLanes = Callable[[Any, Int[Array, " lane"], Any], Any]
 
 
 def single(on_lanes: OnLanes) -> Callable[[Any, Int[Array, ""] | int, Any], Any]:
-    """The function of one environment that a function of lanes amounts to.
+    """Turn a function of lanes into a function of one environment that `jax.vmap` maps efficiently.
 
-    `on_lanes(table, index, given)` has lanes last in `index`, in every array of `given` and in its result. The table
-    is shared by all lanes; its arrays have rows to choose from on their last axis, and `index` chooses a lane's own.
-    The result takes and gives the same without the axis of lanes.
+    `on_lanes(table, index, given)` has lanes last in `index`, in every array of `given` and in its result. All lanes
+    share the table; `index` chooses each lane's entry on the last axis of the table's arrays. The returned function
+    has the same arguments and result without the lane axis.
     """
     merged = custom_vmap(on_lanes)
 
@@ -47,5 +47,5 @@ def single(on_lanes: OnLanes) -> Callable[[Any, Int[Array, ""] | int, Any], Any]
 
 
 def _merge(x: Array) -> Array:
-    """[batch, ..., lane] -> [..., batch * lane]."""
+    """Merge [batch, ..., lane] into [..., batch * lane]."""
     return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1])

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.task.environment import LOOKS, ObservationType
+from levelproof.levelgen.task.environment import OBSERVE, ObservationType
 from levelproof.physics.types import State
 from levelproof.pipeline.errors import UserError
 
@@ -34,5 +34,5 @@ def observe(kind: ObservationType, level: Level, states: State) -> Any:
 @partial(jax.jit, static_argnames="kind")
 def _observe(kind: ObservationType, level: Level, states: State) -> Any:
     level, states = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), 0, -1), (level, states))
-    shown = jax.vmap(lambda state: LOOKS[kind](replace(level, state=state), state))(states)
+    shown = jax.vmap(lambda state: OBSERVE[kind](replace(level, state=state), state))(states)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), shown)

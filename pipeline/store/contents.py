@@ -16,7 +16,7 @@ import numpy as np
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.witness import Record
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
-from levelproof.levelgen.level import MAX_THINGS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
+from levelproof.levelgen.level import MAX_PER_KIND, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level, Role, name_of
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.physics.buffers import buffers_of
@@ -85,7 +85,7 @@ def size_in(fields: Any, encoding: Encoding) -> Size:
     with suppress(KeyError, IndexError, TypeError):
         shapes = {field["name"]: field["shape"] for field in fields}
         size = Size(*(shapes[name][0] for name in COUNTED))
-        fits = all(type(n) is int and low <= n <= MAX_THINGS for low, n in zip(FEWEST, size, strict=True))
+        fits = all(type(n) is int and low <= n <= MAX_PER_KIND for low, n in zip(FEWEST, size, strict=True))
         if fits and fields == _told(size, encoding):
             return size
     raise ContentsError("its fields are those of no size")

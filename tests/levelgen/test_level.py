@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from levelproof.levelgen.level import MAX_THINGS, SIZES, Level, concatenate_levels, name_of, size_of
+from levelproof.levelgen.level import MAX_PER_KIND, SIZES, Level, concatenate_levels, name_of, size_of
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.physics.types import Size
 
 
-@given(st.builds(Size, *[st.integers(0, MAX_THINGS)] * 4))
+@given(st.builds(Size, *[st.integers(0, MAX_PER_KIND)] * 4))
 def test_every_size_has_one_name(size: Size) -> None:
     assert size_of(name_of(size)) == size
 
@@ -36,7 +36,7 @@ def test_what_is_no_name_is_refused(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("5-2-1-1", "size is 5-2-1-1: that is s, so write that"),
+        ("5-2-1-1", "size is 5-2-1-1: that is s, so write that instead"),
         ("65-1-1-1", "size is 65-1-1-1: at most 64 polygons fit into a level"),
         ("6-1-999-1", "size is 6-1-999-1: at most 64 joints fit into a level"),
     ],

@@ -12,7 +12,7 @@ from jaxtyping import Int
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.levelgen.files.kinetix import Fields, level_from_kinetix
 from levelproof.levelgen.files.level_file import flaws
-from levelproof.levelgen.level import ACTIONS, MAX_THINGS, Level, name_of
+from levelproof.levelgen.level import ACTIONS, MAX_PER_KIND, Level, name_of
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.physics.types import FIXED_POLYGONS, Size
 from levelproof.pipeline.read.kinetix.records import LEVEL_FIELDS, WORLD, dtype_of
@@ -103,7 +103,7 @@ def read_trajectories(array: StoredArray, first: int, last: int) -> Trajectories
 def _size_of(array: StoredArray) -> Size:
     names = array.dtype.names or ()
     counts = [array.dtype[f"{WORLD}{name}"].shape for name in COUNTED_FIELDS if f"{WORLD}{name}" in names]
-    if len(counts) == len(COUNTED_FIELDS) and all(len(shape) == 1 and shape[0] <= MAX_THINGS for shape in counts):
+    if len(counts) == len(COUNTED_FIELDS) and all(len(shape) == 1 and shape[0] <= MAX_PER_KIND for shape in counts):
         size = Size(*(shape[0] for shape in counts))
         if size.polygons >= FIXED_POLYGONS and size.bodies > FIXED_POLYGONS:
             return size
