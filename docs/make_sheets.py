@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from levelproof.experts.labels import Label
-from levelproof.levelgen.pictures.raster import rasterised, sheet, write_png
+from levelproof.levelgen.pictures.raster import rasterise, sheet, write_png
 from levelproof.pipeline.look.show import film_of
 from levelproof.pipeline.store.manifest import read_manifest
 
@@ -19,7 +19,7 @@ PIXELS = 220  # width of a level's picture
 def main(split: Path) -> None:
     manifest = read_manifest(split, ["label"])
     solved = manifest.level_ids[manifest.labels == Label.SOLVED][:LEVELS]
-    pictures = [rasterised(film_of(split, int(level_id)).scenes[-1], PIXELS) for level_id in solved]
+    pictures = [rasterise(film_of(split, int(level_id)).scenes[-1], PIXELS) for level_id in solved]
     write_png(sheet(pictures, COLUMNS), Path(__file__).with_name(f"solved-{split.name}.png"))
 
 

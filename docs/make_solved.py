@@ -7,7 +7,7 @@ python docs/make_solved.py data/64k/l 66 32 76 88 83 89
 import sys
 from pathlib import Path
 
-from levelproof.levelgen.pictures.raster import rasterised, sheet
+from levelproof.levelgen.pictures.raster import rasterise, sheet
 from levelproof.pipeline.look.show import film_of
 
 COLUMNS = 3
@@ -18,7 +18,7 @@ FILM = Path(__file__).with_name("solved.webp")
 
 def main(split: Path, level_ids: list[int]) -> None:
     films = [film_of(split, level_id) for level_id in level_ids]
-    pictures = [[rasterised(scene, PIXELS) for scene in film.scenes] for film in films]
+    pictures = [[rasterise(scene, PIXELS) for scene in film.scenes] for film in films]
     frames = [
         sheet([film[min(frame, len(film) - 1)] for film in pictures], COLUMNS)
         for frame in range(max(map(len, pictures)))

@@ -14,7 +14,7 @@ import numpy as np
 from levelproof.levelgen.frames import in_world, turned
 from levelproof.levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role, name_of
 from levelproof.levelgen.sampling.scenery import NORMAL
-from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.levelgen.sampling.shuffle import collision_matrix
 from levelproof.physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
 from levelproof.physics.types import FIXED_POLYGONS
 
@@ -222,7 +222,7 @@ def _edited(level: Level, change: Callable[[Level], None]) -> Level:
     bodies = one.state.position[FIXED_POLYGONS:][one.model.active[FIXED_POLYGONS:]]
     if not np.isfinite(after.state.position).all() or np.abs(bodies).max(initial=0) > 2 * WORLD_SIDE:
         raise EditError("That is too far outside the world.")
-    return replace(after, model=replace(after.model, collides=np.asarray(separate(after.model))))
+    return replace(after, model=replace(after.model, collides=np.asarray(collision_matrix(after.model))))
 
 
 def _free(active: Any, kind: str, level: Level) -> int:

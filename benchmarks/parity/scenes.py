@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
 from levelproof.levelgen.level import WORLD_SIDE, Level
-from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.levelgen.sampling.shuffle import collision_matrix
 from levelproof.physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
 from levelproof.physics.types import FIXED_POLYGONS, State
 
@@ -141,7 +141,7 @@ def chains(level: Level, rng: np.random.Generator) -> Level:
         "joint_limited": model.joint_limited & ~fixed,
     }
     model = replace(model, **joints)
-    model = replace(model, collides=np.asarray(separate(model)))
+    model = replace(model, collides=np.asarray(collision_matrix(model)))
     return replace(level, model=model, state=replace(state, position=position.astype(np.float32)))
 
 

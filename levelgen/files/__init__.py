@@ -1,1 +1,1 @@
-"""Levels as the reference has them: its arrays and its level files."""
+"""Levels in the reference's formats: its arrays and its level files."""

@@ -1,6 +1,6 @@
-"""What may stand where in a level file: names, types and bounds; and reading a value that nobody vouches for.
+"""The entries of a level file, with their names, types and bounds, and the reading of untrusted values.
 
-Names, their order, and what must be there: `kinetix.util.saving` 3.0.2 and what it stores
+Names, their order and which are required follow `kinetix.util.saving` 3.0.2 and the types it stores
 (`kinetix.environment.env_state`, `jax2d.sim_state`).
 """
 
@@ -11,18 +11,18 @@ from typing import Any
 from levelproof.levelgen.level import MAX_PER_KIND, MOTOR_BINDINGS, THRUSTER_BINDINGS, Role
 from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, SOLVER_BATCH, SOLVER_ITERATIONS, Size
 
-LARGEST = 1000.0  # of a quantity of a thing; the engine itself stops bodies at 15 m and 100 m/s
-LARGEST_INVERSE = 1e9  # 1/kg and 1/(kg m^2)
-LARGEST_RULE = 1_000_000
+MAX_QUANTITY = 1000.0  # of a body, joint or thruster; the engine itself clips at 15 m and 100 m/s
+MAX_INVERSE = 1e9  # 1/kg and 1/(kg m^2)
+MAX_RULE = 1_000_000
 
 
 class LevelFileError(ValueError):
-    """A level file that cannot be used, or a level that such a file cannot hold: where, and what it should be."""
+    """A level file is unusable, or a level does not fit into one; the message says where, and what is allowed."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What may stand at one point of a file: a number, or numbers in nested objects with the keys "0", "1", ..."""
+    """One entry of a file: a number or bool, or an array of them as nested objects with the keys "0", "1", ..."""
 
     kind: type[float] | type[int] | type[bool]
     low: float = 0.0
@@ -30,10 +30,10 @@ class Entry:
     shape: tuple[int, ...] = ()
 
     def read(self, parent: object, name: str, where: str) -> Any:
-        """The value called `name` in the object at `where`; nested lists, if it is more than one number.
+        """Read the value `name` of the object at `where`; return nested lists if the entry is an array.
 
         Raises:
-            LevelFileError: it is missing, or something else.
+            LevelFileError: the value is missing or invalid.
         """
         return self._read(item(parent, name, where), f"{where}.{name}", self.shape)
 
@@ -41,32 +41,37 @@ class Entry:
         if shape:
             return [self._read(item(value, str(i), where), f"{where}.{i}", shape[1:]) for i in range(shape[0])]
         if self.kind is bool:
-            good = isinstance(value, bool)
+            valid = isinstance(value, bool)
         else:
             numbers = int if self.kind is int else int | float
-            good = isinstance(value, numbers) and not isinstance(value, bool) and self.low <= value <= self.high
-        if not good:
+            valid = isinstance(value, numbers) and not isinstance(value, bool) and self.low <= value <= self.high
+        if not valid:
             number = f"a {'whole ' if self.kind is int else ''}number from {self.low:,g} to {self.high:,g}"
             wanted = "true or false" if self.kind is bool else number
-            raise LevelFileError(f"{where} is {told(value)}, it has to be {wanted}")
+            raise LevelFileError(f"{where} is {abbreviate(value)}, but must be {wanted}")
         return self.kind(value)  # pyright: ignore[reportArgumentType]
 
 
 def item(parent: object, name: str, where: str) -> object:
-    """An object's entry; `where` the object is, in words that a person finds it by.
+    """Return an object's entry.
+
+    Args:
+        parent: the object.
+        name: key of the entry.
+        where: path of the object in the file, for error messages; "" for the whole file.
 
     Raises:
-        LevelFileError: there is none.
+        LevelFileError: `parent` is not an object, or has no such entry.
     """
     if not isinstance(parent, dict):
-        raise LevelFileError(f"{where or 'the whole'} is {told(parent)}, it has to be an object")
+        raise LevelFileError(f"{where or 'the whole file'} is {abbreviate(parent)}, but must be an object")
     if name not in parent:
         raise LevelFileError(f"{where}{'.' if where else ''}{name} is missing")
     return parent[name]
 
 
-def told(value: object) -> str:
-    """A value in a few words, however much it is."""
+def abbreviate(value: object) -> str:
+    """Abbreviate a value for an error message."""
     if isinstance(value, dict | list):
         return "an object" if isinstance(value, dict) else "a list"
     words = json.dumps(value[:40] if isinstance(value, str) else value)
@@ -74,15 +79,15 @@ def told(value: object) -> str:
 
 
 def _real(*shape: int) -> Entry:
-    return Entry(float, -LARGEST, LARGEST, shape)
+    return Entry(float, -MAX_QUANTITY, MAX_QUANTITY, shape)
 
 
 FLAG = Entry(bool)
-AMOUNT = Entry(float, 0.0, LARGEST)
-INVERSE = Entry(float, 0.0, LARGEST_INVERSE)
-BINDING = Entry(int, 0, 255)  # of what is not active; level_file looks at the others
+AMOUNT = Entry(float, 0.0, MAX_QUANTITY)
+INVERSE = Entry(float, 0.0, MAX_INVERSE)
+BINDING = Entry(int, 0, 255)  # of inactive actuators; level_file checks the active ones
 GRAVITY = _real(2)
-IN_WORLD = Entry(float, -10 * LARGEST, 10 * LARGEST, (2,))  # worked out from a position and an anchor
+IN_WORLD = Entry(float, -10 * MAX_QUANTITY, 10 * MAX_QUANTITY, (2,))  # computed from a position and an anchor
 BODY = {
     "position": _real(2),
     "rotation": _real(),
@@ -103,7 +108,7 @@ BODY = {
 
 
 def entries_of(size: Size) -> dict[str, dict[str, Entry]]:
-    """The entries of each kind of thing."""
+    """Return the entries of polygons, circles, joints and thrusters."""
     body = Entry(int, 0, size.bodies - 1)
     joint = {
         "a_index": body,
@@ -136,9 +141,9 @@ def entries_of(size: Size) -> dict[str, dict[str, Entry]]:
     return {"polygon": BODY, "circle": BODY, "joint": joint, "thruster": thruster}
 
 
-_OTHERS = dict.fromkeys(("num_circles", "num_joints", "num_thrusters"), Entry(int, 0, MAX_PER_KIND))
-COUNTS = {"num_polygons": Entry(int, FIXED_POLYGONS, MAX_PER_KIND), **_OTHERS}
-STATIC_CONSTANTS = {  # of which this engine has one value
+_COUNTS_FROM_0 = dict.fromkeys(("num_circles", "num_joints", "num_thrusters"), Entry(int, 0, MAX_PER_KIND))
+COUNTS = {"num_polygons": Entry(int, FIXED_POLYGONS, MAX_PER_KIND), **_COUNTS_FROM_0}
+STATIC_CONSTANTS = {  # this engine supports one value of each
     "max_polygon_vertices": MAX_VERTICES,
     "num_solver_iterations": SOLVER_ITERATIONS,
     "solver_batch_size": SOLVER_BATCH,
@@ -147,7 +152,7 @@ STATIC_CONSTANTS = {  # of which this engine has one value
     "num_motor_bindings": MOTOR_BINDINGS,
     "num_thruster_bindings": THRUSTER_BINDINGS,
 }
-# what the reference wants to find, and nothing here depends on
+# required by the reference; nothing here depends on them
 STATIC_EXTRA = {"screen_dim": {"0": 500, "1": 500}, "downscale": 4, "max_shape_size": 2}
 EXTRA = {"pixels_per_unit": 100, "num_shape_roles": len(Role)}
 NO_CONTACT = {
@@ -160,10 +165,10 @@ NO_CONTACT = {
     "restitution_velocity_target": 0.0,
 }
 
-STEPS = Entry(int, 1, LARGEST_RULE)
-_RULE = Entry(float, 0.0, LARGEST_RULE)
+STEPS = Entry(int, 1, MAX_RULE)
+_RULE = Entry(float, 0.0, MAX_RULE)
 TASK = {"max_timesteps": STEPS, "dense_reward_scale": _RULE}
-PHYSICS = {  # our name in physics.types.Params -> theirs
+PHYSICS = {  # our name in physics.types.Params -> the reference's
     "dt": "dt",
     "slop": "slop",
     "joint_bias_velocity": "baumgarte_coefficient_joints_v",

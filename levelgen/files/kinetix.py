@@ -1,8 +1,8 @@
-"""The reference's states as plain arrays, to and from ours.
+"""Conversion between the reference's states, as plain arrays, and ours.
 
 Here a state of Kinetix 3.0.2 is a dict of numpy arrays: names are the paths of its `EnvState`
-(`polygon/position`, `acc_rr_manifolds/active`, `gravity` ...), and the level axis is FIRST, as `vmap` leaves it.
-Ours has it last. Numpy in, numpy out; nothing here imports the reference.
+(`polygon/position`, `acc_rr_manifolds/active`, `gravity` ...), and the level axis is FIRST, as `vmap` returns it.
+Our arrays have it last. Numpy in, numpy out; nothing here imports the reference.
 """
 
 from collections.abc import Mapping
@@ -17,12 +17,13 @@ from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, Size, 
 
 Fields = dict[str, np.ndarray]
 
-POLYGON_RADIUS = np.float32(0.1)  # m, as the next
+# Values that the reference's sampler leaves in unused fields (`fillers`), m
+POLYGON_RADIUS = np.float32(0.1)
 CIRCLE_VERTICES = np.float32(0.05) * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]], np.float32)
 
 BODIES = ("polygon", "circle")
 MANIFOLDS = ("acc_rr_manifolds", "acc_cr_manifolds", "acc_cc_manifolds")
-# Our name -> theirs; `*` stands for each of BODIES, `@` for each of MANIFOLDS
+# Our name -> the reference's; `*` stands for each of BODIES, `@` for each of MANIFOLDS
 MODEL = {
     "gravity": "gravity",
     "active": "*/active",
@@ -65,7 +66,7 @@ STATE = {
     "joint_impulse": "joint/acc_impulse",
     "joint_angular_impulse": "joint/acc_r_impulse",
 }
-MANIFOLD = {  # what is active in it, STATE has
+MANIFOLD = {  # without `active`, which STATE has
     "normal": "@/normal",
     "penetration": "@/penetration",
     "point": "@/collision_point",
@@ -81,21 +82,21 @@ TASK = {
 
 
 def level_from_kinetix(fields: Mapping[str, np.ndarray]) -> Level:
-    """Levels whose initial state is the reference's state (impulses included), level axis last."""
+    """Convert states to levels that start from them (impulses included), level axis last."""
     return Level(model=Model(**_ours(fields, MODEL)), state=state_from_kinetix(fields), **_ours(fields, TASK))
 
 
 def state_from_kinetix(fields: Mapping[str, np.ndarray]) -> State:
-    """Only what evolves, level axis last."""
+    """Convert the evolving part of states, level axis last."""
     return State(**_ours(fields, STATE))
 
 
 def state_to_kinetix(
     level: Level, state: State, timestep: Int[np.ndarray, "level"], last_distance: Float[np.ndarray, "level"]
 ) -> Fields:
-    """Every field of the reference's state, level axis first.
+    """Convert to every field of the reference's state, level axis first.
 
-    What its next step does not depend on (manifold geometry, cached points, an editor's flags) is zero.
+    Fields that its next step does not depend on (manifold geometry, cached points, an editor's flags) are zero.
     """
     size = level.size
     fields = level_to_kinetix(level) | to_kinetix(size, state, STATE)
@@ -118,22 +119,22 @@ def state_to_kinetix(
 
 
 def level_to_kinetix(level: Level) -> Fields:
-    """What is constant within a level and not zero in the files of this program, level axis first."""
+    """Convert the constant part of levels, without the fields that are always zero here; level axis first."""
     return to_kinetix(level.size, level.model, MODEL) | to_kinetix(level.size, level, TASK)
 
 
-def to_kinetix(size: Size, of: Any, names: Mapping[str, str]) -> Fields:
-    """The fields of a dataclass of ours that `names` has, under the reference's names, level axis first."""
+def to_kinetix(size: Size, arrays: Any, names: Mapping[str, str]) -> Fields:
+    """Convert the fields in `names` of one of our dataclasses to the reference's names, level axis first."""
     fields = {}
     for ours, theirs in names.items():
-        fields |= _theirs(size, theirs, np.moveaxis(np.asarray(getattr(of, ours)), -1, 0))
+        fields |= _theirs(size, theirs, np.moveaxis(np.asarray(getattr(arrays, ours)), -1, 0))
     return fields
 
 
 def fillers(level: Level) -> Fields:
-    """What the reference's sampler leaves in places that nothing reads, level axis first.
+    """Return the values that the reference's sampler leaves in fields that nothing reads, level axis first.
 
-    Of a circle it draws the sides of a rectangle that is not there: this is the one that seven in ten of them have.
+    For a circle, it also draws the vertices of a rectangle: those of CIRCLE_VERTICES in seven of ten circles.
     """
     scenery = np.arange(level.size.polygons)[:, None] < FIXED_POLYGONS
     polygons, circles = np.split(np.asarray(level.model.active), [level.size.polygons])
@@ -145,17 +146,22 @@ def fillers(level: Level) -> Fields:
 
 
 def _ours(fields: Mapping[str, np.ndarray], names: Mapping[str, str]) -> dict[str, Any]:
-    """Level axis last, in the engine's 32-bit types, contiguous (numpy, where types say jax)."""
-    found = {}
+    """Convert to our fields: level axis last, the engine's 32-bit types, contiguous numpy (annotations say jax)."""
+    converted = {}
     for ours, theirs in names.items():
         values = np.moveaxis(np.concatenate(_parts(fields, theirs), 1), 0, -1)
         kind = values.dtype.kind
-        found[ours] = np.ascontiguousarray(values, bool if kind == "b" else np.int32 if kind in "iu" else np.float32)
-    return found
+        converted[ours] = np.ascontiguousarray(
+            values, bool if kind == "b" else np.int32 if kind in "iu" else np.float32
+        )
+    return converted
 
 
 def _parts(fields: Mapping[str, np.ndarray], name: str) -> list[np.ndarray]:
-    """In our order: physics/pairs.py has all first points before all second ones, they have a pair's side by side."""
+    """Return a field's parts in our order: first contact points of all pairs, then second ones (physics/pairs.py).
+
+    The reference has both points of a pair side by side.
+    """
     if "@" in name:
         polygons, *others = (fields[name.replace("@", kind)] for kind in MANIFOLDS)
         return [polygons[:, :, 0], polygons[:, :, 1], *others]
@@ -163,7 +169,7 @@ def _parts(fields: Mapping[str, np.ndarray], name: str) -> list[np.ndarray]:
 
 
 def _theirs(size: Size, name: str, values: np.ndarray) -> Fields:
-    """One of our arrays, level axis first."""
+    """Convert one of our arrays, level axis first, to the reference's fields."""
     if "*" in name:
         parts = dict(zip(BODIES, np.split(values, [size.polygons], 1), strict=True))
     elif "@" in name:

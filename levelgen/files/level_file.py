@@ -1,11 +1,11 @@
 """The reference's level files: JSON, read into a level and its rules, and written from them.
 
-As `kinetix.util.saving` 3.0.2 reads and writes them: `env_state` has a list of objects for each kind of thing,
-`env_params` and `static_env_params` have rules, constants and the size. A file may come from anywhere: its length is
-looked at before it is read, every value has a type and bounds, and an error says where it is.
+The format is that of `kinetix.util.saving` 3.0.2: `env_state` has a list of objects for each of polygons, circles,
+joints and thrusters; `env_params` and `static_env_params` have rules, constants and the size. Files are untrusted: the
+length is checked before reading, every value has a type and bounds, and an error says where it is.
 
-Like the reference, the reader works out anew which bodies may collide. A level starts without contacts, so what a
-file says of contacts is not read; the reference forgets it too when it evaluates on a level.
+Like the reference, the reader recomputes which bodies may collide. A level starts without contacts, so a file's
+contacts are not read; the reference, too, drops them when it evaluates on a level.
 """
 
 import json
@@ -20,17 +20,17 @@ import jax
 import numpy as np
 
 from levelproof.levelgen.files import entries as layout
-from levelproof.levelgen.files.entries import Entry, LevelFileError, entries_of, item, told
+from levelproof.levelgen.files.entries import Entry, LevelFileError, abbreviate, entries_of, item
 from levelproof.levelgen.files.kinetix import MANIFOLDS, Fields, level_from_kinetix, state_to_kinetix
 from levelproof.levelgen.frames import in_world
 from levelproof.levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
 from levelproof.levelgen.sampling.scenery import empty_level
-from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.levelgen.sampling.shuffle import collision_matrix
 from levelproof.levelgen.task.rules import NO_DISTANCE, TaskParams
 from levelproof.physics.types import FIXED_POLYGONS, Params, Size
 
 MAX_BYTES = 4_000_000  # of a file; the reference's own have at most 52,438
-PATHS = {  # where levelgen.files.kinetix has what a file keeps with a thing
+PATHS = {  # names in levelgen.files.kinetix of entries that a file keeps with a body, joint or thruster
     "role": "{}_shape_roles",
     "density": "{}_densities",
     "motor_binding": "motor_bindings",
@@ -40,25 +40,25 @@ PATHS = {  # where levelgen.files.kinetix has what a file keeps with a thing
 
 @dataclass(frozen=True)
 class LevelFile:
-    """What a level file says: one level and the rules it is played by."""
+    """The content of a level file: one level and the rules it is played by."""
 
     level: Level  # one lane, numpy arrays
     rules: TaskParams
 
 
 def read_level_file(path: str | os.PathLike[str]) -> LevelFile:
-    """The level in a file that Kinetix or its editor wrote, or `write_level_file`.
+    """Read a level file written by Kinetix, its editor or `write_level_file`.
 
     Raises:
-        LevelFileError: there is no such file, or it has no level that can be used.
+        LevelFileError: the file cannot be read, or its level cannot be used.
     """
     path = Path(path)
     try:
-        about = path.stat()
-        if not stat.S_ISREG(about.st_mode):  # a pipe or a device may never end
-            raise LevelFileError("it is no ordinary file")
-        if about.st_size > MAX_BYTES:
-            raise LevelFileError(f"it has {about.st_size:,} bytes, and no level needs more than {MAX_BYTES:,}")
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe or a device may never end
+            raise LevelFileError("it is not a regular file")
+        if status.st_size > MAX_BYTES:
+            raise LevelFileError(f"it has {status.st_size:,} bytes, but no level needs more than {MAX_BYTES:,}")
         with path.open("rb") as file:
             return parse(file.read(MAX_BYTES))
     except OSError as error:
@@ -71,9 +71,9 @@ def write_level_file(file: LevelFile, path: Path) -> None:
     """Write a level as JSON that Kinetix and its editor open; the file appears whole or not at all.
 
     Raises:
-        LevelFileError: such a file cannot hold the level: it is not one lane, or starts with contacts, or has motors
-            that run by themselves.
-        OSError: it cannot be written.
+        LevelFileError: a file cannot hold the level: it is not one lane, starts with contacts, or has motors that run
+            by themselves.
+        OSError: the file cannot be written.
     """
     text = json.dumps(to_document(file)) + "\n"
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
@@ -85,15 +85,15 @@ def write_level_file(file: LevelFile, path: Path) -> None:
 
 
 def parse(text: bytes) -> LevelFile:
-    """The level in a file's bytes.
+    """Parse a file's bytes.
 
     Raises:
-        LevelFileError: there is none that can be used.
+        LevelFileError: they hold no usable level.
     """
     try:
         document = json.loads(text.decode())
     except UnicodeDecodeError:
-        raise LevelFileError("it is no text") from None
+        raise LevelFileError("it is not UTF-8 text") from None
     except RecursionError:
         raise LevelFileError("it is nested too deeply") from None
     except ValueError as error:
@@ -102,22 +102,24 @@ def parse(text: bytes) -> LevelFile:
 
 
 def from_document(document: object) -> LevelFile:
-    """The level in what JSON makes of a file.
+    """Build a level file from its parsed JSON.
 
     Raises:
-        LevelFileError: there is none that can be used.
+        LevelFileError: it holds no usable level.
     """
     world, params, static = (item(document, name, "") for name in ("env_state", "env_params", "static_env_params"))
     for name, needed in layout.STATIC_CONSTANTS.items():
         value = item(static, name, "static_env_params")
         if value != needed:
-            raise LevelFileError(f"static_env_params.{name} is {told(value)}, this engine has {told(needed)} only")
+            raise LevelFileError(
+                f"static_env_params.{name} is {abbreviate(value)}, but this engine supports only {abbreviate(needed)}"
+            )
     size = Size(*(entry.read(static, name, "static_env_params") for name, entry in layout.COUNTS.items()))
     if size.bodies == FIXED_POLYGONS:
-        raise LevelFileError("static_env_params has no room for a body besides the scenery")
+        raise LevelFileError("static_env_params has no room for a body beside the scenery")
     level = level_from_kinetix(_fields(world, size))
     _check(level)
-    collides: Any = np.asarray(separate(level.model))
+    collides: Any = np.asarray(collision_matrix(level.model))
     physics = {ours: layout.RULES[ours].read(params, theirs, "env_params") for ours, theirs in layout.PHYSICS.items()}
     task = {name: entry.read(params, name, "env_params") for name, entry in layout.TASK.items()}
     frame_skip = layout.STEPS.read(static, "frame_skip", "static_env_params")
@@ -126,23 +128,23 @@ def from_document(document: object) -> LevelFile:
 
 
 def to_document(file: LevelFile) -> dict[str, Any]:
-    """What JSON makes a file of, readable by `from_document` and by the reference.
+    """Convert a level file to JSON objects that `from_document` and the reference read.
 
     Raises:
-        LevelFileError: such a file cannot hold the level.
+        LevelFileError: a file cannot hold the level.
     """
     level, rules, size = file.level, file.rules, file.level.size
     if (levels := level.state.rotation.shape[-1]) != 1:
-        raise LevelFileError(f"these are {levels} levels, and a file holds one")
+        raise LevelFileError(f"these are {levels} levels, but a file holds one")
     if np.any(np.asarray(level.state.contact_active)):
-        raise LevelFileError("the level starts with contacts, and a file's levels start without")
+        raise LevelFileError("the level starts with contacts, which a file cannot hold")
     if np.any(np.asarray(level.motor_auto) & np.asarray(level.model.joint_active)):
-        raise LevelFileError("the level has a motor that runs by itself, and a file cannot say so")
+        raise LevelFileError("the level has a motor that runs by itself, which a file cannot express")
     fields, counts = _with_points(level), dict(zip(layout.COUNTS, size, strict=True))
     physics = {theirs: getattr(rules.physics, ours) for ours, theirs in layout.PHYSICS.items()}
     document = {
         "env_state": {
-            **{kind: _things(fields, kind, entries) for kind, entries in entries_of(size).items()},
+            **{kind: _objects(fields, kind, entries) for kind, entries in entries_of(size).items()},
             "collision_matrix": _nested(fields["collision_matrix"][0]),
             **{kind: [layout.NO_CONTACT] * fields[f"{kind}/active"].size for kind in MANIFOLDS},
             "gravity": _nested(fields["gravity"][0]),
@@ -155,31 +157,31 @@ def to_document(file: LevelFile) -> dict[str, Any]:
             **layout.STATIC_EXTRA,
         },
     }
-    from_document(document)  # nothing is written that cannot be read
+    from_document(document)  # write nothing that cannot be read back
     return document
 
 
 def _fields(world: object, size: Size) -> Fields:
-    """The things of a world as the reference's arrays; no contacts, and no collision matrix yet."""
+    """Convert a world's objects to the reference's arrays; without contacts and collision matrix."""
     fields = _with_points(empty_level(size, 1))
     for (kind, entries), count in zip(entries_of(size).items(), size, strict=True):
-        things = item(world, kind, "env_state")
-        if not isinstance(things, list) or len(things) != count:
-            found = f"a list of {len(things)}" if isinstance(things, list) else told(things)
-            raise LevelFileError(f"env_state.{kind} is {found}, static_env_params.num_{kind}s says {count}")
+        objects = item(world, kind, "env_state")
+        if not isinstance(objects, list) or len(objects) != count:
+            value = f"a list of {len(objects)}" if isinstance(objects, list) else abbreviate(objects)
+            raise LevelFileError(f"env_state.{kind} is {value}, but static_env_params.num_{kind}s is {count}")
         for name, entry in entries.items():
-            values = [entry.read(thing, name, f"env_state.{kind}[{i}]") for i, thing in enumerate(things)]
+            values = [entry.read(one, name, f"env_state.{kind}[{i}]") for i, one in enumerate(objects)]
             dtype = {float: np.float32, int: np.int32, bool: np.bool_}[entry.kind]
             fields[_path(kind, name)] = np.array(values, dtype).reshape(1, count, *entry.shape)
     return fields | {"gravity": np.array([layout.GRAVITY.read(world, "gravity", "env_state")], np.float32)}
 
 
 def flaws(level: Level) -> Iterator[tuple[Any, str, str]]:
-    """What the engine cannot have, and no entry alone can tell: which things of a kind (thing, lane), the kind, why."""
+    """Yield what the engine cannot simulate and no single entry shows: (flags [row, lane], kind, reason)."""
     model, state, scenery = level.model, level.state, slice(FIXED_POLYGONS)
     moves = (model.inverse_mass != 0) | (model.inverse_inertia != 0) | (state.angular_velocity != 0)
     moves |= np.any(np.asarray(state.velocity), 1)
-    yield moves[scenery], "polygon", "is scenery and may move: its inverse masses and velocities have to be 0"
+    yield moves[scenery], "polygon", "is scenery and may move: its inverse masses and velocities must be 0"
     flat = model.active[: level.size.polygons] & (model.n_vertices < 3)
     yield flat, "polygon", "is active and has fewer than 3 vertices"
     yield model.joint_active & (model.joint_a == model.joint_b), "joint", "joins a body to itself"
@@ -190,16 +192,16 @@ def flaws(level: Level) -> Iterator[tuple[Any, str, str]]:
 
 
 def _check(level: Level) -> None:
-    """Raises LevelFileError where the one lane has a flaw."""
-    for bad, kind, why in flaws(level):
-        if len(found := np.flatnonzero(bad)):
-            raise LevelFileError(f"env_state.{kind}[{found[0]}] {why}")
+    """Raise LevelFileError if the one lane has a flaw."""
+    for flags, kind, reason in flaws(level):
+        if len(rows := np.flatnonzero(flags)):
+            raise LevelFileError(f"env_state.{kind}[{rows[0]}] {reason}")
 
 
-def _things(fields: Fields, kind: str, entries: Mapping[str, Entry]) -> list[dict[str, Any]]:
-    """All things of a kind as objects."""
+def _objects(fields: Fields, kind: str, entries: Mapping[str, Entry]) -> list[dict[str, Any]]:
+    """Return all polygons, circles, joints or thrusters as JSON objects."""
     columns = {name: fields[_path(kind, name)][0] for name in entries}
-    extra = {"highlighted": False} if kind in ("polygon", "circle") else {}  # by the reference's editor
+    extra = {"highlighted": False} if kind in ("polygon", "circle") else {}  # read by the reference's editor
     count = len(columns["active"])
     return [{name: _nested(column[i]) for name, column in columns.items()} | extra for i in range(count)]
 
@@ -209,13 +211,13 @@ def _path(kind: str, name: str) -> str:
 
 
 def _nested(values: Any) -> Any:
-    """Vectors as a file has them."""
+    """Convert an array to nested objects with the keys "0", "1", ..., as in a file."""
     values = np.asarray(values)
     return {str(i): _nested(row) for i, row in enumerate(values)} if values.ndim else values.item()
 
 
 def _with_points(level: Level) -> Fields:
-    """The reference's arrays, with the positions of joints and thrusters that its first picture shows."""
+    """Convert to the reference's arrays, with the positions of joints and thrusters that its first picture shows."""
     model, state = jax.tree.map(lambda x: np.asarray(x)[..., 0], (level.model, level.state))
     return state_to_kinetix(level, level.state, np.zeros(1), np.full(1, NO_DISTANCE)) | {
         "joint/global_position": in_world(state, model.joint_a, model.joint_anchor_a)[None],

@@ -1,1 +1,1 @@
-"""What a level is called and when two are the same: ids and keys, content hash, signature."""
+"""A level's identity: id and random keys, content hash, signature."""

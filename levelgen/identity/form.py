@@ -1,9 +1,9 @@
-"""One way to write a level's content down, however its things are numbered and named.
+"""The canonical form of a level's content, the same however bodies, joints and thrusters are numbered.
 
-Bodies are sorted by their own numbers, exact copies of a body (at one position, with one motion) by what is joined to
-them, and copies that are joined alike by the numbers they have. Joints, thrusters and entries of the action are sorted
-as they are written. So levels with the same form have the same content; and levels with the same content have the
-same form unless they have copies that are joined alike, whose numbers may then show.
+Bodies are sorted by their own values; exact copies of a body (at one position, with one motion) by what is joined to
+them; copies that are joined alike by their indices. Joints, thrusters and entries of the action are sorted by their
+encoding. So levels with the same form have the same content; and levels with the same content have the same form,
+unless they contain copies that are joined alike, whose order may then differ.
 """
 
 from collections import defaultdict
@@ -11,23 +11,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-MARK = b"exact"  # how every form begins
+MARK = b"exact"  # prefix of every form
 NOBODY = -1  # in place of a neighbour's rank
 NO_ENTRY = -1
 
 
 class Side(NamedTuple):
-    """A joint that acts, as seen from one of its two bodies."""
+    """An acting joint, as seen from one of its two bodies."""
 
     first: int
     second: int
-    row: bytes  # numbers, turned around where it is seen from b
-    direction: int  # that the entry's forward turns it in: 1, -1, or 0 where that makes no difference
-    entry: int  # of the action, that the motor obeys
+    row: bytes  # values, reversed if seen from b
+    direction: int  # in which the entry's forward turns it: 1, -1, or 0 if that makes no difference
+    entry: int  # of the action that the motor obeys, or NO_ENTRY
 
 
 class Push(NamedTuple):
-    """A thruster that acts."""
+    """An acting thruster."""
 
     body: int
     row: bytes
@@ -36,17 +36,17 @@ class Push(NamedTuple):
 
 @dataclass(frozen=True)
 class World:
-    """The content of one level, bodies numbered at will."""
+    """The content of one level, with bodies in any order."""
 
     gravity: bytes
-    bodies: list[bytes]  # own numbers of each active body
+    bodies: list[bytes]  # own values of each active body
     joints: list[tuple[Side, Side]]
     pushes: list[Push]
     apart: list[tuple[int, int]]  # bodies that do not collide
 
 
 def canonical_form(world: World) -> bytes:
-    """All there is, with the bodies' ranks for names."""
+    """Encode a world, with its bodies named by rank."""
     rank = _body_ranks(world)
     name = [number.to_bytes(4, "little") for number in rank]
     held, motors, flames = [], defaultdict(list), defaultdict(list)
@@ -59,7 +59,7 @@ def canonical_form(world: World) -> bytes:
             motors[side.entry].append((line, side.direction))
     for push in world.pushes:
         flames[push.entry].append(_joined(name[push.body], push.row))
-    # which direction of an entry is forward is a name, too
+    # which direction of an entry counts as forward is a convention, too: take the smaller encoding
     both_ways = [[sorted((line, way * d) for line, d in bound) for way in (1, -1)] for bound in motors.values()]
     form = _joined(
         world.gravity,
@@ -73,7 +73,7 @@ def canonical_form(world: World) -> bytes:
 
 
 def _body_ranks(world: World) -> list[int]:
-    """The rank of each body, no two the same."""
+    """Rank the bodies, each with a different rank."""
     own = _ranks(world.bodies)
     around: list[list[tuple[int, bytes]]] = [[] for _ in own]
     for sides in world.joints:
@@ -88,11 +88,11 @@ def _body_ranks(world: World) -> list[int]:
 
 
 def _ranks(keys: Sequence[Any]) -> list[int]:
-    """Numbers from 0 in the order of the keys, the same for equal ones."""
-    number = {key: i for i, key in enumerate(sorted(set(keys)))}
-    return [number[key] for key in keys]
+    """Rank keys from 0; equal keys share a rank."""
+    rank = {key: i for i, key in enumerate(sorted(set(keys)))}
+    return [rank[key] for key in keys]
 
 
 def _joined(*parts: bytes) -> bytes:
-    """One string that says where each part ends."""
+    """Join parts, each with its length in front, so that boundaries are unambiguous."""
     return b"".join(len(part).to_bytes(4, "little") + part for part in parts)

@@ -1,7 +1,7 @@
-"""A level is its id: the random keys of everything that belongs to one level.
+"""Random keys of a level, all derived from its id.
 
-Every random stream has a name here and a key of its own, derived from the level id alone, so that nothing about
-a level depends on its neighbours, its work unit or its worker.
+Every random stream has a name here and its own key, derived from the level id alone, so that nothing about a level
+depends on its neighbours, its work unit or its worker.
 """
 
 from collections.abc import Callable
@@ -16,9 +16,9 @@ from jax.extend.random import define_prng_impl, threefry_prng_impl
 from jaxtyping import Array, Int, Key
 from numpy.typing import ArrayLike
 
-SAMPLER_VERSION = 1  # raise it when the same id would give another level, or other random streams
-ROOT_KEY = (0, 0)  # as words, not as a seed: `jax_random_seed_offset` is added to every seed
-MAX_LEVEL_ID = 2**31 - 1  # so that an id fits into 32 bits, with a sign and without
+SAMPLER_VERSION = 1  # increment when a change gives an id another level or other random streams
+ROOT_KEY = (0, 0)  # as words, not as a seed, to which JAX would add `jax_random_seed_offset`
+MAX_LEVEL_ID = 2**31 - 1  # fits into 32 bits, signed or unsigned
 
 
 def _pinned(draw: Callable[..., Any]) -> Callable[..., Any]:
@@ -32,7 +32,7 @@ def _pinned(draw: Callable[..., Any]) -> Callable[..., Any]:
     return drawn
 
 
-# Keys carry their generator along, so every draw from one is pinned, also in a caller's own `jax.jit`
+# Keys carry their generator, so every draw from one is pinned, even in a caller's own `jax.jit`
 GENERATOR = define_prng_impl(
     key_shape=threefry_prng_impl.key_shape,
     seed=_pinned(threefry_prng_impl.seed),
@@ -45,33 +45,33 @@ GENERATOR = define_prng_impl(
 
 
 class Stream(IntEnum):
-    """What a level's random numbers are used for. The numbers are part of every result: never reuse one."""
+    """Uses of a level's random numbers. Every result depends on these values: never reuse one."""
 
     LEVEL = 0  # the sampler
     EXPERT = 1  # initial networks, exploration, minibatches
     EVALUATION = 2  # the record that labels the level
     SCOUT = 3  # random play before training
     SEARCH = 4  # exploration of a search
-    PORTABILITY = 5  # the moved starts that witnesses are replayed from
+    PORTABILITY = 5  # the perturbed starts from which witnesses are replayed
     SUCCESS_RATE = 6  # attempts of an expert whose training has ended
 
 
 def level_id_array(level_ids: ArrayLike) -> Int[np.ndarray, " level"]:
-    """Level ids as every array of them has them: int32 on the host.
+    """Validate level ids; return them as int32 on the host.
 
     Raises:
-        ValueError: they are no list of whole numbers, or one is not 0 .. MAX_LEVEL_ID.
+        ValueError: they are not a list of integers, or one is not 0 .. MAX_LEVEL_ID.
     """
     ids = np.asarray(level_ids)
     if ids.ndim != 1 or (len(ids) and not np.issubdtype(ids.dtype, np.integer)):
-        raise ValueError(f"level ids are a list of whole numbers, and these are {ids.dtype} of shape {ids.shape}")
+        raise ValueError(f"level ids must be a list of integers, but these are {ids.dtype} of shape {ids.shape}")
     if len(ids) and not 0 <= ids.min() <= ids.max() <= MAX_LEVEL_ID:
-        raise ValueError(f"level ids {ids.min()} to {ids.max()} do not fit: they run from 0 to {MAX_LEVEL_ID}")
+        raise ValueError(f"level ids run from {ids.min()} to {ids.max()}, but must be within 0 to {MAX_LEVEL_ID}")
     return ids.astype(np.int32)
 
 
 def key_for(level_id: Int[Array, ""] | int, stream: Stream) -> Key[Array, ""]:
-    """The key of one named stream of a level.
+    """Return the key of one named stream of a level.
 
     `level_id` is 0 .. MAX_LEVEL_ID; it may be traced, and mapped with `jax.vmap`.
     """

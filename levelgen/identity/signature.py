@@ -1,7 +1,7 @@
-"""Which levels look nearly the same: a coarse hash of what a picture shows. docs/levels.md.
+"""Signatures: coarse hashes of what a picture shows, shared by levels that look nearly the same. See docs/levels.md.
 
-Two levels that differ by little may still lie on two sides of a border between steps. So there are two hashes, of two
-grids half a step apart: where one has a border, the other has none.
+Values are rounded to steps. Two levels that differ slightly may still lie on two sides of a border between steps, so
+there are two hashes, of two grids half a step apart: where one has a border, the other has none.
 """
 
 import hashlib
@@ -9,30 +9,30 @@ from typing import Any
 
 import numpy as np
 
-from levelproof.levelgen.identity.content import acting_joints, acting_thrusters, kinds, level_first
+from levelproof.levelgen.identity.content import acting_joints, acting_thrusters, body_kinds, level_first
 from levelproof.levelgen.level import Level
 from levelproof.physics.types import MAX_VERTICES
 
 VERSION = 1  # of the rules; signatures of different versions never compare equal
 DIGITS = 16  # of each hash, hexadecimal
 GRIDS = 2
-POSITION = 0.5  # m; steps that are told apart
-LENGTH = 0.2  # m
-ANGLE = np.pi / 4  # rad
-FARTHEST = 2**31 - 1  # steps
+POSITION = 0.5  # m, step
+LENGTH = 0.2  # m, step
+ANGLE = np.pi / 4  # rad, step
+MAX_STEP = 2**31 - 1  # index of a step
 
 
 def signatures(level: Level) -> list[list[str]]:
-    """Of each level one hash for each grid, such as `n1:` and 16 digits. Nearly the same levels share one of them.
+    """Return two hashes of each level, one per grid: `n1:` and 16 digits. Nearly equal levels share one of them.
 
-    Levels of the same content share both: what has no effect is left out here as well.
+    Levels of the same content share both: values without effect are left out here as well.
     """
     levels = level_first(level)
     return [list(both) for both in zip(*(_of_grid(levels, grid) for grid in range(GRIDS)), strict=True)]
 
 
 def _of_grid(levels: Any, grid: int) -> list[str]:
-    model, bodies, found = levels.model, _bodies(levels, grid), []
+    model, bodies, hashes = levels.model, _bodies(levels, grid), []
     joint_acts, thruster_acts = acting_joints(levels), acting_thrusters(levels)
     angle = _step(model.thruster_rotation, ANGLE, grid)
     for i, active in enumerate(model.active):
@@ -46,14 +46,14 @@ def _of_grid(levels: Any, grid: int) -> list[str]:
             row[int(model.thruster_body[i, t])] + angle[i, t].tobytes() for t in np.flatnonzero(thruster_acts[i])
         ]
         lines = [b"%d" % grid, *sorted(row.values()), b"joints", *sorted(joints), b"thrusters", *sorted(thrusters)]
-        found.append(f"n{VERSION}:{hashlib.sha256(b'|'.join(lines)).hexdigest()[:DIGITS]}")
-    return found
+        hashes.append(f"n{VERSION}:{hashlib.sha256(b'|'.join(lines)).hexdigest()[:DIGITS]}")
+    return hashes
 
 
 def _bodies(levels: Any, grid: int) -> np.ndarray:
-    """(level, body, word): kind, role, whether it can move, position, sides; a circle looks the same at every angle."""
+    """Return (level, body, word): kind, role, mobility, vertex count, position, angle (0 for circles), sides."""
     model, state = levels.model, levels.state
-    kind = kinds(levels)
+    kind = body_kinds(levels)
     used = (np.arange(MAX_VERTICES) < model.n_vertices[..., None])[..., None]
     sides = np.where(used, model.vertices, -np.inf).max(2) - np.where(used, model.vertices, np.inf).min(2)
     sides = np.concatenate([sides, np.repeat(2 * model.radius[..., None], 2, -1)], 1)
@@ -70,6 +70,6 @@ def _bodies(levels: Any, grid: int) -> np.ndarray:
 
 
 def _step(values: np.ndarray, step: float, grid: int) -> np.ndarray:
-    """The number of the step that a value lies in, on one of the grids."""
-    steps = np.floor(values.astype(np.float64) / step + (grid + 0.5) / GRIDS)  # round numbers lie between borders
-    return np.clip(np.nan_to_num(steps, nan=FARTHEST), -FARTHEST, FARTHEST).astype("<i4")
+    """Return the index of the step that contains each value, on one of the grids."""
+    steps = np.floor(values.astype(np.float64) / step + (grid + 0.5) / GRIDS)  # so that round values lie inside a step
+    return np.clip(np.nan_to_num(steps, nan=MAX_STEP), -MAX_STEP, MAX_STEP).astype("<i4")

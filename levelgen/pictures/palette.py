@@ -1,10 +1,10 @@
-"""The colours of pictures as CSS custom properties: pages that draw levels themselves take them from here."""
+"""The colours of pictures as CSS custom properties, for pages that draw levels themselves."""
 
 from levelproof.levelgen.pictures import style
 
 
 def palette_css() -> str:
-    """A style sheet that names every colour, by light and by dark."""
+    """Return a style sheet that defines every colour, with a light and a dark variant."""
     both = {
         **{role.name.lower(): colour for role, colour in style.ROLE_COLOUR.items()},
         **{f"binding-{entry}": colour for entry, colour in enumerate(style.BINDING_COLOUR)},

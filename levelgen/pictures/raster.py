@@ -1,6 +1,6 @@
-"""Scenes as pixels: anti-aliased pictures for people, sheets and films of them.
+"""Scenes as pixels: anti-aliased pictures for people, contact sheets and films.
 
-Pixels for agents are elsewhere: these pictures are drawn on the host and are not meant to be fast.
+They are drawn on the host and need not be fast; `levelgen.task.observe.pixels` draws pixels for agents.
 """
 
 import io
@@ -32,33 +32,33 @@ def draw(
     caption: Caption | None = None,
     pixels: int = PIXELS,
 ) -> Image.Image:
-    """A picture of one level in a state, for people.
+    """Draw one level in a state, for people.
 
     Args:
-        level: the level, or many of them (level axis last).
-        state: bodies where they are, one lane for each of the levels; `level.state` for the start.
+        level: one level, or many (level axis last).
+        state: state of each level's bodies; `level.state` for the start.
         index: the lane to draw.
-        action: multi-discrete, one entry a binding: shown as pressed keys, flames and arrows; None: not shown.
-        caption: words above the world.
+        action: multi-discrete, one entry per binding: shown as pressed keys, flames and arrows; None: not shown.
+        caption: text above the world.
         pixels: width of the picture; its height follows.
     """
-    return rasterised(scene_of(level, state, index, action, caption), pixels)
+    return rasterise(scene_of(level, state, index, action, caption), pixels)
 
 
-def rasterised(scene: Scene, pixels: int = PIXELS) -> Image.Image:
-    """A scene as a picture that is `pixels` wide."""
+def rasterise(scene: Scene, pixels: int = PIXELS) -> Image.Image:
+    """Rasterise a scene to a picture that is `pixels` wide."""
     return picture_of(svg_of([scene], [1.0], pixels))
 
 
 def picture_of(drawing: str) -> Image.Image:
-    """An SVG drawing as a picture of its size, in the letters of all pictures."""
-    png = resvg_py.svg_to_bytes(svg_string=drawing, skip_system_fonts=True, font_files=[_letters().name])
+    """Rasterise an SVG drawing at its own size, with the font of all pictures."""
+    png = resvg_py.svg_to_bytes(svg_string=drawing, skip_system_fonts=True, font_files=[_font_file().name])
     return Image.open(io.BytesIO(png)).convert("RGB")
 
 
 @cache
-def _letters() -> IO[bytes]:
-    """The letters as a file, because resvg reads no others; it lasts as long as the process."""
+def _font_file() -> IO[bytes]:
+    """Write the font to a temporary file, since resvg reads fonts only from files; it lasts as long as the process."""
     file = NamedTemporaryFile(suffix=".ttf")  # noqa: SIM115
     file.write(font().font_bytes)
     file.flush()
@@ -66,26 +66,26 @@ def _letters() -> IO[bytes]:
 
 
 def sheet(pictures: Sequence[Image.Image], columns: int) -> Image.Image:
-    """Pictures of one size side by side, row after row."""
+    """Arrange pictures of one size in rows of `columns`."""
     width, height = pictures[0].size
     rows = -(-len(pictures) // columns)
     page = Image.new("RGB", (width * min(columns, len(pictures)), height * rows), PAPER)
-    for number, picture in enumerate(pictures):
-        page.paste(picture, (width * (number % columns), height * (number // columns)))
+    for i, picture in enumerate(pictures):
+        page.paste(picture, (width * (i % columns), height * (i // columns)))
     return page
 
 
 def write_gif(pictures: Iterable[Image.Image], path: Path, seconds: Sequence[float] | float) -> None:
-    """A film that repeats; `seconds` a picture is rounded to the format's hundredths.
+    """Write a looping film; `seconds` per picture are rounded to the format's hundredths.
 
-    One palette serves all pictures, so that flat colours do not flicker from picture to picture.
+    All pictures share one palette, so that flat colours do not flicker.
     """
     frames = list(pictures)
     step = max(1, len(frames) // 8)
     palette = sheet(frames[::step], columns=3).quantize(128, Image.Quantize.MEDIANCUT)
     reduced = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    each = [seconds] * len(frames) if isinstance(seconds, int | float) else seconds
-    duration = [10 * round(100 * value) for value in each]
+    lengths = [seconds] * len(frames) if isinstance(seconds, int | float) else seconds
+    duration = [10 * round(100 * value) for value in lengths]
     reduced[0].save(path, "GIF", save_all=True, append_images=reduced[1:], duration=duration, loop=0, optimize=False)
 
 

@@ -1,12 +1,12 @@
-"""What a picture for people shows: one lane of a level and its state as shapes, described once for every renderer.
+"""Scenes: one lane of a level and its state as shapes for people, described once for every renderer.
 
 Bodies are filled by role (grey plain, green, blue, red); bodies that cannot move are darker and hatched. A ring is
-a revolute joint, a crossed square a fixed one. A motor's ring has the colour of its binding and an arrow while it
-runs, a thruster is a nozzle with a flame while it fires; the row below shows the live entries of the action,
-M1 to M4 for motors and T1, T2 for thrusters.
+a revolute joint, a crossed square a fixed one. A motor's ring has the colour of its binding, and an arrow while it
+runs; a thruster is a nozzle, with a flame while it fires. The row below shows the live entries of the action, M1 to M4
+for motors and T1, T2 for thrusters.
 
-All scenes of a level have the same parts in the same order, so a film is what its parts do. Lengths are metres, y is
-upwards, angles are radians.
+All scenes of a level have the same parts in the same order, so a film animates parts. Lengths are metres, y points
+up, angles are radians.
 """
 
 from functools import cache
@@ -32,10 +32,10 @@ def scene_of(
     action: Int[np.ndarray, "6"] | None = None,
     caption: Caption | None = None,
 ) -> Scene:
-    """Lane `index` of a level in a state, under an action (one multi-discrete entry a binding; None: none shown)."""
+    """Describe lane `index` of a level in a state, under an action (one entry per binding; None: not shown)."""
     level, state = jax.tree.map(lambda x: _lane(x, index), (level, state))
-    order = np.argsort(np.asarray(level.model.inverse_mass) != 0, kind="stable")  # what cannot move lies behind
-    parts = [Part(_room())]
+    order = np.argsort(np.asarray(level.model.inverse_mass) != 0, kind="stable")  # immovable bodies lie behind
+    parts = [Part(_background())]
     parts += [_body(level, state, int(body)) for body in order if level.model.active[body]]
     for thruster in np.flatnonzero(level.model.thruster_active):
         parts += _thruster(level, state, int(thruster), action)
@@ -62,8 +62,8 @@ def _shade(colour: style.Colour, factor: float) -> style.Colour:
     return red, green, blue
 
 
-def _room() -> str:
-    """Walls, then the air with a grid of metres."""
+def _background() -> str:
+    """Draw the walls, then the air with a grid of metres."""
     side = WORLD_SIDE
     shapes = rectangle((-style.BORDER, 0), (side + style.BORDER, side + style.BORDER), style.FIXED_PLAIN)
     shapes += rectangle((0, 0), (side, side), style.SKY)
@@ -75,7 +75,7 @@ def _room() -> str:
 
 
 def _paper(footer: float) -> str:
-    """What hides all that leaves the world upwards or downwards."""
+    """Draw the paper above and below the world, which hides bodies that leave it."""
     top, right = WORLD_SIDE + style.BORDER, WORLD_SIDE + style.BORDER
     above = rectangle((-style.BORDER, top), (right, top + style.HEADER), style.PAPER)
     return above + rectangle((-style.BORDER, -footer), (right, 0), style.PAPER) if footer else above
@@ -98,7 +98,7 @@ def _body(level: Level, state: State, body: int) -> Part:
 
 
 def _motor_turn(level: Level, joint: int, action: np.ndarray | None) -> int:
-    """1: the motor turns body b counterclockwise against body a, -1: clockwise, 0: it is off."""
+    """Return 1 if the motor turns body b counterclockwise relative to body a, -1 for clockwise, 0 if it is off."""
     if action is None or not level.model.motor_on[joint] or level.model.joint_fixed[joint]:
         return 0
     choice = 1 if level.motor_auto[joint] else int(action[level.motor_binding[joint]])
@@ -106,7 +106,7 @@ def _motor_turn(level: Level, joint: int, action: np.ndarray | None) -> int:
 
 
 def _joint(level: Level, state: State, joint: int, action: np.ndarray | None) -> list[Part]:
-    """The joint, and the arrow of its motor."""
+    """Draw a joint and the arrow of its motor."""
     model = level.model
     position = _point(in_world(state, int(model.joint_a[joint]), model.joint_anchor_a[joint]))
     if model.joint_fixed[joint]:
@@ -121,7 +121,7 @@ def _joint(level: Level, state: State, joint: int, action: np.ndarray | None) ->
 
 
 def _arrow(turn: int, colour: style.Colour) -> str:
-    """Three quarters of a circle around a joint, with an arrow head at its end."""
+    """Draw three quarters of a circle around a joint, with an arrow head at its end."""
     if not turn:
         return ""
     radius, angles = 0.17, np.linspace(0.25 * np.pi, 1.75 * np.pi, 25)
@@ -133,7 +133,7 @@ def _arrow(turn: int, colour: style.Colour) -> str:
 
 
 def _thruster(level: Level, state: State, thruster: int, action: np.ndarray | None) -> list[Part]:
-    """The flame and the nozzle, which opens against the force on the body: that is along the thruster's rotation."""
+    """Draw flame and nozzle; the nozzle opens opposite to the force, which acts along the thruster's rotation."""
     model, binding = level.model, MOTOR_BINDINGS + int(level.thruster_binding[thruster])
     body = int(model.thruster_body[thruster])
     position = _point(in_world(state, body, model.thruster_position[thruster]))

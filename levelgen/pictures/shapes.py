@@ -1,6 +1,6 @@
-"""What a picture consists of: SVG elements in parts that move, and how wide words are.
+"""Elements of a picture: SVG shapes, parts that move, scenes, and the width of text.
 
-Lengths are metres, y is upwards, angles are radians.
+Lengths are metres, y points up, angles are radians.
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from PIL import ImageFont
 from levelproof.levelgen.pictures.style import EDGE, HATCHING, Colour
 
 Point = tuple[float, float]
-Host = np.ndarray | jax.Array  # levels and states that were read or computed
-LETTERS = 100  # units per metre where letters are drawn: browsers round the sizes of small ones
-MIDDLE = 0.37  # of their size, that the middle of letters is above the line they stand on
+Host = np.ndarray | jax.Array  # arrays of levels and states, read or computed
+LETTERS = 100  # font units per metre: browsers round small font sizes
+MIDDLE = 0.37  # height of a letter's middle above the baseline, in font sizes
 
 
 @dataclass(frozen=True)
 class Part:
-    """Elements that move together, in a frame of their own. "": the part does not show now."""
+    """Elements that move together, in their own frame; shapes "" mean that the part is hidden now."""
 
     shapes: str
     position: Point = (0.0, 0.0)
@@ -31,7 +31,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is drawn, the last part on top."""
+    """The parts of a picture, the last one on top."""
 
     parts: tuple[Part, ...]
     title: str
@@ -41,12 +41,12 @@ class Scene:
 def polygon(
     points: Sequence[Point] | Host, fill: Colour, edge: Colour | None = None, width: float = EDGE, hatched: bool = False
 ) -> str:
-    """Filled, with a line around it if it has an edge."""
+    """Draw a filled polygon, with a line around it if it has an edge colour."""
     return _filled(f'polygon points="{_points(points)}"', fill, edge, width, hatched)
 
 
 def disc(centre: Point, radius: float, fill: Colour, edge: Colour, hatched: bool = False) -> str:
-    """A filled circle; its edge lies within the radius."""
+    """Draw a filled circle; its edge lies within the radius."""
     circle = f'circle cx="{number(centre[0])}" cy="{number(centre[1])}" r="{number(radius - EDGE / 2)}"'
     return _filled(circle, fill, edge, EDGE, hatched)
 
@@ -58,18 +58,18 @@ def _filled(shape: str, fill: Colour, edge: Colour | None, width: float, hatched
 
 
 def line(points: Sequence[Point] | Host, colour: Colour, width: float) -> str:
-    """Straight from point to point."""
+    """Draw straight lines from point to point."""
     return f'<polyline points="{_points(points)}" fill="none"{_stroke(colour, width)}/>'
 
 
 def rectangle(low: Point, high: Point, fill: Colour, corner: float = 0.0) -> str:
-    """Upright, without an edge; `corner`: radius of its corners."""
+    """Draw an upright rectangle without an edge; `corner`: radius of its corners."""
     (x, y), (width, height) = map(number, low), (number(b - a) for a, b in zip(low, high, strict=True))
     return f'<rect x="{x}" y="{y}" width="{width}" height="{height}" rx="{number(corner)}" fill="rgb{fill}"/>'
 
 
 def text(position: Point, words: str, colour: Colour, size: float, ends: bool = False) -> str:
-    """Words that begin or end at a position, half of their height above it; as wide as `text_width` in any letters."""
+    """Draw words that start (or end, if `ends`) at a position, vertically centred; `text_width` wide in any font."""
     x, y = number(position[0]), number(position[1] - MIDDLE * size)
     width, anchor = number(LETTERS * text_width(words, size)), ' text-anchor="end"' if ends else ""
     return (
@@ -87,19 +87,19 @@ def _points(points: Sequence[Point] | Host) -> str:
 
 
 def number(value: float) -> str:
-    """In as few letters as a tenth of a millimetre takes."""
+    """Format a number to a tenth of a millimetre, without trailing zeros."""
     words = f"{value:.4f}".rstrip("0").rstrip(".")
     return "0" if words == "-0" else words
 
 
 @cache
 def font() -> ImageFont.FreeTypeFont:
-    """The letters of all pictures: Pillow's own."""
+    """Return the font of all pictures: Pillow's own."""
     letters = ImageFont.load_default(LETTERS)
     assert isinstance(letters, ImageFont.FreeTypeFont)
     return letters
 
 
 def text_width(words: str, size: float) -> float:
-    """Of words in letters of a size, m."""
+    """Return the width of words in a font size, m."""
     return font().getlength(words) * size / LETTERS

@@ -1,7 +1,7 @@
 """Scenes as SVG: a picture or a film in one file.
 
-A film is one drawing whose parts move: what a part does becomes SMIL animations, which browsers play in a loop.
-Programs that do not play them show the first scene.
+A film is one drawing whose parts move by SMIL animations, which browsers play in a loop. Programs that do not play
+them show the first scene.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ TOP = WORLD_SIDE + BORDER + HEADER  # m, of a picture's upper edge above the wor
 
 
 def svg_of(scenes: Sequence[Scene], seconds: Sequence[float], pixels: int = PIXELS) -> str:
-    """The text of a file, `pixels` wide: a film that repeats, each scene shown for its seconds; of one, a picture.
+    """Write an SVG file, `pixels` wide: a looping film that shows each scene for its seconds; one scene: a picture.
 
-    The scenes are of one level.
+    All scenes must be of one level.
     """
     first, (*ends, length) = scenes[0], accumulate(seconds)
     clock = tuple(end / length for end in (0.0, *ends)), length
@@ -42,11 +42,11 @@ def svg_of(scenes: Sequence[Scene], seconds: Sequence[float], pixels: int = PIXE
     )
 
 
-Clock = tuple[tuple[float, ...], float]  # when the scenes of a film begin, as shares of its length; its length, s
+Clock = tuple[tuple[float, ...], float]  # start of each scene as a fraction of the film; length of the film, s
 
 
 def _animate(clock: Clock, tag: str, values: Sequence[str], smooth: bool) -> str:
-    """An element that makes its parent follow one value a scene; of equal ones in a row, the ends alone."""
+    """Animate the parent element by one value per scene; of a run of equal values, keep only the ends."""
     (starts, length), last = clock, len(values) - 1
     keep = [
         i
@@ -54,7 +54,7 @@ def _animate(clock: Clock, tag: str, values: Sequence[str], smooth: bool) -> str
         if i in (0, last) or values[i - 1] != value or (smooth and values[i + 1] != value)
     ]
     times, chosen = [f"{starts[i]:.5f}" for i in keep], [values[i] for i in keep]
-    if smooth:  # the last scene stands still until the end
+    if smooth:  # hold the last scene until the end
         times, chosen = [*times, "1"], [*chosen, chosen[-1]]
     mode = "" if smooth else ' calcMode="discrete"'
     return (
@@ -64,21 +64,21 @@ def _animate(clock: Clock, tag: str, values: Sequence[str], smooth: bool) -> str
 
 
 def _part(states: Sequence[Part], clock: Clock) -> str:
-    """All that a part does: where it is in each scene, and which shapes it shows."""
+    """Draw a part with its motion over the scenes, and with the visibility of each of its shapes."""
     drawn = []
-    for look in dict.fromkeys(state.shapes for state in states if state.shapes):
-        shown = ["visible" if state.shapes == look else "hidden" for state in states]
-        if "hidden" in shown:
-            timing = _animate(clock, 'animate attributeName="visibility"', shown, smooth=False)
-            look = f'<g visibility="{shown[0]}">{timing}{look}</g>'
-        drawn.append(look)
-    spots = [",".join(map(number, state.position)) for state in states]
+    for shapes in dict.fromkeys(state.shapes for state in states if state.shapes):
+        visibility = ["visible" if state.shapes == shapes else "hidden" for state in states]
+        if "hidden" in visibility:
+            timing = _animate(clock, 'animate attributeName="visibility"', visibility, smooth=False)
+            shapes = f'<g visibility="{visibility[0]}">{timing}{shapes}</g>'
+        drawn.append(shapes)
+    positions = [",".join(map(number, state.position)) for state in states]
     turns = [number(np.degrees(state.angle)) for state in states]
-    if not drawn or {*spots, *turns} == {"0,0", "0"}:
+    if not drawn or {*positions, *turns} == {"0,0", "0"}:
         return "".join(drawn)
     motion = ""
-    if len({*zip(spots, turns, strict=True)}) > 1:
-        way = 'animateTransform attributeName="transform" type='
-        motion = _animate(clock, f'{way}"translate"', spots, smooth=True)
-        motion += _animate(clock, f'{way}"rotate" additive="sum"', turns, smooth=True)
-    return f'<g transform="translate({spots[0]}) rotate({turns[0]})">{motion}{"".join(drawn)}</g>'
+    if len({*zip(positions, turns, strict=True)}) > 1:
+        tag = 'animateTransform attributeName="transform" type='
+        motion = _animate(clock, f'{tag}"translate"', positions, smooth=True)
+        motion += _animate(clock, f'{tag}"rotate" additive="sum"', turns, smooth=True)
+    return f'<g transform="translate({positions[0]}) rotate({turns[0]})">{motion}{"".join(drawn)}</g>'

@@ -1,4 +1,4 @@
-"""The words of a picture: title, badge and clock above the world, and the keys of an action below it."""
+"""The text of a picture: title, badge and clock above the world, the keys of an action below it."""
 
 from dataclasses import dataclass
 
@@ -14,16 +14,16 @@ ELLIPSIS = "…"
 
 @dataclass(frozen=True)
 class Caption:
-    """The words above the world."""
+    """The text above the world."""
 
-    title: str = ""  # left; shortened to what there is room for
+    title: str = ""  # left; shortened to fit
     clock: str = ""  # right
     outcome: str = ""  # a badge in the middle
     good: bool = True  # colour of the badge
 
 
 def caption_parts(caption: Caption) -> list[Part]:
-    """Title, badge and clock, each a part."""
+    """Draw title, clock and badge, one part each."""
     middle, size = WORLD_SIDE + style.BORDER + style.HEADER / 2, style.CAPTION_SIZE
     left, right = 0.04, WORLD_SIDE - 0.04
     title, clock, outcome = (printable(words) for words in (caption.title, caption.clock, caption.outcome))
@@ -44,12 +44,12 @@ def caption_parts(caption: Caption) -> list[Part]:
 
 
 def printable(words: str) -> str:
-    """Names of files may hold anything."""
+    """Replace unprintable characters, which file names may contain, by question marks."""
     return "".join(letter if letter.isprintable() else "?" for letter in words)
 
 
 def _fitted(words: str, room: float, size: float) -> str:
-    """As much of the words' beginning as there is room for, m."""
+    """Shorten words at the end until they fit into `room`, m."""
     if text_width(words, size) <= room:
         return words
     while words and text_width(words + ELLIPSIS, size) > room:
@@ -58,7 +58,7 @@ def _fitted(words: str, room: float, size: float) -> str:
 
 
 def key_parts(level: Level, action: Int[np.ndarray, "6"]) -> list[Part]:
-    """A key for each live entry, lit in its binding's colour while it is used."""
+    """Draw a key for each live entry, lit in its binding's colour while it is pressed."""
     middle, left, parts = -style.FOOTER / 2, 0.04, []
     for entry in live_entries(level):
         is_motor = entry < MOTOR_BINDINGS
@@ -74,7 +74,7 @@ def key_parts(level: Level, action: Int[np.ndarray, "6"]) -> list[Part]:
 
 
 def live_entries(level: Level) -> list[int]:
-    """Action entries of ONE level (no lane axis) that some motor or thruster obeys."""
+    """Return the action entries of ONE level (no lane axis) that some motor or thruster obeys."""
     model = level.model
     motor = model.joint_active & ~model.joint_fixed & model.motor_on & ~level.motor_auto
     motors = {int(binding) for binding in level.motor_binding[motor]}

@@ -1,1 +1,1 @@
-"""Random levels: a distribution's draws, proposed body by body and kept where nothing overlaps."""
+"""Random levels: bodies proposed one by one from a distribution; of each, the proposal that overlaps least is kept."""

@@ -1,7 +1,8 @@
-"""What random levels are like: every number the sampler uses.
+"""The distribution of random levels: every number that the sampler uses.
 
-The defaults are the reference's random-level distribution, Kinetix 3.0.2: names in brackets are fields of its
-`UEDParams`, file names are modules of `kinetix.environment.ued`, where a number is written into the code.
+The defaults are the random-level distribution of the reference, Kinetix 3.0.2. Beside each field stands its source:
+[name] is a field of the reference's `UEDParams`; (module.function) of `kinetix.environment.ued` has the number in its
+code.
 """
 
 import math
@@ -10,7 +11,7 @@ from dataclasses import dataclass, fields
 from levelproof.levelgen.level import HALF_WORLD
 from levelproof.physics.bounds import require
 
-# m, largest reach of a free body from its centre: green and blue may have to fit into one half of the world
+# m, of a free body from its centre: green and blue may each have to fit into one half of the world
 MAX_REACH = HALF_WORLD / 2
 CONTROL_WEIGHTS = ("motor_only_weight", "thruster_only_weight", "motor_and_thruster_weight")
 
@@ -19,10 +20,10 @@ CONTROL_WEIGHTS = ("motor_only_weight", "thruster_only_weight", "motor_and_thrus
 class Distribution:
     """A distribution over levels (hashable: pass as a static argument).
 
-    `*_chance` are probabilities, `*_weight` are in proportion to one another.
+    `*_chance` are probabilities; `*_weight` are relative to one another.
 
     Raises:
-        ValueError: a value out of its range; the message starts with the field's name.
+        ValueError: a value is out of range; the message starts with the field's name.
     """
 
     # The floor's role; plain otherwise
@@ -32,35 +33,35 @@ class Distribution:
 
     # Shapes
     max_size: float = 1.0  # m, across a shape before lengthening [max_shape_size]
-    goal_size_factor: float = 1.0  # times max_size for free green and blue bodies [goal_body_size_factor]
+    goal_size_factor: float = 1.0  # times max_size, for free green and blue bodies [goal_body_size_factor]
     min_half_side: float = 0.05  # m, of a rectangle (util.sample_dimensions)
     min_radius: float = 0.1  # m, of a circle (util.sample_dimensions)
-    circle_size_factor: float = 0.8  # times max_size for circles [circle_max_size_coeff]
+    circle_size_factor: float = 0.8  # times max_size, for circles [circle_max_size_coeff]
     long_side_chance: float = 0.3  # one side of a rectangle is lengthened [large_rect_dim_chance]
-    long_side_factor: float = 2.0  # how many times as long that side is [large_rect_dim_scale]
+    long_side_factor: float = 2.0  # times the length of that side [large_rect_dim_scale]
 
     # Free bodies
     opposite_sides_chance: float = 0.5  # green starts left, blue right [goal_body_opposide_side_chance]
-    fixed_chance: float = 0.02  # a weightless body is fixed [fixate_chance_min]
-    fixed_chance_per_mass: float = 4.0  # 1/kg, added to fixed_chance: big bodies rather are fixed [fixate_chance_scale]
-    max_fixed_chance: float = 1.0  # a body is fixed, however heavy it is [fixate_chance_max]
+    fixed_chance: float = 0.02  # a body of mass 0 is fixed; heavier ones more often [fixate_chance_min]
+    fixed_chance_per_mass: float = 4.0  # 1/kg, times the mass, added to fixed_chance [fixate_chance_scale]
+    max_fixed_chance: float = 1.0  # upper bound on the chance that a body is fixed [fixate_chance_max]
     lowered_chance: float = 0.0  # a fixed body of the upper half moves to the lower [fixate_shape_bottom_bias]
     goal_lowered_chance: float = 0.6  # added for green, blue, red [fixate_shape_bottom_bias_special_role]
-    red_weight: float = 1 / 3  # of a new red body, while there is none, against 1 of a plain one (util.get_role)
+    red_weight: float = 1 / 3  # of a new red body, against 1 of a plain one, while the level has no red (util.get_role)
 
-    # What must act, in proportion; what a size has no room for is left out (distributions.sample_kinetix_level)
-    motor_only_weight: float = 1.0  # of levels that motors alone act in
-    thruster_only_weight: float = 1.0  # of levels that thrusters alone act in
-    motor_and_thruster_weight: float = 1.0  # of levels that both act in
+    # What must act; kinds that a size has no room for are left out (distributions.sample_kinetix_level)
+    motor_only_weight: float = 1.0  # of levels that require a motor
+    thruster_only_weight: float = 1.0  # of levels that require a thruster
+    motor_and_thruster_weight: float = 1.0  # of levels that require both
 
     # Connected bodies
-    connected_circle_chance: float = 0.5  # a circle, not a rectangle, if there is room for both (as above)
-    fixed_target_weight: float = 0.05  # of a fixed body as the one to connect to [connect_to_fixated_prob_coeff]
-    polygon_connections: int = 2  # more joints only if all polygons have these (mutators.mutate_add_connected_shape)
-    min_revolute_joints: int = 2  # so many joints, the first ones, are revolute [min_rjoints_bias]
-    fixed_joint_chance: float = 0.5  # a later joint is fixed (mutators.mutate_add_connected_shape)
-    visible_margin: float = 0.05  # m, a body must reach beyond its partner as they turn [connect_visibility_min]
-    hidden_penalty: float = 10.0  # contacts that a proposal counts as, if it does not [connect_no_visibility_bias]
+    connected_circle_chance: float = 0.5  # a circle if both kinds fit (mutators.mutate_add_connected_shape)
+    fixed_target_weight: float = 0.05  # of a fixed body as a target; others: 1 [connect_to_fixated_prob_coeff]
+    polygon_connections: int = 2  # per polygon, exceeded only if all have them (mutators.mutate_add_connected_shape)
+    min_revolute_joints: int = 2  # no joint is fixed before this many are revolute [min_rjoints_bias]
+    fixed_joint_chance: float = 0.5  # a joint after these is fixed (mutators.mutate_add_connected_shape)
+    visible_margin: float = 0.05  # m, reach beyond the partner at some angle of the joint [connect_visibility_min]
+    hidden_penalty: float = 10.0  # contacts added to the count of a proposal that does not [connect_no_visibility_bias]
 
     # Motors
     motor_chance: float = 0.8  # a revolute joint's motor is on [motor_on_chance]
@@ -68,7 +69,7 @@ class Distribution:
     max_motor_speed: float = 3.0  # fastest, of task.physics.motor_speed [motor_max_speed]
     min_motor_power: float = 1.0  # weakest, of task.physics.motor_power [motor_min_power]
     max_motor_power: float = 3.0  # strongest, of task.physics.motor_power [motor_max_power]
-    max_wheel_power: float = 1.0  # strongest where a circle is joined: strong wheels upset the engine [wheel_max_power]
+    max_wheel_power: float = 1.0  # strongest at a circle: strong wheels destabilise the engine [wheel_max_power]
     limit_chance: float = 0.4  # a revolute joint of two polygons has limits [joint_limit_chance]
     max_limit: float = math.pi  # rad, widest limit of a joint, to either side [joint_limit_max]
 
@@ -77,13 +78,13 @@ class Distribution:
     aligned_chance: float = 0.8  # a thruster points along the line through its body's centre [thruster_align_com_prob]
     min_thruster_power: float = 0.5  # weakest, per unit of mass (mutators.mutate_add_thruster)
     max_thruster_power: float = 2.0  # strongest, per unit of mass (mutators.mutate_add_thruster)
-    thruster_power_factor: float = 2.0  # times the power that is drawn between these two [thruster_power_multiplier]
+    thruster_power_factor: float = 2.0  # times the power drawn between these two [thruster_power_multiplier]
 
-    # What comes after green, blue and the third body
-    connected_weight: float = 0.35  # of a body that a joint holds to another one [add_connected_shape_chance]
+    # Bodies after green, blue and the third one
+    connected_weight: float = 0.35  # of a body joined to another one [add_connected_shape_chance]
     free_weight: float = 0.35  # of a body without a joint [add_shape_chance]
     empty_weight: float = 0.3  # of no body [add_no_shape_chance]
-    proposals: int = 8  # positions tried for each body; the one that touches least is kept [add_shape_n_proposals]
+    proposals: int = 8  # proposals per body; the one with the fewest contacts is kept [add_shape_n_proposals]
     small_world: int = 7  # bodies; up to this many: one proposal, no fixed bodies (distributions.sample_kinetix_level)
 
     # Last

@@ -1,7 +1,7 @@
-"""The sampler's moves: a free body, a body joined to another, a thruster.
+"""The sampler's moves: propose a free body, propose a body joined to another, add a thruster.
 
-Facts: `kinetix.environment.ued.mutators` 3.0.2 (mutate_add_shape, mutate_add_connected_shape,
-mutate_add_thruster); numbers are fields of `Distribution`.
+They follow `kinetix.environment.ued.mutators` 3.0.2: `propose_free` is mutate_add_shape, `propose_connected` is
+mutate_add_connected_shape, `add_thruster` is mutate_add_thruster. Their numbers are fields of `Distribution`.
 """
 
 import math
@@ -31,10 +31,12 @@ from levelproof.physics.mass import inverse
 from levelproof.physics.types import FIXED_POLYGONS
 from levelproof.physics.vector import Vec, unvec, vec, where
 
-TURN = 2 * math.pi  # rad
+TURN = 2 * math.pi  # rad, a full turn
 
 
 class ThrusterDraws(NamedTuple):
+    """Random numbers of one thruster, each [lane]."""
+
     wanted: Lane
     body: Lane
     x: Lane
@@ -47,8 +49,8 @@ class ThrusterDraws(NamedTuple):
 
 
 def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, joint: Joint, dist: Distribution) -> Proposal:
-    """A body somewhere in the world, above the floor; the `joint`, that of any other proposal, is not joined."""
-    room_polygon, room_circle = room(level)
+    """Propose a body above the floor, without a joint. `joint` fills the unused field of the result."""
+    room_polygon, room_circle = has_room(level)
     is_polygon = first_of_two(room_polygon, room_circle, d.is_polygon)
     role = draw_role(level, d.role, True, dist)
     goal = role != Role.PLAIN
@@ -61,7 +63,7 @@ def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, joint: Joint, d
     lowered = fixed & (d.lowered < dist.lowered_chance + jnp.where(goal, dist.goal_lowered_chance, 0.0))
     position = free_position(d, shape, role, dist)
     lower = jnp.where(lowered & (position.y >= HALF_WORLD), HALF_WORLD, 0.0)
-    no = jnp.zeros_like(fixed)
+    never = jnp.zeros_like(fixed)
     return Proposal(
         possible=room_polygon | room_circle,
         shape=shape,
@@ -69,14 +71,14 @@ def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, joint: Joint, d
         rotation=d.rotation * TURN,
         role=role,
         fixed=fixed,
-        joined=no,
+        joined=never,
         joint=joint,
-        hidden=no,
+        hidden=never,
     )
 
 
 def free_position(d: BodyDraws, shape: BodyShape, role: Int[Array, " lane"], dist: Distribution) -> Vec:
-    """Within the world by the body's reach; green on the left and blue on the right where on opposite sides."""
+    """Draw a position whose body lies within the world; if on opposite sides, green goes left and blue right."""
     reach = jnp.maximum(jnp.maximum(shape.half.x, shape.half.y) * math.sqrt(2), shape.radius)
     opposite = d.opposite < dist.opposite_sides_chance
     low = reach + jnp.where(opposite & (role == Role.BLUE), HALF_WORLD, 0.0)
@@ -85,22 +87,22 @@ def free_position(d: BodyDraws, shape: BodyShape, role: Int[Array, " lane"], dis
 
 
 def propose_connected(level: Level, d: BodyDraws, revolute: Flag, dist: Distribution) -> Proposal:
-    """A body joined to one that is there, wherever that puts it."""
+    """Propose a body joined to an existing one, even if that puts it outside the world."""
     model, polygons = level.model, level.size.polygons
-    room_polygon, room_circle = room(level)
+    room_polygon, room_circle = has_room(level)
     weight = target_weights(level, dist)
     any_polygon = model.active[FIXED_POLYGONS:polygons].any(0)
     any_circle = (weight[polygons:] > 0).any(0)
     target_is_polygon = first_of_two(any_polygon, any_circle, d.target_is_polygon) | ~room_polygon
     is_polygon = first_of_two(room_polygon, room_circle, d.is_polygon, dist.connected_circle_chance)
-    is_polygon |= ~target_is_polygon & room_polygon  # no circle to a circle
+    is_polygon |= ~target_is_polygon & room_polygon  # a circle is not joined to a circle
     shape = draw_shape(d, is_polygon, dist.max_size, dist)
     target = choose_target(level, weight, target_is_polygon, d.target)
 
     half = shape.half.scale(1.0 * is_polygon)  # circles are joined at their centres
-    anchor = spot(d.anchor_x, d.anchor_y, -half, half)
+    anchor = point_between(d.anchor_x, d.anchor_y, -half, half)
     low, high = extent(level, target)
-    target_anchor = spot(d.target_anchor_x, d.target_anchor_y, low, high)
+    target_anchor = point_between(d.target_anchor_x, d.target_anchor_y, low, high)
     rotation = d.rotation * TURN
     meet = vec(at(level.state.position, target)) + turned(target_anchor, at(level.state.rotation, target))
     role = draw_role(level, d.role, at(level.role, target) == Role.PLAIN, dist)
@@ -116,32 +118,32 @@ def propose_connected(level: Level, d: BodyDraws, revolute: Flag, dist: Distribu
         fixed=jnp.zeros_like(possible),
         joined=possible,
         joint=joint,
-        hidden=~both_show(shape, partner, anchor, target_anchor, dist),
+        hidden=~both_visible(shape, partner, anchor, target_anchor, dist),
     )
 
 
 def target_weights(level: Level, dist: Distribution) -> Float[Array, "body lane"]:
-    """How readily each body is connected to: less with each joint it has, rarely if it is fixed."""
+    """Return each body's weight as a joint's target: it falls with every joint, and is small for fixed bodies."""
     model, bodies = level.model, level.size.bodies
-    number = jnp.arange(bodies)[:, None]
-    ends = ((model.joint_a[:, None] == number) * 1.0 + (model.joint_b[:, None] == number)) * model.joint_active[:, None]
+    body = jnp.arange(bodies)[:, None]
+    ends = ((model.joint_a[:, None] == body) * 1.0 + (model.joint_b[:, None] == body)) * model.joint_active[:, None]
     joints = ends.sum(0)
     free = jnp.where(
-        jnp.arange(bodies)[:, None] < level.size.polygons,
+        body < level.size.polygons,
         jnp.maximum(1 - joints / dist.polygon_connections, 0.0),
         joints == 0,
     )
     movable = jnp.where(model.inverse_mass == 0, dist.fixed_target_weight, 1.0)
-    return jnp.where(model.active & (number >= FIXED_POLYGONS), free * movable, 0.0)
+    return jnp.where(model.active & (body >= FIXED_POLYGONS), free * movable, 0.0)
 
 
 def choose_target(
     level: Level, weight: Float[Array, "body lane"], is_polygon: Flag, u: Lane
 ) -> Bool[Array, "body lane"]:
-    """A polygon (any, the scenery included, where all have their joints) or a circle without a joint."""
+    """Choose a polygon (if all have their joints: any, scenery included) or a circle without a joint."""
     polygons = level.size.polygons
-    full = (weight[:polygons] > 0).any(0)
-    among_polygons = jnp.where(full, weight[:polygons], level.model.active[:polygons])
+    any_left = (weight[:polygons] > 0).any(0)
+    among_polygons = jnp.where(any_left, weight[:polygons], level.model.active[:polygons])
     circles = weight[polygons:]
     parts = [choose(among_polygons, u) & is_polygon]
     if level.size.circles:
@@ -149,21 +151,30 @@ def choose_target(
     return jnp.concatenate(parts)
 
 
-def spot(x: Lane, y: Lane, low: Vec, high: Vec) -> Vec:
-    """A point between two corners."""
+def point_between(x: Lane, y: Lane, low: Vec, high: Vec) -> Vec:
+    """Return a point between two corners."""
     return Vec(between(x, low.x, high.x), between(y, low.y, high.y))
 
 
 def draw_joint(
     level: Level, d: BodyDraws, ends: tuple[Array, Vec, Vec], polygons: Flag, revolute: Flag, dist: Distribution
 ) -> Joint:
-    """Joint and motor at its `ends`, the first three of Joint; `polygons` where it joins two of them."""
+    """Draw a joint and its motor.
+
+    Args:
+        level: the level so far.
+        d: random numbers.
+        ends: target and anchors, the first three fields of Joint.
+        polygons: whether the joint connects two polygons.
+        revolute: whether the joint must be revolute.
+        dist: the distribution.
+    """
     model = level.model
     enough = (model.joint_active & ~model.joint_fixed).sum(0) >= dist.min_revolute_joints
     fixed = (d.joint_fixed < dist.fixed_joint_chance) & enough & ~revolute
     turns = ~fixed
     limited = turns & polygons & (d.limited < dist.limit_chance)
-    top = jnp.where(polygons, dist.max_motor_power, dist.max_wheel_power)
+    max_power = jnp.where(polygons, dist.max_motor_power, dist.max_wheel_power)
     return Joint(
         *ends,
         joint_fixed=fixed,
@@ -172,25 +183,27 @@ def draw_joint(
         joint_max=jnp.where(limited, between(d.limit_max, 0.0, dist.max_limit), 0.0),
         motor_on=turns & (d.motor < dist.motor_chance),
         motor_speed=jnp.where(turns, between(d.motor_speed, dist.min_motor_speed, dist.max_motor_speed), 0.0),
-        motor_power=jnp.where(turns, between(d.motor_power, dist.min_motor_power, top), 0.0),
+        motor_power=jnp.where(turns, between(d.motor_power, dist.min_motor_power, max_power), 0.0),
         motor_binding=(d.motor_binding * MOTOR_BINDINGS).astype(jnp.int32),
     )
 
 
-def both_show(new: BodyShape, target: BodyShape, anchor: Vec, target_anchor: Vec, dist: Distribution) -> Flag:
+def both_visible(new: BodyShape, target: BodyShape, anchor: Vec, target_anchor: Vec, dist: Distribution) -> Flag:
     """Whether each of two joined bodies can be seen beside the other at some angle of their joint.
 
-    As the reference has it: where it numbers the target as the joint's first body (always but for a new polygon on
-    a circle), it tests each body with the OTHER one's anchor.
+    As in the reference: if the target is the joint's first body (always, except for a new polygon on a circle), each
+    body is tested with the OTHER one's anchor.
     """
     exchanged = ~new.is_polygon | target.is_polygon
     new_anchor, other_anchor = where(exchanged, target_anchor, anchor), where(exchanged, anchor, target_anchor)
     margin = dist.visible_margin
-    return _shows(new, target, new_anchor, other_anchor, margin) & _shows(target, new, other_anchor, new_anchor, margin)
+    return _reaches_beyond(new, target, new_anchor, other_anchor, margin) & _reaches_beyond(
+        target, new, other_anchor, new_anchor, margin
+    )
 
 
-def _shows(small: BodyShape, big: BodyShape, small_anchor: Vec, big_anchor: Vec, margin: float) -> Flag:
-    """Whether `small` reaches beyond `big`: by its farthest corner, or beyond the nearest side."""
+def _reaches_beyond(small: BodyShape, big: BodyShape, small_anchor: Vec, big_anchor: Vec, margin: float) -> Flag:
+    """Whether the farthest corner (or radius) of `small` reaches beyond the nearest side (or radius) of `big`."""
     far_x, far_y = (half + jnp.abs(p) for half, p in zip(small.half, small_anchor, strict=True))
     farthest = Vec(far_x, far_y).norm()
     reach = jnp.where(small.is_polygon, farthest, small.radius)
@@ -202,12 +215,12 @@ def _shows(small: BodyShape, big: BodyShape, small_anchor: Vec, big_anchor: Vec,
 def add_thruster(
     level: Level, d: ThrusterDraws, wanted: Flag, candidates: Bool[Array, "body lane"], dist: Distribution
 ) -> Level:
-    """A thruster on one of the movable candidates, which mostly pushes through its centre."""
+    """Add a thruster to one of the movable candidates; if `aligned`, it pushes through the body's centre."""
     model, polygons = level.model, level.size.polygons
     candidates &= model.inverse_mass != 0
     body = choose(1.0 * candidates, d.body) & candidates
     low, high = extent(level, body)
-    in_polygon = spot(d.x, d.y, low, high)
+    in_polygon = point_between(d.x, d.y, low, high)
     angle, radius = d.x * TURN, d.y * at(radii(level), body)
     position = where(body[:polygons].any(0), in_polygon, Vec(radius * jnp.cos(angle), radius * jnp.sin(angle)))
     outward = position.scale(jnp.where(d.outward > 0.5, 1.0, -1.0))
@@ -229,20 +242,20 @@ def add_thruster(
     return replace(level, model=model, thruster_binding=put(level.thruster_binding, row, binding))
 
 
-def room(level: Level) -> tuple[Flag, Flag]:
-    """Whether a polygon and a circle more would fit."""
+def has_room(level: Level) -> tuple[Flag, Flag]:
+    """Whether one more polygon fits, and one more circle."""
     polygons = level.size.polygons
     return ~level.model.active[:polygons].all(0), ~level.model.active[polygons:].all(0)
 
 
 def extent(level: Level, chosen: Bool[Array, "body lane"]) -> tuple[Vec, Vec]:
-    """Lower left and upper right corner of the chosen polygon in its own frame; zero for circles."""
+    """Return the lower left and upper right corner of the chosen polygon in its own frame; zero for circles."""
     vertices = level.model.vertices
     polygon = chosen[: level.size.polygons]
     return vec(at(vertices.min(1), polygon)), vec(at(vertices.max(1), polygon))
 
 
 def radii(level: Level) -> Float[Array, "body lane"]:
-    """Of all bodies, zero for polygons."""
+    """Return the radius of every body, zero for polygons, m."""
     lanes = level.model.radius.shape[-1]
     return jnp.concatenate([jnp.zeros((level.size.polygons, lanes)), level.model.radius])

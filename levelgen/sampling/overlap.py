@@ -1,9 +1,10 @@
-"""How much a body touches the others: the number of contacts the engine would find.
+"""How much a new body overlaps the others: the number of contacts that the engine would find.
 
-The sampler asks this of every proposal, so only pairs with the new body are looked at, all at once. Contacts count as
-in physics/manifold.py, which a test compares: up to two of a pair of polygons, one where a circle is concerned; joined
-bodies count too. The geometry is not shared with it, because it measures from vertices where the kernel has projections
-on faces: other last bits, and now and then another count, would make other levels of the same ids.
+The reference counts all contacts of every proposed level. Those among older bodies are the same in all proposals of a
+body, so only pairs with the new body are counted here, all at once. Contacts count as in physics/manifold.py, which a
+test compares: up to two per pair of polygons, one per pair with a circle; joined bodies count too. The geometry is not
+shared with manifold.py, whose kernel projects on faces instead of measuring from vertices: its last bits, and
+occasionally its count, differ, which would change the levels of existing ids.
 """
 
 from typing import NamedTuple
@@ -17,13 +18,15 @@ from levelproof.physics.vector import Vec, nonzero, vec
 
 
 class WorldPolygons(NamedTuple):
-    """In the world, clockwise, all with four vertices."""
+    """Polygons in the world frame, clockwise, all with four vertices."""
 
     vertex: Vec  # components [vertex, polygon, lane]
     face: Faces  # from a vertex to the next
 
 
 class WorldCircles(NamedTuple):
+    """Circles in the world frame."""
+
     centre: Vec  # components [circle, lane]
     radius: Float[Array, "circle lane"]
 
@@ -35,7 +38,7 @@ def count_contacts(
     body: WorldCircles,
     is_polygon: Bool[Array, " lane"],
 ) -> Int[Array, " lane"]:
-    """Contacts of a new body with the active bodies: a polygon with these corners in the world, or a circle `body`."""
+    """Count a new body's contacts with the active bodies; it is a polygon with `corners`, or the circle `body`."""
     n = model.size.polygons
     cos, sin, position = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n]), vec(state.position)
     local = vec(model.vertices).map(lambda x: x.swapaxes(0, 1))
@@ -56,7 +59,7 @@ def in_world(vertex: Vec) -> WorldPolygons:
 
 
 def polygon_contacts(a: WorldPolygons, b: WorldPolygons) -> Int[Array, "polygon lane"]:
-    """0, 1 or 2 of each pair: the two deepest vertices beyond the face that separates most."""
+    """Count each pair's contacts, 0 to 2: the two deepest vertices beyond the face that separates most."""
     (first_a, second_a), (first_b, second_b) = deepest(a, b), deepest(b, a)
     second = jnp.where(first_a + FLIP_BIAS < first_b, second_b, second_a)
     touching = jnp.maximum(first_a, first_b) < 0
@@ -64,10 +67,10 @@ def polygon_contacts(a: WorldPolygons, b: WorldPolygons) -> Int[Array, "polygon 
 
 
 def deepest(a: WorldPolygons, b: WorldPolygons) -> tuple[Float[Array, "polygon lane"], Float[Array, "polygon lane"]]:
-    """Distances of b's two deepest vertices from the face of a that separates most (negative: inside)."""
+    """Return the distances of b's two deepest vertices from the face of a that separates most (negative: inside)."""
     reach = [
         a.face.outward.dot(Vec(b.vertex.x[k] - a.vertex.x, b.vertex.y[k] - a.vertex.y)) for k in range(4)
-    ]  # of b's vertex k from each face
+    ]  # distance of b's vertex k from each face of a
     low, high = jnp.minimum(reach[0], reach[1]), jnp.maximum(reach[0], reach[1])
     low2, high2 = jnp.minimum(reach[2], reach[3]), jnp.maximum(reach[2], reach[3])
     first = jnp.minimum(low, low2)
@@ -80,7 +83,7 @@ def deepest(a: WorldPolygons, b: WorldPolygons) -> tuple[Float[Array, "polygon l
 
 
 def touch(polygons: WorldPolygons, circles: WorldCircles) -> Bool[Array, "pair lane"]:
-    """Whether the circle's centre is inside the polygon or within its radius of an edge."""
+    """Whether the circle's centre lies inside the polygon or within its radius of an edge."""
     vertex, (edge, length, normal) = polygons
     along = edge.scale(1 / nonzero(length))
     offset = circles.centre - vertex

@@ -1,7 +1,7 @@
 """A body that the sampler may add: its random numbers, its shape, its joint, and how it enters a level.
 
-All lanes last; one-hot choices stand for indices. Facts: `kinetix.environment.ued` 3.0.2; numbers are fields of
-`Distribution`.
+Lanes are last; choices are one-hot instead of indices. Follows `kinetix.environment.ued` 3.0.2; numbers are fields of
+`Distribution`. A proposal is only the new body and joint, where the reference's mutators return a whole new level.
 """
 
 import math
@@ -35,13 +35,13 @@ class BodyDraws(NamedTuple):
     radius: Lane
     rotation: Lane
     role: Lane
-    # free
+    # free bodies only
     x: Lane
     y: Lane
     opposite: Lane
     fixed: Lane
     lowered: Lane
-    # connected
+    # connected bodies only
     target_is_polygon: Lane
     target: Lane
     anchor_x: Lane
@@ -59,7 +59,7 @@ class BodyDraws(NamedTuple):
 
 
 class BodyShape(NamedTuple):
-    """A rectangle or a circle; what the other kind would need is at its minimum."""
+    """A rectangle or a circle; the fields of the other kind have their minimum."""
 
     is_polygon: Flag
     half: Vec  # m, half width and half height
@@ -67,7 +67,7 @@ class BodyShape(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """From the proposed body to its target. What has the name of a field of Model is what stands there."""
+    """A joint from the proposed body to its target. Fields named as in Model hold that field's value."""
 
     target: Bool[Array, "body lane"]
     anchor: Vec  # in the frame of the proposed body
@@ -83,7 +83,7 @@ class Joint(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """A body to add, with a joint where `joined`; nothing where not `possible`."""
+    """A body to add if `possible`, with a joint if `joined`."""
 
     possible: Flag
     shape: BodyShape
@@ -93,11 +93,11 @@ class Proposal(NamedTuple):
     fixed: Flag
     joined: Flag
     joint: Joint
-    hidden: Flag  # one of the joined bodies may lie within the other whatever the joint's angle
+    hidden: Flag  # at every angle of the joint, one of the bodies may lie within the other
 
 
 def draw_shape(d: BodyDraws, is_polygon: Flag, size: Lane | float, dist: Distribution) -> BodyShape:
-    """Uniform half sides or radius; one side of some rectangles is longer (util.sample_dimensions)."""
+    """Draw uniform half sides or a radius; some rectangles get one longer side (util.sample_dimensions)."""
     longest = size / 2 / math.sqrt(2)
     half = [
         jnp.where(is_polygon, between(u, dist.min_half_side, longest), dist.min_half_side) for u in (d.half_x, d.half_y)
@@ -111,16 +111,17 @@ def draw_shape(d: BodyDraws, is_polygon: Flag, size: Lane | float, dist: Distrib
 
 
 def corners(half: Vec) -> Float[Array, "vertex 2 lane"]:
+    """Return a rectangle's corners in its own frame."""
     return jnp.asarray(CORNERS)[:, :, None] * unvec(half)[None]
 
 
 def corners_in_world(p: Proposal) -> Float[Array, "vertex 2 lane"]:
-    """As if the body were a polygon."""
+    """Return the corners of the body as if it were a polygon."""
     return unvec(turned(vec(corners(p.shape.half)), p.rotation) + p.position)
 
 
 def shape_mass(shape: BodyShape) -> tuple[Lane, Lane]:
-    """kg and kg m^2 at the density of 1 kg/m^2 that all bodies have."""
+    """Return mass, kg, and inertia, kg m^2; all bodies have a density of 1 kg/m^2."""
     vertices, four = corners(shape.half)[None], jnp.full((1, *shape.radius.shape), MAX_VERTICES)
     mass = jnp.where(shape.is_polygon, polygon_area(vertices, four)[0], circle_area(shape.radius))
     inertia = jnp.where(shape.is_polygon, polygon_inertia(vertices, four)[0], circle_inertia(shape.radius))
@@ -128,15 +129,15 @@ def shape_mass(shape: BodyShape) -> tuple[Lane, Lane]:
 
 
 def draw_role(level: Level, u: Lane, red_allowed: Flag | bool, dist: Distribution) -> Int[Array, " lane"]:
-    """Green and blue come first, then plain, and at most one red (util.get_role)."""
-    there = [(level.model.active & (level.role == role)).any(0) for role in (Role.GREEN, Role.BLUE, Role.RED)]
-    complete = there[0] & there[1]
-    red = jnp.where(complete & ~there[2] & red_allowed, dist.red_weight, 0.0)
-    return pick(jnp.stack([1.0 * complete, 1.0 * ~there[0], 1.0 * ~there[1], red]), u)
+    """Draw a role: green and blue first, then plain or red, and at most one red (util.get_role)."""
+    present = [(level.model.active & (level.role == role)).any(0) for role in (Role.GREEN, Role.BLUE, Role.RED)]
+    complete = present[0] & present[1]
+    red = jnp.where(complete & ~present[2] & red_allowed, dist.red_weight, 0.0)
+    return pick(jnp.stack([1.0 * complete, 1.0 * ~present[0], 1.0 * ~present[1], red]), u)
 
 
 def insert(level: Level, p: Proposal) -> Level:
-    """The level with the proposed body, and its joint, in the first free rows."""
+    """Insert the proposed body and its joint in the first free rows of a level."""
     polygons, model, state = level.size.polygons, level.model, level.state
     polygon = first_free(model.active[:polygons]) & p.shape.is_polygon & p.possible
     circle = first_free(model.active[polygons:]) & ~p.shape.is_polygon & p.possible
@@ -160,11 +161,11 @@ def insert(level: Level, p: Proposal) -> Level:
 
 
 def _insert_joint(level: Level, p: Proposal, body: Bool[Array, "body lane"]) -> Level:
-    """The joint's first body is the one with the smaller number."""
+    """Insert the proposal's joint; its first body is the one with the smaller index, as in the reference."""
     model, joint = level.model, p.joint
     row = first_free(model.joint_active) & p.joined
-    numbers = jnp.arange(level.size.bodies)[:, None]
-    own, target = at(numbers, body), at(numbers, joint.target)
+    indices = jnp.arange(level.size.bodies)[:, None]
+    own, target = at(indices, body), at(indices, joint.target)
     target_first = target < own
     first, second = (
         where(target_first, joint.target_anchor, joint.anchor),
@@ -172,10 +173,10 @@ def _insert_joint(level: Level, p: Proposal, body: Bool[Array, "body lane"]) -> 
     )
     rotation = p.rotation - at(level.state.rotation, joint.target)
     rotation = jnp.where(joint.joint_fixed, jnp.where(target_first, rotation, -rotation), 0.0)
-    same = {name: put(vars(model)[name], row, x) for name, x in joint._asdict().items() if name in vars(model)}
+    copied = {name: put(vars(model)[name], row, x) for name, x in joint._asdict().items() if name in vars(model)}
     model = replace(
         model,
-        **same,
+        **copied,
         joint_active=model.joint_active | row,
         joint_a=put(model.joint_a, row, jnp.minimum(own, target)),
         joint_b=put(model.joint_b, row, jnp.maximum(own, target)),

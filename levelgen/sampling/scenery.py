@@ -1,7 +1,7 @@
-"""The empty world: floor, left wall, right wall and ceiling, and no bodies yet.
+"""The empty world: floor, left wall, right wall and ceiling, without other bodies.
 
 Positions and vertices are those of Jax2D 1.0.1 (`jax2d.engine.create_empty_sim`), the skewed ceiling included.
-Each polygon of the scenery is deep enough to stand for a half-plane.
+Each polygon of the scenery is deep enough to act as a half-plane.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ MEETS_ALL, NORMAL = 2, 1  # collision modes of the scenery and of other bodies
 
 
 def empty_level(size: Size, lanes: int) -> Level:
-    """Levels with the scenery only; every other row is free and holds zeros, as in the reference."""
+    """Return levels with the scenery only; every other row is free and holds the reference's blank values."""
     zeros, scenery = zeros_of(Level, size, lanes), np.arange(size.bodies) < FIXED_POLYGONS
     model = replace(
         zeros.model,
@@ -47,12 +47,12 @@ def empty_level(size: Size, lanes: int) -> Level:
 
 
 def _padded(values: tuple, rows: int) -> np.ndarray:
-    """Zeros below the scenery's rows."""
-    given = np.array(values, np.float32)
-    return np.concatenate([given, np.zeros((rows - len(given), *given.shape[1:]), np.float32)])
+    """Append rows of zeros to the scenery's values."""
+    scenery = np.array(values, np.float32)
+    return np.concatenate([scenery, np.zeros((rows - len(scenery), *scenery.shape[1:]), np.float32)])
 
 
 def _in_lanes(values: np.ndarray, lanes: int) -> Array:
-    """The same values in every lane, in the engine's 32-bit types."""
+    """Broadcast values to all lanes, in the engine's 32-bit types."""
     kind = {"f": jnp.float32, "i": jnp.int32, "b": bool}[values.dtype.kind]
     return jnp.broadcast_to(jnp.asarray(values, kind)[..., None], (*values.shape, lanes))

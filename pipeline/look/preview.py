@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.levelgen.level import size_of
-from levelproof.levelgen.pictures.raster import rasterised
+from levelproof.levelgen.pictures.raster import rasterise
 from levelproof.levelgen.pictures.scene import scene_of
 from levelproof.levelgen.pictures.shapes import Scene
 from levelproof.levelgen.pictures.words import Caption
@@ -71,5 +71,5 @@ def _pictured(manifest: Manifest, rows: pa.Table) -> Iterator[dict[str, Any]]:
 
 def _picture(scene: Scene) -> dict[str, Any]:
     file = io.BytesIO()
-    rasterised(scene, PIXELS).save(file, "PNG", optimize=True)
+    rasterise(scene, PIXELS).save(file, "PNG", optimize=True)
     return {"bytes": file.getvalue(), "path": None}

@@ -14,7 +14,7 @@ import numpy as np
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.witness import Record, replay, steps_to_goal, succeeds
 from levelproof.levelgen.level import ACTIONS, Level, name_of
-from levelproof.levelgen.pictures.raster import rasterised, sheet, write_gif, write_png
+from levelproof.levelgen.pictures.raster import rasterise, sheet, write_gif, write_png
 from levelproof.levelgen.pictures.scene import scene_of
 from levelproof.levelgen.pictures.shapes import Scene
 from levelproof.levelgen.pictures.svg import svg_of
@@ -177,7 +177,7 @@ def write_sheet(film: Film, path: Path) -> None:
     """Draw up to six of the film's pictures, including the first and the last."""
     columns, rows = SHEET
     chosen = spread(len(film.scenes), columns * rows)
-    write_png(sheet([rasterised(film.scenes[i]) for i in chosen], columns), path)
+    write_png(sheet([rasterise(film.scenes[i]) for i in chosen], columns), path)
 
 
 def write_mp4(film: Film, path: Path) -> None:
@@ -195,7 +195,7 @@ def write_mp4(film: Film, path: Path) -> None:
         )
     rate = 1 / film.seconds[0]
     rest = round(film.seconds[-1] * rate)
-    pictures = list(map(rasterised, film.scenes))
+    pictures = list(map(rasterise, film.scenes))
     width, height = pictures[0].size
     command = [program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
     command += ["-r", f"{rate:.6g}", "-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
@@ -215,7 +215,7 @@ def packaged_ffmpeg() -> str | None:
 
 
 WRITERS: dict[str, Callable[[Film, Path], object]] = {
-    ".gif": lambda film, path: write_gif(map(rasterised, film.scenes), path, film.seconds),
+    ".gif": lambda film, path: write_gif(map(rasterise, film.scenes), path, film.seconds),
     ".png": write_sheet,
     ".mp4": write_mp4,
     ".svg": lambda film, path: path.write_text(svg_of(film.scenes, film.seconds), encoding="utf-8"),

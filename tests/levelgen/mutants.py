@@ -8,7 +8,7 @@ import numpy as np
 
 from levelproof.levelgen.level import SIZES, Level, Role
 from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
-from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.levelgen.sampling.shuffle import collision_matrix
 from levelproof.physics.types import FIXED_POLYGONS
 
 SCENERY = slice(FIXED_POLYGONS)
@@ -56,4 +56,4 @@ def mutants(size: str, count: int, distribution: Distribution, seed: int = 0) ->
     mutate(state.angular_velocity[free], uniform(state.angular_velocity[free], -20, 20))
     mutate(state.position[free], uniform(state.position[free], 0, 5))
     mutate(state.joint_impulse, uniform(state.joint_impulse, -1, 1))
-    return dataclasses.replace(level, model=dataclasses.replace(model, collides=np.asarray(separate(model))))
+    return dataclasses.replace(level, model=dataclasses.replace(model, collides=np.asarray(collision_matrix(model))))

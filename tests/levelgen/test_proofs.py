@@ -16,7 +16,7 @@ from levelproof.levelgen.proofs import Facts, Proof
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.sampling.scenery import empty_level
-from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.levelgen.sampling.shuffle import collision_matrix
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
@@ -193,7 +193,7 @@ def world(
         m.thruster_active[0], m.thruster_body[0], m.thruster_power[0] = True, thruster, 1
     for name, value in model.items():
         getattr(m, name)[...] = value
-    return changed(level, collides=np.asarray(separate(m)))
+    return changed(level, collides=np.asarray(collision_matrix(m)))
 
 
 def proof(level: Level, rules: TaskParams = DEFAULT_RULES) -> Proof:

@@ -1,1 +1,1 @@
-"""What is seen of a state: features side by side, a set of entities, or pixels."""
+"""Observations of a state: a flat vector of features, a set of entities, or pixels."""

@@ -1,6 +1,7 @@
-"""What an agent sees, as one row a thing: the padded symbolic observation, and entities with masks for attention.
+"""Observations with one row per entity: the padded symbolic one, and sets of entities with masks for attention.
 
-Lanes are last, as everywhere. The columns of a thing are those of the flat observation (`levelgen.task.observe.flat`).
+An entity is a body, joint or thruster. Lanes are last, as everywhere. An entity's columns are its features in the flat
+observation (`levelgen.task.observe.flat`).
 Facts: `kinetix.render.renderer_symbolic_flat` and `renderer_symbolic_entity` 3.0.2.
 """
 
@@ -28,38 +29,38 @@ KINDS = 4  # polygons, circles, joints, thrusters
 
 
 def padded_shape(size: Size) -> tuple[int, int]:
-    """Things and columns of `symbolic_padded`."""
+    """Return the entity and column counts of `symbolic_padded`."""
     tables = tables_of(size)
     return sum(count for count, _ in tables), max(rows for _, rows in tables) + KINDS + 1
 
 
-def symbolic_padded(level: Level, state: State) -> Float[Array, "thing column lane"]:
-    """Polygons but the walls and the ceiling, circles, joints, thrusters: a row each.
+def symbolic_padded(level: Level, state: State) -> Float[Array, "entity column lane"]:
+    """Observe polygons (without walls and ceiling), circles, joints and thrusters, a row each.
 
-    Columns: those of the thing's kind, zeros, the kind one-hot, gravity.
+    Columns: the entity's features, zeros as padding, its kind one-hot, gravity.
     """
     size, flat = level.size, symbolic_flat(level, state)
-    (things, columns), lanes = padded_shape(size), flat.shape[-1]
-    rows, seen = [], 0
+    (count_all, columns), lanes = padded_shape(size), flat.shape[-1]
+    rows, start = [], 0
     for kind, (count, width) in enumerate(tables_of(size)):
-        own = flat[seen : seen + count * width].reshape(count, width, lanes)
+        own = flat[start : start + count * width].reshape(count, width, lanes)
         zeros = jnp.zeros((count, columns - KINDS - 1 - width, lanes))
         is_kind = jnp.broadcast_to(jnp.eye(KINDS)[kind][:, None], (count, KINDS, lanes))
         rows.append(jnp.concatenate([own, zeros, is_kind], axis=1))
-        seen += count * width
-    gravity = jnp.broadcast_to(flat[-1], (things, 1, lanes))
+        start += count * width
+    gravity = jnp.broadcast_to(flat[-1], (count_all, 1, lanes))
     return jnp.concatenate([jnp.concatenate(rows), gravity], axis=1)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class EntityObservation:
-    """Sets of things for attention. Every joint is there twice: as seen from body b, then from body a.
+    """Sets of entities for attention. Every joint appears twice: as seen from body b, then from body a.
 
-    Numbers are neither clipped nor blank where a thing is not active (the masks tell). Bodies are numbered polygons
-    first. attention_mask[k, i, j]: i may look at j, both active, because (0) all may, (1) joints hold them together
-    or keep them from colliding, (2) a joint joins them, (3) i < j (a circle before a polygon) touched in the last
-    physics step.
+    Values are not clipped, and not blanked for inactive entities; the masks say which are active. Bodies are indexed
+    polygons first. attention_mask[k, i, j]: active body i may attend to active body j because (0) all may, (1) they
+    cannot collide, since a chain of joints holds them together, (2) a joint joins them, (3) the pair (i, j), i < j or
+    a circle before a polygon, touched in the last physics step.
     """
 
     circles: Float[Array, "circle 19 lane"]
@@ -71,12 +72,12 @@ class EntityObservation:
     joint_mask: Bool[Array, "joint_end lane"]
     thruster_mask: Bool[Array, "thruster lane"]
     attention_mask: Bool[Array, "4 body body lane"]
-    joint_indexes: Int[Array, "joint_end 2 lane"]  # looks from, looks at; 0 where not active
+    joint_indexes: Int[Array, "joint_end 2 lane"]  # attending body, attended body; 0 for inactive joints
     thruster_indexes: Int[Array, "thruster lane"]  # its body
 
 
 def entities(level: Level, state: State) -> EntityObservation:
-    """The entities of a state."""
+    """Observe the entities of a state."""
     level, size = replace(level, state=jax.tree.map(jnp.nan_to_num, state)), level.size
     model, polygons, circles = level.model, slice(0, size.polygons), slice(size.polygons, size.bodies)
     radius = [model.radius, jnp.ones_like(model.radius)]
@@ -98,14 +99,14 @@ def entities(level: Level, state: State) -> EntityObservation:
     )
 
 
-def _table(rows: list[Array]) -> Float[Array, "thing row lane"]:
+def _table(rows: list[Array]) -> Float[Array, "entity row lane"]:
     return jnp.stack(jnp.broadcast_arrays(*(jnp.nan_to_num(row.astype(jnp.float32)) for row in rows)), axis=1)
 
 
 def _attention_mask(level: Level, joint_index: Int[Array, "2 joint lane"]) -> Bool[Array, "4 body body lane"]:
     model, bodies = level.model, level.size.bodies
-    number = jnp.arange(bodies)[:, None]
-    is_end = (joint_index[:, :, None] == number) & model.joint_active[:, None]  # [end, joint, body, lane]
+    body = jnp.arange(bodies)[:, None]
+    is_end = (joint_index[:, :, None] == body) & model.joint_active[:, None]  # [end, joint, body, lane]
     joined = (is_end[0][:, :, None] & is_end[1][:, None]).any(0)
     masks = [jnp.ones_like(joined), ~model.collides, joined | joined.swapaxes(0, 1), _touching(level)]
     both = model.active[:, None] & model.active[None]
@@ -113,11 +114,11 @@ def _attention_mask(level: Level, joint_index: Int[Array, "2 joint lane"]) -> Bo
 
 
 def _touching(level: Level) -> Bool[Array, "body body lane"]:
-    """Contacts of the last physics step, at their pair's two numbers."""
+    """Return a matrix of the body pairs that touched in the last physics step."""
     pairs, active = pairs_of(level.size), level.state.contact_active
     n, kinds = len(pairs.polygon), (pairs.polygon, pairs.circle_polygon, pairs.circle)
     first, second = sum((kind.a for kind in kinds), ()), sum((kind.b for kind in kinds), ())
-    where = np.full((level.size.bodies, level.size.bodies), len(first))  # the last row: no pair
-    where[first, second] = np.arange(len(first))
+    row = np.full((level.size.bodies, level.size.bodies), len(first))  # the last row stands for no pair
+    row[first, second] = np.arange(len(first))
     none = jnp.zeros((1, active.shape[-1]), bool)
-    return jnp.concatenate([active[:n] | active[n : 2 * n], active[2 * n :], none])[where]
+    return jnp.concatenate([active[:n] | active[n : 2 * n], active[2 * n :], none])[row]

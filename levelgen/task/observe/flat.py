@@ -1,8 +1,9 @@
-"""What an agent sees: the symbolic-flat observation, one row per feature.
+"""The symbolic-flat observation, one row per feature.
 
-Rows, in this order: every polygon but the walls and the ceiling, circles, joints, thrusters, gravity. What is not
-active is zero. Most rows are constant within a level (`level_features`); only positions and speeds of movable bodies
-change (`state_features`, at the rows `dynamic_features`), which a network's first layer can exploit.
+Rows, in this order: polygons (without walls and ceiling), circles, joints, thrusters, gravity. Features of inactive
+entities (bodies, joints, thrusters) are zero. Most rows are constant within a level (`level_features`); only positions
+and velocities of movable bodies change (`state_features`, at the rows `dynamic_features`), which a network's first
+layer can exploit.
 Facts: `kinetix.render.renderer_symbolic_flat` and `renderer_symbolic_common` 3.0.2.
 """
 
@@ -18,7 +19,7 @@ from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, Size, 
 
 LIMIT = 10.0  # features are clipped to +-LIMIT
 GRAVITY_UNIT = 10.0  # m/s^2
-SPIN_UNIT = 10.0  # rad/s; angular velocity w is seen as tanh(w / SPIN_UNIT)
+SPIN_UNIT = 10.0  # rad/s; angular velocity w is observed as tanh(w / SPIN_UNIT)
 NO_VERTEX = -1.0  # coordinates of a triangle's fourth vertex
 UNSEEN_WALLS = range(1, FIXED_POLYGONS)  # left wall, right wall, ceiling
 
@@ -28,17 +29,17 @@ DYNAMIC_ROWS = (0, 1, 2, 3, 7, 12, 13)
 BODY_ROWS = 16
 POLYGON_ROWS = BODY_ROWS + 1 + 2 * MAX_VERTICES + 1  # 0 for "no circle", vertices, whether a triangle
 CIRCLE_ROWS = BODY_ROWS + 2  # radius, 1 for "circle"
-JOINT_ROWS = 18 + MOTOR_BINDINGS  # and a one-hot body twice
-THRUSTER_ROWS = 6 + THRUSTER_BINDINGS  # and a one-hot body
+JOINT_ROWS = 18 + MOTOR_BINDINGS  # plus two one-hot bodies
+THRUSTER_ROWS = 6 + THRUSTER_BINDINGS  # plus a one-hot body
 
 
 def feature_count(size: Size) -> int:
-    """Rows of the observation: 140 for size s."""
+    """Return the number of rows of the observation: 140 for size s."""
     return sum(count * rows for count, rows in tables_of(size)) + 1
 
 
 def tables_of(size: Size) -> tuple[tuple[int, int], ...]:
-    """(how many, rows of each) of polygons, circles, joints and thrusters, in the order of the observation."""
+    """Return (count, rows of each) for polygons, circles, joints and thrusters, in the observation's order."""
     return (
         (size.polygons - len(UNSEEN_WALLS), POLYGON_ROWS),
         (size.circles, CIRCLE_ROWS),
@@ -49,7 +50,7 @@ def tables_of(size: Size) -> tuple[tuple[int, int], ...]:
 
 @cache
 def dynamic_features(size: Size) -> Int[np.ndarray, "dynamic"]:
-    """Rows of the observation that can change within a level, ascending. The floor never moves."""
+    """Return the rows of the observation that can change within a level, ascending. The floor never moves."""
     polygons = POLYGON_ROWS * (1 + np.arange(size.polygons - FIXED_POLYGONS))
     circles = POLYGON_ROWS * (1 + len(polygons)) + CIRCLE_ROWS * np.arange(size.circles)
     index = (np.concatenate([polygons, circles])[:, None] + np.array(DYNAMIC_ROWS)).reshape(-1)
@@ -60,44 +61,44 @@ def dynamic_features(size: Size) -> Int[np.ndarray, "dynamic"]:
 def symbolic_flat(
     level: Level, state: State, constant: Float[Array, "feature lane"] | None = None
 ) -> Float[Array, "feature lane"]:
-    """The whole observation of a state, clipped to +-LIMIT, NaN as 0.
+    """Observe a state: all features, clipped to +-LIMIT, NaN as 0.
 
-    `constant` is `level_features(level)` where the caller has it: computed once per rollout, not per step.
+    `constant` is `level_features(level)`, if the caller has computed it (once per rollout instead of per step).
     """
     constant = level_features(level) if constant is None else constant
     moving = state_features(level, state)
     lanes = max(constant.shape[-1], moving.shape[-1])
     constant, moving = (jnp.broadcast_to(x, (len(x), lanes)) for x in (constant, moving))
-    # The two are interleaved run by run: concatenated slices, where an indexed write would be a slow scatter.
-    pieces, seen = [], 0
+    # Interleave the two run by run by concatenating slices: an indexed write would be a slow scatter.
+    pieces, used = [], 0
     for start, stop, is_dynamic in _runs(level.size):
-        pieces.append(moving[seen : seen + stop - start] if is_dynamic else constant[start:stop])
-        seen += (stop - start) * is_dynamic
+        pieces.append(moving[used : used + stop - start] if is_dynamic else constant[start:stop])
+        used += (stop - start) * is_dynamic
     return jnp.concatenate(pieces)
 
 
 @cache
 def _runs(size: Size) -> tuple[tuple[int, int, bool], ...]:
-    """(first row, row after the last, whether they are dynamic) of each run of rows of one kind."""
+    """Return (first row, row after the last, whether dynamic) for each run of constant or dynamic rows."""
     is_dynamic = np.isin(np.arange(feature_count(size)), dynamic_features(size))
     edges = [0, *(np.flatnonzero(np.diff(is_dynamic)) + 1).tolist(), len(is_dynamic)]
     return tuple((start, stop, bool(is_dynamic[start])) for start, stop in pairwise(edges))
 
 
 def state_features(level: Level, state: State) -> Float[Array, "dynamic lane"]:
-    """The rows `dynamic_features`: position, velocity, spin and heading of every movable body."""
+    """Return the rows `dynamic_features`: position, velocity, spin and heading of every movable body."""
     at = slice(FIXED_POLYGONS, None)
     return _side_by_side(motion_rows(state, at), level.model.active[at])
 
 
 def motion_rows(state: State, at: slice) -> list[Array]:
-    """A body's DYNAMIC_ROWS."""
+    """Return the DYNAMIC_ROWS of some bodies."""
     spin, rotation = jnp.tanh(state.angular_velocity[at] / SPIN_UNIT), state.rotation[at]
     return [*_split(state.position[at]), *_split(state.velocity[at]), spin, jnp.sin(rotation), jnp.cos(rotation)]
 
 
 def level_features(level: Level) -> Float[Array, "feature lane"]:
-    """Everything that is constant within a level; zeros at the rows `dynamic_features`."""
+    """Return all features that are constant within a level; zeros at the rows `dynamic_features`."""
     model, size = level.model, level.size
     floor, movable = slice(0, 1), slice(FIXED_POLYGONS, size.polygons)
     parts = [
@@ -120,7 +121,7 @@ def level_features(level: Level) -> Float[Array, "feature lane"]:
 
 
 def body_rows(level: Level, at: slice, constant: bool = False) -> list[Array]:
-    """Rows of some bodies in `level.state`, each [body, lane]; if `constant`, zero where a state decides them."""
+    """Return the rows of some bodies in `level.state`, each [body, lane]; if `constant`, dynamic ones are zero."""
     model = level.model
     *motion, spin, sine, cosine = motion_rows(level.state, at)
     if constant:
@@ -131,7 +132,7 @@ def body_rows(level: Level, at: slice, constant: bool = False) -> list[Array]:
 
 
 def polygon_rows(model: Model, at: slice) -> list[Array]:
-    """What a polygon has beyond a body's rows."""
+    """Return the rows of polygons that follow a body's rows."""
     count, vertices = model.n_vertices[at], model.vertices[at]
     corners = [jnp.where(k < count[:, None], vertices[:, k], NO_VERTEX) for k in range(MAX_VERTICES)]
     triangle = (count <= 3).astype(jnp.float32)
@@ -139,7 +140,7 @@ def polygon_rows(model: Model, at: slice) -> list[Array]:
 
 
 def joint_rows(level: Level, seen_from_a: bool = False) -> list[Array]:
-    """Rows of joints as seen from one body, whose anchor comes first."""
+    """Return the rows of joints as seen from one body, whose anchor comes first."""
     model = level.model
     anchors = [model.joint_anchor_b, model.joint_anchor_a]
     near, far = anchors[::-1] if seen_from_a else anchors
@@ -176,16 +177,16 @@ def thruster_rows(level: Level) -> list[Array]:
     ]
 
 
-def _split(xy: Float[Array, "thing 2 lane"]) -> list[Array]:
+def _split(xy: Float[Array, "entity 2 lane"]) -> list[Array]:
     return [xy[:, 0], xy[:, 1]]
 
 
-def _one_hot(number: Int[Array, "thing lane"], count: int) -> list[Array]:
-    return [number == k for k in range(count)]
+def _one_hot(index: Int[Array, "entity lane"], count: int) -> list[Array]:
+    return [index == k for k in range(count)]
 
 
 def _side_by_side(rows: list[Array], active: Array) -> Float[Array, "feature lane"]:
-    """Each thing's rows side by side, [row, thing, lane] to [thing * row, lane], blank where not active."""
+    """Flatten [row, entity, lane] to [entity * row, lane]; inactive entities become zero."""
     rows = jnp.broadcast_arrays(*(row.astype(jnp.float32) for row in rows))
     stacked = jnp.where(active[:, None], jnp.stack(rows, axis=1), 0.0)
     return _tidy(stacked).reshape(-1, stacked.shape[-1])

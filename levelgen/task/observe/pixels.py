@@ -1,8 +1,8 @@
 """125x125 pixels for agents, drawn from the state of ONE environment (map with `jax.vmap`).
 
 A picture is a stack of shapes, the last one on top. All are convex, so a shape covers one interval of every column:
-its ends are computed once a column, and a pixel only compares its height with them.
-Facts: `kinetix.render.renderer_pixels` 3.0.2 at its downscale of 4. The thruster's drawing is our own, in its colours.
+its ends are computed once per column, and each pixel only compares its height with them.
+Facts: `kinetix.render.renderer_pixels` 3.0.2 at its downscale of 4. Thrusters are drawn differently, in its colours.
 """
 
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ from levelproof.physics.types import FIXED_POLYGONS, State
 
 PIXELS_PER_METRE = 25
 SIDE = int(WORLD_SIDE * PIXELS_PER_METRE)  # pixels
-PATCH = 2 * PIXELS_PER_METRE  # a body shows inside a square of this side only
-BORDER = 2 * PIXELS_PER_METRE  # invisible; patches are moved to lie inside it
+PATCH = 2 * PIXELS_PER_METRE  # side of the square around a body's centre; the body is drawn only inside it
+BORDER = 2 * PIXELS_PER_METRE  # invisible margin; patches are shifted to lie within it
 THRUSTER_SIDE = 4.0  # pixels
-BITS = 9  # of a packed colour's parts
+BITS = 9  # per channel of a packed colour
 
 RGB = tuple[float, float, float]
 BACKGROUND: RGB = (255, 255, 255)
@@ -34,11 +34,11 @@ ROLE_COLOUR: dict[Role, RGB] = {
     Role.BLUE: (0, 102, 204),
     Role.RED: (255, 102, 102),
 }
-FIXED_SHADE = 0.5  # of a role's colour on what cannot move
+FIXED_SHADE = 0.5  # times the role's colour, for bodies that cannot move
 NO_MOTOR: RGB = (255, 255, 255)
 BINDING_COLOUR: tuple[RGB, ...] = ((255, 255, 0), (255, 0, 255), (0, 255, 255), (255, 153, 51))
-# Of the thruster: (from, to) along its axis and across it, as shares of its side from the middle; brightness, and
-# whether it has the binding's colour.
+# Rectangles of a thruster: (from, to) along its axis and across it, in sides from its middle; brightness; whether it
+# has the binding's colour
 THRUSTER = (
     ((-0.5, -0.2), (-0.12, 0.12), 0.6, True),
     ((-0.2, 0.06), (-0.34, 0.34), 0.8, True),
@@ -49,14 +49,14 @@ THRUSTER = (
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PixelsObservation:
-    """What an agent sees."""
+    """The pixel observation."""
 
     image: Float[Array, "x y 3"]  # y upwards; red, green, blue from 0 to 1
     global_info: Float[Array, "1"]  # gravity / 10
 
 
 class Coverage(NamedTuple):
-    """What a shape covers of each column, in pixels, and its colour."""
+    """The interval that a shape covers in each column, in pixels, and its colour."""
 
     low: Float[Array, " x"]
     high: Float[Array, " x"]
@@ -64,21 +64,21 @@ class Coverage(NamedTuple):
 
 
 def pixels(level: Level, state: State) -> PixelsObservation:
-    """The picture of a state; neither has an axis of lanes."""
+    """Draw a state; neither level nor state has a lane axis."""
     height = jnp.arange(SIDE, dtype=jnp.float32)
-    # Stored before they are used, and the image too: XLA would compute them anew for every pixel and colour.
+    # The barriers store intervals and image: XLA would recompute them for every pixel and colour.
     low, high, colour = jax.lax.optimization_barrier(jax.tree.map(lambda *x: jnp.stack(x), *_shapes(level, state)))
     image = jnp.full((SIDE, SIDE), _packed(np.array(BACKGROUND)))
-    for number in range(len(low)):
-        covered = (low[number][:, None] <= height) & (height <= high[number][:, None])
-        image = jnp.where(covered, colour[number], image)
+    for shape in range(len(low)):
+        covered = (low[shape][:, None] <= height) & (height <= high[shape][:, None])
+        image = jnp.where(covered, colour[shape], image)
     image = jax.lax.optimization_barrier(image)
     parts = jnp.stack([image >> 2 * BITS, image >> BITS, image], axis=-1) & (2**BITS - 1)
     return PixelsObservation(parts / jnp.float32(2 * 255), level.model.gravity[1:] / GRAVITY_UNIT)
 
 
 def _shapes(level: Level, state: State) -> list[Coverage]:
-    """From the floor to the thrusters."""
+    """Return all shapes, from the floor (bottom) to the thrusters (top)."""
     model, size = level.model, level.size
     centre = state.position * PIXELS_PER_METRE
     colours = _role_colour(level.role, model.inverse_mass == 0)
@@ -104,7 +104,7 @@ def _shapes(level: Level, state: State) -> list[Coverage]:
 
 
 def _joint(level: Level, state: State, joint: int, colours: Float[Array, "binding 3"]) -> Coverage:
-    """One pixel."""
+    """Return a joint's single pixel."""
     model, body = level.model, level.model.joint_a[joint]
     driven = model.motor_on[joint] & ~model.joint_fixed[joint]
     colour = jnp.where(driven, colours[level.motor_binding[joint]], jnp.array(NO_MOTOR))
@@ -117,7 +117,7 @@ def _joint(level: Level, state: State, joint: int, colours: Float[Array, "bindin
 
 
 def _thruster(level: Level, state: State, thruster: int, colours: Float[Array, "binding 3"]) -> list[Coverage]:
-    """Three rectangles along the thruster's axis."""
+    """Return the three rectangles along a thruster's axis."""
     model, body = level.model, level.model.thruster_body[thruster]
     centre = jnp.round(_on_body(state, body, model.thruster_position[thruster]))
     angle = model.thruster_rotation[thruster] + state.rotation[body]
@@ -136,7 +136,7 @@ Interval = tuple[Float[Array, " x"], Float[Array, " x"]]
 
 
 def _polygon(corners: Float[Array, "corner 2"]) -> Interval:
-    """What lies right of each side; a side without length has nothing on its right."""
+    """Return the interval of a clockwise polygon: right of every side. A side of length 0 excludes everything."""
     ends = jnp.roll(corners, -1, axis=0)
     dx, dy = corners[:, 1] - ends[:, 1], ends[:, 0] - corners[:, 0]
     bound = corners[:, 0] * dx + corners[:, 1] * dy
@@ -144,7 +144,7 @@ def _polygon(corners: Float[Array, "corner 2"]) -> Interval:
 
 
 def _spoke(centre: Float[Array, "2"], angle: Float[Array, ""]) -> Interval:
-    """Two pixels wide, from the centre on."""
+    """Return the interval of a ray from the centre, two pixels wide."""
     back = jnp.array([jnp.sin(angle), -jnp.cos(angle)])
     side = jnp.array([-back[1], back[0]])
     normals = jnp.stack([back, side, -side])
@@ -153,7 +153,7 @@ def _spoke(centre: Float[Array, "2"], angle: Float[Array, ""]) -> Interval:
 
 
 def _columns(dx: Float[Array, " plane"], dy: Float[Array, " plane"], bound: Float[Array, " plane"]) -> Interval:
-    """What lies in all half-planes x * dx + y * dy <= bound, of each column; in pixels."""
+    """Return, for each column, the interval inside all half-planes x * dx + y * dy <= bound; in pixels."""
     x = jnp.arange(SIDE, dtype=jnp.float32)[:, None]
     room = bound - x * dx  # y * dy <= room
     edge = room / jnp.where(dy == 0, 1.0, dy)
@@ -171,7 +171,7 @@ def _disc(centre: Float[Array, "2"], radius: Float[Array, ""]) -> Interval:
 
 
 def _patch(centre: Float[Array, "2"]) -> Interval:
-    """The square in which a body shows."""
+    """Return the interval of the square in which a body is drawn."""
     start = jnp.clip(jnp.trunc(centre + BORDER - PATCH / 2), 0, SIDE + 2 * BORDER - PATCH) - BORDER
     x = jnp.arange(SIDE)
     inside = (start[0] <= x) & (x < start[0] + PATCH)
@@ -188,18 +188,18 @@ def _if(shown: Array, shape: Coverage) -> Coverage:
 
 def _role_colour(role: Int[Array, " *body"], fixed: Array) -> Int[Array, " *body"]:
     colours = np.array([ROLE_COLOUR[Role(number)] for number in range(len(Role))], np.float32)
-    held = np.concatenate([[FIXED], FIXED_SHADE * colours[1:]])
-    return jnp.where(fixed, _packed(held)[role], _packed(colours)[role])
+    fixed_colours = np.concatenate([[FIXED], FIXED_SHADE * colours[1:]])
+    return jnp.where(fixed, _packed(fixed_colours)[role], _packed(colours)[role])
 
 
 def _packed(colour: Any) -> Int[Array, " *colours"]:
-    """(..., 3) numbers up to 255 as one each, in halves: what is half as bright is exact, too."""
+    """Pack (..., 3) channels up to 255 into one integer each, in units of 1/2 so that FIXED_SHADE stays exact."""
     red, green, blue = jnp.moveaxis((2 * jnp.asarray(colour, jnp.float32)).astype(jnp.int32), -1, 0)
     return (red << 2 * BITS) | (green << BITS) | blue
 
 
 def _on_body(state: State, body: Int[Array, ""], anchor: Float[Array, "2"]) -> Float[Array, "2"]:
-    """A point of a body's frame, in pixels."""
+    """Transform a point of a body's frame to pixels."""
     return PIXELS_PER_METRE * (state.position[body] + _turn(anchor, state.rotation[body]))
 
 

@@ -138,39 +138,39 @@ def test_whatever_a_level_cannot_say_in_a_file_is_refused() -> None:
             to_document(LevelFile(made, TaskParams()))
 
 
-NUMBER = r"it has to be a number from -1,000 to 1,000"
+NUMBER = r"but must be a number from -1,000 to 1,000"
 WRONG = [
     ("env_state.polygon.4.position.1", float("nan"), rf"^env_state\.polygon\[4\]\.position\.1 is NaN, {NUMBER}$"),
     ("env_state.polygon.4.position.1", float("inf"), f"is Infinity, {NUMBER}"),
     ("env_state.polygon.4.position.1", 1e30, f"is 1e.30, {NUMBER}"),
     ("env_state.polygon.4.position.1", "0.5", f'is "0.5", {NUMBER}'),
     ("env_state.polygon.4.position.1", True, f"is true, {NUMBER}"),
-    ("env_state.polygon.4.position", 3, r"position is 3, it has to be an object$"),
-    ("env_state.polygon.4.position", [1, 2], "position is a list, it has to be an object"),
+    ("env_state.polygon.4.position", 3, r"position is 3, but must be an object$"),
+    ("env_state.polygon.4.position", [1, 2], "position is a list, but must be an object"),
     ("env_state.polygon.4.position", {"0": 1}, r"polygon\[4\]\.position\.1 is missing$"),
-    ("env_state.polygon.4", None, r"polygon\[4\] is null, it has to be an object"),
-    ("env_state.circle.1.radius", -1, r"circle\[1\]\.radius is -1, it has to be a number from 0 to 1,000"),
-    ("env_state.circle.1.active", 1, "active is 1, it has to be true or false"),
-    ("env_state.circle.1.role", 4, "role is 4, it has to be a whole number from 0 to 3"),
-    ("env_state.circle.1.role", 1.0, "role is 1.0, it has to be a whole number"),
-    ("env_state.joint.0.a_index", 7, r"joint\[0\]\.a_index is 7, it has to be a whole number from 0 to 6"),
+    ("env_state.polygon.4", None, r"polygon\[4\] is null, but must be an object"),
+    ("env_state.circle.1.radius", -1, r"circle\[1\]\.radius is -1, but must be a number from 0 to 1,000"),
+    ("env_state.circle.1.active", 1, "active is 1, but must be true or false"),
+    ("env_state.circle.1.role", 4, "role is 4, but must be a whole number from 0 to 3"),
+    ("env_state.circle.1.role", 1.0, "role is 1.0, but must be a whole number"),
+    ("env_state.joint.0.a_index", 7, r"joint\[0\]\.a_index is 7, but must be a whole number from 0 to 6"),
     ("env_state.joint.0.b_index", -1, "b_index is -1"),
     ("env_state.joint.0.motor_binding", 4, r"joint\[0\] has a motor_binding beyond 3"),
-    ("env_state.thruster.0.object_index", 10**30, r"object_index is 10{30}, it has"),
-    ("env_state.thruster.0.object_index", 10**4000, r"object_index is 10+ \.\.\., it has"),
-    ("env_state.thruster", {}, r"thruster is an object, static_env_params.num_thrusters says 1"),
-    ("env_state.polygon", [], "polygon is a list of 0, static_env_params.num_polygons says 5"),
-    ("env_state.polygon", [0] * 1_000_000, "polygon is a list of 1000000, static_env_params.num_polygons says 5"),
+    ("env_state.thruster.0.object_index", 10**30, r"object_index is 10{30}, but must be"),
+    ("env_state.thruster.0.object_index", 10**4000, r"object_index is 10+ \.\.\., but must be"),
+    ("env_state.thruster", {}, r"thruster is an object, but static_env_params.num_thrusters is 1"),
+    ("env_state.polygon", [], "polygon is a list of 0, but static_env_params.num_polygons is 5"),
+    ("env_state.polygon", [0] * 1_000_000, "polygon is a list of 1000000, but static_env_params.num_polygons is 5"),
     ("env_state.polygon.4.n_vertices", 2, r"polygon\[4\] is active and has fewer than 3 vertices"),
     ("env_state.polygon.2.inverse_mass", 1, r"polygon\[2\] is scenery and may move"),
     ("env_state.polygon.0.velocity", {"0": 0, "1": 1}, r"polygon\[0\] is scenery and may move"),
-    ("static_env_params.num_polygons", 1_000_000, r"num_polygons is 1000000, it has to be a whole number from 4 to 64"),
+    ("static_env_params.num_polygons", 1_000_000, r"num_polygons is 1000000, but must be a whole number from 4 to 64"),
     ("static_env_params.num_polygons", 3, "num_polygons is 3"),
-    ("static_env_params.solver_batch_size", 8, "solver_batch_size is 8, this engine has 16 only"),
-    ("static_env_params.do_warm_starting", False, "do_warm_starting is false, this engine has true only"),
-    ("static_env_params.frame_skip", 0, "frame_skip is 0, it has to be a whole number from 1 to 1e.06"),
-    ("env_params.dt", 0, "env_params.dt is 0, it has to be a number from 1e-06 to 1"),
-    ("env_params", "x" * 1000, r'^env_params is "x{39} \.\.\., it has to be an object'),
+    ("static_env_params.solver_batch_size", 8, "solver_batch_size is 8, but this engine supports only 16"),
+    ("static_env_params.do_warm_starting", False, "do_warm_starting is false, but this engine supports only true"),
+    ("static_env_params.frame_skip", 0, "frame_skip is 0, but must be a whole number from 1 to 1e.06"),
+    ("env_params.dt", 0, "env_params.dt is 0, but must be a number from 1e-06 to 1"),
+    ("env_params", "x" * 1000, r'^env_params is "x{39} \.\.\., but must be an object'),
 ]
 
 
@@ -212,7 +212,7 @@ def test_bindings_of_no_kind_are_refused_everywhere(kind: str, binding: object) 
     thing = "joint" if kind == "motor" else kind
     made = changed(f"env_state.{thing}.0.{kind}_binding", binding)
     made["env_state"][thing][0]["active"] = False
-    with pytest.raises(LevelFileError, match=rf"{kind}_binding is .*, it has to be a whole number from 0 to 255$"):
+    with pytest.raises(LevelFileError, match=rf"{kind}_binding is .*, but must be a whole number from 0 to 255$"):
         from_document(made)
 
 
@@ -234,14 +234,14 @@ def test_a_world_without_places_for_bodies() -> None:
     ("text", "words"),
     [
         (b"", "it is not JSON"),
-        (b"\xff\xfe", "it is no text"),
+        (b"\xff\xfe", "it is not UTF-8 text"),
         (b"{", "it is not JSON"),
         (b"[" * MAX_BYTES, "nested too deeply"),
         (b'{"a":' * (MAX_BYTES // 5), "nested too deeply"),
         (b"1" * 5000, "it is not JSON"),
-        (b"[]", "the whole is a list, it has to be an object"),
+        (b"[]", "the whole file is a list, but must be an object"),
         (b"{}", "^env_state is missing$"),
-        (b"null", "the whole is null"),
+        (b"null", "the whole file is null"),
     ],
     ids=lambda x: str(x)[:12],
 )
@@ -350,8 +350,8 @@ def peak_memory(path: Path) -> int:
 def test_what_is_no_ordinary_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
     for name, words in (
-        ("pipe.json", "no ordinary file"),
-        (".", "no ordinary file"),
+        ("pipe.json", "not a regular file"),
+        (".", "not a regular file"),
         ("nothing.json", r"^Cannot read the level file .*nothing\.json \(No such file or directory\)\.$"),
         ("x" * 300, "File name too long"),
     ):

@@ -13,7 +13,7 @@ import pytest
 import resvg_py
 from PIL import Image
 
-from levelproof.levelgen.pictures.raster import rasterised
+from levelproof.levelgen.pictures.raster import rasterise
 from levelproof.levelgen.pictures.scene import scene_of
 from levelproof.levelgen.pictures.shapes import Scene
 from levelproof.levelgen.pictures.svg import svg_of
@@ -50,7 +50,7 @@ def picture(svg: str) -> np.ndarray:
 
 
 def pixels(of: Scene) -> np.ndarray:
-    return np.asarray(rasterised(of)).astype(int)
+    return np.asarray(rasterise(of)).astype(int)
 
 
 def coarse(image: np.ndarray) -> np.ndarray:

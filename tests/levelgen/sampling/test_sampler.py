@@ -18,7 +18,7 @@ from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.overlap import WorldCircles, count_contacts
 from levelproof.levelgen.sampling.sampler import CHUNK, sample_levels
 from levelproof.levelgen.sampling.scenery import FLOOR_TOP, empty_level
-from levelproof.levelgen.sampling.shuffle import separate
+from levelproof.levelgen.sampling.shuffle import collision_matrix
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.physics.pairs import pairs_of
 from levelproof.physics.step import step
@@ -181,7 +181,7 @@ def test_what_is_not_there_is_empty(level: Level) -> None:
 def test_scenery_and_chains_are_those_of_the_reference(size: str) -> None:
     golden = load(HERE / f"{size}.npz").level
     ours, lanes = empty_level(SIZES[size], golden.role.shape[-1]), np.s_[:FIXED_POLYGONS]
-    np.testing.assert_array_equal(jax.jit(separate)(golden.model), golden.model.collides)
+    np.testing.assert_array_equal(jax.jit(collision_matrix)(golden.model), golden.model.collides)
     for name in ("vertices", "inverse_mass", "collision_mode", "active", "n_vertices"):
         np.testing.assert_array_equal(getattr(ours.model, name)[lanes], getattr(golden.model, name)[lanes])
     for name in ("position", "rotation"):

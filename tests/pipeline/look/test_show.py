@@ -15,7 +15,7 @@ from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.witness import succeeds
 from levelproof.levelgen.files.level_file import LevelFile, write_level_file
 from levelproof.levelgen.level import SIZES
-from levelproof.levelgen.pictures.raster import draw, rasterised
+from levelproof.levelgen.pictures.raster import draw, rasterise
 from levelproof.levelgen.proofs import examine
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import TaskParams, advance, reset
@@ -123,7 +123,7 @@ def test_film_starts_with_the_resampled_level(split, tmp_path) -> None:
     again = sample_levels(jnp.array([row["level_id"]], jnp.int32), SIZES["s"], made_job().distribution)
     world = (0, 40, 480, 480)
     bare = draw(again, again.state, action=np.zeros(6, np.int32)).crop(world)
-    ours = rasterised(film.scenes[0]).crop(world)
+    ours = rasterise(film.scenes[0]).crop(world)
     assert (np.asarray(bare) != np.asarray(ours)).any(-1).mean() < 0.02  # except running actuators
 
 
