@@ -1,4 +1,4 @@
-"""Sampled levels changed by hand in every way that a proof depends on."""
+"""Sampled levels, mutated in every way that a proof depends on."""
 
 import dataclasses
 
@@ -12,22 +12,22 @@ from levelproof.levelgen.sampling.shuffle import collision_matrix
 from levelproof.physics.types import FIXED_POLYGONS
 
 SCENERY = slice(FIXED_POLYGONS)
-CHANCE = 0.15  # of each change
+CHANCE = 0.15  # of each mutation
 
 
 def mutants(size: str, count: int, distribution: Distribution, seed: int = 0) -> Level:
-    """Levels of a distribution with some things changed: what moves, acts, touches, and where all of it starts."""
+    """Sample levels and mutate what moves, acts and touches, and where bodies start."""
     random = np.random.default_rng(seed)
     level = jax.tree.map(np.array, sample_levels(jnp.arange(count), SIZES[size], distribution))
     model, state = level.model, level.state
 
     def mutate(values: np.ndarray, new, chance: float = CHANCE) -> None:
-        """Change whole levels at random, and in these half of the values."""
+        """Choose levels at random and replace half of their values."""
         chosen = (random.random(count) < chance) & (random.random(values.shape) < 0.5)
         values[...] = np.where(chosen, np.asarray(new, values.dtype), values)
 
     uniform = lambda values, low, high: random.uniform(low, high, values.shape)
-    choice = lambda values, *of: random.choice(of, values.shape)
+    choice = lambda values, *options: random.choice(options, values.shape)
     for name in ("motor_on", "joint_fixed", "joint_limited", "joint_active", "thruster_active"):
         mutate(getattr(model, name), choice(getattr(model, name), True, False))
     mutate(level.motor_auto, True, 2 * CHANCE)

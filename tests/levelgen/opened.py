@@ -12,26 +12,26 @@ from levelproof.levelgen.level import Level
 
 
 def handmade_levels(python: Path) -> Path:
-    """The folder of the level files in the reference's installation."""
+    """Return the folder of level files in the reference's installation."""
     code = "from importlib.util import find_spec; print(find_spec('kinetix').origin)"
-    told = subprocess.run([python, "-c", code], env=oracle.environment(), capture_output=True, text=True, check=True)
-    return Path(told.stdout.strip()).parent / "levels"
+    ran = subprocess.run([python, "-c", code], env=oracle.environment(), capture_output=True, text=True, check=True)
+    return Path(ran.stdout.strip()).parent / "levels"
 
 
 class Played(NamedTuple):
-    """What the reference made of some files."""
+    """Files as the reference opened and played them."""
 
     files: list[Path]
     arrays: dict[str, np.ndarray]
 
     def states(self) -> Fields:
-        """By the reference's names, (step, level, ...)."""
+        """Return the states under the reference's names, (step, level, ...)."""
         return {
             name.removeprefix("state/"): values for name, values in self.arrays.items() if name.startswith("state/")
         }
 
     def levels(self) -> Level:
-        """As the reference opened them."""
+        """Return the levels as the reference opened them."""
         return level_from_kinetix({name: values[0] for name, values in self.states().items()})
 
 

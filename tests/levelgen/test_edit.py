@@ -1,4 +1,4 @@
-"""Edits of levels: what is joined stays joined, and the engine and level files take what comes of any of them."""
+"""Edits of levels: joined bodies stay joined, and the engine and level files accept every result."""
 
 import math
 from contextlib import suppress
@@ -39,13 +39,13 @@ def empty() -> Level:
 
 
 def joined() -> Level:
-    """A circle on the corner of a rectangle, with a motor, and a thruster on the rectangle."""
+    """Return a circle joined by a motor to a rectangle's corner, and a thruster on the rectangle."""
     level = add_body(add_body(empty(), "rectangle", 2.0, 2.0), "circle", 2.2, 2.2)
     return add_thruster(add_joint(level, 2.2, 2.2), 1.9, 1.9, math.pi / 2)
 
 
 def gap(level: Level) -> float:
-    """m between the ends of the first joint."""
+    """Return the distance between the ends of the first joint, m."""
     one, ends = one_of(level), []
     model = one.model
     for bodies, anchors in ((model.joint_a, model.joint_anchor_a), (model.joint_b, model.joint_anchor_b)):
@@ -55,8 +55,8 @@ def gap(level: Level) -> float:
     return float(np.abs(ends[0] - ends[1]).max())
 
 
-def test_what_is_joined_to_the_scenery_stays() -> None:
-    """The scenery stays where it is, whatever holds it; only the joint may go."""
+def test_body_joined_to_the_scenery_cannot_be_moved() -> None:
+    """The scenery cannot be moved; only the joint may be deleted."""
     level = one_of(joined())
     level.model.joint_b[0] = 2  # the right wall
     held = int(level.model.joint_a[0])
@@ -67,14 +67,14 @@ def test_what_is_joined_to_the_scenery_stays() -> None:
     fix(level, held, True)
 
 
-def test_a_new_body_has_the_mass_of_its_shape() -> None:
+def test_added_body_has_the_mass_of_its_shape() -> None:
     one = one_of(add_body(add_body(empty(), "rectangle", 1, 2), "circle", 3, 2))
     assert one.model.inverse_mass[FIRST] == pytest.approx(1 / 0.25)
     assert one.model.inverse_mass[M.polygons] == pytest.approx(1 / (math.pi * 0.25**2))
     assert one.state.position[FIRST].tolist() == [1, 2]
 
 
-def test_what_is_joined_moves_turns_and_is_resized_together() -> None:
+def test_joined_bodies_move_turn_and_resize_together() -> None:
     level = joined()
     assert not one_of(level).model.collides[FIRST, M.polygons]
     moved, turned = move(level, FIRST, 3, 3), turn(level, M.polygons, 1.0)
@@ -83,19 +83,19 @@ def test_what_is_joined_moves_turns_and_is_resized_together() -> None:
     assert one_of(moved).state.position[M.polygons] == pytest.approx([3.2, 3.2])
 
 
-def test_deleting_a_body_deletes_what_is_on_it() -> None:
+def test_delete_removes_a_body_with_its_joints_and_thrusters() -> None:
     one = one_of(delete(joined(), "body", FIRST))
     assert not one.model.joint_active.any()
     assert not one.model.thruster_active.any()
     assert one.model.collides[FIRST, M.polygons]
 
 
-def test_roles_fixing_and_picking() -> None:
+def test_set_role_fix_and_bodies_at() -> None:
     level = fix(set_role(joined(), FIRST, Role.GREEN), FIRST, True)
     one = one_of(level)
     assert one.role[FIRST] == Role.GREEN
     assert one.model.inverse_mass[FIRST] == 0
-    assert bodies_at(level, 2.2, 2.2) == [M.polygons, FIRST]  # what cannot move is drawn first
+    assert bodies_at(level, 2.2, 2.2) == [M.polygons, FIRST]  # immovable bodies are drawn first
     assert one_of(fix(level, FIRST, False)).model.inverse_mass[FIRST] == pytest.approx(4)
 
 
@@ -111,7 +111,7 @@ def test_roles_fixing_and_picking() -> None:
         (lambda: add_body(add_body(add_body(empty(), "rectangle", 1, 1), "triangle", 1, 1), "triangle", 1, 1), "room"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_one_sentence(edit, words: str) -> None:
+def test_impossible_edit_raises_one_sentence(edit, words: str) -> None:
     with pytest.raises(EditError, match=words) as error:
         edit()
     assert str(error.value).endswith(".")
@@ -135,7 +135,7 @@ ANY = st.one_of(
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 50), st.lists(ANY, max_size=8))
-def test_a_level_file_takes_what_comes_of_any_edits(level_id: int, edits: list) -> None:
+def test_level_file_holds_the_result_of_any_edits(level_id: int, edits: list) -> None:
     level = one_level(level_id)
     for name, *words in edits:
         with suppress(EditError):

@@ -1,4 +1,4 @@
-"""Sizes and their names; levels by number, and joined."""
+"""Sizes and their names; levels chosen by index, and joined."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from levelproof.physics.types import Size
 
 
 @given(st.builds(Size, *[st.integers(0, MAX_PER_KIND)] * 4))
-def test_every_size_has_one_name(size: Size) -> None:
+def test_size_of_reads_name_of(size: Size) -> None:
     assert size_of(name_of(size)) == size
 
 
@@ -28,7 +28,7 @@ def test_names() -> None:
 @pytest.mark.parametrize(
     "name", ["", "x", "S", "8", "8-8-8", "8-8-8-4-4", "8,8,8,4", "08-8-8-4", "8-8--8-4", "８-8-8-4"]
 )
-def test_what_is_no_name_is_refused(name: str) -> None:
+def test_size_of_refuses_an_unknown_name(name: str) -> None:
     with pytest.raises(ValueError, match=rf"^size is '{name}': choose one of s, m, l, or write how many polygons"):
         size_of(name)
 
@@ -41,7 +41,7 @@ def test_what_is_no_name_is_refused(name: str) -> None:
         ("6-1-999-1", "size is 6-1-999-1: at most 64 joints fit into a level"),
     ],
 )
-def test_a_size_that_cannot_be_is_refused(name: str, sentence: str) -> None:
+def test_size_of_refuses_an_impossible_size(name: str, sentence: str) -> None:
     with pytest.raises(ValueError, match="size") as refused:
         size_of(name)
     assert str(refused.value) == sentence
@@ -70,14 +70,14 @@ def test_levels_have_a_length_and_are_chosen_by_index(levels: Level) -> None:
             levels[wrong]
 
 
-def test_an_array_of_one_lane_counts_for_every_level(levels: Level) -> None:
+def test_level_arrays_of_one_lane_broadcast(levels: Level) -> None:
     shared = replace(levels, model=replace(levels.model, gravity=levels.model.gravity[:, :1]))
     assert len(shared) == 12
     assert shared[2:5].model.gravity.shape == (2, 3)
     assert concatenate_levels([shared, shared[:1]]).model.gravity.shape == (2, 13)
 
 
-def test_levels_of_several_calls_are_joined(levels: Level) -> None:
+def test_concatenate_levels_joins_several_calls(levels: Level) -> None:
     assert_same(concatenate_levels([levels[:5], levels[5:6], levels[6:]]), levels)
     with pytest.raises(ValueError, match="levels of the sizes s, 6-0-1-0 cannot be joined"):
         concatenate_levels([levels, empty_level(Size(6, 0, 1, 0), 2)])
@@ -85,7 +85,7 @@ def test_levels_of_several_calls_are_joined(levels: Level) -> None:
         concatenate_levels([])
 
 
-def test_a_size_is_given_by_its_name_wherever_one_is_asked_for() -> None:
+def test_functions_accept_a_size_by_its_name() -> None:
     assert size_of(SIZES["s"]) == SIZES["s"]
     assert_same(sample_levels([0], "s"), sample_levels([0], SIZES["s"]))
     with pytest.raises(ValueError, match="size is 'xl': choose one of s, m, l"):

@@ -1,4 +1,4 @@
-"""What is said of levels without an expert, against brute force: many random action sequences, and worlds by hand."""
+"""Facts and proofs about levels against brute force: many random action sequences, and handmade worlds."""
 
 import dataclasses
 import functools
@@ -32,7 +32,7 @@ FIXED = Distribution(fixed_chance=1.0, lowered_chance=0.5)
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """What is sampled, how it is changed, and which proofs have to be among them."""
+    """Sampled levels: how they are drawn and changed, and which proofs must occur among them."""
 
     size: str
     count: int
@@ -43,7 +43,7 @@ class Sample:
 
 
 ACTS, STANDS = Proof.NOTHING_ACTS, Proof.GOAL_STANDS
-# a step and a time limit of their own, no dense reward, and the padding defect mended
+# their own time step and limit, no dense reward, no padding defect
 OTHER_RULES = TaskParams(frame_skip=3, max_timesteps=96, dense_reward_scale=0, physics=Params(faithful_padding=False))
 # worlds that break down: the auto motors tear joints, bodies leave the room
 STRONG = Params(motor_power=9000, thruster_power=300, joint_stiffness=0.9, max_velocity=1000)
@@ -71,7 +71,7 @@ def sampled(name: str) -> Level:
     level = jax.tree.map(np.asarray, sample_levels(jnp.arange(of.count), SIZES[of.size], of.distribution))
     if name != "m with fixed goals":
         return level
-    goals = np.isin(level.role, (Role.GREEN, Role.BLUE))  # by hand: the sampler lets one of them move
+    goals = np.isin(level.role, (Role.GREEN, Role.BLUE))  # fixed here, because the sampler lets one of them move
     return changed(level, inverse_mass=np.where(goals, 0, level.model.inverse_mass),
                    inverse_inertia=np.where(goals, 0, level.model.inverse_inertia))  # fmt: skip
 
@@ -87,7 +87,7 @@ def changed(level: Level, **model: Any) -> Level:
 
 
 def play(level: Level, key, sticky, rules: TaskParams = DEFAULT_RULES, steps: int = ENV_STEPS, choices=CHOICES):
-    """(done, goal, reward), each [step, lane]: random actions that stay as they are with chance `sticky` [lane].
+    """(done, goal, reward), each [step, lane]: random actions that repeat with probability `sticky` [lane].
 
     `choices` [action] is how many of each there are; with one, it does nothing.
     """
@@ -111,13 +111,13 @@ def _play(level: Level, key, sticky, choices, rules: TaskParams, steps: int):
 
 
 def stickiness(first: int = 0) -> np.ndarray:
-    """Some sequences change at every step, some hardly ever."""
+    """Return repeat probabilities: some sequences change at every step, some hardly ever."""
     return np.resize(np.roll(np.array([0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 1.0], np.float32), first), LANES)
 
 
 @pytest.mark.parametrize("name", BRUTE_FORCE)
-def test_no_action_sequence_changes_what_is_proved(name: str) -> None:
-    """The goal is never reached; and where nothing acts, episodes end as they do when nothing is done."""
+def test_random_actions_never_contradict_a_proof(name: str) -> None:
+    """The goal is never reached; and if nothing acts, episodes end as idle ones do."""
     level, known, rules = sampled(name), facts(name), SAMPLES[name].rules
     proved = np.flatnonzero(known.proof != Proof.NONE)
     assert SAMPLES[name].proofs <= {Proof(p) for p in known.proof[proved]}
@@ -133,7 +133,7 @@ def test_no_action_sequence_changes_what_is_proved(name: str) -> None:
 
 @functools.cache
 def idle(name: str) -> tuple[np.ndarray, ...]:
-    """(done, goal, reward) of doing nothing."""
+    """Return (done, goal, reward) of an idle episode."""
     level, rules, nothing = sampled(name), SAMPLES[name].rules, np.ones_like(CHOICES)
     parts = []
     for start in range(0, level.role.shape[-1], LANES):
@@ -143,7 +143,7 @@ def idle(name: str) -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.parametrize("name", ["s", pytest.param("m", marks=MORE), pytest.param("l", marks=MORE)])
-def test_doing_nothing_ends_as_the_task_says(name: str) -> None:
+def test_facts_agree_with_an_idle_episode(name: str) -> None:
     done, goal, reward = idle(name)
     first = done.argmax(0), np.arange(done.shape[1])
     known = facts(name)
@@ -154,8 +154,8 @@ def test_doing_nothing_ends_as_the_task_says(name: str) -> None:
     assert not (known.reaches & (known.proof != Proof.NONE)).any()
 
 
-def test_the_outcome_differs_where_nothing_is_proved() -> None:
-    """Random actions change how most of the other levels go: the proofs are not empty because nothing matters."""
+def test_random_actions_change_outcomes_of_unproved_levels() -> None:
+    """Random actions change most of the other levels, so proofs do not hold merely because actions never matter."""
     level, known = sampled("s"), facts("s")
     others = np.flatnonzero((known.proof == Proof.NONE) & ~known.reaches)[:LANES]
     others = np.resize(others, LANES)
@@ -164,7 +164,7 @@ def test_the_outcome_differs_where_nothing_is_proved() -> None:
     assert (np.asarray(reward) != idle("s")[2][:, others]).any(0).mean() > 0.8
 
 
-# Worlds by hand: body 4 is a square of 0.4 m, 5 and 6 are circles of 0.2 m
+# Handmade worlds: body 4 is a square of 0.4 m, 5 and 6 are circles of 0.2 m
 SQUARE, BALL, OTHER = 4, 5, 6
 WORLD = Size(polygons=5, circles=2, joints=1, thrusters=1)
 
@@ -173,7 +173,7 @@ def world(
     *, square=(2.5, 3.0), ball=(1.0, 0.6), other=(4.0, 0.6), roles=(Role.PLAIN, Role.GREEN, Role.BLUE), fixed=(),
     joint=None, thruster=None, **model: Any,
 ) -> Level:  # fmt: skip
-    """One level with three bodies at these places. `joint` is (a, b), `thruster` is a body."""
+    """Return a level with three bodies at these positions. `joint` is (a, b), `thruster` is a body."""
     level = jax.tree.map(np.array, empty_level(WORLD, 1))
     m, bodies = level.model, slice(SQUARE, OTHER + 1)
     m.active[bodies] = True
@@ -200,7 +200,7 @@ def proof(level: Level, rules: TaskParams = DEFAULT_RULES) -> Proof:
     return Proof(int(facts_of(level, rules).proof[0]))
 
 
-def test_nothing_acts() -> None:
+def test_levels_without_effective_actuators_prove_nothing_acts() -> None:
     assert proof(world()) is Proof.NOTHING_ACTS
     assert proof(world(thruster=BALL)) is Proof.NONE
     assert proof(world(thruster=BALL, thruster_power=0)) is Proof.NOTHING_ACTS
@@ -215,13 +215,13 @@ def test_nothing_acts() -> None:
     assert proof(alone) is Proof.NOTHING_ACTS
 
 
-def test_where_doing_nothing_reaches_the_goal_or_never_ends_nothing_is_proved() -> None:
+def test_idle_episodes_that_reach_the_goal_or_never_end_prove_nothing() -> None:
     assert proof(world(other=(1.3, 0.6))) is Proof.NONE
     assert bool(facts_of(world(other=(1.3, 0.6)), DEFAULT_RULES).reaches[0])
-    assert proof(world(), TaskParams(max_timesteps=300)) is Proof.NONE  # only 256 are watched
+    assert proof(world(), TaskParams(max_timesteps=300)) is Proof.NONE  # only 256 steps are examined
 
 
-def test_goal_stands() -> None:
+def test_still_goals_prove_goal_stands() -> None:
     still = {"fixed": (BALL, OTHER), "thruster": SQUARE}
     assert proof(world(**still)) is Proof.GOAL_STANDS
     assert proof(world(**{**still, "fixed": (BALL,)})) is Proof.NONE
@@ -235,7 +235,7 @@ def test_goal_stands() -> None:
     assert proof(not_a_number) is Proof.NONE
 
 
-def test_red_first_is_a_failure() -> None:
+def test_touching_red_first_fails() -> None:
     level = world(other=(1.3, 0.6), square=(1.0, 0.9), roles=(Role.RED, Role.GREEN, Role.BLUE))
     known = facts_of(level, DEFAULT_RULES)
     assert bool(known.fails[0])
@@ -243,22 +243,22 @@ def test_red_first_is_a_failure() -> None:
     assert Proof(int(known.proof[0])) is Proof.NOTHING_ACTS
 
 
-def test_what_acts_out_of_reach_of_all_that_moves_proves_nothing() -> None:
-    """A ball turns on a fixed square in the middle; another one lies in the corner. Joints are soft: no theorem."""
+def test_actuator_out_of_reach_proves_nothing() -> None:
+    """A ball turns on a fixed square in the middle, another lies in the corner. Joints are soft: nothing is proved."""
     arm = {"fixed": (SQUARE,), "joint": (SQUARE, OTHER), "other": (2.5, 3.0)}
     assert proof(world(**arm, roles=(Role.GREEN, Role.BLUE, Role.PLAIN))) is Proof.NONE
 
 
-def test_numbers_beyond_what_can_be_multiplied_prove_nothing() -> None:
-    """A thruster on an immovable body does nothing, unless its force is infinite: zero times that is no number."""
+def test_huge_values_prove_nothing() -> None:
+    """A thruster on an immovable body does nothing, unless its force is infinite: zero times infinity is NaN."""
     still = {"thruster": SQUARE, "fixed": (SQUARE,)}
     assert proof(world(**still, thruster_power=1e8)) is Proof.NOTHING_ACTS
     assert proof(world(**still, thruster_power=1e38)) is Proof.NONE
     assert proof(world(**still, thruster_power=1e33), TaskParams(physics=Params(thruster_power=1e6))) is Proof.NONE
 
 
-def test_a_body_that_is_nowhere_touches_nothing() -> None:
-    """Why a goal that stands cannot be reached by breaking the world."""
+def test_body_at_a_nan_position_touches_nothing() -> None:
+    """So breaking the world cannot reach a goal that stands."""
     level = world(other=(1.3, 0.6))
     done, goal, _ = play(take(level, np.zeros(LANES, int)), jax.random.key(0), stickiness(), steps=1)
     assert np.asarray(goal).all()

@@ -1,4 +1,4 @@
-"""The same level written down in other ways: what a content hash must not see."""
+"""Other encodings of the same level, which must not change its content hash."""
 
 import dataclasses
 from functools import cache
@@ -11,7 +11,7 @@ from levelproof.levelgen.level import MOTOR_BINDINGS, SIZES, THRUSTER_BINDINGS, 
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.physics.types import FIXED_POLYGONS
 
-# Fields with a row for each thing of a kind
+# Fields with a row for each body, joint or thruster
 BODY = ("active", "inverse_mass", "inverse_inertia", "friction", "restitution", "collision_mode")
 MOTION = ("position", "rotation", "velocity", "angular_velocity")
 JOINT = ("joint_active", "joint_a", "joint_b", "joint_anchor_a", "joint_anchor_b", "joint_fixed", "joint_rotation")
@@ -29,7 +29,7 @@ def sampled(size: str) -> Level:
 
 
 def one(size: str, number: int) -> Level:
-    """A level of its own that may be changed in place."""
+    """Copy one sampled level, so that it may be changed in place."""
     return take(sampled(size), number)
 
 
@@ -46,7 +46,7 @@ def edited(level: Level, model: dict[str, Any] | None = None, state: dict[str, A
 
 
 def renumbered(level: Level, rng: np.random.Generator) -> Level:
-    """Scenery, movable polygons, circles, joints, thrusters and the vertices of a polygon in another order."""
+    """Permute scenery, movable polygons, circles, joints, thrusters and the vertices of each polygon."""
     size, movable = level.size, rng.permutation(np.arange(FIXED_POLYGONS, level.size.polygons))
     circles = rng.permutation(size.circles)
     bodies = np.concatenate([rng.permutation(FIXED_POLYGONS), movable, circles + size.polygons])
@@ -69,18 +69,18 @@ def renumbered(level: Level, rng: np.random.Generator) -> Level:
 
 
 def weakened(level: Level) -> np.ndarray:
-    """(joint, level): motors that their joint's limits weaken; the engine then looks at the sign of the control."""
+    """Find (joint, level) motors that limits weaken; for these, the engine uses the sign of the control."""
     return level.model.motor_on & level.model.joint_limited & ~level.model.joint_fixed
 
 
 def turned(level: Level, rng: np.random.Generator) -> Level:
-    """Some joints with their sides a and b exchanged."""
+    """Exchange sides a and b of some joints, keeping what their motors do."""
     swap = (rng.random(level.motor_binding.shape) < 0.5) & ~weakened(level)
     return edited(swapped(level, swap), {"motor_speed": np.where(swap, -1, 1) * level.model.motor_speed})
 
 
 def swapped(level: Level, swap: np.ndarray) -> Level:
-    """Sides exchanged, which turns every angle around; motors then run the other way."""
+    """Exchange sides, which negates every angle; motors then run the other way."""
     m, wide, way = level.model, swap[:, None], np.where(swap, np.float32(-1), np.float32(1))
     model = {
         "joint_a": np.where(swap, m.joint_b, m.joint_a),
@@ -99,21 +99,21 @@ def swapped(level: Level, swap: np.ndarray) -> Level:
 
 
 def renamed(level: Level, rng: np.random.Generator) -> Level:
-    """The entries of the action, and which direction of a motor's entry is forward, under other names."""
+    """Permute the entries of the action; reverse which direction of some motor entries is forward."""
     return with_names(level, *names(rng))
 
 
 def names(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """New numbers of motor and of thruster entries, and which motor entries (old numbers) run the other way."""
+    """Draw permutations of motor and thruster entries, and which motor entries (old indices) are reversed."""
     return rng.permutation(MOTOR_BINDINGS), rng.permutation(THRUSTER_BINDINGS), rng.random(MOTOR_BINDINGS) < 0.5
 
 
 def with_names(level: Level, motor: np.ndarray, thruster: np.ndarray, backward: np.ndarray) -> Level:
-    # handmade levels have bindings beyond the last where nothing is active
+    # inactive actuators of handmade levels have bindings beyond the last
     flames = np.minimum(level.thruster_binding, THRUSTER_BINDINGS - 1)
     level = edited(level, motor_binding=np.minimum(level.motor_binding, MOTOR_BINDINGS - 1))
     against = backward[level.motor_binding] & ~level.motor_auto
-    level = swapped(level, against & weakened(level))  # a limit's motor runs the other way by its sides alone
+    level = swapped(level, against & weakened(level))  # exchanging sides alone reverses a motor with limits
     speed = np.where(against & ~weakened(level), -1, 1).astype(np.float32) * level.model.motor_speed
     return edited(
         level,
@@ -124,7 +124,7 @@ def with_names(level: Level, motor: np.ndarray, thruster: np.ndarray, backward: 
 
 
 def more_room(level: Level, rng: np.random.Generator) -> Level:
-    """The same things in a size with more places, free ones among them."""
+    """Copy a level to a larger size, with unused rows in between."""
     old, m, number = level.size, level.model, lambda x: np.where(x >= level.size.polygons, x + 2, x).astype(np.int32)
     grow = lambda x, count, axis=0: np.insert(x, [x.shape[axis]] * count, 0, axis)
 
@@ -144,7 +144,7 @@ def more_room(level: Level, rng: np.random.Generator) -> Level:
 
 
 def idle_changed(level: Level, rng: np.random.Generator) -> Level:
-    """Other numbers wherever they have no effect."""
+    """Change values wherever they have no effect."""
     other: Level = jax.tree.map(np.array, level)
     model, any_of = other.model, lambda x: rng.normal(0, 1, x.shape).astype(np.float32)
     free = ~model.active

@@ -1,4 +1,4 @@
-"""The built wheel: one import name in site-packages, which no file of the user's can shadow."""
+"""The built wheel: one import name in site-packages, which no file of the user can shadow."""
 
 import os
 import shutil
@@ -74,7 +74,7 @@ def test_room_refuses_a_second_import_name(room: str) -> None:
     assert f"ImportError: import levelproof.{room}, not {room}" in done.stderr
 
 
-def test_checkout_without_links_says_how_to_get_them(tmp_path: Path) -> None:
+def test_import_without_links_says_how_to_get_them(tmp_path: Path) -> None:
     package = tmp_path / "levelproof"
     package.mkdir()
     for path in (ROOT / "levelproof").glob("*.py"):
@@ -98,7 +98,7 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(environment)
     site = site_packages(environment / "bin" / "python")
     (site / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"])
-    with zipfile.ZipFile(wheel) as file:  # what installing a pure wheel does, but for the command's script
+    with zipfile.ZipFile(wheel) as file:  # equals installing a pure wheel, except for the command's script
         file.extractall(site)
     return environment / "bin" / "python"
 
@@ -125,7 +125,7 @@ def run_in(folder: Path, *command: str | Path) -> str:
     return done.stdout
 
 
-def test_files_of_the_user_shadow_no_public_name(python: Path, research: Path) -> None:
+def test_users_files_shadow_no_public_name(python: Path, research: Path) -> None:
     program = "import levelproof; print(*{getattr(levelproof, name).__module__ for name in ('open', 'make', 'replay')})"
     assert all(name.startswith("levelproof.") for name in run_in(research, python, "-c", program).split())
     home = run_in(research, python, "-c", "import levelproof.physics as room; print(room.__file__)")
@@ -133,8 +133,8 @@ def test_files_of_the_user_shadow_no_public_name(python: Path, research: Path) -
 
 
 @pytest.mark.campaign
-def test_files_of_the_user_do_not_reach_workers(python: Path, research: Path) -> None:
-    """The main job on Ray workers and the reader run from that folder, in a script of the user's, too."""
+def test_workers_ignore_the_users_files(python: Path, research: Path) -> None:
+    """The main job on Ray workers and the reader run from that folder, also in a script of the user."""
     (research / "train.py").write_text(TRAIN)
     run_in(research, python, "-m", "levelproof", "generate", *TINY, "workers=2")
     assert run_in(research, python, "train.py").startswith("read")

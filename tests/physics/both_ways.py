@@ -1,7 +1,7 @@
-"""One step as machine code and as XLA's operations, compared to the bit, in a process of its own.
+"""Compare one step as machine code and as XLA operations bit for bit, in a separate process.
 
-XLA computes the same bits only when it neither contracts multiplications and additions (it has no instruction for
-that before AVX2) nor rearranges what it is given; the processor's level cannot be chosen but at the start of a process.
+XLA computes the same bits only if it neither contracts multiplications with additions (there is no instruction for it
+before AVX2) nor rearranges operations. The instruction set can only be chosen when a process starts.
 
     python -m tests.physics.both_ways s l 8,8,8,4
 """
@@ -24,25 +24,25 @@ AS_WRITTEN = {"xla_disable_hlo_passes": "algsimp,simplify-fp-conversions", "xla_
 
 
 def worlds(name: str) -> Any:
-    """Golden states of a size's name, scattered worlds of four numbers; to be given to a step."""
+    """Return inputs of a step: golden states for the name of a size, scattered worlds for four numbers."""
     from levelproof.physics.block import Given
     from levelproof.physics.types import Size
 
     if name in "sml":
-        of = load(HERE / f"{name}.npz")
-        return Given(of.level.model, of.state, of.motor, of.thrust)
+        golden = load(HERE / f"{name}.npz")
+        return Given(golden.level.model, golden.state, golden.motor, golden.thrust)
     return Given(*scattered(Size(*map(int, name.split(","))), lanes=256))
 
 
 def digest(tree: Any) -> str:
-    """Of all bits."""
+    """Hash all bits of a tree of arrays."""
     import jax
 
     return hashlib.sha256(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(tree))).hexdigest()
 
 
 def compare(name: str) -> dict[str, Any]:
-    """Of each field of the state and of the manifold, the share of lanes that are alike."""
+    """Return, for each field of state and manifold, the share of lanes with equal bits."""
     import jax
 
     from levelproof.physics.step import as_machine_code, on_all_lanes
@@ -54,8 +54,8 @@ def compare(name: str) -> dict[str, Any]:
     for a, b in zip(ours, theirs, strict=True):
         for field in dataclasses.fields(a):
             x, y = (np.asarray(getattr(tree, field.name)) for tree in (a, b))
-            alike = (x == y) | ((x != x) & (y != y))
-            shares[f"{type(a).__name__}.{field.name}"] = float(alike.reshape(-1, alike.shape[-1]).all(0).mean())
+            equal = (x == y) | ((x != x) & (y != y))
+            shares[f"{type(a).__name__}.{field.name}"] = float(equal.reshape(-1, equal.shape[-1]).all(0).mean())
     touching = np.asarray(ours[0].contact_active).any(0)
     return {"alike": shares, "touching": float(touching.mean()), "digest": digest(ours)}
 

@@ -1,4 +1,4 @@
-"""The same world seen in a mirror: x becomes -x, turns go the other way."""
+"""The mirror image of a world: x becomes -x, rotations change sign."""
 
 import dataclasses
 
@@ -9,23 +9,23 @@ from levelproof.physics.types import MAX_VERTICES, Manifold, Model, State
 
 
 def _flip(x, axis: int = -2) -> np.ndarray:
-    """A vector's x of the other sign; [..., 2, lane]."""
+    """Negate the x of vectors [..., 2, lane]."""
     x = np.asarray(x)
     sign = np.array([-1, 1], x.dtype).reshape([2 if i == x.ndim + axis else 1 for i in range(x.ndim)])
     return x * sign
 
 
 def _corners(vertices, n_vertices) -> np.ndarray:
-    """[polygon, vertex, 2, lane], in the other order, so that they stay clockwise; an unused one stays where it is."""
+    """Mirror vertices [polygon, vertex, 2, lane]; reverse their order to stay clockwise. Unused ones stay last."""
     flipped = _flip(vertices)
-    number, count = np.arange(MAX_VERTICES)[:, None, None], np.asarray(n_vertices)[:, None, None]
-    source = np.where(number < count, count - 1 - number, number)  # [polygon, vertex, 1, lane]
+    index, count = np.arange(MAX_VERTICES)[:, None, None], np.asarray(n_vertices)[:, None, None]
+    source = np.where(index < count, count - 1 - index, index)  # [polygon, vertex, 1, lane]
     source = np.broadcast_to(source, flipped.shape)
     return np.take_along_axis(flipped, source, axis=1)
 
 
 def of_model(model: Model) -> Model:
-    """Thrusters point the other way along x; a joint's limits change places."""
+    """Mirror a model: thrusters point the other way along x; a joint's limits are swapped."""
     return dataclasses.replace(
         model,
         gravity=_flip(model.gravity),
@@ -41,12 +41,12 @@ def of_model(model: Model) -> Model:
 
 
 def of_state(state: State) -> State:
-    """A contact's tangent is its normal turned by a quarter, clockwise, so that its impulse changes sign."""
-    other_sign = ("rotation", "angular_velocity", "contact_tangent_impulse", "joint_angular_impulse")
+    """Mirror a state. A contact's tangent is its normal turned clockwise by 90 degrees, so its impulse changes sign."""
+    negated = ("rotation", "angular_velocity", "contact_tangent_impulse", "joint_angular_impulse")
     vectors = ("position", "velocity", "joint_impulse")
     return dataclasses.replace(
         state,
-        **{name: -np.asarray(getattr(state, name)) for name in other_sign},
+        **{name: -np.asarray(getattr(state, name)) for name in negated},
         **{name: _flip(getattr(state, name)) for name in vectors},
     )
 
@@ -56,5 +56,5 @@ def of_manifold(manifold: Manifold) -> Manifold:
 
 
 def of_world(model, state, motor, thrust):
-    """Motors are driven the other way."""
+    """Mirror a world with its controls: motors are driven the other way."""
     return jax.tree.map(np.asarray, (of_model(model), of_state(state), -np.asarray(motor), thrust))

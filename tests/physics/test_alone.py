@@ -1,4 +1,4 @@
-"""A lane's world is its own: whatever its neighbours are, it goes on to the same bits, also when it has broken down.
+"""A lane's next state does not depend on its neighbours, to the bit, even if its world has broken down.
 
 Other lanes decide what a block computes and what it skips (`physics.lanes`).
 """
@@ -26,35 +26,37 @@ RULES = {
     "strong": STRONG,
     "far": dataclasses.replace(STRONG, max_position=1e6, max_velocity=1e6, max_angular_velocity=1e4),
 }
-ODD = np.array([0, -0.0, 1e-40, -1e-40, 1e3, -1e6, 1e12, -1e25, 1e38, -1e38, np.inf, -np.inf, np.nan], np.float32)
+EXTREME = np.array([0, -0.0, 1e-40, -1e-40, 1e3, -1e6, 1e12, -1e25, 1e38, -1e38, np.inf, -np.inf, np.nan], np.float32)
 LOPSIDED = np.array([(2, 1), (1, 1), (1, 1), (1, 1)], np.float32)[:, :, None]
 Way = Callable[[Given, Params, bool], Any]
 
 
 def wild(lanes: int, seed: int) -> Given:
-    """Worlds in which some numbers are odd: none in half of the lanes, up to a fifth in others; in some the polygons
-    are lopsided and have their corners the wrong way round, so that they touch at a distance."""
+    """Return worlds with some extreme values: none in half of the lanes, up to a fifth in others.
+
+    Some lanes have lopsided, counterclockwise polygons, which touch at a distance.
+    """
     random = np.random.default_rng(seed)
 
-    def strew(x):
+    def corrupt(x):
         if x.dtype != np.float32:
             return x
         share = random.choice([0, 0, 0.02, 0.2], lanes)
-        return np.where(random.random(x.shape) < share, random.choice(ODD, x.shape), x)
+        return np.where(random.random(x.shape) < share, random.choice(EXTREME, x.shape), x)
 
     given = Given(*scattered(SIZE, lanes, seed))
     corners = np.where(random.random(lanes) < 0.3, given.model.vertices[:, ::-1] * LOPSIDED, given.model.vertices)
     model = dataclasses.replace(given.model, vertices=corners)
     control = given.motor * random.choice([1, 1, 100, -1e20], lanes).astype(np.float32)
     return given._replace(
-        model=model, before=jax.tree.map(strew, given.before), motor=control, thrust=strew(given.thrust)
+        model=model, before=jax.tree.map(corrupt, given.before), motor=control, thrust=corrupt(given.thrust)
     )
 
 
 @functools.cache
 def stepped(way: Way, params: Params) -> Callable[[Given], list[np.ndarray]]:
-    sooner = {"xla_backend_optimization_level": 0} if way is on_all_lanes else None  # compiles in half the time
-    run = jax.jit(lambda given: way(given, params, True), compiler_options=sooner)
+    options = {"xla_backend_optimization_level": 0} if way is on_all_lanes else None  # compiles in half the time
+    run = jax.jit(lambda given: way(given, params, True), compiler_options=options)
     return lambda given: [np.asarray(x) for x in jax.tree.leaves(run(given))]
 
 
@@ -64,8 +66,8 @@ def lanes_of(given: Given, lanes: np.ndarray) -> Given:
 
 @pytest.mark.parametrize("rules", RULES)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_in_machine_code_neighbours_change_nothing(rules: str, seed: int) -> None:
-    """Each lane in a block of its own copies, then among others."""
+def test_machine_code_of_a_lane_ignores_its_neighbours(rules: str, seed: int) -> None:
+    """Compare each lane in a block of its own copies with the same lane among others."""
     step, lanes = stepped(as_machine_code, RULES[rules]), 2048
     given, order = wild(lanes, seed), np.random.default_rng(seed).permutation(lanes)
     alone = step(lanes_of(given, np.repeat(order, LANES)))
@@ -74,8 +76,8 @@ def test_in_machine_code_neighbours_change_nothing(rules: str, seed: int) -> Non
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("rules", ["far", "usual", "strong"])
-def test_on_all_lanes_neighbours_change_nothing(rules: str) -> None:
-    """The same where all lanes are one block."""
+def test_xla_step_of_a_lane_ignores_its_neighbours(rules: str) -> None:
+    """Here all lanes are one block."""
     step, lanes = stepped(on_all_lanes, RULES[rules]), 64
     given = wild(lanes, 3)
     among = step(given)
@@ -85,7 +87,7 @@ def test_on_all_lanes_neighbours_change_nothing(rules: str) -> None:
 
 
 @pytest.mark.parametrize("rules", RULES)
-def test_the_worlds_are_wild_and_not_all_broken(rules: str) -> None:
+def test_wild_worlds_are_partly_broken(rules: str) -> None:
     step = stepped(as_machine_code, RULES[rules])
     given = wild(2048, 1)
     after = step(given)

@@ -1,4 +1,4 @@
-"""Both of LLVM's linkers make the same step of the same code."""
+"""Both of LLVM's linkers link the same code to the same step."""
 
 import platform
 import sys
@@ -15,7 +15,7 @@ from levelproof.physics.step import step
 from tests.physics.codegen.kernels import same_bits
 from tests.physics.worlds import ROOM, scattered
 
-JIT: list[binding.LLJIT] = []  # until the process ends, as what it linked
+JIT: list[binding.LLJIT] = []  # kept until the process ends, like the code it linked
 
 
 def after(seed: int = 1) -> list[Any]:
@@ -28,7 +28,7 @@ def after(seed: int = 1) -> list[Any]:
 def test_runtime_dyld_gives_the_bits_of_jitlink(monkeypatch: pytest.MonkeyPatch) -> None:
     by_jitlink = after()
     JIT.append(binding.create_lljit_compiler(use_jit_link=False))
-    marked = lambda asked, make: make() + b"\n; for RuntimeDyld"  # another name, because XLA takes each only once
+    marked = lambda request, make: make() + b"\n; for RuntimeDyld"  # another name: XLA accepts each only once
     monkeypatch.setattr(step_module, "kept_while_sources_stay", marked)
     monkeypatch.setattr(compile_module, "_jit", lambda: JIT[-1])
     step_module._compiled.cache_clear()
@@ -39,7 +39,7 @@ def test_runtime_dyld_gives_the_bits_of_jitlink(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_kernels_are_linked_by_jitlink(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[dict[str, Any]] = []
-    monkeypatch.setattr(binding, "create_lljit_compiler", lambda **settings: asked.append(settings))
+    calls: list[dict[str, Any]] = []
+    monkeypatch.setattr(binding, "create_lljit_compiler", lambda **settings: calls.append(settings))
     compile_module._jit.__wrapped__()
-    assert asked == [{"use_jit_link": True}]
+    assert calls == [{"use_jit_link": True}]

@@ -1,4 +1,4 @@
-"""Masses: as the reference has them on its own states, and from first principles."""
+"""Masses against the reference's on its own states, and from first principles."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ corner = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)], np.float32)
 
 
 def one(vertices: list | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One polygon in one lane, filled up to four vertices."""
+    """Return one polygon in one lane, padded to four vertices."""
     given = np.asarray(vertices, np.float32)
     padded = np.zeros((4, 2), np.float32)
     padded[: len(given)] = given
@@ -28,8 +28,8 @@ def one(vertices: list | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("size", ["s", "m", "l"])
-def test_masses_of_the_reference(size: str) -> None:
-    """Rectangles, triangles and circles of sampled levels."""
+def test_masses_equal_the_references(size: str) -> None:
+    """For rectangles, triangles and circles of sampled levels."""
     level = load(HERE / f"{size}.npz").level
     model, polygons = level.model, level.size.polygons
     density = np.asarray(level.density)
@@ -47,23 +47,23 @@ def test_masses_of_the_reference(size: str) -> None:
 
 @settings(deadline=None)
 @given(sides, sides)
-def test_rectangle(half_width: float, half_height: float) -> None:
+def test_rectangle_has_its_textbook_mass_and_inertia(half_width: float, half_height: float) -> None:
     vertices, four = one(corner * [half_width, half_height])
     mass = 4 * half_width * half_height
     np.testing.assert_allclose(polygon_area(vertices, four), mass, rtol=1e-5)
     np.testing.assert_allclose(polygon_inertia(vertices, four), mass * (half_width**2 + half_height**2) / 3, rtol=1e-5)
 
 
-def test_triangle() -> None:
+def test_triangle_has_its_area() -> None:
     vertices, three = one([(0, 2), (3, 0), (0, 0)])
     np.testing.assert_allclose(polygon_area(vertices, three), 3)
 
 
-def test_a_circle_has_half_the_inertia_of_a_disc() -> None:
+def test_circle_has_half_the_inertia_of_a_disc() -> None:
     """The reference's formula; a disc has m r^2 / 2."""
     radius = np.float32(0.3)
     np.testing.assert_allclose(circle_inertia(radius), circle_area(radius) * radius**2 / 4, rtol=1e-6)
 
 
-def test_what_has_no_extent_has_an_inverse() -> None:
+def test_inverse_of_zero_is_one() -> None:
     assert inverse(np.zeros(2, np.float32)).tolist() == [1, 1]

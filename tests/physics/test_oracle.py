@@ -1,4 +1,4 @@
-"""The engine against the reference: one physics step from each golden state. What is off, and why: docs/physics.md."""
+"""The engine against the reference: one physics step from each golden state; docs/physics.md has the differences."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ from tests.golden.load import HERE, Golden, load
 
 MOTION = ("position", "rotation", "velocity", "angular_velocity")
 SIZES = ("s", "m", "l")
-# of each size: at least so many states show the thing (of 768)
+# minimum number of the 768 states of each size that show a feature
 SHOWN = {
     "polygon contact": 300,
     "circle-polygon contact": 500,
@@ -36,21 +36,21 @@ def golden(size: str) -> Golden:
 
 @functools.cache
 def stepped(size: str):
-    """Our state after one physics step, on the host."""
+    """Return our state after one physics step, on the host."""
     of = golden(size)
     compiled = jax.jit(lambda model, state, motor, thrust: step(model, state, motor, thrust, Params())[0])
     return jax.tree.map(np.asarray, compiled(of.level.model, of.state, of.motor, of.thrust))
 
 
 def errors(ours, theirs) -> np.ndarray:
-    """Largest absolute difference of any position or speed of a lane (NaN counts as infinite)."""
+    """Return each lane's largest absolute difference of any position or velocity (NaN counts as infinite)."""
     gaps = [np.abs(getattr(ours, name) - getattr(theirs, name)) for name in MOTION]
     worst = np.max([gap.reshape(-1, gap.shape[-1]).max(0) for gap in gaps], 0)
     return np.where(np.isnan(worst), np.inf, worst)
 
 
 def circles_inside(of: Golden) -> np.ndarray:
-    """Lanes in which a circle's centre lies in a polygon that it may meet."""
+    """Find lanes in which a circle's centre lies in a polygon that it may collide with."""
     model, polygons = of.level.model, of.level.size.polygons
     position, angle = of.state.position, of.state.rotation[:polygons]
     found = np.zeros(angle.shape[-1], bool)
@@ -69,7 +69,7 @@ def circles_inside(of: Golden) -> np.ndarray:
 
 
 def shows(of: Golden) -> dict[str, np.ndarray]:
-    """Which lanes show what."""
+    """Return, for each feature of SHOWN, the lanes that show it."""
     model, pairs = of.level.model, pairs_of(of.level.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
     active = of.after.contact_active
@@ -103,7 +103,7 @@ def test_golden_states_show_everything(size: str) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_one_step_is_the_references(size: str) -> None:
+def test_one_step_agrees_with_the_reference(size: str) -> None:
     worst = errors(stepped(size), golden(size).after)
     assert (worst < 1e-3).mean() >= 0.995, np.sort(worst)[-10:]
     assert (worst < 1e-4).mean() >= 0.98, np.sort(worst)[-20:]
@@ -111,7 +111,7 @@ def test_one_step_is_the_references(size: str) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_every_kind_of_state_agrees(size: str) -> None:
+def test_step_agrees_with_the_reference_in_every_kind_of_state(size: str) -> None:
     """No kind of state hides its errors behind the others."""
     worst = errors(stepped(size), golden(size).after)
     for name, lanes in shows(golden(size)).items():
@@ -120,21 +120,21 @@ def test_every_kind_of_state_agrees(size: str) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_what_the_next_step_starts_from_agrees(size: str) -> None:
+def test_warm_start_state_agrees_with_the_reference(size: str) -> None:
     """Which contacts are active, and the impulses that warm starting reads."""
     ours, of = stepped(size), golden(size)
     assert (ours.contact_active == of.after.contact_active).all(0).mean() >= 0.995
     names = ("contact_normal_impulse", "contact_tangent_impulse", "joint_impulse", "joint_angular_impulse")
     for name in names:
         a, b = getattr(ours, name), getattr(of.after, name)
-        if name.startswith("contact"):  # the reference leaves old numbers where nothing touches; nobody reads them
+        if name.startswith("contact"):  # the reference leaves stale impulses in inactive contacts and never reads them
             a, b = np.where(of.after.contact_active, a, 0), np.where(of.after.contact_active, b, 0)
         off = np.abs(a - b) / (1 + np.abs(b))
         assert (off.reshape(-1, off.shape[-1]).max(0) < 1e-3).mean() >= 0.985, name
 
 
-def test_the_defect_is_in_the_golden_states() -> None:
-    """Without the padding defect some states of size s come out otherwise, and only those with a padded pair."""
+def test_golden_states_show_the_padding_defect() -> None:
+    """Without the padding defect some states of size s differ, and only those with a padded pair."""
     of = golden("s")
     fixed = jax.jit(
         lambda model, state, motor, thrust: step(model, state, motor, thrust, Params(faithful_padding=False))[0]

@@ -1,4 +1,4 @@
-"""What holds of every world: momentum, rest, mirrors, and how far single precision is from double."""
+"""Properties of every world: momentum, rest, mirror symmetry, and the error of single precision."""
 
 import functools
 
@@ -18,13 +18,13 @@ from tests.physics.worlds import BALL, BOX, FLOOR_TOP, HALF, MASS, OTHER, PARAMS
 SIZES = ("s", "m", "l")
 MOVABLE = (BOX, BALL, OTHER)
 few = settings(max_examples=40, deadline=None)
-numbers = functools.partial(st.floats, width=32, allow_subnormal=False)  # which the processor takes for zero
+numbers = functools.partial(st.floats, width=32, allow_subnormal=False)  # subnormals count as zero
 near, speeds, turns = numbers(-0.5, 0.5), numbers(-3, 3), numbers(-6, 6)
 motions = st.lists(st.tuples(near, near, turns, speeds, speeds, turns), min_size=3, max_size=3)
 
 
 def thrown_together(motions, gravity: float):
-    """The three bodies around the middle of the room, overlapping or not, far from all walls."""
+    """Place the three bodies around the middle of the room, overlapping or not, far from all walls."""
     model, state = room(gravity=gravity)
     for body, (x, y, rotation, v_x, v_y, w) in zip(MOVABLE, motions, strict=True):
         state = changed(state, position={body: (2.5 + x, 2.5 + y)}, rotation={body: rotation})
@@ -33,7 +33,7 @@ def thrown_together(motions, gravity: float):
 
 
 def angular_momentum(model, state, position) -> float:
-    """About the origin, kg m^2/s, of the three movable bodies."""
+    """Return the angular momentum of the three movable bodies about the origin, kg m^2/s."""
     body = list(MOVABLE)
     v, (x, y) = np.asarray(state.velocity)[body, :, 0].T, np.asarray(position)[body, :, 0].T
     spin = state.angular_velocity[body, 0] / model.inverse_inertia[body, 0]
@@ -44,7 +44,7 @@ class TestMomentum:
     @few
     @given(motions)
     def test_collisions_keep_momentum_and_angular_momentum(self, motions) -> None:
-        """Whatever bodies do to each other, they do to each other equally, at one point (before they move on)."""
+        """Bodies act on each other with opposite impulses at one point (taken before they move)."""
         model, state = thrown_together(motions, gravity=0.0)
         after, manifold = play(model, state, *idle())
         assume(manifold.active.any())
@@ -55,7 +55,7 @@ class TestMomentum:
 
     @few
     @given(motions, st.booleans(), numbers(-1, 1))
-    def test_the_centre_of_mass_falls_freely(self, motions, fixed, drive) -> None:
+    def test_centre_of_mass_falls_freely(self, motions, fixed, drive) -> None:
         """With a joint, a motor and collisions among the bodies."""
         model, state = thrown_together(motions, gravity=-9.81)
         model = changed(model, joint_active={0: True}, joint_fixed={0: fixed}, joint_anchor_a={0: (0.3, 0.0)})
@@ -72,7 +72,7 @@ class TestMomentum:
 class TestRest:
     @few
     @given(st.lists(st.tuples(near, near, turns), min_size=3, max_size=3), st.booleans())
-    def test_without_forces_nothing_moves_a_bit(self, places, joined) -> None:
+    def test_bodies_without_forces_keep_every_bit(self, places, joined) -> None:
         """Bodies apart from each other, one perhaps hinged to another where their centres meet."""
         model, state = room(gravity=0.0)
         model = changed(model, collides={(BOX, BALL): False, (BALL, BOX): False})
@@ -87,8 +87,8 @@ class TestRest:
 
     @few
     @given(st.floats(0.5, 4.0), st.sampled_from([0.0, np.pi / 2, np.pi, -np.pi / 2]), st.floats(0.1, 20))
-    def test_a_pile_on_the_floor_stays(self, x, side, mass) -> None:
-        """A box that lies on any of its sides and a ball on it, wherever it is and whatever they weigh."""
+    def test_pile_on_the_floor_stays(self, x, side, mass) -> None:
+        """A box on any of its sides with a ball on top, at any position and of any weight."""
         model, state = room()
         share = MASS / mass
         for body in (BOX, BALL):
@@ -107,21 +107,21 @@ class TestRest:
 
 @functools.cache
 def golden(size: str):
-    """Worlds of a size and what is special about them."""
-    of = load(HERE / f"{size}.npz")
-    return of.level.model, of.state, of.motor, of.thrust
+    """Return the golden worlds of a size with their controls."""
+    golden = load(HERE / f"{size}.npz")
+    return golden.level.model, golden.state, golden.motor, golden.thrust
 
 
 class TestMirror:
-    """A mirrored world goes the mirrored way. Corners of polygons then come in another order, and with them sums.
+    """A mirrored world evolves in mirror image, up to rounding: vertices, and so sums, come in another order.
 
-    One thing in the engine has a side, as in the reference: a motor whose joint's limits are less than twice
-    `Params.motor_limit_zone` apart is weakened as if it were at the upper one.
+    One part of the engine is asymmetric, as in the reference: a motor whose joint's limits are less than twice
+    `Params.motor_limit_zone` apart is weakened as if it were at the upper limit.
     """
 
     @staticmethod
-    def sided(model, motor) -> np.ndarray:
-        """Lanes with such a motor."""
+    def asymmetric(model, motor) -> np.ndarray:
+        """Find lanes with such a motor."""
         narrow = model.joint_limited & (model.joint_max - model.joint_min < 2 * PARAMS.motor_limit_zone)
         return (model.joint_active & ~model.joint_fixed & model.motor_on & (motor != 0) & narrow).any(0)
 
@@ -134,13 +134,13 @@ class TestMirror:
         return here, seen, mirror.of_state(there), mirror.of_manifold(seen_there)
 
     def off(self, size: str, steps: int) -> np.ndarray:
-        """Largest difference of each lane."""
+        """Return the largest difference of each symmetric lane."""
         model, _, motor, _ = golden(size)
         here, _, there, _ = self.both(size, steps)
-        return errors(here, there)[~self.sided(model, motor)]
+        return errors(here, there)[~self.asymmetric(model, motor)]
 
     @pytest.mark.parametrize("size", SIZES)
-    def test_a_mirror_in_a_mirror(self, size: str) -> None:
+    def test_mirroring_twice_restores_the_world(self, size: str) -> None:
         world = golden(size)
         for a, b in zip(
             jax.tree.leaves(world), jax.tree.leaves(mirror.of_world(*mirror.of_world(*world))), strict=True
@@ -162,21 +162,21 @@ class TestMirror:
         for name in ("penetration", "point"):
             np.testing.assert_allclose(getattr(here, name), getattr(there, name), atol=2e-5, err_msg=name)
         turned = np.abs(here.normal - there.normal).max(1)[here.active]
-        assert (turned < 2e-5).mean() >= 0.99  # the rest: a circle's centre almost on an edge
+        assert (turned < 2e-5).mean() >= 0.99  # the others have a circle's centre almost on an edge
         assert turned.max() < 0.1
 
-    def test_without_contacts_and_thrusters_it_is_exact(self) -> None:
+    def test_mirrored_step_without_contacts_and_thrusters_is_exact(self) -> None:
         model, _, motor, thrust = golden("s")
         here, _, there, _ = self.both("s", 1)
         fires = (model.thruster_active & (thrust != 0)).any(0)
-        plain = ~here.contact_active.any(0) & ~fires & ~self.sided(model, motor)
+        plain = ~here.contact_active.any(0) & ~fires & ~self.asymmetric(model, motor)
         assert plain.sum() >= 10
         assert (errors(here, there)[plain] == 0).all()
 
     @pytest.mark.parametrize("size", SIZES)
     @pytest.mark.parametrize(("steps", "share"), [(8, 0.99), (30, 0.975), (60, 0.92)])
     def test_many_steps(self, size: str, steps: int, share: float) -> None:
-        """The rest is chaotic: what begins as rounding has grown to 1e-3."""
+        """The other lanes are chaotic: rounding has grown to 1e-3."""
         assert (self.off(size, steps) < 1e-3).mean() >= share
 
 

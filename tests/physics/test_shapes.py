@@ -1,4 +1,4 @@
-"""A step refuses arrays that do not fit its size, before generated code reads or writes beyond them."""
+"""A step refuses arrays that do not fit its size, before generated code reads or writes out of bounds."""
 
 import re
 from collections.abc import Callable
@@ -59,7 +59,7 @@ def test_step_refuses_an_array_of_another_dtype(way: Callable[..., Any]) -> None
         jax.eval_shape(lambda: way(given, Params(), True))
 
 
-def test_public_step_refuses_what_its_kernel_would() -> None:
+def test_public_step_checks_shapes() -> None:
     given = WRONG["before.contact_active"](world())
     with pytest.raises(ValueError, match=r"^before\.contact_active has shape \(1, 3\)"):
         step(*given)  # pyright: ignore[reportArgumentType]

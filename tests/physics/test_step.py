@@ -1,4 +1,4 @@
-"""The engine from first principles: what rigid bodies have to keep, and what this engine promises of its lanes."""
+"""The engine from first principles: conservation laws, and what it guarantees about lanes."""
 
 import dataclasses
 import functools
@@ -36,7 +36,7 @@ few = settings(max_examples=40, deadline=None)
 
 @functools.cache
 def _compiled(params: Params):
-    """`count` steps; the number is traced, so that one compilation serves all tests."""
+    """Compile `count` steps; the count is traced, so that one compilation serves all tests."""
 
     def run(model, state, motor, thrust, count):
         def body(_, now):
@@ -49,7 +49,7 @@ def _compiled(params: Params):
 
 
 def play(model, state, motor, thrust, steps: int = 1, params: Params = PARAMS):
-    """State and manifold after some physics steps, on the host."""
+    """Return state and manifold after some physics steps, on the host."""
     return host(_compiled(params)(model, state, motor, thrust, steps))
 
 
@@ -58,14 +58,14 @@ def host(tree):
 
 
 def momentum(state) -> np.ndarray:
-    """Linear momentum of the three movable bodies, kg m/s."""
+    """Return the linear momentum of the three movable bodies, kg m/s."""
     return MASS * np.asarray(state.velocity)[[BOX, BALL, OTHER]].sum(0)[..., 0]
 
 
 class TestFreeFlight:
     @few
     @given(st.lists(st.tuples(speeds, speeds, turns), min_size=3, max_size=3))
-    def test_bodies_that_touch_nothing_fall_freely(self, motions) -> None:
+    def test_bodies_without_contacts_fall_freely(self, motions) -> None:
         model, state = room()
         for body, (x, y, w) in zip((BOX, BALL, OTHER), motions, strict=True):
             state = changed(state, velocity={body: (x, y)}, angular_velocity={body: w})
@@ -81,7 +81,7 @@ class TestFreeFlight:
 
     @few
     @given(speeds, speeds, turns, st.booleans())
-    def test_a_joint_keeps_the_momentum_of_its_bodies(self, x, y, w, fixed) -> None:
+    def test_joint_keeps_the_momentum_of_its_bodies(self, x, y, w, fixed) -> None:
         model, state = room(gravity=0.0)
         model = changed(model, joint_active={0: True}, joint_fixed={0: fixed}, joint_anchor_a={0: (0.7, 0.0)})
         model = changed(model, joint_anchor_b={0: (-0.8, 0.0)}, collides={(BOX, BALL): False, (BALL, BOX): False})
@@ -91,14 +91,14 @@ class TestFreeFlight:
 
     @few
     @given(speeds, speeds)
-    def test_a_collision_keeps_momentum(self, x, y) -> None:
+    def test_collision_keeps_momentum(self, x, y) -> None:
         model, state = room(gravity=0.0)
         state = changed(state, position={OTHER: (2.5 + 2 * RADIUS - 0.005, 2.05)}, velocity={BALL: (abs(x) + 0.1, y)})
         after, manifold = play(model, state, *idle())
         assert manifold.active.any()
         np.testing.assert_allclose(momentum(after), momentum(state), atol=1e-4)
 
-    def test_a_motor_turns_both_bodies_and_moves_none(self) -> None:
+    def test_motor_turns_both_bodies_and_moves_neither(self) -> None:
         model, state = room(gravity=0.0)
         model = changed(model, joint_active={0: True}, collides={(BOX, BALL): False, (BALL, BOX): False})
         state = changed(state, position={BALL: (1.0, 2.0)})
@@ -110,7 +110,7 @@ class TestFreeFlight:
         np.testing.assert_allclose(angular.sum(), 0, atol=1e-5)
         np.testing.assert_allclose(after.velocity[[BOX, BALL], :, 0], 0, atol=1e-5)
 
-    def test_a_thruster_pushes_along_itself(self) -> None:
+    def test_thruster_pushes_along_its_rotation(self) -> None:
         model, state = room(gravity=0.0)
         model = changed(model, thruster_active={0: True}, thruster_rotation={0: np.pi / 2})
         motor, thrust = idle()
@@ -121,7 +121,7 @@ class TestFreeFlight:
 
 class TestRest:
     @pytest.mark.parametrize(("body", "height"), [(BOX, HALF), (BALL, RADIUS)])
-    def test_a_body_on_the_floor_stays(self, body, height) -> None:
+    def test_body_on_the_floor_stays(self, body, height) -> None:
         model, state = room()
         state = changed(state, position={body: (2.0, FLOOR_TOP + height - 0.005)})
         if body == BOX:
@@ -132,7 +132,7 @@ class TestRest:
         np.testing.assert_allclose(after.rotation[body, 0], 0, atol=0.02)
 
     @pytest.mark.parametrize(("wall", "height", "side"), [(0, FLOOR_TOP + HALF - 0.005, -1), (3, 4.805, 1)])
-    def test_of_a_flat_boxs_corners_the_one_at_the_faces_start_comes_first(self, wall, height, side) -> None:
+    def test_contacts_of_a_flat_box_begin_at_the_start_of_the_face(self, wall, height, side) -> None:
         """As in the reference. Faces run clockwise: the floor's to the right, the ceiling's to the left."""
         model, state = room()
         state = changed(state, position={BOX: (1.5, height)})
@@ -141,13 +141,13 @@ class TestRest:
         assert manifold.active[[first, second]].all()
         np.testing.assert_allclose(manifold.point[[first, second], 0, 0] - 1.5, [side * HALF, -side * HALF], atol=1e-5)
 
-    def test_everything_comes_down_and_nothing_leaves_the_room(self) -> None:
+    def test_bodies_fall_to_the_floor_of_the_room(self) -> None:
         model, state = room()
         after, _ = play(model, state, *idle(), steps=240)
         lowest = np.array([HALF, RADIUS, RADIUS])
         np.testing.assert_allclose(after.position[[BOX, BALL, OTHER], 1, 0], FLOOR_TOP + lowest, atol=0.02)
 
-    def test_what_cannot_move_never_does(self) -> None:
+    def test_immovable_bodies_never_move(self) -> None:
         model, state = room()
         state = changed(state, position={BALL: (2.0, FLOOR_TOP), BOX: (0.1, 2.0)})
         after, _ = play(model, state, *idle(), steps=8)
@@ -158,8 +158,8 @@ class TestRest:
 class TestInactive:
     @few
     @given(st.sampled_from([BOX, BALL, OTHER]), speeds, turns)
-    def test_an_inactive_body_moves_nothing(self, ghost, speed, turn) -> None:
-        """Placed into another body, thrown at it, whatever: the others move as if it were far away."""
+    def test_inactive_body_moves_nothing(self, ghost, speed, turn) -> None:
+        """Even inside another body or thrown at it: the others move as if it were far away."""
         victim = BALL if ghost != BALL else OTHER
         model, state = room()
         model = changed(model, active={ghost: False})
@@ -175,7 +175,7 @@ class TestInactive:
         for name in ("position", "rotation", "velocity", "angular_velocity"):
             np.testing.assert_array_equal(getattr(near, name)[others], getattr(far, name)[others])
 
-    def test_an_inactive_joint_or_thruster_does_nothing(self) -> None:
+    def test_inactive_joint_or_thruster_does_nothing(self) -> None:
         model, state = room()
         motor, thrust = idle()
         plain, _ = play(model, state, motor, thrust)
@@ -183,7 +183,7 @@ class TestInactive:
         for name in ("position", "rotation", "velocity", "angular_velocity"):
             np.testing.assert_array_equal(getattr(plain, name), getattr(driven, name))
 
-    def test_modes_and_groups_pass_through_each_other(self) -> None:
+    def test_collision_modes_and_groups_let_bodies_pass(self) -> None:
         """Collision modes leave no contact; `collides` leaves the contact without its impulse."""
         model, state = room(gravity=0.0)
         state = changed(state, position={OTHER: (2.6, 2.0)})
@@ -215,14 +215,14 @@ class TestBounds:
 
 
 class TestLanes:
-    """A lane's bits depend on its own world alone, not on its neighbours nor on their number."""
+    """A lane's bits depend only on its own world, not on its neighbours or their number."""
 
     SOME = 64
     STEPS = 16
 
     @classmethod
     def after(cls, lanes, steps: int = STEPS, size: str = "s"):
-        """Golden states, those of `lanes` in a batch of their own, some physics steps later."""
+        """Step the golden states of `lanes`, as a batch of their own."""
         of = load(HERE / f"{size}.npz")
         take = lambda tree: jax.tree.map(lambda x: np.ascontiguousarray(x[..., lanes]), tree)
         return play(take(of.level.model), take(of.state), of.motor[:, lanes], of.thrust[:, lanes], steps)[0]
@@ -232,7 +232,7 @@ class TestLanes:
         for field in dataclasses.fields(ours):
             np.testing.assert_array_equal(getattr(ours, field.name), getattr(theirs, field.name), field.name)
 
-    def test_the_order_of_lanes_changes_no_bits(self) -> None:
+    def test_order_of_lanes_changes_no_bits(self) -> None:
         order = np.random.default_rng(1).permutation(self.SOME)
         straight = self.after(np.arange(self.SOME))
         self.same_bits(self.after(order), jax.tree.map(lambda x: x[..., order], straight))
@@ -241,31 +241,31 @@ class TestLanes:
         ("size", "count"), [("s", 40), *(pytest.param(size, 3, marks=pytest.mark.campaign) for size in "sml")]
     )
     def test_neighbours_change_no_bits(self, size: str, count: int) -> None:
-        """Lanes filled up with repetitions of the last one, as those of a job's end are."""
-        filled = self.after(np.minimum(np.arange(self.SOME), count - 1), size=size)
+        """The batch is padded with copies of the last lane, as at the end of a job."""
+        padded = self.after(np.minimum(np.arange(self.SOME), count - 1), size=size)
         whole = self.after(np.arange(self.SOME), size=size)
         mine = lambda tree: jax.tree.map(lambda x: x[..., :count], tree)
-        self.same_bits(mine(filled), mine(whole))
+        self.same_bits(mine(padded), mine(whole))
 
     @pytest.mark.parametrize(
         ("size", "count"),
         [
-            *(("s", 1), ("s", 16), ("l", 129)),  # less than a block, a whole one, some and the rest
+            *(("s", 1), ("s", 16), ("l", 129)),  # less than a block, one block, blocks and a remainder
             *(pytest.param(*case, marks=pytest.mark.campaign) for case in itertools.product("sml", (3, 17, 100))),
         ],
     )
-    def test_the_number_of_lanes_changes_no_bits(self, size: str, count: int) -> None:
+    def test_number_of_lanes_changes_no_bits(self, size: str, count: int) -> None:
         alone, together = self.after(np.arange(count), size=size), self.after(np.arange(256), size=size)
         self.same_bits(alone, jax.tree.map(lambda x: x[..., :count], together))
 
     @pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.campaign) for size in "ml")])
-    def test_being_watched_changes_no_bits(self, size: str) -> None:
-        """A step that writes no contacts down leads to the same state."""
+    def test_returning_contacts_changes_no_bits(self, size: str) -> None:
+        """A step that returns no contacts leads to the same state."""
         of = load(HERE / f"{size}.npz")
         given = of.level.model, of.state, of.motor, of.thrust
         self.same_bits(host(jax.jit(lambda *given: step(*given, seen=False)[0])(*given)), play(*given)[0])
 
-    def test_one_model_serves_many_lanes(self) -> None:
+    def test_step_broadcasts_one_model(self) -> None:
         """A model with one lane broadcasts over the lanes of its states."""
         model, state = room()
         single, _ = room(lanes=1)
@@ -277,21 +277,21 @@ class TestLanes:
 
 
 class TestPadding:
-    """The reference forgets the accumulated impulses of the last pair of each kind; see docs/physics.md."""
+    """The reference loses the accumulated impulses of the last pair of each kind; see docs/physics.md."""
 
     @staticmethod
     def resting_on_the_other(params: Params):
-        """The last circle-circle pair, pressed together for some steps without gravity's help."""
+        """Let one circle rest on another, the last circle-circle pair, for some steps."""
         model, state = room()
         state = changed(state, position={BALL: (2.5, FLOOR_TOP + RADIUS), OTHER: (2.5, FLOOR_TOP + 3 * RADIUS - 0.005)})
         return play(model, state, *idle(), steps=4, params=params)[0]
 
-    def test_the_last_pair_remembers_nothing(self) -> None:
+    def test_padding_defect_clears_the_last_pairs_impulse(self) -> None:
         after = self.resting_on_the_other(Params(faithful_padding=True))
         assert after.contact_active[-1].all()
         assert (after.contact_normal_impulse[-1] == 0).all()
 
-    def test_the_fix_remembers(self) -> None:
+    def test_without_the_padding_defect_the_last_pair_keeps_its_impulse(self) -> None:
         after = self.resting_on_the_other(Params(faithful_padding=False))
         assert (after.contact_normal_impulse[-1] > 0).all()
         weight = MASS * 9.81 / 60
@@ -305,8 +305,10 @@ class TestPadding:
             (17, {BOX: (2.5, FLOOR_TOP + HALF), OTHER: (2.5, FLOOR_TOP + 2 * HALF + RADIUS - 0.005)}, -9.81),
         ],
     )
-    def test_the_last_pair_of_each_kind(self, contact: int, positions: dict, gravity: float) -> None:
-        """Ceiling and box, second circle and box; the two circles: above."""
+    def test_padding_defect_clears_impulses_of_each_kinds_last_pair(
+        self, contact: int, positions: dict, gravity: float
+    ) -> None:
+        """Ceiling and box, second circle and box; the test above has the two circles."""
         model, state = room(gravity=gravity)
         state = changed(state, position={BALL: (4.0, 2.0), OTHER: (1.0, 2.0)} | positions)
         for faithful in (True, False):
@@ -314,13 +316,13 @@ class TestPadding:
             assert after.contact_active[contact].all()
             assert ((after.contact_normal_impulse[contact] == 0) == faithful).all()
 
-    def test_a_kind_whose_last_batch_is_full_forgets_nothing(self) -> None:
+    def test_padding_defect_spares_kinds_whose_last_batch_is_full(self) -> None:
         """8 polygons and 8 circles: 22 polygon pairs, 64 circle-polygon pairs, 28 pairs of circles."""
         forgotten = np.flatnonzero(table_of(Size(8, 8, 0, 0), faithful_padding=True).kept == 0)
         assert forgotten.tolist() == [21, 43, 44 + 64 + 27]
         assert (table_of(Size(8, 8, 0, 0), faithful_padding=False).kept == 1).all()
 
-    def test_other_pairs_are_not_touched(self) -> None:
+    def test_padding_defect_spares_other_pairs(self) -> None:
         """A box on the floor is not the last pair of its kind in a room with a ceiling."""
         model, state = room()
         state = changed(state, position={BOX: (2.0, FLOOR_TOP + HALF - 0.005), BALL: (3.4, 2.0)})

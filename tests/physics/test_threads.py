@@ -1,4 +1,4 @@
-"""Threads that take their first steps at once share one kernel."""
+"""Threads that take their first steps at the same time share one kernel."""
 
 import os
 import subprocess

@@ -29,12 +29,12 @@ def by_xla(x: np.ndarray) -> np.ndarray:
 
 
 def as_machine_code(x: np.ndarray) -> np.ndarray:
-    """[cosine, sine, tanh; number], of any shape of numbers that fills blocks."""
+    """Return [cosine, sine, tanh; angle]; the number of angles must fill whole blocks."""
     return KERNEL.as_machine_code(x.reshape(1, -1))[0]
 
 
 def units(ours: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """Errors in units in the last place of the exact result."""
+    """Return errors in units in the last place of the exact result."""
     return np.abs(ours - exact) / np.spacing(np.abs(exact.astype(np.float32))).astype(np.float64)
 
 
@@ -47,7 +47,7 @@ class TestCosSin:
         ("largest", "error"), [(np.pi / 4, 1e-7), (10.0, 1e-7), (100.0, 1e-7), (8192.0, 1e-7), (1e5, 1e-6)]
     )
     def test_error(self, way, largest: float, error: float) -> None:
-        """1e-7 are 1.7 units in the last place of 1."""
+        """1e-7 is 1.7 units in the last place of 1."""
         x = np.random.default_rng(1).uniform(-largest, largest, COUNT).astype(np.float32)
         cos, sin, _ = way(x)
         np.testing.assert_allclose(cos, np.cos(x.astype(float)), rtol=0, atol=error)
@@ -55,7 +55,7 @@ class TestCosSin:
 
     @ways
     def test_units_in_the_last_place(self, way) -> None:
-        """Where neither is small, two; within a turn, where they cross zero, as many as the rest of pi has digits."""
+        """Two where the result is not small; more at its zeros, for lack of digits of pi in QUARTER_PARTS."""
         x = np.random.default_rng(2).uniform(-2 * np.pi, 2 * np.pi, COUNT).astype(np.float32)
         cos, sin, _ = way(x)
         for ours, exact in ((cos, np.cos(x.astype(float))), (sin, np.sin(x.astype(float)))):
@@ -65,8 +65,8 @@ class TestCosSin:
 
     @ways
     @pytest.mark.parametrize("step", [np.pi / 4, np.pi / 2])
-    def test_where_quadrants_meet(self, way, step: float) -> None:
-        """At and beside every multiple of an eighth of a turn: a quarter's number may be rounded either way."""
+    def test_error_at_quadrant_borders(self, way, step: float) -> None:
+        """At and beside every multiple of an eighth of a turn, where the quadrant may be rounded either way."""
         nearest = (np.arange(-8191, 8192) * step).astype(np.float32)
         beside = [np.nextafter(nearest, np.float32(towards)) for towards in (-np.inf, np.inf)]
         x = np.concatenate([nearest, *beside])
@@ -85,8 +85,8 @@ class TestCosSin:
 
     @settings(max_examples=100, deadline=None)
     @given(st.lists(st.floats(width=32), min_size=LANES, max_size=LANES))
-    def test_any_angle_is_somewhere_on_the_circle(self, angles) -> None:
-        """Also one of 1e38 rad; an infinite one is nowhere, and harms no other lane."""
+    def test_any_finite_angle_gives_a_point_on_the_circle(self, angles) -> None:
+        """Even 1e38 rad. An infinite angle gives NaN and affects no other lane."""
         x = np.array(angles, np.float32)
         for cos, sin, _ in (as_machine_code(x), by_xla(x)):
             finite = np.isfinite(x)
@@ -111,7 +111,7 @@ class TestTanh:
         np.testing.assert_array_equal(way(x)[2], -way(-x)[2])
 
     @ways
-    def test_the_ends(self, way) -> None:
+    def test_tanh_of_zeros_infinities_and_nan(self, way) -> None:
         x = np.resize(np.float32([0.0, -0.0, np.inf, -np.inf, np.nan, 3e38, -3e38, 100]), LANES)
         ours = way(x)[2]
         np.testing.assert_allclose(ours[:8], [0, 0, 1, -1, np.nan, 1, -1, 1], atol=5e-7)

@@ -1,4 +1,4 @@
-"""Shapes in the types are kept: every field says its own, and the engine returns what it says."""
+"""Shapes: every field is annotated, and the engine returns the annotated shapes."""
 
 import dataclasses
 import inspect
@@ -28,19 +28,19 @@ def test_every_field_is_annotated_with_its_shape_lanes_last(cls: type) -> None:
         assert hint.dim_str.split()[-1] == "lane", name
 
 
-def test_worlds_have_the_shapes_that_the_types_say() -> None:
+def test_step_returns_the_annotated_shapes() -> None:
     lanes = 3
     model, state = room(lanes)
     after, manifold = jax.eval_shape(lambda: step(model, state, *idle(lanes), Params()))
     for value in (model, state, after, manifold):
-        said = buffers_of(type(value), ROOM)
+        annotated = buffers_of(type(value), ROOM)
         for field in dataclasses.fields(value):
-            array, buffer = getattr(value, field.name), getattr(said, field.name)
+            array, buffer = getattr(value, field.name), getattr(annotated, field.name)
             assert (array.shape, str(array.dtype)) == ((*buffer.shape, lanes), buffer.dtype), field.name
 
 
-def test_scratch_memory_has_the_shapes_that_annotations_say() -> None:
-    """With lanes and without, of all dtypes, of axes named and numbered."""
+def test_buffers_of_follows_the_annotations_of_scratch() -> None:
+    """With and without lanes, for all dtypes, with named and numeric axes."""
     scratch = buffers_of(Scratch, FEW)
     contacts = 2 * (6 * 5 // 2 - 4 * 3 // 2) + 3 * 6 + 3
     assert scratch.bodies.motion == Buffer((9, 5))
@@ -59,7 +59,7 @@ def test_types_are_trees_of_arrays() -> None:
     assert model.size == ROOM
 
 
-def test_every_number_of_the_params_says_what_it_is() -> None:
+def test_params_fields_have_comments() -> None:
     """Each constant has its unit or effect in a comment on its line."""
     lines = [line for line in inspect.getsource(Params).splitlines() if ": float" in line or ": bool" in line]
     assert len(lines) == len(dataclasses.fields(Params))
@@ -68,7 +68,7 @@ def test_every_number_of_the_params_says_what_it_is() -> None:
 
 
 @pytest.mark.parametrize("size", [ROOM, ROOM._replace(polygons=12, circles=4), ROOM._replace(polygons=6, circles=3)])
-def test_pairs_are_those_that_may_touch(size) -> None:
+def test_pairs_of_lists_the_pairs_that_may_touch(size) -> None:
     pairs = pairs_of(size)
     polygon = set(zip(pairs.polygon.a, pairs.polygon.b, strict=True))
     every = {(i, j) for i in range(size.polygons) for j in range(i + 1, size.polygons)}

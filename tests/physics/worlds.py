@@ -1,4 +1,4 @@
-"""Small worlds made by hand, for tests of the engine."""
+"""Small handmade worlds for tests of the engine."""
 
 import dataclasses
 
@@ -15,13 +15,13 @@ FLOOR_TOP = 0.4  # m
 HALF = 0.2  # m, of the box's side
 RADIUS = 0.25  # m, of the circles
 MASS = 2.0  # kg
-LANES = 8  # all alike, where nothing else is said: a whole vector
+LANES = 8  # one whole vector; all alike unless a test changes them
 PARAMS = Params()
 WALLS = ((2.5, -4.6), (-5.0, 2.5), (10.0, 2.5), (2.5, 10.0))  # centres of 10 m boxes
 
 
 def room(lanes: int = LANES, gravity: float = -9.81) -> tuple[Model, State]:
-    """A box and two balls apart from each other in a closed room, nothing active but the room and they."""
+    """Return a box and two balls, apart from each other, in a closed room; joints and thrusters are inactive."""
     polygons, circles, joints, thrusters = ROOM
     bodies = polygons + circles
 
@@ -82,13 +82,16 @@ def changed(tree, **rows):
 
 
 def idle(lanes: int = LANES) -> tuple[np.ndarray, np.ndarray]:
-    """Motors and thrusters off."""
+    """Return controls with motors and thrusters off."""
     return np.zeros((ROOM.joints, lanes), np.float32), np.zeros((ROOM.thrusters, lanes), np.float32)
 
 
 def scattered(size: Size, lanes: int, seed: int = 1) -> tuple[Model, State, np.ndarray, np.ndarray]:
-    """Worlds of any size with everything in them, other in each lane: bodies strewn about a room, overlapping, thrown,
-    some missing, joined at random and remembering impulses of contacts; and controls of the motors and thrusters."""
+    """Return random worlds of any size, different in each lane, with controls of motors and thrusters.
+
+    Bodies are scattered about a room, overlapping and moving, some inactive, joined at random, with contact impulses to
+    warm-start from.
+    """
     random = np.random.default_rng(seed)
     uniform = lambda low, high, *shape: random.uniform(low, high, (*shape, lanes)).astype(np.float32)
     chance = lambda share, *shape: random.random((*shape, lanes)) < share

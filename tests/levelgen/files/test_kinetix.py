@@ -1,4 +1,4 @@
-"""Conversion to and from the reference's layout: nothing lost, contacts in the right places."""
+"""Conversion to and from the reference's layout: nothing is lost, contacts keep their pairs."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ INTEGERS = {
 
 
 def random_instance(kind: type, size: Size, rng: np.random.Generator, **given: object) -> object:
-    """An instance of a dataclass of arrays, filled by the shapes in its annotations."""
+    """Fill a dataclass of arrays at random, with the shapes of its annotations."""
     names = {"body": size.bodies, "polygon": size.polygons, "circle": size.circles, "joint": size.joints}
     names |= {"thruster": size.thrusters, "vertex": 4, "contact": pairs_of(size).contacts, "lane": LANES}
     values = dict(given)
@@ -59,7 +59,7 @@ def assert_same(left: object, right: object) -> None:
 
 
 @pytest.mark.parametrize("name", SIZES)
-def test_there_and_back(name: str) -> None:
+def test_conversion_round_trip_keeps_everything(name: str) -> None:
     level = random_level(SIZES[name])
     fields = state_to_kinetix(level, level.state, np.arange(LANES), np.full(LANES, -1.0))
     assert_same(level_from_kinetix(fields), level)
@@ -69,7 +69,7 @@ def test_there_and_back(name: str) -> None:
 
 
 def test_contacts_keep_their_pairs() -> None:
-    """Number every contact by its two bodies and its point, and look where each number arrives."""
+    """Number every contact by its two bodies and its point; check where each number arrives."""
     size = SIZES["m"]
     pairs, level = pairs_of(size), random_level(size)
     labels = [(*ab, 0) for ab in zip(pairs.polygon.a, pairs.polygon.b, strict=True)]
@@ -85,7 +85,7 @@ def test_contacts_keep_their_pairs() -> None:
     np.testing.assert_array_equal(circle, [670, 680, 780])
 
 
-def test_what_no_step_depends_on_is_zero() -> None:
+def test_converted_fields_without_effect_are_zero() -> None:
     level = random_level(SIZES["s"])
     time = np.arange(LANES)
     fields = state_to_kinetix(level, level.state, time, np.full(LANES, 2.0))

@@ -1,4 +1,4 @@
-"""Level files without the reference: round trips, and what happens to a file that nobody vouches for."""
+"""Level files without the reference: round trips, and untrusted files."""
 
 import copy
 import dataclasses
@@ -34,7 +34,7 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Params, Size
 
 RULES = TaskParams(frame_skip=3, max_timesteps=100, dense_reward_scale=0.5, physics=Params(dt=0.01, motor_power=500.0))
-MAX_MEMORY = 250e6  # bytes, for the worst that MAX_BYTES can say
+MAX_MEMORY = 250e6  # bytes, for the worst file of MAX_BYTES
 
 
 @functools.cache
@@ -48,12 +48,12 @@ def one(level: Level, lane: int) -> Level:
 
 @functools.cache
 def document() -> Any:
-    """A level of size s as JSON has it. Not to be changed."""
+    """Return the JSON of a level of size s. Do not modify it."""
     return json.loads(json.dumps(to_document(LevelFile(one(levels(SIZES["s"]), 2), TaskParams()))))
 
 
 def changed(path: str, value: object) -> Any:
-    """That level with another value at a path such as `env_state.polygon.4.radius`."""
+    """Return that level with another value at a path such as `env_state.polygon.4.radius`."""
     made = copy.deepcopy(document())
     *parents, last = path.split(".")
     parent = functools.reduce(lambda x, key: x[int(key) if isinstance(x, list) else key], parents, made)
@@ -68,14 +68,14 @@ def assert_same(ours: LevelFile, theirs: LevelFile) -> None:
         assert a.dtype == b.dtype
 
 
-# A size of which other tests sample levels, so that their program serves here, too; others in a campaign
+# A size that other tests sample, so that their compiled program is reused; others in a campaign
 OTHERS = (SIZES["m"], SIZES["l"], Size(4, 3, 2, 2), Size(7, 1, 3, 4))
 ROUND_TRIPS = [SIZES["s"], *(pytest.param(size, marks=pytest.mark.campaign) for size in OTHERS)]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", ROUND_TRIPS, ids=str)
-def test_a_sampled_level_survives_a_round_trip(size: Size, tmp_path: Path) -> None:
+def test_sampled_level_survives_a_round_trip(size: Size, tmp_path: Path) -> None:
     for lane in range(8):
         file = LevelFile(one(levels(size), lane), RULES)
         write_level_file(file, tmp_path / "level.json")
@@ -84,13 +84,13 @@ def test_a_sampled_level_survives_a_round_trip(size: Size, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("size", [Size(5, 0, 0, 0), Size(4, 1, 0, 0), Size(64, 64, 64, 64)], ids=str)
-def test_the_smallest_and_the_largest_sizes_fit(size: Size, tmp_path: Path) -> None:
+def test_smallest_and_largest_sizes_fit_into_a_file(size: Size, tmp_path: Path) -> None:
     write_level_file(LevelFile(empty_level(size, 1), TaskParams()), tmp_path / "level.json")
     assert (tmp_path / "level.json").stat().st_size < MAX_BYTES
     assert read_level_file(tmp_path / "level.json").level.size == size
 
 
-def test_a_file_has_what_the_reference_asks_for() -> None:
+def test_file_has_all_entries_that_the_reference_requires() -> None:
     world = document()["env_state"]
     assert list(document()) == ["env_state", "env_params", "static_env_params"]
     assert [len(world[kind]) for kind in ("polygon", "circle", "joint", "thruster", *MANIFOLDS)] == [
@@ -102,8 +102,8 @@ def test_a_file_has_what_the_reference_asks_for() -> None:
     assert document()["env_params"]["baumgarte_coefficient_collision"] == 0.2
 
 
-def test_places_of_joints_are_where_their_two_bodies_say() -> None:
-    """A joint's place is written from body a; at the start of a level it is that of body b too."""
+def test_file_positions_of_joints_agree_with_both_bodies() -> None:
+    """A joint's position is computed from body a; at the start of a level, body b gives the same."""
     found = 0
     for lane in range(8):
         world = to_document(LevelFile(one(levels(SIZES["s"]), lane), TaskParams()))["env_state"]
@@ -118,7 +118,7 @@ def test_places_of_joints_are_where_their_two_bodies_say() -> None:
     assert found > 3
 
 
-def test_whatever_a_level_cannot_say_in_a_file_is_refused() -> None:
+def test_writer_refuses_levels_that_a_file_cannot_hold() -> None:
     level = one(levels(SIZES["s"]), 2)
     assert level.model.joint_active.all()
     own_will = dataclasses.replace(level, motor_auto=np.ones_like(level.motor_auto))
@@ -175,13 +175,13 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("path", "value", "words"), WRONG, ids=lambda x: str(x)[:30])
-def test_wrong_values_are_named_with_their_place(path: str, value: object, words: str) -> None:
+def test_reader_names_the_path_of_a_wrong_value(path: str, value: object, words: str) -> None:
     assert document()["env_state"]["thruster"][0]["active"] in (True, False)
     with pytest.raises(LevelFileError, match=words):
         parse(json.dumps(changed(path, value)).encode())
 
 
-def test_a_joint_from_a_body_to_itself() -> None:
+def test_reader_refuses_a_joint_from_a_body_to_itself() -> None:
     made = changed("env_state.joint.0.a_index", 4)
     made["env_state"]["joint"][0]["b_index"] = 4
     with pytest.raises(LevelFileError, match="joins a body to itself"):
@@ -197,7 +197,7 @@ def test_a_joint_from_a_body_to_itself() -> None:
         ("thruster", 3, 1, "thruster"),
     ],
 )
-def test_active_actuators_have_bindings_that_exist(kind: str, binding: int, most: int, names: str) -> None:
+def test_reader_refuses_unknown_bindings_of_active_actuators(kind: str, binding: int, most: int, names: str) -> None:
     """A motor that is off and a fixed joint, too: a policy reads their bindings."""
     for switches in ({}, {"motor_on": False}, {"is_fixed_joint": True}):
         made = changed(f"env_state.{kind}.0.{names}_binding", binding)
@@ -208,7 +208,7 @@ def test_active_actuators_have_bindings_that_exist(kind: str, binding: int, most
 
 @pytest.mark.parametrize("kind", ["motor", "thruster"])
 @pytest.mark.parametrize("binding", [-1, 256, 1.0, None])
-def test_bindings_of_no_kind_are_refused_everywhere(kind: str, binding: object) -> None:
+def test_reader_refuses_malformed_bindings_of_any_actuator(kind: str, binding: object) -> None:
     thing = "joint" if kind == "motor" else kind
     made = changed(f"env_state.{thing}.0.{kind}_binding", binding)
     made["env_state"][thing][0]["active"] = False
@@ -216,14 +216,14 @@ def test_bindings_of_no_kind_are_refused_everywhere(kind: str, binding: object) 
         from_document(made)
 
 
-def test_actuators_that_are_not_there_may_be_bound_to_anything() -> None:
-    """As two thrusters of the reference's own levels are."""
+def test_reader_accepts_unknown_bindings_of_inactive_actuators() -> None:
+    """Two thrusters of the reference's own levels have such bindings."""
     made = changed("env_state.thruster.0.thruster_binding", 3)
     made["env_state"]["thruster"][0]["active"] = False
     assert from_document(made).level.thruster_binding[0, 0] == 3
 
 
-def test_a_world_without_places_for_bodies() -> None:
+def test_reader_refuses_a_size_without_room_for_bodies() -> None:
     made = changed("static_env_params.num_polygons", 4)
     made["static_env_params"]["num_circles"] = 0
     with pytest.raises(LevelFileError, match="no room for a body"):
@@ -245,7 +245,7 @@ def test_a_world_without_places_for_bodies() -> None:
     ],
     ids=lambda x: str(x)[:12],
 )
-def test_what_is_no_level(text: bytes, words: str) -> None:
+def test_parse_refuses_text_that_is_not_a_level(text: bytes, words: str) -> None:
     with pytest.raises(LevelFileError, match=words):
         parse(text)
 
@@ -265,7 +265,7 @@ JUNK = st.recursive(
 
 @functools.cache
 def places() -> list[tuple[str, ...]]:
-    """Paths of everything in the level that is read."""
+    """Return the paths of everything in the level that is read."""
 
     def below(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
         yield path
@@ -279,7 +279,7 @@ def places() -> list[tuple[str, ...]]:
 
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.just("set") | st.just("drop"), JUNK), min_size=1, max_size=3))
 @settings(max_examples=150, deadline=None)
-def test_a_level_with_anything_anywhere_is_refused_in_a_sentence_or_read(changes) -> None:
+def test_reader_reads_or_refuses_arbitrary_values_anywhere(changes) -> None:
     made = copy.deepcopy(document())
     for number, what, junk in changes:
         *parents, last = places()[number % len(places())]
@@ -291,13 +291,13 @@ def test_a_level_with_anything_anywhere_is_refused_in_a_sentence_or_read(changes
             else:
                 del parent[key]
         except (KeyError, IndexError, TypeError, ValueError, AttributeError):
-            continue  # an earlier change took the place away
+            continue  # an earlier change removed the path
     assert_sentence_or_level(json.dumps(made).encode())
 
 
 @given(st.binary(max_size=60), st.integers(0, 3_000), st.integers(0, 40))
 @settings(max_examples=150, deadline=None)
-def test_bytes_of_any_kind_are_refused_in_a_sentence_or_read(junk: bytes, start: int, gone: int) -> None:
+def test_reader_reads_or_refuses_arbitrary_bytes(junk: bytes, start: int, gone: int) -> None:
     assert_sentence_or_level(junk)
     text = json.dumps(document()).encode()
     assert_sentence_or_level(text[:start] + junk + text[start + gone :])
@@ -323,21 +323,21 @@ BITS = {"objects": b"{},", "fuller objects": b'{"":0},', "lists in lists": b"[" 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bit", BITS.values(), ids=BITS)
-def test_memory_is_bounded_whatever_the_file_says(bit: bytes, tmp_path: Path) -> None:
+def test_reader_bounds_memory_for_any_file(bit: bytes, tmp_path: Path) -> None:
     path = tmp_path / "level.json"
     path.write_bytes(b"[" + bit * ((MAX_BYTES - 3) // len(bit)) + b"0]")
     assert peak_memory(path) < MAX_MEMORY
 
 
-def test_a_gigabyte_is_not_read(tmp_path: Path) -> None:
+def test_reader_does_not_read_a_gigabyte(tmp_path: Path) -> None:
     path = tmp_path / "level.json"
     with path.open("wb") as file:
-        file.truncate(1 << 30)  # sparse: takes no room
+        file.truncate(1 << 30)  # sparse: uses no disk space
     assert peak_memory(path) < 1e6
 
 
 def peak_memory(path: Path) -> int:
-    """Bytes that Python takes to refuse a file."""
+    """Return the peak memory of refusing a file, bytes."""
     tracemalloc.start()
     try:
         with pytest.raises(LevelFileError, match=r"^Cannot use the level file "):
@@ -347,7 +347,7 @@ def peak_memory(path: Path) -> int:
         tracemalloc.stop()
 
 
-def test_what_is_no_ordinary_file(tmp_path: Path) -> None:
+def test_reader_refuses_a_missing_or_irregular_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
     for name, words in (
         ("pipe.json", "not a regular file"),

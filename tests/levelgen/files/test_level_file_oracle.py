@@ -1,4 +1,4 @@
-"""Level files against the reference: all of its handmade levels, and ours, opened by it. Skipped where it is not."""
+"""Level files against the reference, which opens all its handmade levels, and ours. Skipped if it is not installed."""
 
 import functools
 from pathlib import Path
@@ -17,20 +17,20 @@ from tests.levelgen.opened import Played, handmade_levels, open_in_reference
 
 pytestmark = pytest.mark.campaign
 HANDMADE = {"s": 10, "m": 24, "l": 40}
-STEPS = 32  # env steps that each level is played
-OURS = 4  # levels of our sampler that are opened with the handmade ones
+STEPS = 32  # env steps played per level
+OURS = 4  # sampled levels opened with the handmade ones
 
 
 @pytest.fixture(scope="module")
 def handmade(reference: Path) -> dict[str, list[Path]]:
-    """The level files of the reference's installation by size."""
+    """Return the level files of the reference's installation by size."""
     folder = handmade_levels(reference)
     return {size: sorted((folder / size).glob("*.json")) for size in SIZES}
 
 
 @pytest.fixture(scope="module")
 def played(reference: Path, handmade, tmp_path_factory):
-    """Of each size: the handmade levels, one of them written by us, and levels of our sampler; all played."""
+    """Play, for each size, the handmade levels, one of them rewritten by us, and sampled levels."""
     folder = tmp_path_factory.mktemp("levels")
 
     @functools.cache
@@ -44,7 +44,7 @@ def played(reference: Path, handmade, tmp_path_factory):
 
 
 def exported(size: Size, folder: Path, name: str, count: int = OURS) -> list[Path]:
-    """Files of the first levels of a size."""
+    """Write files of the first levels of a size."""
     levels = sample_levels(np.arange(count), size, Distribution())
     paths = [folder / f"{name}-{i}.json" for i in range(count)]
     for i, path in enumerate(paths):
@@ -65,7 +65,7 @@ def assert_same(ours: Level, theirs: Level) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_every_handmade_level_is_read_with_its_rules(handmade, size) -> None:
+def test_reader_reads_every_handmade_level_with_its_rules(handmade, size) -> None:
     assert len(handmade[size]) == HANDMADE[size]
     for path in handmade[size]:
         file = read_level_file(path)
@@ -74,7 +74,7 @@ def test_every_handmade_level_is_read_with_its_rules(handmade, size) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_every_handmade_level_survives_a_round_trip(handmade, size, tmp_path) -> None:
+def test_handmade_levels_survive_a_round_trip(handmade, size, tmp_path) -> None:
     for path in handmade[size]:
         file = read_level_file(path)
         write_level_file(file, tmp_path / path.name)
@@ -84,7 +84,7 @@ def test_every_handmade_level_survives_a_round_trip(handmade, size, tmp_path) ->
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_the_reference_opens_the_same_levels(played, size) -> None:
+def test_reference_opens_the_same_levels(played, size) -> None:
     """Bit for bit: the handmade levels as we read them, and ours as we wrote them."""
     of = played(size)
     assert len(of.files) == HANDMADE[size] + 1 + OURS
@@ -92,8 +92,8 @@ def test_the_reference_opens_the_same_levels(played, size) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_every_level_steps_as_in_the_reference(played, size) -> None:
-    """One env step of ours from each state of the reference's play."""
+def test_file_levels_step_as_in_the_reference(played, size) -> None:
+    """Takes one env step of ours from each state that the reference played."""
     of = played(size)
     steps, levels = of.arrays["action"].shape[:2]
     before = {name: values[:-1].reshape(steps * levels, *values.shape[2:]) for name, values in of.states().items()}
@@ -113,13 +113,13 @@ def test_every_level_steps_as_in_the_reference(played, size) -> None:
     assert (off < 1e-3).mean() >= 0.995, np.sort(off.ravel())[-20:]
     assert (off < 1e-4).mean() >= 0.97
     median = dict(zip((path.stem for path in of.files), np.median(off, 0), strict=True))
-    assert max(median.values()) < 1e-4, median  # no level is always off
+    assert max(median.values()) < 1e-4, median  # no level is off throughout
     same = np.abs(outcome.reward - of.arrays["reward"].ravel()) < 1e-3
     same &= (outcome.done == of.arrays["done"].ravel()) & (outcome.goal == of.arrays["goal"].ravel())
     assert same.mean() >= 0.999
 
 
-def test_a_custom_size_opens_in_the_reference(reference, tmp_path) -> None:
+def test_reference_opens_a_custom_size(reference, tmp_path) -> None:
     files = exported(Size(polygons=7, circles=1, joints=3, thrusters=4), tmp_path, "custom", count=2)
     of = open_in_reference(reference, files, tmp_path / "out.npz")
     assert_same(side_by_side(files), of.levels())

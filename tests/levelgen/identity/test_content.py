@@ -1,4 +1,4 @@
-"""The content hash: the same for every numbering and naming of a level, another for any other level."""
+"""The content hash: the same for every numbering and naming of a level, different for any other level."""
 
 import itertools
 from functools import cache
@@ -32,14 +32,14 @@ from tests.levelgen.variants import (
 EXAMPLES = settings(max_examples=20, deadline=None)
 ANY_LEVEL = st.tuples(st.sampled_from("sml"), st.integers(0, COUNT - 1))
 SEED = st.integers(0, 2**32 - 1)
-SOME = [*(pytest.param(size, marks=pytest.mark.campaign) for size in "sm"), "l"]  # l has all there is
+SOME = [*(pytest.param(size, marks=pytest.mark.campaign) for size in "sm"), "l"]  # l has everything
 SAME = (renumbered, turned, renamed, more_room, idle_changed)
 
 
 @pytest.mark.parametrize("change", SAME, ids=lambda change: change.__name__)
 @EXAMPLES
 @given(ANY_LEVEL, SEED)
-def test_numbers_names_room_and_what_is_idle_do_not_matter(change, which: tuple[str, int], seed: int) -> None:
+def test_irrelevant_change_keeps_the_content_hash(change, which: tuple[str, int], seed: int) -> None:
     level = one(*which)
     other = change(level, np.random.default_rng(seed))
     assert content_hashes(other) == content_hashes(level)
@@ -48,7 +48,7 @@ def test_numbers_names_room_and_what_is_idle_do_not_matter(change, which: tuple[
 
 @EXAMPLES
 @given(ANY_LEVEL, SEED)
-def test_nor_do_all_of_them_together(which: tuple[str, int], seed: int) -> None:
+def test_combined_irrelevant_changes_keep_the_content_hash(which: tuple[str, int], seed: int) -> None:
     level, rng = one(*which), np.random.default_rng(seed)
     other = level
     for change in rng.permutation(np.array(SAME)):
@@ -66,7 +66,7 @@ WHO = ("joint_a", "joint_b", "thruster_body", "active", "joint_active", "collide
 
 
 def counts(level: Level, name: str) -> np.ndarray:
-    """(thing, level): those whose attribute counts."""
+    """Return (row, level): where an attribute is content."""
     model = level.model
     moves = model.inverse_mass != 0
     held = np.take_along_axis(moves, model.joint_a, 0) | np.take_along_axis(moves, model.joint_b, 0)
@@ -75,7 +75,7 @@ def counts(level: Level, name: str) -> np.ndarray:
     which = {
         **dict.fromkeys((*BODIES, "active"), model.active),
         **dict.fromkeys((*HELD, "joint_active"), joints),
-        **dict.fromkeys(("joint_a", "joint_b"), joints & (model.joint_active.sum(0) == 1)),  # no other does the same
+        **dict.fromkeys(("joint_a", "joint_b"), joints & (model.joint_active.sum(0) == 1)),  # without a duplicate joint
         **dict.fromkeys(LIMITS, limited & ~model.joint_fixed),
         **dict.fromkeys(MOTORS, runs & ~model.joint_fixed),
         **dict.fromkeys(THRUSTERS, model.thruster_active),
@@ -90,15 +90,15 @@ def counts(level: Level, name: str) -> np.ndarray:
 
 @cache
 def having(name: str) -> list[tuple[str, int, int]]:
-    """All things of all levels whose attribute counts: size, level, number."""
+    """Return (size, level, index) of all bodies, joints or thrusters whose attribute is content."""
     return [(size, i, k) for size in SIZES for k, i in np.argwhere(counts(sampled(size), name)).tolist()]
 
 
 @pytest.mark.parametrize("name", BODIES + HELD + LIMITS + MOTORS + THRUSTERS + WHO)
 @EXAMPLES
 @given(st.data())
-def test_everything_else_matters(name: str, data: st.DataObject) -> None:
-    """The smallest change there is, of one thing, changes the hash."""
+def test_content_hash_notices_the_smallest_change(name: str, data: st.DataObject) -> None:
+    """The smallest possible change of one attribute of one body, joint or thruster."""
     size, number, thing = data.draw(st.sampled_from(having(name)))
     level = one(size, number)
     before, values = content_hashes(level), field(level, name)
@@ -124,7 +124,7 @@ def field(level: Level, name: str) -> np.ndarray:
     return next(getattr(part, name) for part in (level, level.model, level.state) if hasattr(part, name))
 
 
-def test_what_obeys_together_and_against_each_other_matters() -> None:
+def test_content_hash_notices_which_motors_obey_together_or_opposed() -> None:
     model = sampled("l").model
     motors = model.joint_active & model.motor_on & ~model.joint_fixed & (model.motor_speed != 0)
     chosen = np.flatnonzero(motors.sum(0) >= 2)
@@ -140,12 +140,12 @@ def test_what_obeys_together_and_against_each_other_matters() -> None:
         level.motor_binding[second] = 1
         apart = content_hashes(level)
         level.model.motor_speed[second] *= -1
-        assert content_hashes(level) == apart  # alone on its entry, a motor's direction is a name
+        assert content_hashes(level) == apart  # the direction of a motor that is alone on its entry is arbitrary
         assert len({*together, *against, *apart}) == 3
 
 
-def test_a_weakened_motor_that_runs_the_other_way_is_another() -> None:
-    """The engine weakens a motor where its control, not its speed, goes towards the limit."""
+def test_reversing_a_motor_weakened_by_a_limit_changes_the_content_hash() -> None:
+    """The engine weakens a motor if its control, not its speed, goes towards the limit."""
     weak = weakened(sampled("l")) & sampled("l").model.joint_active & (sampled("l").model.motor_speed != 0)
     for i in np.flatnonzero(weak.any(0))[:20]:
         level = one("l", i)
@@ -154,7 +154,7 @@ def test_a_weakened_motor_that_runs_the_other_way_is_another() -> None:
         assert content_hashes(level) != before
 
 
-def test_what_the_engine_skips_is_no_content() -> None:
+def test_content_ignores_what_the_engine_skips() -> None:
     """A joint between bodies that cannot move, and a thruster without power."""
     level = one("s", int(np.flatnonzero(sampled("s").model.joint_active.any(0))[0]))
     level.model.inverse_mass[...], level.model.thruster_power[...] = 0, 0
@@ -164,19 +164,19 @@ def test_what_the_engine_skips_is_no_content() -> None:
     assert (content_hashes(level), signatures(level)) == before
 
 
-def test_sampled_levels_are_all_different() -> None:
+def test_sampled_levels_have_different_content_hashes() -> None:
     for size in SIZES:
         assert len(set(content_hashes(sampled(size)))) == COUNT
 
 
-def test_a_mirror_image_is_another_level() -> None:
+def test_mirror_image_has_another_content_hash() -> None:
     level = one("s", 3)
     mirrored = level.state.position * np.array([[-1], [1]], np.float32) + np.array([[5], [0]], np.float32)
     assert content_hashes(edited(level, state={"position": mirrored})) != content_hashes(level)
 
 
-def test_hashes_stay_what_they_are() -> None:
-    """Of a level made without the sampler, whose last bits may differ from machine to machine."""
+def test_content_hashes_of_version_1() -> None:
+    """Uses a level made without the sampler, whose last bits may differ between machines."""
     level: Level = jax.tree.map(np.zeros_like, one("m", 0))
     level.model.active[[0, 4, 6]] = True
     level.model.inverse_mass[[4, 6]] = np.array([[0.5], [0.25]])
@@ -189,11 +189,11 @@ def test_hashes_stay_what_they_are() -> None:
     assert signatures(level) == [["n1:aba1dfcb80240912", "n1:4b1994e94f32b348"]]
 
 
-# Played alike: what the hash calls the same
+# Levels with the same hash play alike
 
 
 def play(level: Level, actions: np.ndarray) -> np.ndarray:
-    """Places and angles of all bodies after each env step, (step, body, 3, level)."""
+    """Return positions and angles of all bodies after each env step, (step, body, 3, level)."""
     rules, now, seen = TaskParams(dense_reward_scale=0.0), reset(level), []
     go = jax.jit(lambda now, action: step(level, now, action, rules)[0])
     for action in actions:
@@ -203,7 +203,7 @@ def play(level: Level, actions: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", SOME)
-def test_what_is_idle_has_no_effect_on_a_single_bit(size: str) -> None:
+def test_idle_values_change_no_bits_of_an_episode(size: str) -> None:
     level, rng = sampled(size), np.random.default_rng(0)
     actions = rng.integers(0, 2, (8, 6, COUNT)).repeat(3, 0).astype(np.int32)
     active = level.model.active[:, None]
@@ -212,11 +212,11 @@ def test_what_is_idle_has_no_effect_on_a_single_bit(size: str) -> None:
 
 
 @pytest.mark.parametrize("size", SOME)
-def test_other_sides_and_names_are_played_alike(size: str) -> None:
-    """But for the last bits, which the solver's sums in another order change, and chaos makes grow."""
+def test_levels_of_equal_hash_play_alike(size: str) -> None:
+    """Except for the last bits, which depend on the order of the solver's sums and grow by chaos."""
     level, rng = sampled(size), np.random.default_rng(0)
     weak = (weakened(level) & level.model.joint_active).any(0)
-    assert weak.any() == (size != "s")  # whose joints have no limits
+    assert weak.any() == (size != "s")  # joints of size s have no limits
     motor, thruster, backward = names(rng)
     actions = rng.integers(0, [[3]] * MOTOR_BINDINGS + [[2], [2]], (4, 6, COUNT)).repeat(3, 0).astype(np.int32)
     other_actions = np.array(actions)
@@ -233,7 +233,7 @@ def test_other_sides_and_names_are_played_alike(size: str) -> None:
 
 
 def worlds(bodies: int) -> st.SearchStrategy[World]:
-    """Copies of one body, tied in all ways but by a few joints and thrusters."""
+    """Draw worlds of copies of one body that differ only in a few joints and thrusters."""
     body = st.integers(0, bodies - 1)
 
     def joined(a: int, b: int, row: bytes, direction: int, entry: int) -> tuple[Side, Side]:
@@ -249,7 +249,7 @@ def worlds(bodies: int) -> st.SearchStrategy[World]:
 
 
 def by_hand(world: World) -> list[str]:
-    """The least of all ways to write a world down: every numbering, every naming."""
+    """Return the smallest encoding of a world over all numberings and namings."""
     ways = itertools.product(
         itertools.permutations(range(len(world.bodies))),
         itertools.permutations(range(2)),
@@ -272,12 +272,12 @@ def by_hand(world: World) -> list[str]:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(2, 3).flatmap(lambda count: st.tuples(worlds(count), worlds(count))))
-def test_worlds_of_one_form_are_the_same_by_trying_everything(both: tuple[World, World]) -> None:
+def test_worlds_have_one_form_exactly_if_some_renumbering_maps_them(both: tuple[World, World]) -> None:
     if canonical_form(both[0]) == canonical_form(both[1]):
         assert by_hand(both[0]) == by_hand(both[1])
 
 
-def test_copies_that_are_joined_otherwise_have_one_form_in_every_numbering() -> None:
+def test_form_ignores_the_numbering_of_copies_that_are_joined_differently() -> None:
     """The legs of a walker: two copies of a thigh and of a shin, at the two ends of one body."""
     links = [(0, 1, b"left"), (0, 2, b"right"), (1, 3, b"left knee"), (2, 4, b"right knee")]
     joints = [(Side(a, b, row, 1, k), Side(b, a, row + b" back", -1, k)) for k, (a, b, row) in enumerate(links)]
@@ -287,15 +287,15 @@ def test_copies_that_are_joined_otherwise_have_one_form_in_every_numbering() -> 
 
 
 def moved(world: World, place: np.ndarray) -> World:
-    """Body i as number place[i], joints and entries in another order."""
+    """Renumber body i as place[i]; reorder joints and entries."""
     side = lambda s: s._replace(first=int(place[s.first]), second=int(place[s.second]))
     bodies = [world.bodies[i] for i in np.argsort(place)]
     joints = [(side(b), side(a)) for a, b in reversed(world.joints)]
     return World(world.gravity, bodies, joints, [], [(int(place[j]), int(place[i])) for i, j in world.apart])
 
 
-def test_a_ring_of_six_copies_is_not_two_rings_of_three() -> None:
-    """Which no look at neighbours tells."""
+def test_form_tells_a_ring_of_six_copies_from_two_rings_of_three() -> None:
+    """Comparing neighbours alone cannot tell them apart."""
     six = ring_of(*((i, (i + 1) % 6) for i in range(6)), bodies=6)
     threes = ring_of((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), bodies=6)
     assert canonical_form(six) != canonical_form(threes)
@@ -310,7 +310,7 @@ def ring_of(*links: tuple[int, int], bodies: int) -> World:
 
 
 def jittered(level: Level, by: float) -> Level:
-    """Everything but the scenery a little elsewhere, m and rad."""
+    """Perturb everything but the scenery, by m and rad."""
     rng, state = np.random.default_rng(0), level.state
     noise = [rng.normal(0, by, x.shape).astype(np.float32) for x in (state.position, state.rotation)]
     for x in noise:
@@ -319,7 +319,7 @@ def jittered(level: Level, by: float) -> Level:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_level_a_little_elsewhere_is_near(size: str) -> None:
+def test_signatures_of_a_jittered_level_share_one(size: str) -> None:
     level = sampled(size)
     near = {}
     for by in (0.001, 0.01, 0.3):
@@ -332,6 +332,6 @@ def test_a_level_a_little_elsewhere_is_near(size: str) -> None:
     assert near[0.3] < 0.1
 
 
-def test_different_levels_are_not_near() -> None:
+def test_signatures_of_different_levels_differ() -> None:
     for size in SIZES:
         assert len({half for both in signatures(sampled(size)) for half in both}) == 2 * COUNT

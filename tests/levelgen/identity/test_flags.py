@@ -1,4 +1,4 @@
-"""Levels and streams stay the same whatever a user has set in JAX."""
+"""Levels and random streams do not depend on the user's JAX settings."""
 
 import hashlib
 import os
@@ -39,7 +39,7 @@ DRAWS: dict[str, Callable[[Any], Any]] = {
     "split": lambda key: jax.random.key_data(jax.random.split(key, 3)),
     "fold_in": lambda key: jax.random.key_data(jax.random.fold_in(key, 3)),
 }
-# Sources of randomness that decide no result: shapes alone; what a page shows of an expert under way
+# Sources of randomness that affect no result: shapes only; what a page shows of a running expert
 HARMLESS = {"levelgen/task/environment.py", "pipeline/play/training.py"}
 
 
@@ -48,7 +48,7 @@ def digest(arrays: Any) -> str:
 
 
 def results() -> Iterator[str]:
-    """Digests of draws from every stream, of levels, and of what scouts find in them, a line each."""
+    """Yield digests of draws from every stream, of levels, and of what scouts find in them, a line each."""
     yield digest(jax.jit(lambda: {stream: {f: DRAWS[f](key_for(5, stream)) for f in DRAWS} for stream in Stream})())
     levels = sample_levels(IDS, SIZES["s"])
     yield " ".join(content_hashes(levels))
@@ -56,7 +56,7 @@ def results() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("name", DRAWS)
-def test_flag_of_the_caller_leaves_draw_unchanged(name: str) -> None:
+def test_callers_jax_flag_leaves_draws_unchanged(name: str) -> None:
     key, draw = key_for(5, Stream.EXPERT), DRAWS[name]
     usual = np.asarray(draw(key))
     with jax.threefry_partitionable(False):
@@ -72,7 +72,7 @@ def test_environment_variables_leave_levels_and_scouts_unchanged() -> None:
     assert theirs.splitlines() == list(results())
 
 
-def test_every_result_is_drawn_from_the_keys_of_a_level() -> None:
+def test_random_draws_use_only_the_keys_of_levels() -> None:
     found = {
         str(path.relative_to(ROOT))
         for layer in ("physics", "levelgen", "experts", "pipeline")

@@ -21,13 +21,13 @@ def data(level_id: int, stream: Stream) -> tuple[int, ...]:
     ],
 )
 def test_keys_are_those_of_version_1(level_id: int, stream: Stream, expected: tuple[int, int]) -> None:
-    """Integer arithmetic alone: they hold on every machine. If they change, raise SAMPLER_VERSION."""
+    """Integer arithmetic alone, so they hold on every machine. If they change, increment SAMPLER_VERSION."""
     assert SAMPLER_VERSION == 1
     assert data(level_id, stream) == expected
 
 
 @pytest.mark.parametrize("wrong", [[[0, 1], [2, 3]], [0.7], 5, [-1], [2**31], [True]])
-def test_what_is_no_list_of_ids(wrong: object) -> None:
+def test_level_id_array_refuses_other_types(wrong: object) -> None:
     with pytest.raises(ValueError, match="level ids"):
         level_id_array(wrong)  # pyright: ignore[reportArgumentType]
 
@@ -45,6 +45,6 @@ def test_keys_do_not_depend_on_how_many_are_made() -> None:
         assert tuple(np.asarray(key).tolist()) == data(level_id, Stream.EVALUATION)
 
 
-def test_the_generator_is_named() -> None:
-    """Whatever JAX's default is."""
+def test_keys_carry_the_named_generator() -> None:
+    """Whatever JAX's default generator is."""
     assert "fry" in str(key_for(0, Stream.LEVEL).dtype)

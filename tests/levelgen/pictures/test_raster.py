@@ -1,4 +1,4 @@
-"""Pictures: what must be visible is, colours mean what the module says, films play."""
+"""Pictures show what they must, in the colours that the module describes; films play."""
 
 import dataclasses
 
@@ -30,11 +30,11 @@ def changed(left: Image.Image, right: Image.Image) -> int:
 
 
 def lane_with(flag: np.ndarray) -> int:
-    """A lane where some entry of (thing, lane) holds."""
+    """Return a lane in which some entry of flag (row, lane) holds."""
     return int(np.flatnonzero(flag.any(0))[0])
 
 
-def test_bodies_have_their_role_colours(golden) -> None:
+def test_picture_shows_bodies_in_their_role_colours(golden) -> None:
     model = golden.level.model
     movable = model.active & (model.inverse_mass != 0)
     for role in Role:
@@ -43,7 +43,7 @@ def test_bodies_have_their_role_colours(golden) -> None:
         assert sum(seen) >= 4, role  # a body may hide behind another
 
 
-def test_a_picture_keeps_to_one_size(golden) -> None:
+def test_pictures_of_a_level_have_one_size(golden) -> None:
     plain = draw(golden.level, golden.state, 0)
     assert plain.size[0] == 480
     assert draw(golden.level, golden.state, 1).size == plain.size
@@ -51,8 +51,8 @@ def test_a_picture_keeps_to_one_size(golden) -> None:
     assert draw(golden.level, golden.state, 0, pixels=240).size[0] == 240
 
 
-def test_what_cannot_move_is_hatched(golden) -> None:
-    """The same circle, held and free: the held one has more edge than fill."""
+def test_picture_hatches_immovable_bodies(golden) -> None:
+    """The same circle, fixed and free: the fixed one has more edge colour than fill."""
     model = golden.level.model
     lane = lane_with(model.active & (model.inverse_mass != 0) & (golden.level.role == Role.PLAIN))
     inverse_mass = model.inverse_mass.copy()
@@ -63,7 +63,7 @@ def test_what_cannot_move_is_hatched(golden) -> None:
 
 
 @pytest.mark.parametrize("thing", ["motor", "thruster"])
-def test_actuators_show_when_they_are_used(golden, thing: str) -> None:
+def test_picture_shows_actuators_in_use(golden, thing: str) -> None:
     level, model = golden.level, golden.level.model
     if thing == "motor":
         acts = model.joint_active & model.motor_on & ~model.joint_fixed & ~level.motor_auto
@@ -74,13 +74,13 @@ def test_actuators_show_when_they_are_used(golden, thing: str) -> None:
     entry = int(level.motor_binding[0, lane]) if thing == "motor" else 4 + int(level.thruster_binding[0, lane])
     used[entry] = 1
     off, on = draw(level, golden.state, lane, action=OFF), draw(level, golden.state, lane, action=used)
-    world = (0, 40, 480, off.size[1] - 30)  # without the words and the keys
+    world = (0, 40, 480, off.size[1] - 30)  # without caption and keys
     assert changed(off.crop(world), on.crop(world)) > 20
     assert shows(on, BINDING_COLOUR[entry])
 
 
-def test_the_flame_points_away_from_the_push(golden) -> None:
-    """The engine pushes a body along its thruster; hot gas leaves on the other side."""
+def test_flame_points_opposite_to_the_force(golden) -> None:
+    """The engine pushes a body along its thruster; the flame is on the other side."""
     model, state = golden.level.model, golden.state
     lane = lane_with(model.thruster_active[:1])
     body = int(model.thruster_body[0, lane])
@@ -102,13 +102,13 @@ def test_the_flame_points_away_from_the_push(golden) -> None:
     assert np.dot(middle - place, push) < -0.1
 
 
-def test_live_entries_are_those_that_do_something(golden) -> None:
+def test_live_entries_have_an_effect(golden) -> None:
     for lane in range(64):
         one = jax.tree.map(lambda x, lane=lane: x[..., lane], golden.level)
         assert golden.action_mask[live_entries(one), lane].all()  # that mask counts motors that are off, too
 
 
-def test_the_words_show(golden) -> None:
+def test_picture_shows_its_caption(golden) -> None:
     bare = draw(golden.level, golden.state, 0)
     told = draw(golden.level, golden.state, 0, caption=Caption("level 7 · size m", "1.2 s", "goal reached"))
     bad = draw(golden.level, golden.state, 0, caption=Caption("level 7 · size m", "1.2 s", "touched red", good=False))
@@ -117,7 +117,7 @@ def test_the_words_show(golden) -> None:
     assert shows(bad.crop((0, 0, 480, 34)), ROLE_COLOUR[Role.RED])
 
 
-def test_a_film_plays(golden, tmp_path) -> None:
+def test_gif_shows_each_picture_for_its_time(golden, tmp_path) -> None:
     pictures = [draw(golden.level, golden.state, lane, pixels=160) for lane in range(5)]
     write_gif(pictures, tmp_path / "film.gif", [0.07] * 4 + [1.0])
     with Image.open(tmp_path / "film.gif") as film:

@@ -22,7 +22,7 @@ from tests.golden.load import HERE, load
 from tests.pace import patience
 
 SVG = "{http://www.w3.org/2000/svg}"
-WORLD = slice(40, 500)  # rows without words, for which machines have other letters
+WORLD = slice(40, 500)  # rows without text, whose font may differ between machines
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 
 
@@ -37,7 +37,7 @@ def scene(of, lane: int, **caption) -> Scene:
 
 
 def film(of, steps: int = 5) -> tuple[list[Scene], list[float]]:
-    """One level in states of others: everything moves, turns, and goes on and off."""
+    """Show one level in states of others, so that everything moves, turns, and goes on and off."""
     level = jax.tree.map(lambda x: x[..., :1], of.level)
     told = [Caption("film", f"{step} s", "goal reached" if step == steps - 1 else "") for step in range(steps)]
     scenes = [scene_of(level, of.state, step, of.action[:, step], words) for step, words in enumerate(told)]
@@ -54,7 +54,7 @@ def pixels(of: Scene) -> np.ndarray:
 
 
 def coarse(image: np.ndarray) -> np.ndarray:
-    """Means over squares of eight pixels: what remains of a difference that is no edge's."""
+    """Average over squares of eight pixels, so that differences at edges vanish."""
     height, width = image.shape[0] // 8 * 8, image.shape[1] // 8 * 8
     return image[:height, :width].reshape(height // 8, 8, width // 8, 8, 3).mean((1, 3))
 
@@ -67,7 +67,7 @@ def assert_alike(svg: np.ndarray, png: np.ndarray) -> None:
 
 
 def at(svg: str, second: float) -> str:
-    """What a browser shows of a film at a time: its animations' values in place of what they animate."""
+    """Freeze a film as a browser shows it at a time: replace animated attributes by their values."""
     root = ET.fromstring(svg)
     for parent in root.iter():
         moves = []
@@ -99,8 +99,8 @@ def _value(element: ET.Element, second: float) -> str:
     return ",".join(str(np.interp(share, times, column)) for column in numbers.T)
 
 
-def test_a_difference_would_show(golden) -> None:
-    """One part that moves by six pixels, or that is not there."""
+def test_comparison_notices_a_moved_or_missing_part(golden) -> None:
+    """One part that is moved by six pixels or missing."""
     still = scene(golden["l"], 3)
     body = max(i for i, part in enumerate(still.parts) if part.angle)
     part = still.parts[body]
@@ -111,34 +111,34 @@ def test_a_difference_would_show(golden) -> None:
 
 
 @pytest.mark.parametrize("size", "sml")
-def test_a_film_shows_each_scene_at_its_time(golden, size: str) -> None:
+def test_film_shows_each_scene_at_its_time(golden, size: str) -> None:
     scenes, seconds = film(golden[size])
     svg = svg_of(scenes, seconds)
     for number, start in enumerate(np.cumsum([0.0, *seconds[:-1]])):
         assert_alike(picture(at(svg, float(start))), pixels(scenes[number]))
-    assert_alike(picture(at(svg, sum(seconds) - 0.01)), pixels(scenes[-1]))  # it rests on the last
+    assert_alike(picture(at(svg, sum(seconds) - 0.01)), pixels(scenes[-1]))  # the last scene is held
 
 
-def test_a_film_begins_with_its_first_scene(golden) -> None:
+def test_film_begins_with_its_first_scene(golden) -> None:
     """For programs that do not play films."""
     scenes, seconds = film(golden["m"])
     assert_alike(picture(svg_of(scenes, seconds)), pixels(scenes[0]))
 
 
-def test_what_stands_still_is_not_animated(golden) -> None:
+def test_still_parts_are_not_animated(golden) -> None:
     still = scene(golden["l"], 0)
     svg = svg_of([still] * 10, [0.1] * 10)
     assert "animate" not in svg
     assert svg == svg_of([still], [0.1])
 
 
-def test_a_film_is_small(golden) -> None:
+def test_film_file_is_small(golden) -> None:
     scenes, seconds = film(golden["l"], 64)
     assert len(svg_of(scenes, seconds)) < 150_000
 
 
 @pytest.mark.parametrize("title", ["<script>alert(1)</script>", 'a & b "quoted"', "\x00\x1b[31m\udcff", "x" * 500])
-def test_any_title_is_text(golden, title: str) -> None:
+def test_svg_escapes_any_title(golden, title: str) -> None:
     root = ET.fromstring(svg_of([scene(golden["s"], 0, title=title)], [1.0]).encode())
     assert not list(root.iter(f"{SVG}script"))
     words = [element.text or "" for element in root.iter(f"{SVG}text")]
@@ -148,7 +148,7 @@ def test_any_title_is_text(golden, title: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason="needs the program chromium or google-chrome")
-def test_a_browser_plays_it(golden, tmp_path) -> None:
+def test_browser_plays_a_film(golden, tmp_path) -> None:
     scenes, seconds = film(golden["l"])
     svg = svg_of(scenes, seconds)
     for number, start in enumerate(np.cumsum([0.0, *seconds[:-1]])):
@@ -156,7 +156,7 @@ def test_a_browser_plays_it(golden, tmp_path) -> None:
 
 
 def photograph(svg: str, second: float, folder: Path) -> np.ndarray:
-    """What a browser shows of a film at a time."""
+    """Take a screenshot of a film in a browser at a time."""
     seek = f"let s = document.querySelector('svg'); s.pauseAnimations(); s.setCurrentTime({second});"
     page, shot = folder / "page.html", folder / "shot.png"
     page.write_text(f"<!doctype html><meta charset=utf-8><body style='margin:0'>{svg}<script>{seek}</script>")

@@ -1,4 +1,4 @@
-"""Random levels: the reference's statistics, and what holds for every level."""
+"""Random levels have the reference's statistics, and properties that hold for every level."""
 
 import dataclasses
 import hashlib
@@ -31,8 +31,8 @@ MANY = {"s": 4096, "m": 4096, "l": 2048}  # in a campaign
 MORE = pytest.mark.campaign
 ROUND = Size(4, 3, 2, 2)  # no polygon but the scenery
 CROWD = Size(7, 3, 1, 1)
-SIGNIFICANT = 1e-3  # over all statistics of a size together
-RARE = 10  # values seen less often, in both samples together, are counted as one
+SIGNIFICANT = 1e-3  # for all statistics of a size together
+RARE = 10  # values that occur less often, in both samples together, are merged into one
 
 
 @cache
@@ -62,7 +62,7 @@ def reference_statistics(size: str) -> dict[str, dict[str, np.ndarray]]:
 
 
 def p_value(ours: np.ndarray, theirs: dict[str, np.ndarray]) -> float:
-    """Of the hypothesis that both samples have one distribution: chi-square of counts, or Kolmogorov-Smirnov."""
+    """Return the p-value that both samples have one distribution: chi-square of counts, or Kolmogorov-Smirnov."""
     ours = np.asarray(ours, np.float32)
     if "quantiles" in theirs:
         expected = np.linspace(0, 1, len(theirs["quantiles"]))
@@ -82,7 +82,7 @@ def p_value(ours: np.ndarray, theirs: dict[str, np.ndarray]) -> float:
 @pytest.mark.parametrize(
     ("size", "count"), [*COUNTS.items(), *(pytest.param(*item, marks=MORE) for item in MANY.items())]
 )
-def test_statistics_of_the_reference(size: str, count: int) -> None:
+def test_sampler_has_the_references_statistics(size: str, count: int) -> None:
     ours, theirs = summaries(sampled(SIZES[size], count)), reference_statistics(size)
     assert {name for name, values in ours.items() if len(values)} == set(theirs)
     p = {name: p_value(ours[name], theirs[name]) for name in theirs}
@@ -93,16 +93,16 @@ def test_statistics_of_the_reference(size: str, count: int) -> None:
 
 @MORE
 @pytest.mark.parametrize(("chance", "count"), [(0.7, COUNTS["s"]), (0.75, MANY["s"])])
-def test_the_statistics_notice_a_change(chance: float, count: int) -> None:
-    """Fewer motors than four in five are on; no other statistic."""
+def test_statistics_notice_a_changed_distribution(chance: float, count: int) -> None:
+    """Fewer motors than four in five are on; no other statistic changes."""
     changed = Distribution(motor_chance=chance)
     ours, theirs = summaries(sampled(SIZES["s"], count, changed)), reference_statistics("s")
     p = {name: p_value(ours[name], theirs[name]) for name in theirs}
     assert [name for name in p if p[name] < SIGNIFICANT / len(p)] == ["joint motor on"]
 
 
-def test_a_level_depends_on_its_id_alone(level: Level) -> None:
-    """Bit for bit, in any company, order and place."""
+def test_level_depends_on_its_id_alone(level: Level) -> None:
+    """Bit for bit, whatever other levels are sampled, in any order and position."""
     ids = np.array([5, 3, 5, CHUNK + 2, 0])
     alone = [sample_levels(ids[i : i + 1], level.size) for i in range(len(ids))]
     together = sample_levels(jnp.asarray(ids), level.size)
@@ -124,7 +124,7 @@ def test_levels_of_version_1() -> None:
     assert digests == {"s": "e8988f5977c671a4", "m": "13e88ef1ba1b54dc", "l": "9e8317e219c8246d"}
 
 
-def test_no_levels() -> None:
+def test_sampler_returns_no_levels_for_no_ids() -> None:
     none = sample_levels(np.arange(0), SIZES["s"])
     assert none.role.shape == (SIZES["s"].bodies, 0)
 
@@ -142,17 +142,17 @@ def test_green_or_blue_can_move(level: Level) -> None:
     assert (goal & (level.model.inverse_mass > 0)).any(0).all()
 
 
-def test_something_can_act(level: Level) -> None:
+def test_sampled_level_has_a_motor_or_thruster(level: Level) -> None:
     assert np.asarray(action_mask(level)).any(0).all()
 
 
-def test_small_worlds_have_no_fixed_bodies() -> None:
+def test_small_sizes_have_no_fixed_bodies() -> None:
     model = sampled(SIZES["s"], COUNTS["s"]).model
     assert (model.inverse_mass[FIXED_POLYGONS:] > 0)[model.active[FIXED_POLYGONS:]].all()
 
 
-def test_free_bodies_are_within_the_world(level: Level) -> None:
-    """Where nothing joins or lowers them."""
+def test_free_bodies_lie_within_the_world(level: Level) -> None:
+    """If nothing joins or lowers them."""
     model, polygons, numbers = level.model, level.size.polygons, np.arange(level.size.bodies)[:, None, None]
     joined = ((model.joint_a == numbers) | (model.joint_b == numbers)) & model.joint_active
     free = model.active & (model.inverse_mass > 0) & ~joined.any(1)
@@ -166,7 +166,7 @@ def test_free_bodies_are_within_the_world(level: Level) -> None:
         assert (high < WORLD_SIDE + slack)[free].all()
 
 
-def test_what_is_not_there_is_empty(level: Level) -> None:
+def test_unused_rows_are_blank(level: Level) -> None:
     model, gone = level.model, ~level.model.active
     assert (level.state.position[np.broadcast_to(gone[:, None], level.state.position.shape)] == 0).all()
     assert (level.role[gone] == Role.PLAIN).all()
@@ -178,7 +178,7 @@ def test_what_is_not_there_is_empty(level: Level) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_scenery_and_chains_are_those_of_the_reference(size: str) -> None:
+def test_scenery_and_collision_matrix_equal_the_references(size: str) -> None:
     golden = load(HERE / f"{size}.npz").level
     ours, lanes = empty_level(SIZES[size], golden.role.shape[-1]), np.s_[:FIXED_POLYGONS]
     np.testing.assert_array_equal(jax.jit(collision_matrix)(golden.model), golden.model.collides)
@@ -189,8 +189,8 @@ def test_scenery_and_chains_are_those_of_the_reference(size: str) -> None:
     assert np.abs(np.asarray(ours.model.gravity) - [[0], [-9.81]]).max() < 1e-6
 
 
-def test_contacts_of_a_new_body() -> None:
-    """As many as the engine finds, with the last polygon or the last circle as the new body."""
+def test_count_contacts_agrees_with_the_engine() -> None:
+    """The new body is the last polygon or the last circle."""
     level = sampled(SIZES["m"], COUNTS["m"])
     model, state, polygons = level.model, level.state, level.size.polygons
     controls = (np.zeros((len(x), state.rotation.shape[-1]), np.float32) for x in (model.joint_a, model.thruster_body))
@@ -215,7 +215,7 @@ def test_contacts_of_a_new_body() -> None:
 
 @MORE
 @pytest.mark.parametrize("size", [ROUND, Size(8, 0, 3, 0)], ids=str)
-def test_any_size(size: Size) -> None:
+def test_sampler_serves_any_size(size: Size) -> None:
     assert_possible(sampled(size, CHUNK), size)
 
 
@@ -230,14 +230,14 @@ def assert_possible(level: Level, size: Size) -> None:
 
 
 @pytest.mark.parametrize("size", [Size(4, 1, 1, 1), Size(3, 4, 1, 1), Size(5, 2, -1, 0)], ids=str)
-def test_sizes_without_room_are_refused(size: Size) -> None:
+def test_sampler_refuses_sizes_without_room(size: Size) -> None:
     with pytest.raises(ValueError, match="leave no room for"):
         sample_levels(np.arange(1), size)
 
 
 @pytest.mark.parametrize("level_id", [-1, 2**31])
-def test_ids_out_of_range_are_refused(level_id: int) -> None:
-    with pytest.raises(ValueError, match="they run from 0 to 2147483647"):
+def test_sampler_refuses_ids_out_of_range(level_id: int) -> None:
+    with pytest.raises(ValueError, match="must be within 0 to 2147483647"):
         sample_levels(np.array([level_id]), SIZES["s"])
 
 
@@ -263,15 +263,15 @@ def test_ids_out_of_range_are_refused(level_id: int) -> None:
         ({"goal_size_factor": 2.0}, "goal_size_factor is 2.0: shapes would reach 2.00 m, over 1.25 m"),
     ],
 )
-def test_a_wrong_distribution_says_what_is_wrong(changes: dict[str, float], message: str) -> None:
+def test_distribution_refuses_wrong_values_by_name(changes: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match="is") as refused:
         Distribution(**changes)  # type: ignore[arg-type]
     assert str(refused.value) == message
 
 
 @MORE
-def test_what_must_act_follows_its_weights() -> None:
-    """A thruster always; a motor too in three levels of four. Size s has no bodies joined but for a motor's sake."""
+def test_required_actuators_follow_their_weights() -> None:
+    """Here a thruster is always required, and a motor in three of four levels. Size s joins bodies only for a motor."""
     changed = Distribution(motor_only_weight=0.0, motor_and_thruster_weight=3.0)
     model = sampled(SIZES["s"], COUNTS["s"], changed).model
     assert model.thruster_active.any(0).all()
@@ -279,8 +279,10 @@ def test_what_must_act_follows_its_weights() -> None:
 
 
 def crowd(floor: Role, wheels: float) -> Level:
-    """Levels of a floor that is green or blue, the other one, a body, and one joined to one of them: a rectangle to
-    anything or, by this chance, a circle to rectangles."""
+    """Sample levels with a green or blue floor, the other goal, a body, and one joined to either of them.
+
+    The joined one is a rectangle, or with chance `wheels` a circle on a rectangle.
+    """
     never = ("thruster_only_weight", "connected_weight", "free_weight", "floor_red_chance", "floor_blue_chance")
     chances = dict.fromkeys(never, 0.0) | {f"floor_{floor.name.lower()}_chance": 1.0, "fixed_chance": 0.5}
     how = Distribution(connected_circle_chance=wheels, small_world=0, proposals=1, **chances)  # type: ignore[arg-type]
@@ -288,18 +290,18 @@ def crowd(floor: Role, wheels: float) -> Level:
 
 
 @pytest.mark.parametrize("chance", [pytest.param(0.0, marks=MORE), 1.0])
-def test_wheels_follow_their_chance(chance: float) -> None:
+def test_connected_circles_follow_their_chance(chance: float) -> None:
     model = crowd(Role.GREEN, chance).model
     assert model.joint_active[0].all()
     circles = model.active[CROWD.polygons :].sum(0)
-    assert circles.min() == chance  # of the levels whose free bodies are rectangles
+    assert circles.min() == chance  # among levels whose free bodies are rectangles
 
 
 PRESETS = [pytest.param(name, marks=() if name == "vehicles" else MORE) for name in distributions()]
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_are_what_they_say(name: str) -> None:
+def test_presets_have_their_described_effect(name: str) -> None:
     level = sampled(SIZES["m"], CHUNK, distributions()[name])
     model = level.model
     movable = np.s_[FIXED_POLYGONS:]
@@ -319,7 +321,7 @@ def test_presets_are_what_they_say(name: str) -> None:
 
 
 @pytest.mark.parametrize("floor", [Role.GREEN, pytest.param(Role.BLUE, marks=MORE)])
-def test_a_floor_that_is_green_or_blue_comes_with_the_other(floor: Role) -> None:
+def test_level_with_a_goal_floor_gets_the_other_goal_as_a_body(floor: Role) -> None:
     other, level = Role.GREEN + Role.BLUE - floor, crowd(floor, 1.0)
     assert_possible(level, CROWD)
     assert (level.role[0] == floor).all()

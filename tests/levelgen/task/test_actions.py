@@ -45,27 +45,27 @@ def test_choices_cover_every_entry() -> None:
 
 
 @pytest.mark.parametrize(("choice", "expected"), [(0, 0.0), (1, 1.0), (2, -1.0)])
-def test_a_motor_obeys_its_entry_only(level: Level, choice: int, expected: float) -> None:
+def test_motor_obeys_only_its_entry(level: Level, choice: int, expected: float) -> None:
     motor, thrust = controls(level, act(e2=choice, e1=1, e3=2))
     np.testing.assert_array_equal(motor[:, 0], [expected, 0.0])
     np.testing.assert_array_equal(thrust[:, 0], [0.0, 0.0])
 
 
-def test_all_thrusters_of_an_entry_fire_together(level: Level) -> None:
+def test_thrusters_of_one_entry_fire_together(level: Level) -> None:
     _, thrust = controls(level, act(e5=1))
     np.testing.assert_array_equal(thrust[:, 0], [1.0, 1.0])
     _, thrust = controls(level, act(e4=1))
     np.testing.assert_array_equal(thrust[:, 0], [0.0, 0.0])
 
 
-def test_automatic_motors_run_forward_whatever_the_action(level: Level) -> None:
+def test_automatic_motor_ignores_the_action(level: Level) -> None:
     automatic = dataclasses.replace(level, motor_auto=jnp.array([[True], [False]]))
     for choice in range(3):
         motor, _ = controls(automatic, act(e2=choice))
         np.testing.assert_array_equal(motor[:, 0], [1.0, 0.0])
 
 
-def test_lanes_do_not_mix(level: Level) -> None:
+def test_controls_do_not_mix_lanes(level: Level) -> None:
     two = jax.tree.map(lambda x: jnp.concatenate([x, x], -1), level)
     motor, _ = controls(two, jnp.concatenate([act(e2=1), act(e0=2)], -1))
     np.testing.assert_array_equal(motor, [[1.0, 0.0], [0.0, -1.0]])
@@ -80,6 +80,6 @@ def test_mask_is_what_active_free_joints_and_active_thrusters_obey(level: Level)
 
 
 def test_mask_counts_motors_that_are_off_or_automatic(level: Level) -> None:
-    """So does the reference; the entry has no effect all the same."""
+    """As in the reference, although such an entry has no effect."""
     off = with_model(level, motor_on=jnp.zeros((2, 1), bool))
     np.testing.assert_array_equal(action_mask(off), action_mask(level))

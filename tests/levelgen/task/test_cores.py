@@ -1,4 +1,4 @@
-"""Environments divided among CPU cores from one process: the same bits as on one."""
+"""Environments spread over CPU cores by one process have the same bits as on one core."""
 
 import os
 import subprocess
@@ -32,7 +32,7 @@ print("equal")
 """
 
 
-def test_two_cores_give_the_bits_of_one() -> None:
+def test_two_cores_give_the_same_bits_as_one() -> None:
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
     root = Path(__file__).parents[3]
     done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=root, env=environment, capture_output=True, text=True)

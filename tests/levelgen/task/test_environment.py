@@ -1,4 +1,4 @@
-"""The environment for users of gymnax: one at a time, mapped, mapped twice, around loops: always the same world."""
+"""The environment for users of gymnax: single, mapped, mapped twice or around loops, always the same world."""
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +58,7 @@ def assert_same(left, right) -> None:
 
 
 def play(env: Environment, params: EnvParams, state: EnvState, keys: jax.Array, actions):
-    """Mapped steps in a loop: (state, (observations, rewards, ends))."""
+    """Take mapped steps in a loop: return (state, (observations, rewards, ends))."""
 
     def step(state, inputs):
         number, action = inputs
@@ -69,7 +69,7 @@ def play(env: Environment, params: EnvParams, state: EnvState, keys: jax.Array, 
     return jax.jit(lambda: jax.lax.scan(step, state, (jnp.arange(STEPS), jnp.asarray(actions))))()
 
 
-def test_a_mapped_step_is_the_tasks_step(levels: Level, keys, actions) -> None:
+def test_mapped_step_equals_the_tasks_step(levels: Level, keys, actions) -> None:
     env, params = make(levels, auto_reset=False)
     state, (seen, reward, done) = play(env, params, starts(levels), keys, actions)
     world, advance = task.reset(levels), jax.jit(lambda world, action: task.advance(levels, world, action, env.rules))
@@ -82,7 +82,7 @@ def test_a_mapped_step_is_the_tasks_step(levels: Level, keys, actions) -> None:
 
 
 @pytest.mark.campaign
-def test_one_environment_is_a_lane_of_many(levels: Level, made, keys, actions) -> None:
+def test_single_environment_equals_a_lane_of_many(levels: Level, made, keys, actions) -> None:
     env, params = made
     many = jax.vmap(env.step, (0, 0, 0, None))(keys, starts(levels), actions[0], params)
     one = env.step(keys[5], jax.tree.map(lambda x: x[5], starts(levels)), actions[0, 5], params)
@@ -91,7 +91,7 @@ def test_one_environment_is_a_lane_of_many(levels: Level, made, keys, actions) -
 
 
 @pytest.mark.campaign
-def test_mapped_twice_is_mapped_once(levels: Level, made, keys, actions) -> None:
+def test_mapping_twice_equals_mapping_once(levels: Level, made, keys, actions) -> None:
     env, params = made
     fold = lambda tree: jax.tree.map(lambda x: x.reshape(4, 6, *x.shape[1:]), tree)
     given = (keys, starts(levels), jnp.asarray(actions[0]))
@@ -108,7 +108,7 @@ def test_mapped_twice_is_mapped_once(levels: Level, made, keys, actions) -> None
 
 
 @pytest.mark.campaign
-def test_a_mapped_loop_is_a_loop_of_mapped_steps(levels: Level, made, keys, actions) -> None:
+def test_mapped_loop_equals_a_loop_of_mapped_steps(levels: Level, made, keys, actions) -> None:
     env, params = made
 
     def episode(key, state, actions):
@@ -126,7 +126,7 @@ def test_a_mapped_loop_is_a_loop_of_mapped_steps(levels: Level, made, keys, acti
 
 
 @pytest.mark.campaign
-def test_levels_may_differ_between_mapped_parameters(levels: Level, made, keys) -> None:
+def test_mapped_parameters_may_have_different_levels(levels: Level, made, keys) -> None:
     """Mapping over the parameters too: each environment draws from its own levels."""
     env, _ = made
     groups = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], 4, 6), -2, 0), EnvParams(env.levels))
@@ -145,8 +145,8 @@ def test_resets_draw_from_all_levels(levels: Level, made) -> None:
     assert drawn.any(0).all()
 
 
-def test_one_key_for_everything_still_meets_every_level(levels: Level) -> None:
-    """Code that never splits its keys: each goes to reset, to the sampling of actions and to every step."""
+def test_reusing_one_key_still_meets_every_level(levels: Level) -> None:
+    """For code that never splits its keys: each goes to reset, to the sampling of actions and to every step."""
     eleven = jax.tree.map(lambda x: x[..., :11], levels)  # as many as there are discrete actions
     env, params = make(eleven, ActionType.DISCRETE, rules=task.TaskParams(max_timesteps=1))
     keys = jax.random.split(jax.random.PRNGKey(0), 256)
@@ -165,7 +165,7 @@ def test_one_key_for_everything_still_meets_every_level(levels: Level) -> None:
     assert (same < 0.2).all(), same  # 1 in 11 by chance
 
 
-def test_an_end_resets(levels: Level, keys) -> None:
+def test_step_resets_after_the_end(levels: Level, keys) -> None:
     env, params = make(levels, rules=task.TaskParams(max_timesteps=1))
     stop, own = jnp.zeros((LEVELS, 6), jnp.int32), starts(levels)
     seen, state, _, done, info = jax.jit(jax.vmap(env.step, (0, 0, 0, None, 0)))(keys, own, stop, params, own)
@@ -174,7 +174,7 @@ def test_an_end_resets(levels: Level, keys) -> None:
     assert info["truncated"].sum() > LEVELS / 2  # the rest reached the goal or failed in that step
     np.testing.assert_array_equal(info["level_index"], np.arange(LEVELS))
     assert (np.asarray(info["distance"]) > 0).all()
-    assert_same(state, own)  # the given state, and what is seen of it
+    assert_same(state, own)  # the given state and its observation
     np.testing.assert_array_equal(seen, jax.jit(jax.vmap(env.get_obs))(own))
     _, drawn, _, done, _ = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, own, stop, params)
     assert done.all()
@@ -182,8 +182,8 @@ def test_an_end_resets(levels: Level, keys) -> None:
     assert not np.array_equal(drawn.level.model.inverse_mass, own.level.model.inverse_mass)  # other levels
 
 
-def test_info_tells_what_value_functions_and_curricula_need(levels: Level, keys, actions) -> None:
-    """Played beside an environment that does not reset: which shows how an episode ended, and what was seen then."""
+def test_info_reports_the_end_and_the_last_observation(levels: Level, keys, actions) -> None:
+    """An environment without reset, played alongside, shows how an episode ended and its last observation."""
     limit = 8
     env, params = make(levels, rules=task.TaskParams(max_timesteps=limit), final_observation=True)
     bare, _ = make(levels, rules=env.rules, auto_reset=False)
@@ -210,13 +210,13 @@ def test_info_tells_what_value_functions_and_curricula_need(levels: Level, keys,
     assert (ends > 0).all(), ends
 
 
-def test_parameters_are_those_of_make_where_none_are_given(levels: Level, made) -> None:
+def test_parameters_default_to_those_of_make(levels: Level, made) -> None:
     env, params = made
     assert_same(env.reset(jax.random.key(1)), env.reset(jax.random.key(1), params))
 
 
 @pytest.mark.campaign
-def test_of_one_level_it_is_always_that_one(levels: Level, made) -> None:
+def test_resets_with_one_level_return_that_level(levels: Level, made) -> None:
     first = EnvParams(jax.tree.map(lambda x: x[..., :1], made[0].levels))
     assert_same(made[0].reset(jax.random.key(1), first)[1], EnvState.start(lane(levels, 0)))
 
@@ -226,7 +226,7 @@ OBSERVATIONS = [pytest.param(kind, marks=pytest.mark.campaign if kind in MORE el
 
 
 @pytest.mark.parametrize("observation_type", OBSERVATIONS)
-def test_observations_are_in_their_space(levels: Level, observation_type: str) -> None:
+def test_observations_lie_in_their_space(levels: Level, observation_type: str) -> None:
     env, params = make(levels, observation_type=observation_type)
     seen, state = env.reset(jax.random.key(0), params)
     space = env.observation_space(params)
@@ -243,7 +243,7 @@ def test_observations_are_in_their_space(levels: Level, observation_type: str) -
 
 
 @pytest.mark.parametrize("action_type", list(ActionType))
-def test_actions_of_their_space(levels: Level, keys, action_type: str) -> None:
+def test_sampled_actions_lie_in_their_space(levels: Level, keys, action_type: str) -> None:
     env, params = make(levels, action_type)
     space = env.action_space(params)
     action = jax.vmap(space.sample)(keys)
@@ -252,16 +252,16 @@ def test_actions_of_their_space(levels: Level, keys, action_type: str) -> None:
     assert isinstance(space, kind)
 
 
-@pytest.mark.campaign  # tests of other things take each kind; the README's Python takes discrete ones
+@pytest.mark.campaign  # other tests use each type; the README's Python uses discrete ones
 @pytest.mark.parametrize("action_type", list(ActionType))
-def test_actions_are_taken(levels: Level, keys, action_type: str) -> None:
+def test_environment_takes_every_action_type(levels: Level, keys, action_type: str) -> None:
     env, params = make(levels, action_type)
     action = jax.vmap(env.action_space(params).sample)(keys)
     _, state, _, _, _ = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, starts(levels), action, params)
     assert np.isfinite(state.now.state.position).all()
 
 
-def test_spaces_know_what_is_not_in_them() -> None:
+def test_spaces_reject_foreign_elements() -> None:
     assert not Discrete(11).contains(11)
     assert not MultiDiscrete(CHOICES).contains(jnp.array([0, 0, 0, 0, 2, 0]))
     assert not Box(-1.0, 1.0, (6,)).contains(jnp.full(6, 1.1))
@@ -275,14 +275,14 @@ def test_spaces_without_bounds_sample_finite_elements(levels: Level) -> None:
         assert space.contains(drawn)
 
 
-def test_unknown_types_are_refused(levels: Level) -> None:
+def test_make_refuses_unknown_types(levels: Level) -> None:
     with pytest.raises(ValueError, match="no ObservationType 'symbols': choose one of symbolic_flat"):
         make(levels, observation_type="symbols")
     with pytest.raises(ValueError, match="no ActionType 'Discrete': choose one of discrete"):
         make(levels, action_type="Discrete")
 
 
-def test_an_action_of_another_kind_is_refused(levels: Level) -> None:
+def test_step_refuses_an_action_of_another_type(levels: Level) -> None:
     for kind, wrong in ("multi_discrete", ()), ("discrete", (6,)), ("continuous", (11,)):
         env, params = make(levels, kind)
         _, state = jax.eval_shape(env.reset, jax.random.key(0), params)
@@ -291,12 +291,12 @@ def test_an_action_of_another_kind_is_refused(levels: Level) -> None:
                 jax.eval_shape(step, jax.random.key(0), state, jnp.zeros(wrong), params)
 
 
-def test_no_levels_are_refused(levels: Level) -> None:
+def test_make_refuses_no_levels(levels: Level) -> None:
     with pytest.raises(ValueError, match="there are no levels to reset to"):
         make(jax.tree.map(lambda x: x[..., :0], levels))
 
 
-def test_numbers_of_64_bits_are_refused(levels: Level) -> None:
+def test_environment_refuses_64_bit_mode(levels: Level) -> None:
     with jax.enable_x64(True):
         for what in (lambda: make(levels), lambda: sample_levels(np.arange(2), SIZES["s"])):
             with pytest.raises(ValueError, match="jax_enable_x64 is on"):
@@ -307,7 +307,7 @@ def test_numbers_of_64_bits_are_refused(levels: Level) -> None:
     "size",
     [Size(6, 0, 1, 0), *(pytest.param(of, marks=pytest.mark.campaign) for of in (Size(4, 2, 0, 1), Size(6, 0, 0, 1)))],
 )
-def test_sizes_without_things_of_a_kind(size: Size) -> None:
+def test_environment_works_for_sizes_without_some_kinds(size: Size) -> None:
     env, params = make(sample_levels(np.arange(3), size))
     keys = jax.random.split(jax.random.key(0), 3)
     _, state = jax.vmap(env.reset, (0, None))(keys, params)
@@ -317,7 +317,7 @@ def test_sizes_without_things_of_a_kind(size: Size) -> None:
     assert np.isfinite(state.now.state.position).all()
 
 
-def test_nothing_is_differentiated_through_the_world(levels: Level) -> None:
+def test_gradients_do_not_flow_through_the_world(levels: Level) -> None:
     env, params = make(levels, ActionType.CONTINUOUS)
     _, state = env.reset(jax.random.key(0), params)
 

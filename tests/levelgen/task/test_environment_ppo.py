@@ -1,4 +1,4 @@
-"""A public PPO that was written for gymnax, rejax 0.1.3, learns here; and whole runs may be mapped."""
+"""A public PPO written for gymnax, rejax 0.1.3, learns here, and whole runs may be mapped."""
 
 import jax
 import jax.numpy as jnp
@@ -12,19 +12,19 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.environment import ActionType, Environment, EnvParams, make
 
 STEPS = 262_144
-EPISODES = 128  # of an evaluation
+EPISODES = 128  # per evaluation
 SEEDS = 3
 
 
 class WithGymnaxSpace(Environment):
-    """rejax asks for the class of gymnax's own space of discrete actions; all else it takes as it is."""
+    """Our environment with gymnax's own class of discrete spaces, which rejax checks for; it accepts the rest."""
 
     def action_space(self, params: EnvParams | None = None) -> spaces.Discrete:
         return spaces.Discrete(super().action_space(params).n)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def solved(algo, ts, rng) -> jax.Array:
-    """Share of first episodes that reach the goal."""
+    """Return the share of first episodes that reach the goal."""
     act = algo.make_act(ts)
 
     def play(rng):
@@ -44,8 +44,8 @@ def solved(algo, ts, rng) -> jax.Array:
 
 
 @pytest.mark.campaign
-def test_it_learns() -> None:
-    """On four random levels, of which some are solved by chance. What a seed learns hangs on the machine's rounding."""
+def test_ppo_learns() -> None:
+    """On four random levels, some of which random play solves. What a seed learns depends on the machine's rounding."""
     env, params = make(sample_levels(jnp.arange(4), SIZES["s"]), ActionType.DISCRETE)
     algo = PPO.create(
         env=WithGymnaxSpace(**vars(env)), env_params=params, num_envs=64, num_steps=64, num_epochs=4,
@@ -58,7 +58,7 @@ def test_it_learns() -> None:
 
 
 @pytest.mark.campaign
-def test_continuous_actions_train_without_ado() -> None:
+def test_ppo_trains_with_continuous_actions() -> None:
     env, params = make(sample_levels(jnp.arange(4), SIZES["s"]), ActionType.CONTINUOUS)
     algo = PPO.create(
         env=env, env_params=params, num_envs=16, num_steps=32, num_minibatches=2, num_epochs=1,
@@ -71,8 +71,8 @@ def test_continuous_actions_train_without_ado() -> None:
 
 
 @pytest.mark.campaign
-def test_seeds_train_side_by_side() -> None:
-    """`vmap` of a whole training run, as people do for error bars: here of one rollout."""
+def test_training_runs_can_be_mapped_over_seeds() -> None:
+    """`vmap` over a whole training run, as for error bars; here over one rollout."""
     env, params = make(sample_levels(jnp.arange(2), SIZES["s"]), ActionType.DISCRETE)
 
     def rollout(rng):

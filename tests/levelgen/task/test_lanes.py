@@ -1,4 +1,4 @@
-"""Lanes beside the environment of one: the same worlds, rewards, ends and observations."""
+"""Lanes against mapped single environments: the same worlds, rewards, ends and observations."""
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +50,7 @@ def test_lanes_step_as_mapped_environments_do(levels: Level) -> None:
     jax.tree.map(np.testing.assert_array_equal, played, jax.jit(lanes.take)(table, state.level_index))
 
 
-def test_a_lane_state_has_nothing_of_the_levels(levels: Level) -> None:
+def test_lane_state_contains_no_level_arrays(levels: Level) -> None:
     env, params = make(levels)
     _, state, _ = jax.eval_shape(lambda: Lanes(env).reset(Lanes(env).table(params), jnp.arange(3)))
     assert {x.shape[-1] for x in jax.tree.leaves(state)} == {3}
@@ -58,7 +58,7 @@ def test_a_lane_state_has_nothing_of_the_levels(levels: Level) -> None:
 
 
 @pytest.mark.parametrize("kind", list(ObservationType))
-def test_every_observation_is_that_of_the_environment(levels: Level, kind: str) -> None:
+def test_lanes_observe_as_the_environment_does(levels: Level, kind: str) -> None:
     env, params = make(levels[:2], observation_type=kind)
     lanes = Lanes(env)
     shown = jax.eval_shape(lambda: lanes.reset(lanes.table(params), jnp.arange(2))[0])

@@ -36,7 +36,7 @@ def golden(size: str) -> Golden:
 
 @functools.cache
 def env_step(size: str):
-    """Our env step from every golden state: the next task state and the outcome, on the host."""
+    """Take our env step from every golden state: return the next task state and the result, on the host."""
     of = golden(size)
     params = TaskParams(
         frame_skip=of.about["frame_skip"], dense_reward_scale=float(np.float32(of.about["dense_reward_scale"]))
@@ -48,7 +48,7 @@ def env_step(size: str):
 
 @functools.cache
 def episode_step(max_timesteps: int = 256):
-    """A compiled env step with automatic reset."""
+    """Compile an env step with automatic reset."""
     params = TaskParams(max_timesteps=max_timesteps)
     return jax.jit(lambda level, now, action: step(level, now, action, params))
 
@@ -69,11 +69,11 @@ class TestAgainstTheReference:
         same = np.abs(outcome.reward - of.reward) < 1e-4
         same &= (outcome.done == of.done) & (outcome.goal == of.goal)
         assert same.mean() >= 0.995, np.flatnonzero(~same)
-        assert of.goal.sum() > 40  # goals, ends by red and steps in between are all there
+        assert of.goal.sum() > 40  # goals, failures and steps in between all occur
         assert (of.reward < -0.5).sum() > 20
         assert (~of.done).sum() > 300
 
-    def test_the_next_state(self, size: str) -> None:
+    def test_advance_gives_the_references_next_state(self, size: str) -> None:
         of, (after, _) = golden(size), env_step(size)
         worst = np.zeros(of.reward.size)
         for name in ("position", "rotation", "velocity", "angular_velocity"):
@@ -89,7 +89,7 @@ class TestAgainstTheReference:
 
 @functools.cache
 def still() -> Level:
-    """Eight levels of size s, taken from golden states that are not at an end."""
+    """Return eight levels of size s, from golden states that do not end an episode."""
     of = golden("s")
     return as_level(of, np.flatnonzero(~of.done & (of.timestep < 200))[:8])
 
@@ -98,7 +98,7 @@ def actions(level: Level) -> np.ndarray:
     return np.full((6, level.role.shape[-1]), OFF, np.int32)
 
 
-def test_an_episode_starts_with_the_level() -> None:
+def test_episode_starts_from_the_level() -> None:
     level = still()
     fresh = reset(level)
     assert fresh.state is level.state
@@ -107,7 +107,7 @@ def test_an_episode_starts_with_the_level() -> None:
 
 
 @pytest.mark.slow
-def test_no_shaping_on_the_first_step() -> None:
+def test_first_step_has_no_shaping_reward() -> None:
     level = still()
     now, first = episode_step()(level, reset(level), actions(level))
     assert (np.asarray(first.reward)[~np.asarray(first.done)] == 0).all()
@@ -119,7 +119,7 @@ def test_no_shaping_on_the_first_step() -> None:
 
 
 @pytest.mark.slow
-def test_the_time_limit_ends_and_restarts() -> None:
+def test_time_limit_ends_and_restarts_an_episode() -> None:
     level = still()
     start = reset(level)
     late = dataclasses.replace(start, timestep=jnp.full_like(start.timestep, 255))
@@ -136,7 +136,7 @@ def test_the_time_limit_ends_and_restarts() -> None:
 
 
 @pytest.mark.slow
-def test_nan_ends_its_own_episode_only() -> None:
+def test_nan_ends_only_its_own_episode() -> None:
     level = still()
     velocity = np.array(level.state.velocity)
     velocity[5, 0, 2] = np.nan
@@ -152,7 +152,7 @@ def test_nan_ends_its_own_episode_only() -> None:
     np.testing.assert_array_equal(np.asarray(outcome.reward)[others], np.asarray(unharmed.reward)[others])
 
 
-def test_restart_touches_only_what_is_done() -> None:
+def test_restart_changes_only_lanes_that_are_done() -> None:
     level = still()
     now = dataclasses.replace(reset(level), timestep=jnp.arange(8, dtype=jnp.int32) + 1)
     done = jnp.arange(8) % 2 == 0
@@ -160,7 +160,7 @@ def test_restart_touches_only_what_is_done() -> None:
 
 
 def with_roles(level: Level, roles: dict[int, Role], active: bool = True) -> Level:
-    """All bodies plain but for `roles`, all active or none."""
+    """Give all bodies the role plain except for `roles`; make all active or none."""
     role = np.full_like(level.role, Role.PLAIN)
     for body, value in roles.items():
         role[body] = value
@@ -169,7 +169,7 @@ def with_roles(level: Level, roles: dict[int, Role], active: bool = True) -> Lev
 
 
 def contacts_with(level: Level, contact: int | None) -> Manifold:
-    """No contact but one."""
+    """Return a manifold with at most one contact."""
     contacts, lanes = pairs_of(level.size).contacts, level.role.shape[-1]
     active = np.zeros((contacts, lanes), bool)
     if contact is not None:
@@ -178,7 +178,7 @@ def contacts_with(level: Level, contact: int | None) -> Manifold:
 
 
 def pair_contacts(level: Level) -> list[tuple[int, int, int, bool]]:
-    """(contact, body a, body b, whether the task looks at it) of every contact."""
+    """Return (contact, body a, body b, whether the task checks it) of every contact."""
     pairs = pairs_of(level.size)
     polygon = list(zip(pairs.polygon.a, pairs.polygon.b, strict=True))
     others = [pair for kind in (pairs.circle_polygon, pairs.circle) for pair in zip(kind.a, kind.b, strict=True)]
@@ -188,8 +188,8 @@ def pair_contacts(level: Level) -> list[tuple[int, int, int, bool]]:
 
 @pytest.mark.parametrize("first", list(Role))
 @pytest.mark.parametrize("second", list(Role))
-def test_touching_follows_the_roles(first: Role, second: Role) -> None:
-    """Green with blue is the goal, green with red the end; no other two roles mean anything."""
+def test_touches_follows_the_roles(first: Role, second: Role) -> None:
+    """Green with blue is the goal, green with red a failure; other pairs of roles have no effect."""
     one = as_level(golden("s"), slice(0, 1))
     for contact, a, b, counts in pair_contacts(one):
         level, active = with_roles(one, {a: first, b: second}), contacts_with(one, contact)
@@ -199,7 +199,7 @@ def test_touching_follows_the_roles(first: Role, second: Role) -> None:
         assert fail == (counts and {first, second} == {Role.GREEN, Role.RED}), (contact, a, b)
 
 
-def test_inactive_bodies_have_no_role() -> None:
+def test_touches_ignores_roles_of_inactive_bodies() -> None:
     one = as_level(golden("s"), slice(0, 1))
     contact, a, b, _ = pair_contacts(one)[-1]
     asleep = with_roles(one, {a: Role.GREEN, b: Role.BLUE}, active=False)
@@ -208,7 +208,7 @@ def test_inactive_bodies_have_no_role() -> None:
     assert goal_distance(asleep, asleep.state)[0] == 0
 
 
-def test_distance_is_between_centres_summed_over_pairs() -> None:
+def test_goal_distance_sums_over_pairs_of_centres() -> None:
     one = as_level(golden("s"), slice(0, 1))
     level = with_roles(one, {4: Role.BLUE, 5: Role.GREEN, 6: Role.BLUE})
     place = np.asarray(level.state.position)[..., 0]
@@ -217,8 +217,8 @@ def test_distance_is_between_centres_summed_over_pairs() -> None:
 
 
 @pytest.mark.slow
-def test_red_wins_over_blue() -> None:
-    """Green touching both in the same physics step is no goal."""
+def test_touching_red_and_blue_at_once_fails() -> None:
+    """Green touching both in the same physics step does not reach the goal."""
     of = golden("s")
     pairs = pairs_of(of.level.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
@@ -245,6 +245,6 @@ def test_red_wins_over_blue() -> None:
         ({"dense_reward_scale": -1.0}, "dense_reward_scale is -1.0"),
     ],
 )
-def test_impossible_rules_are_refused(change: dict, words: str) -> None:
+def test_task_params_refuse_impossible_rules(change: dict, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         TaskParams(**change)

@@ -20,7 +20,7 @@ SPLITS_DONE = int(version("gymnax").partition(".")[0]) >= 1
 COUNT = 24
 
 
-def test_it_steps_as_the_installed_gymnax_does() -> None:
+def test_wrapper_steps_as_the_installed_gymnax_does() -> None:
     levels = sample_levels(np.arange(COUNT), "s")
     env, params = make(levels, ActionType.DISCRETE, rules=task.TaskParams(max_timesteps=1), final_observation=True)
     wrapped = to_gymnax(env)
@@ -35,12 +35,12 @@ def test_it_steps_as_the_installed_gymnax_does() -> None:
     np.testing.assert_array_equal(wrapped.is_truncated(own), np.zeros(COUNT))
     if SPLITS_DONE:
         names = set(jax.eval_shape(base.Environment.step, DoneAtOnce(), keys[0], jnp.zeros(()), 0)[5])
-        assert names == {"terminated", "truncated", "final_observation"}  # what gymnax itself puts there
+        assert names == {"terminated", "truncated", "final_observation"}  # the entries that gymnax itself adds
         assert names <= set(info)
 
 
 class DoneAtOnce(base.Environment):  # pyright: ignore[reportGeneralTypeIssues, reportUntypedBaseClass]
-    """A gymnax environment of one step, written as gymnax's own are."""
+    """A gymnax environment whose episodes last one step, written like gymnax's own."""
 
     def reset_env(self, key, params):
         return jnp.zeros(2), jnp.zeros(())
@@ -56,7 +56,7 @@ class DoneAtOnce(base.Environment):  # pyright: ignore[reportGeneralTypeIssues, 
     ("action_type", "kind"),
     [(ActionType.DISCRETE, "Discrete"), (ActionType.MULTI_DISCRETE, "Tuple"), (ActionType.CONTINUOUS, "Box")],
 )
-def test_spaces_are_those_of_gymnax(action_type: str, kind: str) -> None:
+def test_wrapper_spaces_are_gymnaxs(action_type: str, kind: str) -> None:
     env, params = make(sample_levels(np.arange(COUNT), "s"), action_type, ObservationType.PIXELS)
     wrapped = to_gymnax(env)
     space = wrapped.action_space(params)

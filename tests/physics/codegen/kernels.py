@@ -1,4 +1,4 @@
-"""Small kernels, run as machine code and as operations of XLA."""
+"""Small kernels, run as machine code and as XLA operations."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -16,13 +16,13 @@ Arrays = Sequence[np.ndarray]
 
 
 def rows(elements: st.SearchStrategy, dtype: Any, count: int = 3) -> st.SearchStrategy[np.ndarray]:
-    """[count, lane], of one block."""
+    """Draw rows [count, lane] of one block."""
     numbers = st.lists(elements, min_size=count * LANES, max_size=count * LANES)
     return numbers.map(lambda x: np.array(x, dtype).reshape(count, LANES))
 
 
 class Kernel:
-    """A kernel of some arguments, results and scratch memory: `body(*references)`; the first argument has lanes."""
+    """A kernel `body(*references)` with its arguments, results and scratch memory; the first argument has lanes."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class Kernel:
 
 
 def same_bits(ours: Arrays, theirs: Arrays, zeros: bool = True) -> None:
-    """Every number alike; any NaN is as good as another. `zeros`: a zero's sign counts."""
+    """Assert equal bits; all NaN count as equal. `zeros`: whether the sign of zeros counts."""
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_array_equal(a, b)
         if zeros and a.dtype == np.float32:

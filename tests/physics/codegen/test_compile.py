@@ -8,8 +8,8 @@ from levelproof.physics.codegen import compile as compile_module
 from levelproof.physics.codegen.buffers import LANES, Buffer
 
 
-def test_the_same_kernel_is_compiled_and_registered_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """XLA takes a name only once."""
+def test_register_compiles_the_same_kernel_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """XLA accepts a name only once."""
     compiled, compiling = [], compile_module._object_code
 
     def noted(text: str) -> bytes:

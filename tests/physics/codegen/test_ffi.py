@@ -1,4 +1,4 @@
-"""The structures that a handler reads are those of XLA's C header, which jaxlib ships."""
+"""The structures that a handler reads match XLA's C header, which jaxlib ships."""
 
 import ctypes
 import re
@@ -22,12 +22,12 @@ NUMBERS = {
 
 @pytest.fixture(scope="module")
 def header() -> str:
-    """Without comments."""
+    """Return the header without comments."""
     return re.sub(r"//.*", "", HEADER.read_text())
 
 
 def declared(header: str, name: str) -> list[tuple[str, str]]:
-    """Type and name of each field of a structure."""
+    """Return type and name of each field of a structure."""
     found = re.search(rf"\bstruct {name} {{(.*?)}}", header, re.DOTALL)
     assert found, f"{HEADER} has no {name}"
     fields = re.findall(r"([\w\s]+?[\s*]+)(\w+);", found[1])
@@ -35,7 +35,7 @@ def declared(header: str, name: str) -> list[tuple[str, str]]:
 
 
 def kind_of(header: str, name: str) -> type:
-    """A C type as ctypes has it."""
+    """Return the ctypes type of a C type."""
     if name.endswith("*"):
         return ctypes.c_void_p
     if name in NUMBERS:
@@ -53,7 +53,7 @@ def structure(header: str, name: str) -> type[ctypes.Structure]:
 
 
 @pytest.mark.parametrize("ours", READ)
-def test_fields_are_where_the_header_has_them(header: str, ours: type[ctypes.Structure]) -> None:
+def test_structure_fields_have_the_headers_offsets(header: str, ours: type[ctypes.Structure]) -> None:
     theirs = structure(header, ours.__name__)
     assert len(theirs._fields_) >= len(ours._fields_) > 0
     for name, kind, *_ in ours._fields_:
@@ -63,18 +63,18 @@ def test_fields_are_where_the_header_has_them(header: str, ours: type[ctypes.Str
         assert issubclass(kind, ctypes.Structure) == issubclass(dict(theirs._fields_)[name], ctypes.Structure)
 
 
-def test_the_version_that_a_handler_announces_is_the_headers(header: str) -> None:
-    """A new version may mean something else by the same fields: read what changed, then announce it."""
-    said = {name: int(number) for name, number in re.findall(r"#define XLA_FFI_API_(MAJOR|MINOR) (\d+)", header)}
-    assert said == {"MAJOR": ffi.VERSION_MAJOR, "MINOR": ffi.VERSION_MINOR}
+def test_handler_announces_the_headers_version(header: str) -> None:
+    """A new version may give the same fields another meaning: read what changed before announcing it."""
+    version = {name: int(number) for name, number in re.findall(r"#define XLA_FFI_API_(MAJOR|MINOR) (\d+)", header)}
+    assert version == {"MAJOR": ffi.VERSION_MAJOR, "MINOR": ffi.VERSION_MINOR}
     query = re.search(r"XLA_FFI_Extension_Metadata = (\d+)", header)
     assert query
     assert int(query[1]) == ffi.METADATA_QUERY
 
 
-def test_structures_of_other_fields_are_told_apart(header: str) -> None:
-    """The comparison sees a field that has moved."""
+def test_header_comparison_notices_a_moved_field(header: str) -> None:
+    """Move one field of the header."""
     moved = header.replace("XLA_FFI_ExecutionStage stage;", "int64_t more; XLA_FFI_ExecutionStage stage;")
     assert moved != header
     with pytest.raises(AssertionError, match=r"CallFrame\.stage is not where"):
-        test_fields_are_where_the_header_has_them(moved, ffi.CallFrame)
+        test_structure_fields_have_the_headers_offsets(moved, ffi.CallFrame)

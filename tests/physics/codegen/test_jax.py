@@ -1,4 +1,4 @@
-"""What JAX makes of the step: the primitives and parameters that physics/codegen/lower.py was written for."""
+"""JAX traces the step to the primitives and parameters that physics/codegen/lower.py supports."""
 
 import dataclasses
 import functools
@@ -48,7 +48,7 @@ CHANGED = (
 
 
 def equations(jaxpr: core.Jaxpr) -> Iterator[core.JaxprEqn]:
-    """Of a jaxpr and of all within it."""
+    """Yield the equations of a jaxpr and of all jaxprs within it."""
     for equation in jaxpr.eqns:
         yield equation
         for inner in jax.tree.leaves(equation.params, is_leaf=lambda x: isinstance(x, core.Jaxpr | core.ClosedJaxpr)):
@@ -59,43 +59,43 @@ def equations(jaxpr: core.Jaxpr) -> Iterator[core.JaxprEqn]:
 
 
 @functools.cache
-def of_the_step() -> list[core.JaxprEqn]:
+def step_equations() -> list[core.JaxprEqn]:
     given = buffers_like(Given(*scattered(SIZE, LANES)))
     return list(equations(trace(block_buffers(SIZE, Params(), True, given), Params()).jaxpr))
 
 
-def test_the_step_uses_the_primitives_that_are_known() -> None:
-    used = {equation.primitive.name for equation in of_the_step()}
-    new, gone = used - set(PARAMETERS), set(PARAMETERS) - used
-    assert not new, CHANGED.format(f"makes new primitives of the step: {sorted(new)}")
-    assert not gone, CHANGED.format(f"makes no more of the primitives {sorted(gone)}")
+def test_step_uses_exactly_the_known_primitives() -> None:
+    used = {equation.primitive.name for equation in step_equations()}
+    new, unused = used - set(PARAMETERS), set(PARAMETERS) - used
+    assert not new, CHANGED.format(f"uses new primitives in the step: {sorted(new)}")
+    assert not unused, CHANGED.format(f"no longer uses the primitives {sorted(unused)}")
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_a_primitive_has_the_parameters_that_are_known(name: str) -> None:
-    for equation in of_the_step():
+def test_primitive_has_the_expected_parameters(name: str) -> None:
+    for equation in step_equations():
         if equation.primitive.name == name:
-            said = CHANGED.format(f"gives {name} the parameters {sorted(equation.params)}")
-            assert set(equation.params) == PARAMETERS[name], said
+            message = CHANGED.format(f"gives {name} the parameters {sorted(equation.params)}")
+            assert set(equation.params) == PARAMETERS[name], message
 
 
-def test_parameters_that_are_not_read_mean_nothing() -> None:
-    """They may only say what is the default."""
-    for equation in of_the_step():
+def test_unread_parameters_have_their_defaults() -> None:
+    """Parameters that `lower` ignores must have their default values."""
+    for equation in step_equations():
         name, params = equation.primitive.name, equation.params
-        means_nothing = (
+        are_defaults = (
             params.get("sharding") is None
             and params.get("accuracy") is None
             and params.get("out_dtype") is None
             and params.get("reverse", False) is False
             and params.get("memory_space") is None
         )
-        assert means_nothing, CHANGED.format(f"makes {name} with {params}")
+        assert are_defaults, CHANGED.format(f"makes {name} with {params}")
 
 
-def test_a_reference_is_indexed_as_is_known() -> None:
-    """By one indexer: whole numbers, scalars, and slices of start, size and stride."""
-    for equation in of_the_step():
+def test_references_are_indexed_as_lower_expects() -> None:
+    """By one indexer of integers, scalars, and slices with start, size and stride."""
+    for equation in step_equations():
         if equation.primitive.name in ("get", "swap"):
             operands = equation.invars[1 + (equation.primitive.name == "swap") :]
             transforms = jax.tree.unflatten(equation.params["tree"], operands)

@@ -1,4 +1,4 @@
-"""Machine code is made once, and what a disk did to it since is not executed."""
+"""Machine code is compiled once and stored; a damaged file is not executed."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ import pytest
 from levelproof.physics.codegen import kept as module
 from levelproof.physics.codegen.kept import kept, kept_while_sources_stay
 
-# A process that steps a world, and says how often it wrote a kernel, and optimised one, and what came of the step
+# A process that steps a world and prints how many kernels it wrote and optimised, and a digest of the step
 PROGRAM = """
 import sys
 import jax
@@ -22,7 +22,7 @@ emit, made = binding.TargetMachine.emit_object, []
 binding.TargetMachine.emit_object = lambda self, module: made.append(module) or emit(self, module)
 from levelproof.physics import step
 from levelproof.physics.codegen import kept
-kept.BEGAN = float("inf")  # whoever runs this may have changed a source a moment ago
+kept.BEGAN = float("inf")  # a source may have been edited a moment ago
 write, written = step.write, []
 step.write = lambda *given: written.append(given) or write(*given)
 from tests.physics.test_machines import digest
@@ -45,7 +45,7 @@ def made(code: bytes) -> tuple[Callable[[], bytes], list[bytes]]:
     return lambda: calls.append(code) or code, calls
 
 
-def test_another_process_executes_what_the_first_made(tmp_path: Path) -> None:
+def test_second_process_reuses_the_kernel_of_the_first(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
     first, second = (subprocess.check_output(command, cwd=ROOT, text=True).split() for _ in range(2))
     assert (first[:2], second[:2]) == (["1", "1"], ["0", "0"])
@@ -53,7 +53,7 @@ def test_another_process_executes_what_the_first_made(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [lambda code: code[:-1], lambda code: b"", lambda code: code[:-1] + b"!"])
-def test_what_is_damaged_is_made_again(folder: Path, damage: Callable[[bytes], bytes]) -> None:
+def test_kept_remakes_a_damaged_file(folder: Path, damage: Callable[[bytes], bytes]) -> None:
     assert kept("one", made(b"code")[0]) == b"code"
     (file,) = folder.iterdir()
     file.write_bytes(damage(file.read_bytes()))
@@ -63,12 +63,12 @@ def test_what_is_damaged_is_made_again(folder: Path, damage: Callable[[bytes], b
     assert list(folder.iterdir()) == [file]
 
 
-def test_another_key_is_other_code(folder: Path) -> None:
+def test_kept_stores_code_by_key(folder: Path) -> None:
     assert [kept(name, made(name.encode())[0]) for name in ("one", "two", "one")] == [b"one", b"two", b"one"]
     assert len(list(folder.iterdir())) == 2
 
 
-def test_a_folder_that_is_none_costs_time_and_nothing_else(folder: Path) -> None:
+def test_kept_works_without_a_folder(folder: Path) -> None:
     jax.config.update("jax_compilation_cache_dir", str(folder / "gone"))
     make, calls = made(b"code")
     assert [kept("one", make), kept("one", make)] == [b"code"] * 2
@@ -77,7 +77,7 @@ def test_a_folder_that_is_none_costs_time_and_nothing_else(folder: Path) -> None
 
 @pytest.fixture
 def source(folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The only one that kernels come from; written long before this process began."""
+    """Replace the kernels' sources by one file, written long before this process began."""
     path = tmp_path_factory.mktemp("sources") / "one.py"
     path.write_text("source")
     os.utime(path, (0, 0))
@@ -93,7 +93,7 @@ def changed(source: Path, text: str, when: float) -> None:
     module._sources.cache_clear()
 
 
-def test_other_sources_make_other_code(source: Path) -> None:
+def test_kept_notices_changed_sources(source: Path) -> None:
     make, calls = made(b"code")
     for text, so_far in (("source", 1), ("source", 1), ("other", 2), ("source", 2)):
         changed(source, text, 0)
@@ -106,8 +106,8 @@ def test_other_sources_make_other_code(source: Path) -> None:
     assert len(calls) == 4
 
 
-def test_of_sources_that_have_changed_since_the_process_began_nothing_is_kept(source: Path, folder: Path) -> None:
-    """It may still run the former ones."""
+def test_kept_stores_nothing_if_a_source_changed_since_the_start(source: Path, folder: Path) -> None:
+    """The process may still run the previous version."""
     make, calls = made(b"code")
     changed(source, "source", module.BEGAN + 1)
     assert [kept_while_sources_stay("one", make) for _ in range(2)] == [b"code"] * 2

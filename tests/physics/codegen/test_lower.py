@@ -17,7 +17,7 @@ from tests.physics.codegen.kernels import Kernel, rows, same_bits
 
 
 class TestMemory:
-    """References: rows by number, known before or only at run time; arrays without lanes."""
+    """References: rows by index, constant or known only at run time; arrays without lanes."""
 
     ARGUMENTS = (Buffer((5,)), Buffer((3, 4), "int32"), Buffer((4,)), Buffer((7,), "int32", lanes=False))
 
@@ -60,7 +60,7 @@ class TestMemory:
 
     @settings(max_examples=20, deadline=None)
     @given(st.tuples(*[st.integers(0, 4)] * 6, st.integers(0, 2)))
-    def test_rows_by_number(self, numbers) -> None:
+    def test_kernel_indexes_rows_as_xla_does(self, numbers) -> None:
         given = self.arguments(list(numbers))
         same_bits(self.kernel().as_machine_code(*given), self.kernel().as_xla(*given))
 
@@ -71,14 +71,14 @@ class TestMemory:
 
 
 class TestControl:
-    """Loops and branches, in each other."""
+    """Nested loops and branches."""
 
     @staticmethod
     def body(x, number, out, found):
         rows, count = x[...], number[0]
         out[...] = jnp.zeros((9, LANES))
 
-        def grow(i, carry):  # carries of all kinds, lanes and none
+        def grow(i, carry):  # carries of all dtypes, with and without lanes
             total, product, lanes, even = carry
             total = total + x[i]
             return total, product * 2 + i, jnp.where(total > 0, i, lanes), ~even
@@ -125,8 +125,8 @@ class TestControl:
         same_bits(self.KERNEL.as_machine_code(*given), self.KERNEL.as_xla(*given))
 
 
-def test_what_is_called_is_computed_in_its_place() -> None:
-    """`closed_call`, which JAX writes around functions that it has traced already."""
+def test_closed_call_is_inlined() -> None:
+    """JAX wraps functions that it has already traced in `closed_call`."""
     double = jax.make_jaxpr(lambda x: x * 2 + 1)(jax.ShapeDtypeStruct((LANES,), np.float32))
 
     def body(x, out):
@@ -174,10 +174,10 @@ REFUSED: dict[str, Callable] = {
 
 
 class TestRefused:
-    """What a kernel cannot use is named when it is compiled."""
+    """Unsupported features are named at compile time."""
 
     @pytest.mark.parametrize("name", REFUSED)
-    def test_what_a_kernel_cannot_compute(self, name: str) -> None:
+    def test_lower_refuses_unsupported_computations(self, name: str) -> None:
         compute = REFUSED[name]
 
         def body(x, n, out):
@@ -197,7 +197,7 @@ class TestRefused:
             ("element by element", lambda x, n, _: n.__setitem__(slice(None), (x[0] > 0).astype(jnp.int32))),
         ],
     )
-    def test_what_a_kernel_cannot_write(self, name: str, write: Callable) -> None:
+    def test_lower_refuses_unsupported_writes(self, name: str, write: Callable) -> None:
         kernel = Kernel(write, [Buffer((4,)), Buffer((LANES,), "int32", lanes=False)], [Buffer((1,))])
         with pytest.raises(NotImplementedError, match=name):
             kernel.as_machine_code(np.zeros((4, LANES), np.float32), np.zeros(LANES, np.int32))

@@ -29,19 +29,19 @@ floats, ints = st.floats(width=32), st.integers(-(2**31), 2**31 - 1)
 
 
 def every_pair(x: np.ndarray) -> np.ndarray:
-    """[3, lane]: all pairs of some numbers, and a third."""
+    """Return [3, lane]: all pairs of some numbers, and a third number."""
     a, b = (grid.reshape(-1) for grid in np.meshgrid(x, x))
     return np.stack([a, b, np.roll(a, 5)])
 
 
-def table(functions: dict[str, Callable], of: str, to: str) -> Kernel:
-    """A kernel that computes functions of three rows of numbers, one row of results each."""
+def table(functions: dict[str, Callable], argument: str, result: str) -> Kernel:
+    """Build a kernel that computes functions of three rows (dtype `argument`), one row (dtype `result`) each."""
 
     def body(x, out):
         for i, f in enumerate(functions.values()):
             out[i] = f(x[0], x[1], x[2])
 
-    return Kernel(body, [Buffer((3,), of)], [Buffer((len(functions),), to)])
+    return Kernel(body, [Buffer((3,), argument)], [Buffer((len(functions),), result)])
 
 
 def flush(x: np.ndarray) -> np.ndarray:
@@ -109,7 +109,7 @@ LOGICAL = COMPARED | {
 
 
 class TestNumbers:
-    """Every elementwise primitive, of every dtype it is for."""
+    """Every elementwise primitive, for every dtype it supports."""
 
     EXACT_FLOATS = table(EXACT, "float32", "float32")
     CHOSEN_FLOATS = table(CHOSEN, "float32", "float32")
@@ -160,7 +160,7 @@ class TestConversions:
 
 
 def shape_cases() -> dict[str, Callable]:
-    """name -> function of x [6, lane] floats and n [4, lane] integers."""
+    """Return {name: function of x [6, lane] floats and n [4, lane] integers}."""
     weights = np.arange(6, dtype=np.float32)
     by_lane = np.arange(LANES, dtype=np.float32) ** 2
     return {

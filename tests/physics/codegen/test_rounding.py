@@ -1,4 +1,4 @@
-"""Kernels round alike on every thread and processor, and leave a thread's mode as it was."""
+"""Kernels round the same way on every thread and processor, and restore the thread's mode."""
 
 import ctypes
 import re
@@ -41,7 +41,7 @@ def through_xla() -> np.ndarray:
 
 
 def without_xla() -> np.ndarray:
-    """Call the handler as XLA does, on a thread in the mode that the system starts threads in."""
+    """Call the handler as XLA does, on a thread in the system's default mode."""
     arrays = [X, ONE, np.ones_like(X), np.ones(0, np.uint8)]
     keep, buffers = [], []
     for array in arrays:
@@ -75,7 +75,7 @@ def test_kernel_leaves_the_mode_of_its_thread_as_it_was() -> None:
 
 @pytest.mark.parametrize("triple", TARGETS)
 def test_arm_code_sets_the_mode_and_fuses_nothing(triple: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What can be known of ARM without one: the whole step compiles, and its assembly is as its source says."""
+    """Without an ARM processor: the whole step compiles, and its assembly has the expected instructions."""
     binding.initialize_all_targets()
     binding.initialize_all_asmprinters()
     monkeypatch.setattr(binding, "get_default_triple", lambda: triple)

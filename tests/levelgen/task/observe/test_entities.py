@@ -1,4 +1,4 @@
-"""Observations of all kinds, and actions of all kinds, against the reference in 512 states a size."""
+"""All observation and action types against the reference, in 512 states per size."""
 
 import jax
 import numpy as np
@@ -16,16 +16,16 @@ def seen(request: pytest.FixtureRequest) -> Seen:
     return load_seen(request.param)
 
 
-def test_there_are_enough_states(seen: Seen) -> None:
+def test_golden_observations_cover_enough_states(seen: Seen) -> None:
     assert seen.fields["image"].shape[-1] >= 500
 
 
 @pytest.mark.parametrize(("name", "look"), [("flat", symbolic_flat), ("padded", symbolic_padded)])
-def test_rows_are_the_references(seen: Seen, name: str, look) -> None:
+def test_flat_and_padded_rows_equal_the_references(seen: Seen, name: str, look) -> None:
     assert_seen(seen.fields, name, np.asarray(jax.jit(look)(seen.level, seen.level.state)))
 
 
-def test_entities_are_the_references(seen: Seen) -> None:
+def test_entities_equal_the_references(seen: Seen) -> None:
     ours = jax.jit(entities)(seen.level, seen.level.state)
     assert {f"entity/{name}" for name in vars(ours)} <= set(seen.fields)
     for name, values in vars(ours).items():
@@ -35,12 +35,12 @@ def test_entities_are_the_references(seen: Seen) -> None:
 
 
 @pytest.mark.parametrize(("name", "obey"), [("discrete", discrete_controls), ("continuous", continuous_controls)])
-def test_actions_do_what_the_references_do(seen: Seen, name: str, obey) -> None:
+def test_actions_give_the_references_controls(seen: Seen, name: str, obey) -> None:
     ours = np.concatenate(jax.jit(obey)(seen.level, seen.fields[name]))
     np.testing.assert_array_equal(ours, seen.fields[f"control_{name}"])
 
 
-def test_a_world_that_broke_down_is_seen_as_numbers(seen: Seen) -> None:
+def test_observations_of_a_broken_world_are_finite(seen: Seen) -> None:
     broken = jax.tree.map(lambda x: np.full_like(x, np.nan) if x.dtype == np.float32 else x, seen.level.state)
     for look in (symbolic_padded, entities):
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(jax.jit(look)(seen.level, broken)))

@@ -32,7 +32,7 @@ def level(request: pytest.FixtureRequest) -> Level:
 
 @jax.jit
 def moved(state: State) -> State:
-    """Every movable body somewhere else."""
+    """Move every movable body."""
     later = jax.tree.map(lambda x: x, state)
     change = lambda x, by: jnp.asarray(x).at[FIXED_POLYGONS:].add(by)
     return dataclasses.replace(
@@ -45,13 +45,13 @@ def moved(state: State) -> State:
 
 
 @pytest.mark.parametrize(("name", "count"), [("s", 140), ("m", 247), ("l", 679)])
-def test_row_counts_are_the_references(name: str, count: int) -> None:
+def test_feature_count_equals_the_references(name: str, count: int) -> None:
     assert feature_count(SIZES[name]) == count
     movable = SIZES[name].bodies - FIXED_POLYGONS
     assert len(dynamic_features(SIZES[name])) == 7 * movable
 
 
-def test_only_dynamic_rows_change_within_a_level(level: Level) -> None:
+def test_only_dynamic_features_change_within_a_level(level: Level) -> None:
     before, after = symbolic_flat(level, level.state), symbolic_flat(level, moved(level.state))
     assert before.shape == (feature_count(level.size), LANES)
     changed = np.flatnonzero((np.asarray(before) != np.asarray(after)).any(1))
@@ -59,7 +59,7 @@ def test_only_dynamic_rows_change_within_a_level(level: Level) -> None:
     assert len(changed) > 0
 
 
-def test_the_two_parts_make_the_whole(level: Level) -> None:
+def test_constant_and_dynamic_features_make_the_whole(level: Level) -> None:
     index, later = dynamic_features(level.size), moved(level.state)
     whole, constant = np.asarray(symbolic_flat(level, later)), np.asarray(level_features(level))
     assert not constant[index].any()
@@ -69,7 +69,7 @@ def test_the_two_parts_make_the_whole(level: Level) -> None:
     np.testing.assert_array_equal(symbolic_flat(level, later, level_features(level)), whole)
 
 
-def test_rows_of_a_body_are_where_the_layout_says(level: Level) -> None:
+def test_body_features_follow_the_layout(level: Level) -> None:
     seen, size, state = np.asarray(symbolic_flat(level, level.state)), level.size, level.state
     first_movable = seen[POLYGON_ROWS : 2 * POLYGON_ROWS]
     active = np.asarray(level.model.active[FIXED_POLYGONS])
@@ -82,7 +82,7 @@ def test_rows_of_a_body_are_where_the_layout_says(level: Level) -> None:
     np.testing.assert_allclose(seen[-1], -0.981, rtol=1e-6)
 
 
-def test_what_is_not_active_is_zero(level: Level) -> None:
+def test_features_of_inactive_entities_are_zero(level: Level) -> None:
     model = dataclasses.replace(
         level.model,
         active=np.zeros_like(level.model.active),
@@ -93,7 +93,7 @@ def test_what_is_not_active_is_zero(level: Level) -> None:
     assert not np.asarray(seen)[:-1].any()
 
 
-def test_values_are_clipped_and_nan_is_zero(level: Level) -> None:
+def test_features_are_clipped_and_nan_is_zero(level: Level) -> None:
     model = dataclasses.replace(level.model, active=np.ones_like(level.model.active))
     nan_x = jnp.asarray(level.state.position).at[FIXED_POLYGONS, 0].set(jnp.nan)
     far_y = nan_x.at[FIXED_POLYGONS, 1].set(-14.0)
@@ -104,13 +104,13 @@ def test_values_are_clipped_and_nan_is_zero(level: Level) -> None:
     np.testing.assert_array_equal(seen[POLYGON_ROWS : POLYGON_ROWS + 3].T, np.tile([0.0, -LIMIT, LIMIT], (LANES, 1)))
 
 
-def test_one_level_may_serve_many_lanes(level: Level) -> None:
+def test_flat_observation_broadcasts_one_level(level: Level) -> None:
     one = jax.tree.map(lambda x: x[..., :1], level)
     spread = jax.tree.map(lambda x: np.repeat(x, LANES, -1), one)
     np.testing.assert_array_equal(symbolic_flat(one, level.state), symbolic_flat(spread, level.state))
 
 
-def test_a_triangles_missing_vertex_is_marked(level: Level) -> None:
+def test_triangle_has_a_marked_fourth_vertex(level: Level) -> None:
     model = dataclasses.replace(
         level.model, n_vertices=np.full_like(level.model.n_vertices, 3), active=np.ones_like(level.model.active)
     )

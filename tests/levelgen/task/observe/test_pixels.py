@@ -1,4 +1,4 @@
-"""Pixels against the reference's in 512 states a size, and what must be seen in them."""
+"""Pixels against the reference's in 512 states per size, and what they must show."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ def draw(level: Level) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", ["s", "m", pytest.param("l", marks=pytest.mark.campaign)])
-def test_pixels_are_the_references(size: str) -> None:
+def test_pixels_equal_the_references(size: str) -> None:
     seen = load_seen(size)
     ours = draw(seen.level)
     theirs = np.stack([seen.palette_image(lane) for lane in range(len(ours))]).astype(np.float32)
@@ -29,15 +29,15 @@ def test_pixels_are_the_references(size: str) -> None:
     assert off.max() < 2  # of 255, in the worst picture
 
 
-def test_nothing_active_nothing_drawn() -> None:
+def test_pixels_without_active_bodies_show_the_floor_only() -> None:
     level = jax.tree.map(lambda x: x[..., :8], load_seen("m").level)
     off = {name: np.zeros_like(getattr(level.model, name)) for name in ("active", "joint_active", "thruster_active")}
     bare = draw(dataclasses.replace(level, model=dataclasses.replace(level.model, **off)))
-    assert (bare[:, :, 12:] == 255).all()  # above the floor, which is always there
+    assert (bare[:, :, 12:] == 255).all()  # above the floor, which is always drawn
     assert (bare[:, :, :10] < 255).any(-1).all()
 
 
-def test_a_world_that_broke_down_is_drawn_without_what_is_lost() -> None:
+def test_pixels_of_a_broken_world_omit_nan_bodies() -> None:
     level = jax.tree.map(lambda x: x[..., :2], load_seen("s").level)
     lost = jnp.asarray(level.state.position).at[4:].set(jnp.nan)
     state = dataclasses.replace(level.state, position=lost)
