@@ -20,7 +20,7 @@ from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES, controls
-from levelproof.physics.block import Block, Given, Scratch
+from levelproof.physics.block import Block, Inputs, Scratch
 from levelproof.physics.buffers import buffers_of
 from levelproof.physics.codegen.buffers import LANES
 from levelproof.physics.codegen.primitives import ELEMENTWISE
@@ -37,7 +37,7 @@ REPEATS = 40
 CUTS = (*((stage,) for stage in STAGES[:-2]), STAGES[-2:])  # the last is too short to be told from the one before it
 
 
-def worlds(size: str) -> Given:
+def worlds(size: str) -> Inputs:
     """Levels some way into their episodes, and controls."""
     level = sample_levels(np.arange(LEVELS), SIZES[size])
     choices = jnp.array(CHOICES)[:, None]
@@ -49,10 +49,10 @@ def worlds(size: str) -> Given:
     now, actions = jax.jit(lambda now: jax.lax.scan(act, now, jax.random.split(jax.random.key(0), STEPS)))(
         task.reset(level)
     )
-    return Given(level.model, now.state, *controls(level, actions[-1]))
+    return Inputs(level.model, now.state, *controls(level, actions[-1]))
 
 
-def seconds(given: Given, stages: tuple) -> float:
+def seconds(given: Inputs, stages: tuple) -> float:
     """Of one block of lanes."""
     compiled = jax.jit(lambda given: as_machine_code(given, DEFAULT_PARAMS, False, stages))
     jax.block_until_ready(compiled(given))
@@ -64,7 +64,7 @@ def seconds(given: Given, stages: tuple) -> float:
     return best / (LEVELS / LANES)
 
 
-def count(given: Given, stages: tuple) -> Counter:
+def count(given: Inputs, stages: tuple) -> Counter:
     """Vector operations, loads and stores of one block of lanes, on average."""
     size, total = given.model.size, Counter()
 

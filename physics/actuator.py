@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from levelproof.physics.block import Block
-from levelproof.physics.lanes import NOBODY, Scalar, anywhere, each, pick, spread, when
+from levelproof.physics.lanes import NOBODY, Scalar, anywhere, each, gather_pair, scatter_add, when
 from levelproof.physics.trigonometry import cos_sin, tanh
 from levelproof.physics.types import FIXED_POLYGONS, Params
 from levelproof.physics.vector import Vec
@@ -19,7 +19,7 @@ from levelproof.physics.vector import Vec
 
 def drive_motors(block: Block, params: Params) -> None:
     """Add the motors' angular impulses, which drive each joint to its commanded speed."""
-    model, joints, control = block.model, block.scratch.joints, block.given.motor
+    model, joints, control = block.model, block.scratch.joints, block.inputs.motor
 
     def one(j):
         runs = joints.acts[j] & model.motor_on[j] & (control[j] != 0) & ~model.joint_fixed[j]
@@ -29,9 +29,9 @@ def drive_motors(block: Block, params: Params) -> None:
 
 
 def _drive(block: Block, params: Params, j: Scalar, runs: Bool[Array, " lane"]) -> None:
-    model, bodies, joints, control = block.model, block.scratch.bodies, block.scratch.joints, block.given.motor
+    model, bodies, joints, control = block.model, block.scratch.bodies, block.scratch.joints, block.inputs.motor
     a, b = model.joint_a[j], model.joint_b[j]
-    motion_a, motion_b = pick(bodies.motion.shape[0], lambda i: bodies.motion[i], a, b)
+    motion_a, motion_b = gather_pair(bodies.motion.shape[0], lambda i: bodies.motion[i], a, b)
     _, _, inertia_a, inertia_b = joints.masses[j]
     both = inertia_a + inertia_b
     power = params.motor_power * params.dt * model.motor_power[j] / jnp.where(both == 0, 1.0, both)
@@ -45,12 +45,12 @@ def _drive(block: Block, params: Params, j: Scalar, runs: Bool[Array, " lane"]) 
     none = jnp.zeros_like(turn)
     a, b = (jnp.where(runs, body, NOBODY) for body in (a, b))
     on_a, on_b = jnp.stack([none, none, turn]), jnp.stack([none, none, -turn])
-    spread(bodies.push, (a, on_a), (b, on_b), first=FIXED_POLYGONS)
+    scatter_add(bodies.push, (a, on_a), (b, on_b), first=FIXED_POLYGONS)
 
 
 def fire_thrusters(block: Block, params: Params) -> None:
     """Add the thrusters' impulses: a force on one body, along the thruster, at its mount."""
-    model, control = block.model, block.given.thrust
+    model, control = block.model, block.inputs.thrust
 
     def one(t):
         force = model.thruster_power[t] * model.thruster_active[t] * params.thruster_power * control[t] * params.dt
@@ -60,11 +60,13 @@ def fire_thrusters(block: Block, params: Params) -> None:
 
 
 def _fire(block: Block, t: Scalar, force: Float[Array, " lane"]) -> None:
-    model, before, bodies = block.model, block.given.before, block.scratch.bodies
+    model, before, bodies = block.model, block.inputs.before, block.scratch.bodies
     body = model.thruster_body[t]
-    turn, _ = pick(bodies.motion.shape[0], lambda i: jnp.stack([*bodies.turn[i], before.rotation[i]]), body, body)
+    turn, _ = gather_pair(
+        bodies.motion.shape[0], lambda i: jnp.stack([*bodies.turn[i], before.rotation[i]]), body, body
+    )
     cos, sin, rotation = turn
     arm = Vec(*model.thruster_position[t]).rotate(cos, sin)
     push = Vec(*cos_sin(model.thruster_rotation[t] + rotation)).scale(force)
     body = jnp.where(force != 0, body, NOBODY)
-    spread(bodies.push, (body, jnp.stack([push.x, push.y, arm.cross(push)])), first=FIXED_POLYGONS)
+    scatter_add(bodies.push, (body, jnp.stack([push.x, push.y, arm.cross(push)])), first=FIXED_POLYGONS)

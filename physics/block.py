@@ -13,7 +13,7 @@ from levelproof.physics.pairs import Table
 from levelproof.physics.types import Manifold, Model, State
 
 
-class Given(NamedTuple):
+class Inputs(NamedTuple):
     """Inputs of a step."""
 
     model: Model
@@ -85,11 +85,11 @@ class Block(NamedTuple):
     """References to all data of a block of lanes."""
 
     table: Table  # lookup tables of the size
-    given: Given  # the worlds before
+    inputs: Inputs  # the worlds before
     after: State  # receives the worlds after the step
     seen: Manifold | None  # receives the contacts; None unless the caller asked for them
     scratch: Scratch
 
     @property
     def model(self) -> Model:
-        return self.given.model
+        return self.inputs.model

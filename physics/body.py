@@ -24,7 +24,7 @@ def velocity(motion: Float[Array, "5 lane"]) -> Vec:
 
 def start(block: Block, params: Params) -> None:
     """Load the bodies' motion, and add gravity to the velocities of those with finite mass."""
-    model, before, bodies = block.model, block.given.before, block.scratch.bodies
+    model, before, bodies = block.model, block.inputs.before, block.scratch.bodies
 
     def read(i):
         falls = jnp.where(model.inverse_mass[i] != 0, params.dt, 0.0)
@@ -54,7 +54,7 @@ def yield_all(block: Block) -> None:
 
 def integrate(block: Block, params: Params) -> None:
     """Take a semi-implicit Euler step, then clip positions and speeds."""
-    before, after, bodies = block.given.before, block.after, block.scratch.bodies
+    before, after, bodies = block.inputs.before, block.after, block.scratch.bodies
 
     def clip(x, most):
         return jnp.clip(x, -most, most)

@@ -141,22 +141,23 @@ def prepare(
     keep = lambda x: jnp.where(acts, x, 0.0)
 
     def constrain():
-        before, bodies, to = block.given.before, block.scratch.bodies, block.scratch.constraints
+        before, bodies, constraints = block.inputs.before, block.scratch.bodies, block.scratch.constraints
         excess = jnp.maximum(contact.penetration - params.slop, 0.0)
         target = params.contact_bias / params.dt * excess - bounce(block, a, b, contact)
         rough = lambda body: jnp.square(model.friction[body] * params.base_friction)
         friction = jnp.sqrt(rough(a) + rough(b))
         inertia = [keep(model.inverse_inertia[body]) for body in (a, b)]
-        to.geometry[c] = keep(jnp.stack([*contact.normal, *contact.point]))
-        to.effort[c] = jnp.stack([keep(target), keep(friction), keep(mass_a + mass_b), *inertia])
+        constraints.geometry[c] = keep(jnp.stack([*contact.normal, *contact.point]))
+        constraints.effort[c] = jnp.stack([keep(target), keep(friction), keep(mass_a + mass_b), *inertia])
         remembered = acts & before.contact_active[c]  # where the contact acted in the last step and does now
         last = jnp.stack([before.contact_normal_impulse[c], before.contact_tangent_impulse[c]])
         impulse = jnp.where(remembered, last, 0.0)
-        to.impulse[c] = impulse
-        to.batch[c] = jnp.where(acts, so_far, NO_BATCH)  # the count stands in until `assign_batches` knows the batch
-        to.acting[block.table.start[group] + to.counts[group]] = c
-        to.counts[group] += 1
-        normal, point = _geometry(to, c)
+        constraints.impulse[c] = impulse
+        # The count stands in until `assign_batches` knows the batch
+        constraints.batch[c] = jnp.where(acts, so_far, NO_BATCH)
+        constraints.acting[block.table.start[group] + constraints.counts[group]] = c
+        constraints.counts[group] += 1
+        normal, point = _geometry(constraints, c)
         lever = _levers(bodies.motion[a], bodies.motion[b], normal, point)
         _push(bodies, a, b, lever, acts, (impulse[0], impulse[1]))
 
@@ -170,35 +171,35 @@ def assign_batches(block: Block) -> None:
     into batch p mod batches. Of N pairs A touch; the k-th of them, k from 1, has rank N - A + k - 1. That arithmetic
     replaces the sort.
     """
-    to, table = block.scratch.constraints, block.table
+    constraints, table = block.scratch.constraints, block.table
 
     def assign(group):
         kind, batches = table.kind[group], table.batches[group]
-        first = table.pairs[group] - to.touching[kind] - 1
+        first = table.pairs[group] - constraints.touching[kind] - 1
 
         def one(k):
-            c = to.acting[k]
-            rank = first + to.batch[c]
+            c = constraints.acting[k]
+            rank = first + constraints.batch[c]
             turn = rank - batches * jnp.floor((rank + 0.5) / batches)  # rank mod batches, exact for these integers
-            to.batch[c] = jnp.where(to.batch[c] == NO_BATCH, NO_BATCH, turn)
+            constraints.batch[c] = jnp.where(constraints.batch[c] == NO_BATCH, NO_BATCH, turn)
 
-        each(table.start[group] + to.counts[group], one, first=table.start[group])
+        each(table.start[group] + constraints.counts[group], one, first=table.start[group])
 
     def fill(s, filled):
         group, turn = table.group[s], table.turn[s]
 
         def list_if_in(k, filled):
-            c = to.acting[k]
-            to.listed[filled] = c  # overwritten by the next contact if no lane has c in this batch
-            return filled + anywhere(to.batch[c] == turn)
+            c = constraints.acting[k]
+            constraints.listed[filled] = c  # overwritten by the next contact if no lane has c in this batch
+            return filled + anywhere(constraints.batch[c] == turn)
 
         first = table.start[group]
-        filled = jax.lax.fori_loop(first, first + to.counts[group], list_if_in, filled)
-        to.ends[s + 1] = filled
+        filled = jax.lax.fori_loop(first, first + constraints.counts[group], list_if_in, filled)
+        constraints.ends[s + 1] = filled
         return filled
 
     each(GROUPS, assign)
-    to.ends[0] = jnp.int32(0)
+    constraints.ends[0] = jnp.int32(0)
     jax.lax.fori_loop(0, table.segments, fill, jnp.int32(0))
 
 
@@ -208,17 +209,17 @@ def solve(block: Block) -> None:
     A batch only adds to `push`; the bodies take up its impulses when the batch is over. Where a batch has few contacts
     their own bodies do so, else all bodies: the result is the same, and the loop over contacts is the shorter one.
     """
-    bodies, to, table = block.scratch.bodies, block.scratch.constraints, block.table
+    bodies, constraints, table = block.scratch.bodies, block.scratch.constraints, block.table
 
     def batch(s):
         def one(k):
-            _solve_one(block, to.listed[k], s)
+            _solve_one(block, constraints.listed[k], s)
 
         def yield_both(k):
-            for body in (table.a[to.listed[k]], table.b[to.listed[k]]):
+            for body in (table.a[constraints.listed[k]], table.b[constraints.listed[k]]):
                 when(body >= FIXED_POLYGONS, functools.partial(yield_one, block, body))
 
-        first, end = to.ends[s], to.ends[s + 1]
+        first, end = constraints.ends[s], constraints.ends[s + 1]
         each(end, one, first=first)
         few = 2 * (end - first) < bodies.motion.shape[0] - FIXED_POLYGONS
         when(few, lambda: each(end, yield_both, first=first))
@@ -229,18 +230,18 @@ def solve(block: Block) -> None:
 
 def remember(block: Block) -> None:
     """Store the accumulated impulses for the warm start of the next step."""
-    after, to, table = block.after, block.scratch.constraints, block.table
+    after, constraints, table = block.after, block.scratch.constraints, block.table
 
     def write(k):
-        c = to.acting[k]
-        after.contact_normal_impulse[c] = to.impulse[c, 0]
-        after.contact_tangent_impulse[c] = to.impulse[c, 1]
+        c = constraints.acting[k]
+        after.contact_normal_impulse[c] = constraints.impulse[c, 0]
+        after.contact_tangent_impulse[c] = constraints.impulse[c, 1]
 
-    each(GROUPS, lambda group: each(table.start[group] + to.counts[group], write, first=table.start[group]))
+    each(GROUPS, lambda group: each(table.start[group] + constraints.counts[group], write, first=table.start[group]))
 
 
-def _geometry(to: Constraints, c: Scalar) -> tuple[Vec, Vec]:
-    n_x, n_y, p_x, p_y = to.geometry[c]
+def _geometry(constraints: Constraints, c: Scalar) -> tuple[Vec, Vec]:
+    n_x, n_y, p_x, p_y = constraints.geometry[c]
     return Vec(n_x, n_y), Vec(p_x, p_y)
 
 
@@ -254,11 +255,11 @@ def _solve_one(block: Block, c: Scalar, segment: Scalar) -> None:
 
     Acts in the lanes in which the contact belongs to the batch of this segment; other lanes keep their impulses.
     """
-    bodies, to, table = block.scratch.bodies, block.scratch.constraints, block.table
-    a, b, mine, kept = table.a[c], table.b[c], to.batch[c] == table.turn[segment], table.kept[c]
-    n, point = _geometry(to, c)
-    target, friction, mass, inertia_a, inertia_b = to.effort[c]
-    before_normal, before_tangent = to.impulse[c]
+    bodies, constraints, table = block.scratch.bodies, block.scratch.constraints, block.table
+    a, b, mine, kept = table.a[c], table.b[c], constraints.batch[c] == table.turn[segment], table.kept[c]
+    n, point = _geometry(constraints, c)
+    target, friction, mass, inertia_a, inertia_b = constraints.effort[c]
+    before_normal, before_tangent = constraints.impulse[c]
     motion_a, motion_b = bodies.motion[a], bodies.motion[b]
     lever = _levers(motion_a, motion_b, n, point)
     mass_normal = 1 / nonzero(mass + inertia_a * jnp.square(lever.cross_a) + inertia_b * jnp.square(lever.cross_b))
@@ -274,7 +275,7 @@ def _solve_one(block: Block, c: Scalar, segment: Scalar) -> None:
     limit = friction * normal
     tangent = jnp.clip(before_tangent - mass_tangent * slide, -limit, limit)
     # kept is 0 for the pairs whose accumulated impulses the reference's padding defect resets (docs/physics.md)
-    to.impulse[c] = jnp.stack(
+    constraints.impulse[c] = jnp.stack(
         [jnp.where(mine, normal * kept, before_normal), jnp.where(mine, tangent * kept, before_tangent)]
     )
     _push(bodies, a, b, lever, mine, (normal - before_normal, tangent - before_tangent))

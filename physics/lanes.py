@@ -64,7 +64,7 @@ def anywhere(condition: Bool[Array, " lane"]) -> Bool[Array, ""]:
     return jnp.any(condition)
 
 
-def pick(
+def gather_pair(
     count: int, read: Callable[[Any], Array], a: Int[Array, " lane"], b: Int[Array, " lane"]
 ) -> tuple[Array, Array]:
     """Gather two of `count` rows by indices that differ by lane: read(a[lane])[..., lane] and the same for b."""
@@ -80,7 +80,7 @@ def pick(
     return jax.lax.fori_loop(1, count, visit, (first, first))
 
 
-def spread(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]], first: int = 0) -> None:
+def scatter_add(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]], first: int = 0) -> None:
     """Scatter-add: ref[index[lane], ..., lane] += change for each (index, change).
 
     Indices below `first`, NOBODY among them, change nothing.

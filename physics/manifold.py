@@ -73,7 +73,7 @@ def faces(start: Vec) -> Faces:
 
 def outline_polygons(block: Block) -> None:
     """Compute every polygon's geometry, in its own frame and in the world."""
-    model, bodies, to = block.model, block.scratch.bodies, block.scratch.outlines
+    model, bodies, outlines = block.model, block.scratch.bodies, block.scratch.outlines
 
     def one(i):
         triangle = model.n_vertices[i] == 3
@@ -88,16 +88,16 @@ def outline_polygons(block: Block) -> None:
         support = outward.map(lambda x: x[:, None]).dot(start.map(lambda x: x[None])).max(1)
         cos, sin = bodies.turn[i]
         vertex = start.rotate(cos, sin) + position(bodies.motion[i])
-        write_vec(to.start, i, start)
-        write_vec(to.edge, i, edge)
-        write_vec(to.along, i, edge.scale(1 / nonzero(length)))
-        to.length[i] = length
-        to.support[i] = jnp.where(missing, FAR, support)
-        write_vec(to.vertex, i, vertex)
-        write_vec(to.normal, i, outward.rotate(cos, sin))
-        to.box[i] = jnp.stack([vertex.x.min(0), vertex.y.min(0), vertex.x.max(0), vertex.y.max(0)])
+        write_vec(outlines.start, i, start)
+        write_vec(outlines.edge, i, edge)
+        write_vec(outlines.along, i, edge.scale(1 / nonzero(length)))
+        outlines.length[i] = length
+        outlines.support[i] = jnp.where(missing, FAR, support)
+        write_vec(outlines.vertex, i, vertex)
+        write_vec(outlines.normal, i, outward.rotate(cos, sin))
+        outlines.box[i] = jnp.stack([vertex.x.min(0), vertex.y.min(0), vertex.x.max(0), vertex.y.max(0)])
 
-    each(to.support.shape[0], one)
+    each(outlines.support.shape[0], one)
 
 
 def find_contacts(block: Block, found: Found) -> None:
@@ -159,8 +159,8 @@ def may_touch(model: Model, a: ArrayLike, b: ArrayLike) -> Bool[Array, " lane"]:
 
 
 def _outline(block: Block, i: Scalar) -> Outline:
-    of, centre = block.scratch.outlines, position(block.scratch.bodies.motion[i])
-    return Outline(centre, read_vec(of.vertex, i), read_vec(of.normal, i), of.support[i])
+    outlines, centre = block.scratch.outlines, position(block.scratch.bodies.motion[i])
+    return Outline(centre, read_vec(outlines.vertex, i), read_vec(outlines.normal, i), outlines.support[i])
 
 
 class Face(NamedTuple):

@@ -47,7 +47,7 @@ def polygon(
 
 def disc(centre: Point, radius: float, fill: Colour, edge: Colour, hatched: bool = False) -> str:
     """Draw a filled circle; its edge lies within the radius."""
-    circle = f'circle cx="{number(centre[0])}" cy="{number(centre[1])}" r="{number(radius - EDGE / 2)}"'
+    circle = f'circle cx="{digits(centre[0])}" cy="{digits(centre[1])}" r="{digits(radius - EDGE / 2)}"'
     return _filled(circle, fill, edge, EDGE, hatched)
 
 
@@ -64,29 +64,29 @@ def line(points: Sequence[Point] | Host, colour: Colour, width: float) -> str:
 
 def rectangle(low: Point, high: Point, fill: Colour, corner: float = 0.0) -> str:
     """Draw an upright rectangle without an edge; `corner`: radius of its corners."""
-    (x, y), (width, height) = map(number, low), (number(b - a) for a, b in zip(low, high, strict=True))
-    return f'<rect x="{x}" y="{y}" width="{width}" height="{height}" rx="{number(corner)}" fill="rgb{fill}"/>'
+    (x, y), (width, height) = map(digits, low), (digits(b - a) for a, b in zip(low, high, strict=True))
+    return f'<rect x="{x}" y="{y}" width="{width}" height="{height}" rx="{digits(corner)}" fill="rgb{fill}"/>'
 
 
 def text(position: Point, words: str, colour: Colour, size: float, ends: bool = False) -> str:
     """Draw words that start (or end, if `ends`) at a position, vertically centred; `text_width` wide in any font."""
-    x, y = number(position[0]), number(position[1] - MIDDLE * size)
-    width, anchor = number(LETTERS * text_width(words, size)), ' text-anchor="end"' if ends else ""
+    x, y = digits(position[0]), digits(position[1] - MIDDLE * size)
+    width, anchor = digits(LETTERS * text_width(words, size)), ' text-anchor="end"' if ends else ""
     return (
-        f'<text transform="translate({x},{y}) scale({1 / LETTERS},{-1 / LETTERS})" font-size="{number(LETTERS * size)}"'
+        f'<text transform="translate({x},{y}) scale({1 / LETTERS},{-1 / LETTERS})" font-size="{digits(LETTERS * size)}"'
         f'{anchor} textLength="{width}" lengthAdjust="spacingAndGlyphs" fill="rgb{colour}">{escape(words)}</text>'
     )
 
 
 def _stroke(colour: Colour, width: float) -> str:
-    return f' stroke="rgb{colour}" stroke-width="{number(width)}"'
+    return f' stroke="rgb{colour}" stroke-width="{digits(width)}"'
 
 
 def _points(points: Sequence[Point] | Host) -> str:
-    return " ".join(f"{number(x)},{number(y)}" for x, y in np.asarray(points))
+    return " ".join(f"{digits(x)},{digits(y)}" for x, y in np.asarray(points))
 
 
-def number(value: float) -> str:
+def digits(value: float) -> str:
     """Format a number to a tenth of a millimetre, without trailing zeros."""
     words = f"{value:.4f}".rstrip("0").rstrip(".")
     return "0" if words == "-0" else words

@@ -11,7 +11,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from levelproof.levelgen.level import WORLD_SIDE
-from levelproof.levelgen.pictures.shapes import Part, Scene, number, rectangle
+from levelproof.levelgen.pictures.shapes import Part, Scene, digits, rectangle
 from levelproof.levelgen.pictures.style import BORDER, FONTS, HATCH, HEADER, PAPER, PIXELS
 
 WIDTH = WORLD_SIDE + 2 * BORDER  # m, of a picture
@@ -27,7 +27,7 @@ def svg_of(scenes: Sequence[Scene], seconds: Sequence[float], pixels: int = PIXE
     clock = tuple(end / length for end in (0.0, *ends)), length
     height = TOP + first.footer
     size = f'width="{pixels}" height="{round(pixels * height / WIDTH)}" preserveAspectRatio="none"'
-    view = f'viewBox="{-BORDER} {number(-TOP)} {number(WIDTH)} {number(height)}"'
+    view = f'viewBox="{-BORDER} {digits(-TOP)} {digits(WIDTH)} {digits(height)}"'
     parts = [_part(states, clock) for states in zip(*(scene.parts for scene in scenes), strict=True)]
     return "\n".join(
         [
@@ -58,7 +58,7 @@ def _animate(clock: Clock, tag: str, values: Sequence[str], smooth: bool) -> str
         times, chosen = [*times, "1"], [*chosen, chosen[-1]]
     mode = "" if smooth else ' calcMode="discrete"'
     return (
-        f'<{tag} dur="{number(length)}s" repeatCount="indefinite"{mode} '
+        f'<{tag} dur="{digits(length)}s" repeatCount="indefinite"{mode} '
         f'keyTimes="{";".join(times)}" values="{";".join(chosen)}"/>'
     )
 
@@ -72,8 +72,8 @@ def _part(states: Sequence[Part], clock: Clock) -> str:
             timing = _animate(clock, 'animate attributeName="visibility"', visibility, smooth=False)
             shapes = f'<g visibility="{visibility[0]}">{timing}{shapes}</g>'
         drawn.append(shapes)
-    positions = [",".join(map(number, state.position)) for state in states]
-    turns = [number(np.degrees(state.angle)) for state in states]
+    positions = [",".join(map(digits, state.position)) for state in states]
+    turns = [digits(np.degrees(state.angle)) for state in states]
     if not drawn or {*positions, *turns} == {"0,0", "0"}:
         return "".join(drawn)
     motion = ""

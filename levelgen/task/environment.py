@@ -270,15 +270,15 @@ class Environment:
         state = _first_state(levels, index, 0, override)
         return self._observe(state), state
 
-    def _step_lanes(self, levels: Any, index: Int[Array, " lane"], given: tuple[Any, EnvState, Array]) -> Step:
+    def _step_lanes(self, levels: Any, index: Int[Array, " lane"], inputs: tuple[Any, EnvState, Array]) -> Step:
         """Take one env step in every lane; reset if there are levels or an override state.
 
         Args:
             levels: as `_restart` returns them; () for no reset.
             index: as `_restart` returns it.
-            given: (override state or None, state, action).
+            inputs: (override state or None, state, action).
         """
-        override, state, action = given
+        override, state, action = inputs
         driven = CONTROLS[self.action_type](state.level, action)
         now, result, closing, _ = task.advance_driven(state.level, state.now, driven, self.rules)
         after = state.with_task_state(now)
@@ -295,9 +295,9 @@ class Environment:
         return OBSERVE[self.observation_type](state.level, state.level.state)
 
 
-def _detached(*given: Any) -> Any:
+def _detached(*inputs: Any) -> Any:
     """Stop gradients: the world is not differentiable."""
-    return jax.tree.map(jax.lax.stop_gradient, given)
+    return jax.tree.map(jax.lax.stop_gradient, inputs)
 
 
 def _draw_level(key: Key[Array, ""], episode: Int[Array, ""] | int, count: int) -> Int[Array, ""] | int:

@@ -19,28 +19,28 @@ OnLanes = Callable[[Any, Int[Array, " lane"], Any], Any]
 def single(on_lanes: OnLanes) -> Callable[[Any, Int[Array, ""] | int, Any], Any]:
     """Turn a function of lanes into a function of one environment that `jax.vmap` maps efficiently.
 
-    `on_lanes(table, index, given)` has lanes last in `index`, in every array of `given` and in its result. All lanes
+    `on_lanes(table, index, inputs)` has lanes last in `index`, in every array of `inputs` and in its result. All lanes
     share the table; `index` chooses each lane's entry on the last axis of the table's arrays. The returned function
     has the same arguments and result without the lane axis.
     """
     merged = custom_vmap(on_lanes)
 
     @merged.def_vmap
-    def as_lanes(batch: int, is_mapped: Any, table: Any, index: Array, given: Any) -> tuple[Any, Any]:
+    def as_lanes(batch: int, is_mapped: Any, table: Any, index: Array, inputs: Any) -> tuple[Any, Any]:
         lanes = index.shape[-1]
         merge = lambda x, mapped: _merge(x if mapped else jnp.broadcast_to(x, (batch, *x.shape)))
-        table_mapped, index_mapped, given_mapped = is_mapped
+        table_mapped, index_mapped, inputs_mapped = is_mapped
         index = merge(index, index_mapped)
         if any(jax.tree.leaves(table_mapped)):
             rows = jax.tree.leaves(table)[0].shape[-1]
             table = jax.tree.map(merge, table, table_mapped)
             index = index + rows * jnp.repeat(jnp.arange(batch, dtype=index.dtype), lanes)
-        result = merged(table, index, jax.tree.map(merge, given, given_mapped))
+        result = merged(table, index, jax.tree.map(merge, inputs, inputs_mapped))
         result = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], batch, lanes), -2, 0), result)
         return result, jax.tree.map(lambda _: True, result)
 
-    def of_one(table: Any, index: Int[Array, ""] | int, given: Any) -> Any:
-        result = merged(table, jnp.asarray(index)[None], jax.tree.map(lambda x: jnp.asarray(x)[..., None], given))
+    def of_one(table: Any, index: Int[Array, ""] | int, inputs: Any) -> Any:
+        result = merged(table, jnp.asarray(index)[None], jax.tree.map(lambda x: jnp.asarray(x)[..., None], inputs))
         return jax.tree.map(lambda x: x[..., 0], result)
 
     return of_one

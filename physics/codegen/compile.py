@@ -13,7 +13,7 @@ from llvmlite import binding, ir
 
 from levelproof.physics.codegen.buffers import LANES, Buffer
 from levelproof.physics.codegen.ffi import POINTER, add_handler
-from levelproof.physics.codegen.kept import kept
+from levelproof.physics.codegen.kept import cached
 from levelproof.physics.codegen.lower import Memory, lower
 from levelproof.physics.codegen.values import INDEX
 
@@ -84,7 +84,7 @@ def _object_code(text: str) -> bytes:
         passes.getModulePassManager().run(module, passes)
         return target.emit_object(module)
 
-    return kept("\n".join([llvmlite.__version__, cpu, features, text]), optimise)
+    return cached("\n".join([llvmlite.__version__, cpu, features, text]), optimise)
 
 
 def _initialize() -> None:

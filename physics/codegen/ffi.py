@@ -13,7 +13,7 @@ from typing import Any
 from llvmlite import ir
 
 from levelproof.physics.codegen.buffers import LANES, Buffer
-from levelproof.physics.codegen.rounding import settle
+from levelproof.physics.codegen.rounding import set_mode
 from levelproof.physics.codegen.values import INDEX, STORED, Operand
 
 VERSION_MAJOR, VERSION_MINOR = 0, 3
@@ -72,7 +72,7 @@ def add_handler(
     (frame,) = function.args
     b = ir.IRBuilder(function.append_basic_block("entry"))
     _answer_query(b, frame)
-    restore = settle(b)
+    restore = set_mode(b)
     b.call(blocks, [frame])
     restore()
     b.ret(NULL)  # success

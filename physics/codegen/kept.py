@@ -19,7 +19,7 @@ BEGAN = time.time() - 5  # s; other modules were imported shortly before this on
 DIGEST = hashlib.sha256().digest_size  # bytes before the code: a file cut short by a full disk is not executed
 
 
-def kept(key: str, make: Callable[[], bytes]) -> bytes:
+def cached(key: str, make: Callable[[], bytes]) -> bytes:
     """Return `make()`, or its stored result for the same key, which must name all that the code depends on.
 
     Files lie in JAX's compilation cache, if there is one; a folder that cannot be read or written costs only time.
@@ -40,7 +40,7 @@ def kept(key: str, make: Callable[[], bytes]) -> bytes:
     return code
 
 
-def kept_while_sources_stay(request: str, make: Callable[[], bytes]) -> bytes:
+def cached_by_sources(request: str, make: Callable[[], bytes]) -> bytes:
     """Return `make()`, or the stored result for the same `request` from the same sources and library versions.
 
     If a source has changed since this process began, call `make`: which version this process imported is unknown.
@@ -50,7 +50,7 @@ def kept_while_sources_stay(request: str, make: Callable[[], bytes]) -> bytes:
         return make()
     x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
     versions = [sys.version, jax.__version__, np.__version__, llvmlite.__version__]
-    return kept("\n".join([sources, *versions, binding.get_default_triple(), str(x64), request]), make)
+    return cached("\n".join([sources, *versions, binding.get_default_triple(), str(x64), request]), make)
 
 
 @cache

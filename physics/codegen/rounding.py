@@ -17,16 +17,16 @@ FPCR = 1 << 24  # AArch64: exceptions masked, to nearest; flush to zero
 Restore = Callable[[], Operand]
 
 
-def settle(b: ir.IRBuilder) -> Restore:
+def set_mode(b: ir.IRBuilder) -> Restore:
     """Emit instructions that set the mode; return a function that emits those that restore the previous one.
 
     Raises:
         NotImplementedError: the module is for a processor other than x86-64 or AArch64.
     """
     processor = b.module.triple.split("-")[0]
-    if processor not in SETTLED:
+    if processor not in MODE_SETTERS:
         raise NotImplementedError(f"kernels run on x86-64 and AArch64, not on {processor}")
-    return SETTLED[processor](b)
+    return MODE_SETTERS[processor](b)
 
 
 def _x86(b: ir.IRBuilder) -> Restore:
@@ -50,7 +50,7 @@ def _declared(b: ir.IRBuilder, name: str, result: ir.Type, *arguments: ir.Type) 
     return ir.Function(b.module, ir.FunctionType(result, arguments), name)
 
 
-SETTLED: dict[str, Callable[[ir.IRBuilder], Restore]] = {
+MODE_SETTERS: dict[str, Callable[[ir.IRBuilder], Restore]] = {
     "x86_64": _x86,
     "aarch64": _aarch64,
     "arm64": _aarch64,  # as macOS calls it

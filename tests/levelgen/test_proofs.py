@@ -65,10 +65,10 @@ BRUTE_FORCE = ["s mutated", *(pytest.param(name, marks=MORE) for name in SAMPLES
 
 @functools.cache
 def sampled(name: str) -> Level:
-    of = SAMPLES[name]
-    if of.mutated:
-        return mutants(of.size, of.count, of.distribution)
-    level = jax.tree.map(np.asarray, sample_levels(jnp.arange(of.count), SIZES[of.size], of.distribution))
+    sample = SAMPLES[name]
+    if sample.mutated:
+        return mutants(sample.size, sample.count, sample.distribution)
+    level = jax.tree.map(np.asarray, sample_levels(jnp.arange(sample.count), SIZES[sample.size], sample.distribution))
     if name != "m with fixed goals":
         return level
     goals = np.isin(level.role, (Role.GREEN, Role.BLUE))  # fixed here, because the sampler lets one of them move

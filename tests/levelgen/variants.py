@@ -149,9 +149,9 @@ def idle_changed(level: Level, rng: np.random.Generator) -> Level:
     model, any_of = other.model, lambda x: rng.normal(0, 1, x.shape).astype(np.float32)
     free = ~model.active
     for values in (*(getattr(other.state, name) for name in MOTION), model.inverse_mass, model.friction, model.radius):
-        gone = free[level.size.polygons :] if values is model.radius else free
-        gone = np.broadcast_to(gone.reshape(len(gone), *[1] * (values.ndim - 2), gone.shape[-1]), values.shape)
-        values[gone] = any_of(values)[gone]
+        unused = free[level.size.polygons :] if values is model.radius else free
+        unused = np.broadcast_to(unused.reshape(len(unused), *[1] * (values.ndim - 2), unused.shape[-1]), values.shape)
+        values[unused] = any_of(values)[unused]
     unlimited = ~model.joint_limited | model.joint_fixed | ~model.joint_active
     for values in (model.joint_min, model.joint_max):
         values[unlimited] = any_of(values)[unlimited]

@@ -25,13 +25,13 @@ AS_WRITTEN = {"xla_disable_hlo_passes": "algsimp,simplify-fp-conversions", "xla_
 
 def worlds(name: str) -> Any:
     """Return inputs of a step: golden states for the name of a size, scattered worlds for four numbers."""
-    from levelproof.physics.block import Given
+    from levelproof.physics.block import Inputs
     from levelproof.physics.types import Size
 
     if name in "sml":
         golden = load(HERE / f"{name}.npz")
-        return Given(golden.level.model, golden.state, golden.motor, golden.thrust)
-    return Given(*scattered(Size(*map(int, name.split(","))), lanes=256))
+        return Inputs(golden.level.model, golden.state, golden.motor, golden.thrust)
+    return Inputs(*scattered(Size(*map(int, name.split(","))), lanes=256))
 
 
 def digest(tree: Any) -> str:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from levelproof.physics.block import Given
+from levelproof.physics.block import Inputs
 from levelproof.physics.codegen.buffers import LANES
 from levelproof.physics.step import as_machine_code, on_all_lanes
 from levelproof.physics.types import Params, Size
@@ -28,10 +28,10 @@ RULES = {
 }
 EXTREME = np.array([0, -0.0, 1e-40, -1e-40, 1e3, -1e6, 1e12, -1e25, 1e38, -1e38, np.inf, -np.inf, np.nan], np.float32)
 LOPSIDED = np.array([(2, 1), (1, 1), (1, 1), (1, 1)], np.float32)[:, :, None]
-Way = Callable[[Given, Params, bool], Any]
+Way = Callable[[Inputs, Params, bool], Any]
 
 
-def wild(lanes: int, seed: int) -> Given:
+def wild(lanes: int, seed: int) -> Inputs:
     """Return worlds with some extreme values: none in half of the lanes, up to a fifth in others.
 
     Some lanes have lopsided, counterclockwise polygons, which touch at a distance.
@@ -44,7 +44,7 @@ def wild(lanes: int, seed: int) -> Given:
         share = random.choice([0, 0, 0.02, 0.2], lanes)
         return np.where(random.random(x.shape) < share, random.choice(EXTREME, x.shape), x)
 
-    given = Given(*scattered(SIZE, lanes, seed))
+    given = Inputs(*scattered(SIZE, lanes, seed))
     corners = np.where(random.random(lanes) < 0.3, given.model.vertices[:, ::-1] * LOPSIDED, given.model.vertices)
     model = dataclasses.replace(given.model, vertices=corners)
     control = given.motor * random.choice([1, 1, 100, -1e20], lanes).astype(np.float32)
@@ -54,13 +54,13 @@ def wild(lanes: int, seed: int) -> Given:
 
 
 @functools.cache
-def stepped(way: Way, params: Params) -> Callable[[Given], list[np.ndarray]]:
+def stepped(way: Way, params: Params) -> Callable[[Inputs], list[np.ndarray]]:
     options = {"xla_backend_optimization_level": 0} if way is on_all_lanes else None  # compiles in half the time
     run = jax.jit(lambda given: way(given, params, True), compiler_options=options)
     return lambda given: [np.asarray(x) for x in jax.tree.leaves(run(given))]
 
 
-def lanes_of(given: Given, lanes: np.ndarray) -> Given:
+def lanes_of(given: Inputs, lanes: np.ndarray) -> Inputs:
     return jax.tree.map(lambda x: np.asarray(x)[..., lanes], given)
 
 

@@ -29,7 +29,7 @@ def test_runtime_dyld_gives_the_bits_of_jitlink(monkeypatch: pytest.MonkeyPatch)
     by_jitlink = after()
     JIT.append(binding.create_lljit_compiler(use_jit_link=False))
     marked = lambda request, make: make() + b"\n; for RuntimeDyld"  # another name: XLA accepts each only once
-    monkeypatch.setattr(step_module, "kept_while_sources_stay", marked)
+    monkeypatch.setattr(step_module, "cached_by_sources", marked)
     monkeypatch.setattr(compile_module, "_jit", lambda: JIT[-1])
     step_module._compiled.cache_clear()
     before = len(compile_module._libraries)

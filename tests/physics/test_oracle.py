@@ -37,9 +37,9 @@ def golden(size: str) -> Golden:
 @functools.cache
 def stepped(size: str):
     """Return our state after one physics step, on the host."""
-    of = golden(size)
+    sample = golden(size)
     compiled = jax.jit(lambda model, state, motor, thrust: step(model, state, motor, thrust, Params())[0])
-    return jax.tree.map(np.asarray, compiled(of.level.model, of.state, of.motor, of.thrust))
+    return jax.tree.map(np.asarray, compiled(sample.level.model, sample.state, sample.motor, sample.thrust))
 
 
 def errors(ours, theirs) -> np.ndarray:
@@ -49,12 +49,12 @@ def errors(ours, theirs) -> np.ndarray:
     return np.where(np.isnan(worst), np.inf, worst)
 
 
-def circles_inside(of: Golden) -> np.ndarray:
+def circles_inside(sample: Golden) -> np.ndarray:
     """Find lanes in which a circle's centre lies in a polygon that it may collide with."""
-    model, polygons = of.level.model, of.level.size.polygons
-    position, angle = of.state.position, of.state.rotation[:polygons]
-    found = np.zeros(angle.shape[-1], bool)
-    for circle in range(polygons, of.level.size.bodies):
+    model, polygons = sample.level.model, sample.level.size.polygons
+    position, angle = sample.state.position, sample.state.rotation[:polygons]
+    inside_any = np.zeros(angle.shape[-1], bool)
+    for circle in range(polygons, sample.level.size.bodies):
         x, y = (position[circle, axis] - position[:polygons, axis] for axis in (0, 1))
         x, y = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
         inside = model.active[circle] & model.active[:polygons] & model.collides[circle, :polygons]
@@ -64,16 +64,16 @@ def circles_inside(of: Golden) -> np.ndarray:
             b = np.where((k + 1 < model.n_vertices)[:, None], model.vertices[:, (k + 1) % 4], model.vertices[:, 0])
             right = (b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0]) < 0
             inside = inside & (right | ~exists)
-        found |= inside.any(0)
-    return found
+        inside_any |= inside.any(0)
+    return inside_any
 
 
-def shows(of: Golden) -> dict[str, np.ndarray]:
+def shows(sample: Golden) -> dict[str, np.ndarray]:
     """Return, for each feature of SHOWN, the lanes that show it."""
-    model, pairs = of.level.model, pairs_of(of.level.size)
+    model, pairs = sample.level.model, pairs_of(sample.level.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
-    active = of.after.contact_active
-    turn = [np.take_along_axis(of.state.rotation, body, 0) for body in (model.joint_a, model.joint_b)]
+    active = sample.after.contact_active
+    turn = [np.take_along_axis(sample.state.rotation, body, 0) for body in (model.joint_a, model.joint_b)]
     angle = turn[1] - turn[0] - model.joint_rotation
     revolute = model.joint_active & ~model.joint_fixed
     return {
@@ -81,23 +81,23 @@ def shows(of: Golden) -> dict[str, np.ndarray]:
         "two-point polygon contact": (active[:n] & active[n : 2 * n]).any(0),
         "circle-polygon contact": active[2 * n : 2 * n + m].any(0),
         "circle-circle contact": active[2 * n + m :].any(0),
-        "circle centre inside a polygon": circles_inside(of),
+        "circle centre inside a polygon": circles_inside(sample),
         "joint beyond its limit": (
             revolute & model.joint_limited & ((angle < model.joint_min) | (angle > model.joint_max))
         ).any(0),
         "fixed joint": (model.joint_active & model.joint_fixed).any(0),
-        "driven motor": (revolute & model.motor_on & (of.motor != 0)).any(0),
-        "firing thruster": (model.thruster_active & (of.thrust != 0)).any(0),
-        "triangle": (model.active[: of.level.size.polygons] & (model.n_vertices == 3)).any(0),
+        "driven motor": (revolute & model.motor_on & (sample.motor != 0)).any(0),
+        "firing thruster": (model.thruster_active & (sample.thrust != 0)).any(0),
+        "triangle": (model.active[: sample.level.size.polygons] & (model.n_vertices == 3)).any(0),
     }
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_golden_states_show_everything(size: str) -> None:
-    of = golden(size)
-    assert of.reward.size >= 500
-    assert of.about["versions"]["jax2d"] == "1.0.1"
-    counts = {name: int(lanes.sum()) for name, lanes in shows(of).items()}
+    sample = golden(size)
+    assert sample.reward.size >= 500
+    assert sample.about["versions"]["jax2d"] == "1.0.1"
+    counts = {name: int(lanes.sum()) for name, lanes in shows(sample).items()}
     missing = {name: counts[name] for name, least in SHOWN.items() if counts[name] < least}
     assert not missing, f"size {size} shows too little: {missing}"
 
@@ -122,29 +122,29 @@ def test_step_agrees_with_the_reference_in_every_kind_of_state(size: str) -> Non
 @pytest.mark.parametrize("size", SIZES)
 def test_warm_start_state_agrees_with_the_reference(size: str) -> None:
     """Which contacts are active, and the impulses that warm starting reads."""
-    ours, of = stepped(size), golden(size)
-    assert (ours.contact_active == of.after.contact_active).all(0).mean() >= 0.995
+    ours, sample = stepped(size), golden(size)
+    assert (ours.contact_active == sample.after.contact_active).all(0).mean() >= 0.995
     names = ("contact_normal_impulse", "contact_tangent_impulse", "joint_impulse", "joint_angular_impulse")
     for name in names:
-        a, b = getattr(ours, name), getattr(of.after, name)
+        a, b = getattr(ours, name), getattr(sample.after, name)
         if name.startswith("contact"):  # the reference leaves stale impulses in inactive contacts and never reads them
-            a, b = np.where(of.after.contact_active, a, 0), np.where(of.after.contact_active, b, 0)
+            a, b = np.where(sample.after.contact_active, a, 0), np.where(sample.after.contact_active, b, 0)
         off = np.abs(a - b) / (1 + np.abs(b))
         assert (off.reshape(-1, off.shape[-1]).max(0) < 1e-3).mean() >= 0.985, name
 
 
 def test_golden_states_show_the_padding_defect() -> None:
     """Without the padding defect some states of size s differ, and only those with a padded pair."""
-    of = golden("s")
+    sample = golden("s")
     fixed = jax.jit(
         lambda model, state, motor, thrust: step(model, state, motor, thrust, Params(faithful_padding=False))[0]
     )
-    after = jax.tree.map(np.asarray, fixed(of.level.model, of.state, of.motor, of.thrust))
-    pairs = pairs_of(of.level.size)
+    after = jax.tree.map(np.asarray, fixed(sample.level.model, sample.state, sample.motor, sample.thrust))
+    pairs = pairs_of(sample.level.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
-    last = np.zeros(of.reward.size, bool)
+    last = np.zeros(sample.reward.size, bool)
     for contact in (n - 1, 2 * n - 1, 2 * n + m - 1, 2 * n + m + len(pairs.circle) - 1):
-        last |= of.after.contact_active[contact]
+        last |= sample.after.contact_active[contact]
     differs = errors(after, stepped("s")) > 1e-4
     assert differs.sum() > 20
     assert not (differs & ~last).any()
@@ -156,9 +156,9 @@ def test_golden_files_are_small() -> None:
 
 def test_golden_states_are_complete() -> None:
     for size in SIZES:
-        of = golden(size)
-        lanes = of.reward.size
-        for tree in (of.state, of.after, of.env_after):
+        sample = golden(size)
+        lanes = sample.reward.size
+        for tree in (sample.state, sample.after, sample.env_after):
             for field in dataclasses.fields(tree):
                 value = getattr(tree, field.name)
                 assert value.shape[-1] == lanes

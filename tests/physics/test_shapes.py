@@ -9,18 +9,18 @@ import jax
 import numpy as np
 import pytest
 
-from levelproof.physics.block import Given
+from levelproof.physics.block import Inputs
 from levelproof.physics.step import as_machine_code, on_all_lanes, step
 from levelproof.physics.types import Params
 from tests.physics.worlds import idle, room
 
 LANES = 3
-Change = Callable[[Given], Given]
+Change = Callable[[Inputs], Inputs]
 WAYS = [as_machine_code, on_all_lanes]
 
 
-def world() -> Given:
-    return Given(*room(LANES), *idle(LANES))
+def world() -> Inputs:
+    return Inputs(*room(LANES), *idle(LANES))
 
 
 def state(**arrays: Any) -> Change:

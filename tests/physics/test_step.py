@@ -223,9 +223,11 @@ class TestLanes:
     @classmethod
     def after(cls, lanes, steps: int = STEPS, size: str = "s"):
         """Step the golden states of `lanes`, as a batch of their own."""
-        of = load(HERE / f"{size}.npz")
+        sample = load(HERE / f"{size}.npz")
         take = lambda tree: jax.tree.map(lambda x: np.ascontiguousarray(x[..., lanes]), tree)
-        return play(take(of.level.model), take(of.state), of.motor[:, lanes], of.thrust[:, lanes], steps)[0]
+        return play(
+            take(sample.level.model), take(sample.state), sample.motor[:, lanes], sample.thrust[:, lanes], steps
+        )[0]
 
     @staticmethod
     def same_bits(ours, theirs) -> None:
@@ -261,8 +263,8 @@ class TestLanes:
     @pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.campaign) for size in "ml")])
     def test_returning_contacts_changes_no_bits(self, size: str) -> None:
         """A step that returns no contacts leads to the same state."""
-        of = load(HERE / f"{size}.npz")
-        given = of.level.model, of.state, of.motor, of.thrust
+        sample = load(HERE / f"{size}.npz")
+        given = sample.level.model, sample.state, sample.motor, sample.thrust
         self.same_bits(host(jax.jit(lambda *given: step(*given, seen=False)[0])(*given)), play(*given)[0])
 
     def test_step_broadcasts_one_model(self) -> None:

@@ -54,11 +54,11 @@ def document() -> Any:
 
 def changed(path: str, value: object) -> Any:
     """Return that level with another value at a path such as `env_state.polygon.4.radius`."""
-    made = copy.deepcopy(document())
+    altered = copy.deepcopy(document())
     *parents, last = path.split(".")
-    parent = functools.reduce(lambda x, key: x[int(key) if isinstance(x, list) else key], parents, made)
+    parent = functools.reduce(lambda x, key: x[int(key) if isinstance(x, list) else key], parents, altered)
     parent[int(last) if isinstance(parent, list) else last] = value
-    return made
+    return altered
 
 
 def assert_same(ours: LevelFile, theirs: LevelFile) -> None:
@@ -104,7 +104,7 @@ def test_file_has_all_entries_that_the_reference_requires() -> None:
 
 def test_file_positions_of_joints_agree_with_both_bodies() -> None:
     """A joint's position is computed from body a; at the start of a level, body b gives the same."""
-    found = 0
+    checked = 0
     for lane in range(8):
         world = to_document(LevelFile(one(levels(SIZES["s"]), lane), TaskParams()))["env_state"]
         bodies = world["polygon"] + world["circle"]
@@ -114,8 +114,8 @@ def test_file_positions_of_joints_agree_with_both_bodies() -> None:
                 turned = complex(anchor["0"], anchor["1"]) * np.exp(1j * body["rotation"])
                 place = complex(body["position"]["0"], body["position"]["1"]) + turned
                 assert abs(place - complex(joint["global_position"]["0"], joint["global_position"]["1"])) < 1e-5
-                found += 1
-    assert found > 3
+                checked += 1
+    assert checked > 3
 
 
 def test_writer_refuses_levels_that_a_file_cannot_hold() -> None:
@@ -128,14 +128,14 @@ def test_writer_refuses_levels_that_a_file_cannot_hold() -> None:
     broken = dataclasses.replace(
         level, state=dataclasses.replace(level.state, position=np.full_like(level.state.position, np.nan))
     )
-    for made, words in (
+    for altered, words in (
         (levels(SIZES["s"]), "8 levels"),
         (own_will, "runs by itself"),
         (touching, "starts with contacts"),
         (broken, r"polygon\[0\]\.position\.0 is NaN"),
     ):
         with pytest.raises(LevelFileError, match=words):
-            to_document(LevelFile(made, TaskParams()))
+            to_document(LevelFile(altered, TaskParams()))
 
 
 NUMBER = r"but must be a number from -1,000 to 1,000"
@@ -182,10 +182,10 @@ def test_reader_names_the_path_of_a_wrong_value(path: str, value: object, words:
 
 
 def test_reader_refuses_a_joint_from_a_body_to_itself() -> None:
-    made = changed("env_state.joint.0.a_index", 4)
-    made["env_state"]["joint"][0]["b_index"] = 4
+    altered = changed("env_state.joint.0.a_index", 4)
+    altered["env_state"]["joint"][0]["b_index"] = 4
     with pytest.raises(LevelFileError, match="joins a body to itself"):
-        from_document(made)
+        from_document(altered)
 
 
 @pytest.mark.parametrize(
@@ -200,34 +200,34 @@ def test_reader_refuses_a_joint_from_a_body_to_itself() -> None:
 def test_reader_refuses_unknown_bindings_of_active_actuators(kind: str, binding: int, most: int, names: str) -> None:
     """A motor that is off and a fixed joint, too: a policy reads their bindings."""
     for switches in ({}, {"motor_on": False}, {"is_fixed_joint": True}):
-        made = changed(f"env_state.{kind}.0.{names}_binding", binding)
-        made["env_state"][kind][0] |= {"active": True, **(switches if kind == "joint" else {})}
+        altered = changed(f"env_state.{kind}.0.{names}_binding", binding)
+        altered["env_state"][kind][0] |= {"active": True, **(switches if kind == "joint" else {})}
         with pytest.raises(LevelFileError, match=rf"^env_state\.{kind}\[0\] has a {names}_binding beyond {most}$"):
-            from_document(made)
+            from_document(altered)
 
 
 @pytest.mark.parametrize("kind", ["motor", "thruster"])
 @pytest.mark.parametrize("binding", [-1, 256, 1.0, None])
 def test_reader_refuses_malformed_bindings_of_any_actuator(kind: str, binding: object) -> None:
-    thing = "joint" if kind == "motor" else kind
-    made = changed(f"env_state.{thing}.0.{kind}_binding", binding)
-    made["env_state"][thing][0]["active"] = False
+    row_kind = "joint" if kind == "motor" else kind
+    altered = changed(f"env_state.{row_kind}.0.{kind}_binding", binding)
+    altered["env_state"][row_kind][0]["active"] = False
     with pytest.raises(LevelFileError, match=rf"{kind}_binding is .*, but must be a whole number from 0 to 255$"):
-        from_document(made)
+        from_document(altered)
 
 
 def test_reader_accepts_unknown_bindings_of_inactive_actuators() -> None:
     """Two thrusters of the reference's own levels have such bindings."""
-    made = changed("env_state.thruster.0.thruster_binding", 3)
-    made["env_state"]["thruster"][0]["active"] = False
-    assert from_document(made).level.thruster_binding[0, 0] == 3
+    altered = changed("env_state.thruster.0.thruster_binding", 3)
+    altered["env_state"]["thruster"][0]["active"] = False
+    assert from_document(altered).level.thruster_binding[0, 0] == 3
 
 
 def test_reader_refuses_a_size_without_room_for_bodies() -> None:
-    made = changed("static_env_params.num_polygons", 4)
-    made["static_env_params"]["num_circles"] = 0
+    altered = changed("static_env_params.num_polygons", 4)
+    altered["static_env_params"]["num_circles"] = 0
     with pytest.raises(LevelFileError, match="no room for a body"):
-        from_document(made)
+        from_document(altered)
 
 
 @pytest.mark.parametrize(
@@ -280,11 +280,11 @@ def places() -> list[tuple[str, ...]]:
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.just("set") | st.just("drop"), JUNK), min_size=1, max_size=3))
 @settings(max_examples=150, deadline=None)
 def test_reader_reads_or_refuses_arbitrary_values_anywhere(changes) -> None:
-    made = copy.deepcopy(document())
+    altered = copy.deepcopy(document())
     for number, what, junk in changes:
         *parents, last = places()[number % len(places())]
         try:
-            parent = functools.reduce(lambda x, key: x[int(key) if isinstance(x, list) else key], parents, made)
+            parent = functools.reduce(lambda x, key: x[int(key) if isinstance(x, list) else key], parents, altered)
             key = int(last) if isinstance(parent, list) else last
             if what == "set":
                 parent[key] = copy.deepcopy(junk)
@@ -292,15 +292,15 @@ def test_reader_reads_or_refuses_arbitrary_values_anywhere(changes) -> None:
                 del parent[key]
         except (KeyError, IndexError, TypeError, ValueError, AttributeError):
             continue  # an earlier change removed the path
-    assert_sentence_or_level(json.dumps(made).encode())
+    assert_sentence_or_level(json.dumps(altered).encode())
 
 
 @given(st.binary(max_size=60), st.integers(0, 3_000), st.integers(0, 40))
 @settings(max_examples=150, deadline=None)
-def test_reader_reads_or_refuses_arbitrary_bytes(junk: bytes, start: int, gone: int) -> None:
+def test_reader_reads_or_refuses_arbitrary_bytes(junk: bytes, start: int, length: int) -> None:
     assert_sentence_or_level(junk)
     text = json.dumps(document()).encode()
-    assert_sentence_or_level(text[:start] + junk + text[start + gone :])
+    assert_sentence_or_level(text[:start] + junk + text[start + length :])
 
 
 def assert_sentence_or_level(text: bytes) -> None:

@@ -86,22 +86,22 @@ def test_handmade_levels_survive_a_round_trip(handmade, size, tmp_path) -> None:
 @pytest.mark.parametrize("size", SIZES)
 def test_reference_opens_the_same_levels(played, size) -> None:
     """Bit for bit: the handmade levels as we read them, and ours as we wrote them."""
-    of = played(size)
-    assert len(of.files) == HANDMADE[size] + 1 + OURS
-    assert_same(side_by_side(of.files), of.levels())
+    run = played(size)
+    assert len(run.files) == HANDMADE[size] + 1 + OURS
+    assert_same(side_by_side(run.files), run.levels())
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_file_levels_step_as_in_the_reference(played, size) -> None:
     """Takes one env step of ours from each state that the reference played."""
-    of = played(size)
-    steps, levels = of.arrays["action"].shape[:2]
-    before = {name: values[:-1].reshape(steps * levels, *values.shape[2:]) for name, values in of.states().items()}
-    after = {name: values[1:].reshape(steps * levels, *values.shape[2:]) for name, values in of.states().items()}
+    run = played(size)
+    steps, levels = run.arrays["action"].shape[:2]
+    before = {name: values[:-1].reshape(steps * levels, *values.shape[2:]) for name, values in run.states().items()}
+    after = {name: values[1:].reshape(steps * levels, *values.shape[2:]) for name, values in run.states().items()}
     level, then = level_from_kinetix(before), level_from_kinetix(after).state
     now = TaskState(level.state, before["timestep"], before["last_distance"])
-    action = of.arrays["action"].reshape(steps * levels, -1).T.astype(np.int32)
-    rules = read_level_file(of.files[0]).rules
+    action = run.arrays["action"].reshape(steps * levels, -1).T.astype(np.int32)
+    rules = read_level_file(run.files[0]).rules
     step = jax.jit(lambda level, now, action: advance(level, now, action, rules)[:2])
     ours, outcome = jax.tree.map(np.asarray, step(level, now, action))
 
@@ -112,14 +112,14 @@ def test_file_levels_step_as_in_the_reference(played, size) -> None:
     off = off.reshape(steps, levels)
     assert (off < 1e-3).mean() >= 0.995, np.sort(off.ravel())[-20:]
     assert (off < 1e-4).mean() >= 0.97
-    median = dict(zip((path.stem for path in of.files), np.median(off, 0), strict=True))
+    median = dict(zip((path.stem for path in run.files), np.median(off, 0), strict=True))
     assert max(median.values()) < 1e-4, median  # no level is off throughout
-    same = np.abs(outcome.reward - of.arrays["reward"].ravel()) < 1e-3
-    same &= (outcome.done == of.arrays["done"].ravel()) & (outcome.goal == of.arrays["goal"].ravel())
+    same = np.abs(outcome.reward - run.arrays["reward"].ravel()) < 1e-3
+    same &= (outcome.done == run.arrays["done"].ravel()) & (outcome.goal == run.arrays["goal"].ravel())
     assert same.mean() >= 0.999
 
 
 def test_reference_opens_a_custom_size(reference, tmp_path) -> None:
     files = exported(Size(polygons=7, circles=1, joints=3, thrusters=4), tmp_path, "custom", count=2)
-    of = open_in_reference(reference, files, tmp_path / "out.npz")
-    assert_same(side_by_side(files), of.levels())
+    run = open_in_reference(reference, files, tmp_path / "out.npz")
+    assert_same(side_by_side(files), run.levels())

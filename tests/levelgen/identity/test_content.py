@@ -99,18 +99,20 @@ def having(name: str) -> list[tuple[str, int, int]]:
 @given(st.data())
 def test_content_hash_notices_the_smallest_change(name: str, data: st.DataObject) -> None:
     """The smallest possible change of one attribute of one body, joint or thruster."""
-    size, number, thing = data.draw(st.sampled_from(having(name)))
+    size, number, row_index = data.draw(st.sampled_from(having(name)))
     level = one(size, number)
     before, values = content_hashes(level), field(level, name)
-    row = values[thing]
+    row = values[row_index]
     if name in ("joint_a", "joint_b", "thruster_body"):
         taken = (
-            {int(field(level, end)[thing, 0]) for end in ("joint_a", "joint_b")} if "joint" in name else {int(row[0])}
+            {int(field(level, end)[row_index, 0]) for end in ("joint_a", "joint_b")}
+            if "joint" in name
+            else {int(row[0])}
         )
         row[...] = data.draw(st.sampled_from(sorted({*np.flatnonzero(level.model.active).tolist()} - taken)))
     elif name == "collides":
-        other = data.draw(st.sampled_from(sorted({*np.flatnonzero(level.model.active).tolist()} - {thing})))
-        row[other] = values[other, thing] = ~row[other]
+        other = data.draw(st.sampled_from(sorted({*np.flatnonzero(level.model.active).tolist()} - {row_index})))
+        row[other] = values[other, row_index] = ~row[other]
     elif name == "vertices":
         row[0, 0] = np.nextafter(row[0, 0], np.float32(9))
     elif row.dtype == np.float32:

@@ -73,13 +73,13 @@ def test_environment_variables_leave_levels_and_scouts_unchanged() -> None:
 
 
 def test_random_draws_use_only_the_keys_of_levels() -> None:
-    found = {
+    unkeyed = {
         str(path.relative_to(ROOT))
         for layer in ("physics", "levelgen", "experts", "pipeline")
         for path in (ROOT / layer).rglob("*.py")
         if re.search(r"random\.key\(|PRNGKey\(|wrap_key_data\(", path.read_text())
     }
-    assert found == HARMLESS | {"levelgen/identity/keys.py"}
+    assert unkeyed == HARMLESS | {"levelgen/identity/keys.py"}
 
 
 if __name__ == "__main__":

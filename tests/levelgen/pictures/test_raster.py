@@ -62,16 +62,16 @@ def test_picture_hatches_immovable_bodies(golden) -> None:
     assert not shows(draw(held, golden.state, lane), ROLE_COLOUR[Role.PLAIN])
 
 
-@pytest.mark.parametrize("thing", ["motor", "thruster"])
-def test_picture_shows_actuators_in_use(golden, thing: str) -> None:
+@pytest.mark.parametrize("actuator", ["motor", "thruster"])
+def test_picture_shows_actuators_in_use(golden, actuator: str) -> None:
     level, model = golden.level, golden.level.model
-    if thing == "motor":
+    if actuator == "motor":
         acts = model.joint_active & model.motor_on & ~model.joint_fixed & ~level.motor_auto
     else:
         acts = model.thruster_active
     lane = lane_with(acts[:1])
     used = OFF.copy()
-    entry = int(level.motor_binding[0, lane]) if thing == "motor" else 4 + int(level.thruster_binding[0, lane])
+    entry = int(level.motor_binding[0, lane]) if actuator == "motor" else 4 + int(level.thruster_binding[0, lane])
     used[entry] = 1
     off, on = draw(level, golden.state, lane, action=OFF), draw(level, golden.state, lane, action=used)
     world = (0, 40, 480, off.size[1] - 30)  # without caption and keys
@@ -110,10 +110,10 @@ def test_live_entries_have_an_effect(golden) -> None:
 
 def test_picture_shows_its_caption(golden) -> None:
     bare = draw(golden.level, golden.state, 0)
-    told = draw(golden.level, golden.state, 0, caption=Caption("level 7 · size m", "1.2 s", "goal reached"))
+    captioned = draw(golden.level, golden.state, 0, caption=Caption("level 7 · size m", "1.2 s", "goal reached"))
     bad = draw(golden.level, golden.state, 0, caption=Caption("level 7 · size m", "1.2 s", "touched red", good=False))
-    assert changed(bare, told) > 500
-    assert shows(told.crop((0, 0, 480, 34)), ROLE_COLOUR[Role.GREEN])
+    assert changed(bare, captioned) > 500
+    assert shows(captioned.crop((0, 0, 480, 34)), ROLE_COLOUR[Role.GREEN])
     assert shows(bad.crop((0, 0, 480, 34)), ROLE_COLOUR[Role.RED])
 
 

@@ -31,16 +31,16 @@ def golden():
     return {size: load(HERE / f"{size}.npz") for size in "sml"}
 
 
-def scene(of, lane: int, **caption) -> Scene:
-    told = Caption(**{"title": "level 7 · size m", "clock": "1.2 s"} | caption)
-    return scene_of(of.level, of.state, lane, of.action[:, lane], told)
+def scene(sample, lane: int, **caption) -> Scene:
+    captions = Caption(**{"title": "level 7 · size m", "clock": "1.2 s"} | caption)
+    return scene_of(sample.level, sample.state, lane, sample.action[:, lane], captions)
 
 
-def film(of, steps: int = 5) -> tuple[list[Scene], list[float]]:
+def film(sample, steps: int = 5) -> tuple[list[Scene], list[float]]:
     """Show one level in states of others, so that everything moves, turns, and goes on and off."""
-    level = jax.tree.map(lambda x: x[..., :1], of.level)
-    told = [Caption("film", f"{step} s", "goal reached" if step == steps - 1 else "") for step in range(steps)]
-    scenes = [scene_of(level, of.state, step, of.action[:, step], words) for step, words in enumerate(told)]
+    level = jax.tree.map(lambda x: x[..., :1], sample.level)
+    captions = [Caption("film", f"{step} s", "goal reached" if step == steps - 1 else "") for step in range(steps)]
+    scenes = [scene_of(level, sample.state, step, sample.action[:, step], words) for step, words in enumerate(captions)]
     return scenes, [0.1] * (steps - 1) + [1.0]
 
 
@@ -49,8 +49,8 @@ def picture(svg: str) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
 
 
-def pixels(of: Scene) -> np.ndarray:
-    return np.asarray(rasterise(of)).astype(int)
+def pixels(sample: Scene) -> np.ndarray:
+    return np.asarray(rasterise(sample)).astype(int)
 
 
 def coarse(image: np.ndarray) -> np.ndarray:

@@ -66,9 +66,9 @@ def p_value(ours: np.ndarray, theirs: dict[str, np.ndarray]) -> float:
     ours = np.asarray(ours, np.float32)
     if "quantiles" in theirs:
         expected = np.linspace(0, 1, len(theirs["quantiles"]))
-        found = np.searchsorted(np.sort(ours), theirs["quantiles"], "right") / len(ours)
+        counted = np.searchsorted(np.sort(ours), theirs["quantiles"], "right") / len(ours)
         count = 1 / (1 / len(ours) + 1 / theirs["counts"].item())
-        return float(stats.kstwobign.sf(np.abs(found - expected).max() * np.sqrt(count)))
+        return float(stats.kstwobign.sf(np.abs(counted - expected).max() * np.sqrt(count)))
     values = np.union1d(ours, theirs["values"])
     table = np.zeros((2, len(values)))
     table[0] = [(ours == value).sum() for value in values]
@@ -167,10 +167,10 @@ def test_free_bodies_lie_within_the_world(level: Level) -> None:
 
 
 def test_unused_rows_are_blank(level: Level) -> None:
-    model, gone = level.model, ~level.model.active
-    assert (level.state.position[np.broadcast_to(gone[:, None], level.state.position.shape)] == 0).all()
-    assert (level.role[gone] == Role.PLAIN).all()
-    assert (model.inverse_mass[gone] == 0).all()
+    model, unused = level.model, ~level.model.active
+    assert (level.state.position[np.broadcast_to(unused[:, None], level.state.position.shape)] == 0).all()
+    assert (level.role[unused] == Role.PLAIN).all()
+    assert (model.inverse_mass[unused] == 0).all()
     assert (model.motor_power[~model.joint_active] == 0).all()
     assert (model.thruster_power[~model.thruster_active] == 0).all()
     for name in ("velocity", "angular_velocity", "contact_normal_impulse", "joint_impulse"):
@@ -208,9 +208,9 @@ def test_count_contacts_agrees_with_the_engine() -> None:
         cos, sin = np.cos(state.rotation[last]), np.sin(state.rotation[last])
         turned = np.stack([cos * corners[:, 0] - sin * corners[:, 1], sin * corners[:, 0] + cos * corners[:, 1]], 1)
         body = WorldCircles(Vec(*state.position[last][:, None]), model.radius[max(last - polygons, 0)][None])
-        found = count(rest, state, turned + state.position[last], body, np.full(there.shape, last < polygons))
+        counted = count(rest, state, turned + state.position[last], body, np.full(there.shape, last < polygons))
         assert expected[there].sum() > 100
-        np.testing.assert_array_equal(np.asarray(found)[there], expected[there])
+        np.testing.assert_array_equal(np.asarray(counted)[there], expected[there])
 
 
 @MORE

@@ -305,7 +305,10 @@ def test_environment_refuses_64_bit_mode(levels: Level) -> None:
 
 @pytest.mark.parametrize(
     "size",
-    [Size(6, 0, 1, 0), *(pytest.param(of, marks=pytest.mark.campaign) for of in (Size(4, 2, 0, 1), Size(6, 0, 0, 1)))],
+    [
+        Size(6, 0, 1, 0),
+        *(pytest.param(size, marks=pytest.mark.campaign) for size in (Size(4, 2, 0, 1), Size(6, 0, 0, 1))),
+    ],
 )
 def test_environment_works_for_sizes_without_some_kinds(size: Size) -> None:
     env, params = make(sample_levels(np.arange(3), size))

@@ -37,14 +37,14 @@ def test_lanes_step_as_mapped_environments_do(levels: Level) -> None:
     for number in range(STEPS):
         chosen = np.roll(np.arange(COUNT), number)  # the levels that lanes start next
         given = jax.tree.map(lambda x, chosen=chosen: x[chosen], fresh)
-        expected, one, reward, done, told = mapped(keys, one, actions[number], params, given)
+        expected, one, reward, done, expected_info = mapped(keys, one, actions[number], params, given)
         seen, state, played, *rest, info = step(table, played, state, actions[number].T, chosen)
         jax.tree.map(np.testing.assert_array_equal, rest, [reward, done])
         jax.tree.map(np.testing.assert_array_equal, state.now, lanes_last(one.now))
         np.testing.assert_array_equal(state.level_index, one.level_index)
         np.testing.assert_allclose(seen, expected.T, rtol=1e-6)
-        np.testing.assert_allclose(info.pop("final_observation"), told.pop("final_observation").T, rtol=1e-6)
-        jax.tree.map(np.testing.assert_array_equal, info, told)
+        np.testing.assert_allclose(info.pop("final_observation"), expected_info.pop("final_observation").T, rtol=1e-6)
+        jax.tree.map(np.testing.assert_array_equal, info, expected_info)
         ended += int(done.sum())
     assert ended > 2 * COUNT
     jax.tree.map(np.testing.assert_array_equal, played, jax.jit(lanes.take)(table, state.level_index))

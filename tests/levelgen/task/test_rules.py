@@ -37,13 +37,13 @@ def golden(size: str) -> Golden:
 @functools.cache
 def env_step(size: str):
     """Take our env step from every golden state: return the next task state and the result, on the host."""
-    of = golden(size)
+    sample = golden(size)
     params = TaskParams(
-        frame_skip=of.about["frame_skip"], dense_reward_scale=float(np.float32(of.about["dense_reward_scale"]))
+        frame_skip=sample.about["frame_skip"], dense_reward_scale=float(np.float32(sample.about["dense_reward_scale"]))
     )
-    now = TaskState(of.state, of.timestep, of.last_distance)
+    now = TaskState(sample.state, sample.timestep, sample.last_distance)
     compiled = jax.jit(lambda level, now, action: advance(level, now, action, params)[:2])
-    return jax.tree.map(np.asarray, compiled(of.level, now, of.action))
+    return jax.tree.map(np.asarray, compiled(sample.level, now, sample.action))
 
 
 @functools.cache
@@ -57,41 +57,41 @@ def lanes_of(tree, lanes):
     return jax.tree.map(lambda x: np.asarray(x)[..., lanes], tree)
 
 
-def as_level(of: Golden, lanes) -> Level:
-    return lanes_of(of.level, lanes)
+def as_level(sample: Golden, lanes) -> Level:
+    return lanes_of(sample.level, lanes)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", ["s", "m", "l"])
 class TestAgainstTheReference:
     def test_reward_done_and_goal(self, size: str) -> None:
-        of, (_, outcome) = golden(size), env_step(size)
-        same = np.abs(outcome.reward - of.reward) < 1e-4
-        same &= (outcome.done == of.done) & (outcome.goal == of.goal)
+        sample, (_, outcome) = golden(size), env_step(size)
+        same = np.abs(outcome.reward - sample.reward) < 1e-4
+        same &= (outcome.done == sample.done) & (outcome.goal == sample.goal)
         assert same.mean() >= 0.995, np.flatnonzero(~same)
-        assert of.goal.sum() > 40  # goals, failures and steps in between all occur
-        assert (of.reward < -0.5).sum() > 20
-        assert (~of.done).sum() > 300
+        assert sample.goal.sum() > 40  # goals, failures and steps in between all occur
+        assert (sample.reward < -0.5).sum() > 20
+        assert (~sample.done).sum() > 300
 
     def test_advance_gives_the_references_next_state(self, size: str) -> None:
-        of, (after, _) = golden(size), env_step(size)
-        worst = np.zeros(of.reward.size)
+        sample, (after, _) = golden(size), env_step(size)
+        worst = np.zeros(sample.reward.size)
         for name in ("position", "rotation", "velocity", "angular_velocity"):
-            gap = np.abs(getattr(after.state, name) - getattr(of.env_after, name))
+            gap = np.abs(getattr(after.state, name) - getattr(sample.env_after, name))
             worst = np.maximum(worst, gap.reshape(-1, gap.shape[-1]).max(0))
         assert (worst < 1e-3).mean() >= 0.99, np.sort(worst)[-10:]  # two physics steps
 
     def test_clock_and_distance(self, size: str) -> None:
-        of, (after, _) = golden(size), env_step(size)
-        np.testing.assert_array_equal(after.timestep, of.env_timestep)
-        assert (np.abs(after.last_distance - of.env_last_distance) < 1e-3).mean() >= 0.995
+        sample, (after, _) = golden(size), env_step(size)
+        np.testing.assert_array_equal(after.timestep, sample.env_timestep)
+        assert (np.abs(after.last_distance - sample.env_last_distance) < 1e-3).mean() >= 0.995
 
 
 @functools.cache
 def still() -> Level:
     """Return eight levels of size s, from golden states that do not end an episode."""
-    of = golden("s")
-    return as_level(of, np.flatnonzero(~of.done & (of.timestep < 200))[:8])
+    sample = golden("s")
+    return as_level(sample, np.flatnonzero(~sample.done & (sample.timestep < 200))[:8])
 
 
 def actions(level: Level) -> np.ndarray:
@@ -219,19 +219,19 @@ def test_goal_distance_sums_over_pairs_of_centres() -> None:
 @pytest.mark.slow
 def test_touching_red_and_blue_at_once_fails() -> None:
     """Green touching both in the same physics step does not reach the goal."""
-    of = golden("s")
-    pairs = pairs_of(of.level.size)
+    sample = golden("s")
+    pairs = pairs_of(sample.level.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
     at = 2 * n + list(zip(pairs.circle_polygon.a, pairs.circle_polygon.b, strict=True)).index((5, 0))
     circles = 2 * n + m
-    both = np.flatnonzero(of.after.contact_active[at] & of.after.contact_active[circles])
+    both = np.flatnonzero(sample.after.contact_active[at] & sample.after.contact_active[circles])
     assert len(both) > 3  # circle 5 touches the floor and the other circle
-    level = with_roles(as_level(of, both), {5: Role.GREEN, 0: Role.RED, 6: Role.BLUE})
+    level = with_roles(as_level(sample, both), {5: Role.GREEN, 0: Role.RED, 6: Role.BLUE})
     _, outcome = episode_step()(level, reset(level), np.zeros((6, len(both)), np.int32))
     assert np.asarray(outcome.done).all()
     assert not np.asarray(outcome.goal).any()
     np.testing.assert_array_equal(outcome.reward, -1.0)
-    level = with_roles(as_level(of, both), {5: Role.GREEN, 6: Role.BLUE})
+    level = with_roles(as_level(sample, both), {5: Role.GREEN, 6: Role.BLUE})
     _, outcome = episode_step()(level, reset(level), np.zeros((6, len(both)), np.int32))
     assert np.asarray(outcome.goal).all()
     np.testing.assert_array_equal(outcome.reward, 1.0)

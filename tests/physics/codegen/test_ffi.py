@@ -28,9 +28,9 @@ def header() -> str:
 
 def declared(header: str, name: str) -> list[tuple[str, str]]:
     """Return type and name of each field of a structure."""
-    found = re.search(rf"\bstruct {name} {{(.*?)}}", header, re.DOTALL)
-    assert found, f"{HEADER} has no {name}"
-    fields = re.findall(r"([\w\s]+?[\s*]+)(\w+);", found[1])
+    match = re.search(rf"\bstruct {name} {{(.*?)}}", header, re.DOTALL)
+    assert match, f"{HEADER} has no {name}"
+    fields = re.findall(r"([\w\s]+?[\s*]+)(\w+);", match[1])
     return [(re.sub(r"\b(const|struct)\b", "", kind).strip(), field) for kind, field in fields]
 
 
@@ -58,8 +58,8 @@ def test_structure_fields_have_the_headers_offsets(header: str, ours: type[ctype
     assert len(theirs._fields_) >= len(ours._fields_) > 0
     for name, kind, *_ in ours._fields_:
         mine, their = getattr(ours, name), getattr(theirs, name)
-        said = f"{theirs.__name__}.{name} is not where physics/codegen/ffi.py has it: write down the header's fields"
-        assert (mine.offset, mine.size) == (their.offset, their.size), said
+        message = f"{theirs.__name__}.{name} is not where physics/codegen/ffi.py has it: write down the header's fields"
+        assert (mine.offset, mine.size) == (their.offset, their.size), message
         assert issubclass(kind, ctypes.Structure) == issubclass(dict(theirs._fields_)[name], ctypes.Structure)
 
 

@@ -8,7 +8,7 @@ import jax
 import pytest
 from jax.extend import core
 
-from levelproof.physics.block import Given
+from levelproof.physics.block import Inputs
 from levelproof.physics.buffers import buffers_like
 from levelproof.physics.codegen.buffers import LANES
 from levelproof.physics.step import block_buffers, trace
@@ -60,7 +60,7 @@ def equations(jaxpr: core.Jaxpr) -> Iterator[core.JaxprEqn]:
 
 @functools.cache
 def step_equations() -> list[core.JaxprEqn]:
-    given = buffers_like(Given(*scattered(SIZE, LANES)))
+    given = buffers_like(Inputs(*scattered(SIZE, LANES)))
     return list(equations(trace(block_buffers(SIZE, Params(), True, given), Params()).jaxpr))
 
 

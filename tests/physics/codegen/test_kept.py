@@ -10,7 +10,7 @@ import jax
 import pytest
 
 from levelproof.physics.codegen import kept as module
-from levelproof.physics.codegen.kept import kept, kept_while_sources_stay
+from levelproof.physics.codegen.kept import cached, cached_by_sources
 
 # A process that steps a world and prints how many kernels it wrote and optimised, and a digest of the step
 PROGRAM = """
@@ -53,25 +53,25 @@ def test_second_process_reuses_the_kernel_of_the_first(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [lambda code: code[:-1], lambda code: b"", lambda code: code[:-1] + b"!"])
-def test_kept_remakes_a_damaged_file(folder: Path, damage: Callable[[bytes], bytes]) -> None:
-    assert kept("one", made(b"code")[0]) == b"code"
+def test_cached_remakes_a_damaged_file(folder: Path, damage: Callable[[bytes], bytes]) -> None:
+    assert cached("one", made(b"code")[0]) == b"code"
     (file,) = folder.iterdir()
     file.write_bytes(damage(file.read_bytes()))
     make, calls = made(b"code")
-    assert [kept("one", make), kept("one", make)] == [b"code"] * 2
+    assert [cached("one", make), cached("one", make)] == [b"code"] * 2
     assert len(calls) == 1
     assert list(folder.iterdir()) == [file]
 
 
-def test_kept_stores_code_by_key(folder: Path) -> None:
-    assert [kept(name, made(name.encode())[0]) for name in ("one", "two", "one")] == [b"one", b"two", b"one"]
+def test_cached_stores_code_by_key(folder: Path) -> None:
+    assert [cached(name, made(name.encode())[0]) for name in ("one", "two", "one")] == [b"one", b"two", b"one"]
     assert len(list(folder.iterdir())) == 2
 
 
-def test_kept_works_without_a_folder(folder: Path) -> None:
+def test_cached_works_without_a_folder(folder: Path) -> None:
     jax.config.update("jax_compilation_cache_dir", str(folder / "gone"))
     make, calls = made(b"code")
-    assert [kept("one", make), kept("one", make)] == [b"code"] * 2
+    assert [cached("one", make), cached("one", make)] == [b"code"] * 2
     assert len(calls) == 2
 
 
@@ -93,23 +93,23 @@ def changed(source: Path, text: str, when: float) -> None:
     module._sources.cache_clear()
 
 
-def test_kept_notices_changed_sources(source: Path) -> None:
+def test_cached_notices_changed_sources(source: Path) -> None:
     make, calls = made(b"code")
     for text, so_far in (("source", 1), ("source", 1), ("other", 2), ("source", 2)):
         changed(source, text, 0)
-        assert kept_while_sources_stay("one", make) == b"code"
+        assert cached_by_sources("one", make) == b"code"
         assert len(calls) == so_far
     source.rename(source.with_name("two.py"))
     module._sources.cache_clear()
-    kept_while_sources_stay("one", make)
-    kept_while_sources_stay("two", make)
+    cached_by_sources("one", make)
+    cached_by_sources("two", make)
     assert len(calls) == 4
 
 
-def test_kept_stores_nothing_if_a_source_changed_since_the_start(source: Path, folder: Path) -> None:
+def test_cached_stores_nothing_if_a_source_changed_since_the_start(source: Path, folder: Path) -> None:
     """The process may still run the previous version."""
     make, calls = made(b"code")
     changed(source, "source", module.BEGAN + 1)
-    assert [kept_while_sources_stay("one", make) for _ in range(2)] == [b"code"] * 2
+    assert [cached_by_sources("one", make) for _ in range(2)] == [b"code"] * 2
     assert len(calls) == 2
     assert not list(folder.iterdir())

@@ -74,7 +74,7 @@ class TestControl:
     """Nested loops and branches."""
 
     @staticmethod
-    def body(x, number, out, found):
+    def body(x, number, out, integers):
         rows, count = x[...], number[0]
         out[...] = jnp.zeros((9, LANES))
 
@@ -88,7 +88,7 @@ class TestControl:
         until = lax.fori_loop(number[1], count, grow, start)  # of unknown length
         out[0] = fixed[0] + jnp.where(fixed[3], 1.0, -1.0)
         out[1] = until[0] + until[1].astype(jnp.float32)
-        found[0], found[1] = fixed[2] + fixed[1], until[2] + until[1]
+        integers[0], integers[1] = fixed[2] + fixed[1], until[2] + until[1]
 
         def halve(carry):
             x, steps = carry
@@ -96,7 +96,7 @@ class TestControl:
 
         halved, steps = lax.while_loop(lambda carry: jnp.any(jnp.abs(carry[0]) > 0.5), halve, (rows[1], 0))
         out[2] = halved
-        found[2] = jnp.full((LANES,), steps)
+        integers[2] = jnp.full((LANES,), steps)
 
         def branch(k):
             def deeper():
@@ -106,7 +106,7 @@ class TestControl:
             return lambda: lax.cond(count > 3, deeper, lambda: (jnp.zeros(LANES, jnp.int32), number[1]))
 
         lanes, one = lax.cond(number[2] == 0, branch(0), lambda: lax.cond(number[2] == 1, branch(1), branch(2)))
-        found[3] = lanes + one
+        integers[3] = lanes + one
 
         def rows_after(i, _):  # writes inside a branch inside a loop inside a loop
             def write(j, _):

@@ -153,10 +153,12 @@ class TestNumbers:
 
 
 class TestConversions:
-    @pytest.mark.parametrize(("of", "to"), [("int32", "float32"), ("bool", "float32"), ("bool", "int32")])
-    def test_are_exact_or_to_the_nearest_float(self, of: str, to: str) -> None:
+    @pytest.mark.parametrize(("source", "target"), [("int32", "float32"), ("bool", "float32"), ("bool", "int32")])
+    def test_are_exact_or_to_the_nearest_float(self, source: str, target: str) -> None:
         x = every_pair(AWKWARD_INTS)
-        TestNumbers.check(table({"convert": lambda x, *_: x.astype(to)}, of, to), x if of == "int32" else x > 0)
+        TestNumbers.check(
+            table({"convert": lambda x, *_: x.astype(target)}, source, target), x if source == "int32" else x > 0
+        )
 
 
 def shape_cases() -> dict[str, Callable]:

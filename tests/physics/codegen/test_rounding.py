@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from llvmlite import binding, ir
 
-from levelproof.physics.block import Given
+from levelproof.physics.block import Inputs
 from levelproof.physics.buffers import buffers_of
 from levelproof.physics.codegen import compile as compile_module
 from levelproof.physics.codegen import ffi
 from levelproof.physics.codegen.buffers import LANES, Buffer
 from levelproof.physics.codegen.compile import write
-from levelproof.physics.codegen.rounding import settle
+from levelproof.physics.codegen.rounding import set_mode
 from levelproof.physics.step import block_buffers, trace
 from levelproof.physics.types import Params
 from tests.physics.codegen.kernels import Kernel
@@ -60,11 +60,11 @@ def without_xla() -> np.ndarray:
 
 @pytest.mark.parametrize("call", [through_xla, without_xla])
 def test_kernel_takes_subnormal_numbers_as_zeros_on_every_thread(call: Callable[[], np.ndarray]) -> None:
-    found = [call()]
-    thread = threading.Thread(target=lambda: found.append(call()))
+    results = [call()]
+    thread = threading.Thread(target=lambda: results.append(call()))
     thread.start()
     thread.join()
-    np.testing.assert_array_equal(np.stack(found), np.zeros((2, *X.shape), np.float32))
+    np.testing.assert_array_equal(np.stack(results), np.zeros((2, *X.shape), np.float32))
 
 
 def test_kernel_leaves_the_mode_of_its_thread_as_it_was() -> None:
@@ -79,7 +79,7 @@ def test_arm_code_sets_the_mode_and_fuses_nothing(triple: str, monkeypatch: pyte
     binding.initialize_all_targets()
     binding.initialize_all_asmprinters()
     monkeypatch.setattr(binding, "get_default_triple", lambda: triple)
-    buffers = block_buffers(ROOM, Params(), False, buffers_of(Given, ROOM))
+    buffers = block_buffers(ROOM, Params(), False, buffers_of(Inputs, ROOM))
     reads, table, results, scratch = map(jax.tree.leaves, buffers)
     module = binding.parse_assembly(write(trace(buffers, Params()), [*reads, *table], results, scratch))
     target = binding.Target.from_triple(triple).create_target_machine(cpu=TARGETS[triple], opt=3, jit=True)
@@ -97,4 +97,4 @@ def test_kernel_for_an_unknown_processor_is_refused() -> None:
     module.triple = "riscv64-unknown-linux-gnu"
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), []), "f")
     with pytest.raises(NotImplementedError, match="not on riscv64"):
-        settle(ir.IRBuilder(function.append_basic_block("entry")))
+        set_mode(ir.IRBuilder(function.append_basic_block("entry")))
