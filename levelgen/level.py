@@ -106,7 +106,7 @@ def size_of(name: str | Size) -> Size:
         )
     size = Size(*map(int, name.split("-")))
     if name_of(size) != name:
-        raise ValueError(f"size is {name}: that is {name_of(size)}, write that instead")
+        raise ValueError(f"size is {name}: write {name_of(size)} instead")
     for kind, count in zip(size._fields, size, strict=True):
         if count > MAX_PER_KIND:
             raise ValueError(f"size is {name}: at most {MAX_PER_KIND} {kind} fit into a level")

@@ -46,7 +46,7 @@ def test_out_may_be_any_path(text: str) -> None:
     ("override", "sentence"),
     [
         ("size=x", "size is .x.: choose one of s, m, l, or write how many polygons"),
-        ("size=5-2-1-1", "size is 5-2-1-1: that is s, so write that instead"),
+        ("size=5-2-1-1", "size is 5-2-1-1: write s instead"),
         ("size=4-1-1-1", "size is 4-1-1-1: 4 polygons and 1 circles leave no room"),
         ("size=8-8-0-0", "size is 8-8-0-0: it has no room for what must act"),
         ("size=5-1-1-0", "size is 5-1-1-0: it has no room for what must act"),

@@ -36,7 +36,7 @@ def test_size_of_refuses_an_unknown_name(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("5-2-1-1", "size is 5-2-1-1: that is s, so write that instead"),
+        ("5-2-1-1", "size is 5-2-1-1: write s instead"),
         ("65-1-1-1", "size is 65-1-1-1: at most 64 polygons fit into a level"),
         ("6-1-999-1", "size is 6-1-999-1: at most 64 joints fit into a level"),
     ],

@@ -1,8 +1,8 @@
 """Machine code against XLA: each primitive that a kernel can use, on all kinds of numbers and shapes.
 
-Bit for bit, but for three things that IEEE 754 or XLA leave open: which NaN it is; the sign of a zero that max
-and min choose between two zeros; and numbers below 1.2e-38, which XLA's threads take for zero in arithmetic, and
-which operations that only choose (max, min, sign) may hand on as they are.
+Bits are equal except where IEEE 754 or XLA leave a choice: which NaN results; the sign if max and min choose between
+two zeros; and subnormal numbers, which XLA's threads take for zero in arithmetic, and which operations that only
+choose (max, min, sign) may pass through.
 """
 
 from collections.abc import Callable
