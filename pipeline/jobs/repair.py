@@ -20,7 +20,7 @@ from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job, sound_note
 from levelproof.pipeline.store.layout import EXPERTS, data_paths
-from levelproof.pipeline.store.locks import nobody_commits
+from levelproof.pipeline.store.locks import without_commits
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.store.runs import merged, runs, told_levels
 from levelproof.pipeline.store.split import locked, taken
@@ -56,7 +56,7 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
         ids = lost & findings.origins.keys()
     else:
         ids = lost | {i for first, last in findings.missing for i in range(first, last + 1)}
-    with locked(split, partial(say, console)), nobody_commits(split, partial(say, console)):
+    with locked(split, partial(say, console)), without_commits(split, partial(say, console)):
         _note(split, job, findings)
         take_out(split, lost, findings.changed, list(findings.fragments))
     with taken(split, partial(say, console)):

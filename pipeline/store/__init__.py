@@ -1,1 +1,1 @@
-"""What is on the disk: manifests, shards, checkpoints, and the rules of writing them."""
+"""Data on disk: manifests, shards, checkpoints, and the rules for writing them."""

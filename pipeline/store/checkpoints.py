@@ -1,4 +1,4 @@
-"""Experts on the disk, so that a larger budget goes on instead of starting again: one numpy archive per unit."""
+"""Trained experts on disk, from which a larger budget continues: one numpy archive per unit."""
 
 import socket
 from collections.abc import Mapping, Sequence
@@ -33,14 +33,14 @@ T = TypeVar("T")
 
 
 class SourceUnseen(Failure):
-    """A worker does not find the split whose experts should go on."""
+    """A worker does not find the split that `continue_from` names."""
 
 
 def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
-    """Write these experts, by level id, durably.
+    """Write experts, by level id, durably.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the write fails.
     """
     rows = [experts[level_id] for level_id in sorted(experts)]
     begun, curves = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows)), stacked_curves(rows)
@@ -54,81 +54,82 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
 
 
 def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
-    """All experts of a checkpoint, by level id.
+    """Load all experts of a checkpoint, by level id.
 
     Raises:
         UserError: other users can write to it.
-        Failure: it is damaged or gone, or of another version of this program.
+        Failure: it is damaged or missing, or another version of this program wrote it.
     """
     require_own(path, COPY)
     try:
         if not path.is_file():
-            raise ValueError("it is no file" if path.exists() else "it is not there")
+            raise ValueError("it is not a file" if path.exists() else "it is missing")
         require_plain(path, path.stat().st_size)
         with np.load(path, allow_pickle=False) as file:  # whole files only: each array has a checksum
             arrays = {name: file[name] for name in file.files}
         level_ids, curves = arrays.pop("level_id"), arrays.pop("curve")
         if (level_ids.dtype, level_ids.ndim, curves.ndim, len(curves)) != (np.int64, 1, 2, len(level_ids)):
-            raise ValueError("its level ids or curves are none")
-        level_id_array(level_ids)  # within their bounds
+            raise ValueError("its level ids or curves are invalid")
+        level_id_array(level_ids)  # checks their bounds
         begun = unstacked(arrays, "begun/", begun_like(job), len(level_ids))
     except Exception as error:  # numpy and zipfile raise many kinds
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise Failure(
             f"The experts in {path} cannot be read ({reason}): leave out continue_from to train them from the start."
         ) from error
-    return {i: kept(of, curve) for i, of, curve in zip(level_ids.tolist(), begun, curves, strict=True)}
+    return {i: kept(expert, curve) for i, expert, curve in zip(level_ids.tolist(), begun, curves, strict=True)}
 
 
 def stacked_curves(experts: Sequence[Kept]) -> Float[np.ndarray, "expert update"]:
-    """Their learning curves, NaN after each one's end."""
-    curves = np.full((len(experts), max(len(of.curve) for of in experts)), np.nan, np.float32)
-    for row, of in zip(curves, experts, strict=True):
-        row[: len(of.curve)] = of.curve
+    """Stack the experts' learning curves, padded with NaN."""
+    curves = np.full((len(experts), max(len(expert.curve) for expert in experts)), np.nan, np.float32)
+    for row, expert in zip(curves, experts, strict=True):
+        row[: len(expert.curve)] = expert.curve
     return curves
 
 
 def kept(begun: Begun, curve: Float[np.ndarray, " update"]) -> Kept:
-    """An expert with its own part of a row of `stacked_curves`."""
+    """Return an expert with its learning curve, without the padding of `stacked_curves`."""
     return Kept(begun, curve[: int(begun.training.course.updates)].tolist())
 
 
 def unstacked(arrays: Mapping[str, np.ndarray], path: str, like: T, count: int) -> list[T]:
-    """So many trees such as `like`, out of their stacked arrays. Raises ValueError or KeyError if they are none."""
+    """Split stacked arrays into `count` trees such as `like`. Raises ValueError or KeyError if they do not fit."""
     leaves = []
     for name, one in arrays_of(like, path).items():
-        known = arrays[name]
-        if known.shape != (count, *one.shape) or not np.can_cast(known.dtype, one.dtype):  # a cause was a bit once
+        stacked = arrays[name]
+        # Smaller types pass: the cause of an end was a bool in earlier versions
+        if stacked.shape != (count, *one.shape) or not np.can_cast(stacked.dtype, one.dtype):
             raise ValueError(f"{name} has another shape or type")
-        leaves.append(known.astype(one.dtype, copy=False))
+        leaves.append(stacked.astype(one.dtype, copy=False))
     return [jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves]) for i in range(count)]
 
 
 @lru_cache(maxsize=8)
 def begun_like(job: JobConfig) -> Begun:
-    """An expert of this job, in shapes and types."""
+    """Return zeros with the shapes and types of an expert of this job."""
     level = empty_level(size_of(job.size), 1)
     like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), no_success(1), job.expert), level)
     return jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), like)
 
 
 def require_plain(file: Path | IO[bytes], size: int) -> None:
-    """Raises ValueError where an archive of so many bytes is none of ours: they are not packed, no larger than that."""
+    """Raise ValueError if an archive of `size` bytes is compressed or claims to hold more: ours never are or do."""
     with ZipFile(file) as archive:
         parts = archive.infolist()
     if any(part.compress_type != ZIP_STORED for part in parts) or sum(part.file_size for part in parts) > size:
-        raise ValueError("it is packed, and experts are not")
+        raise ValueError("it is compressed, which experts never are")
 
 
 def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
-    """Experts of the split `job.continue_from` that can go on with these levels; others begin.
+    """Load the experts of the split `job.continue_from` that can continue on these levels; all others start new.
 
-    A level that its expert solved ends the same with any larger budget, unless experts get their whole budget, or the
-    last evaluation alone solved it: those begin again. The witness says that, or the expert's course where the witness
-    is a search's around its own.
+    An expert that solved its level starts new, because it ends the same with any larger budget; not so if experts use
+    their whole budget, or if the last evaluation alone solved the level. Whether the expert solved it follows from the
+    witness or, if the witness is from a search around the expert's own, from the expert's course.
 
     Raises:
-        SourceUnseen: that split is not there for this process.
+        SourceUnseen: this process does not find that split.
         Failure: a checkpoint is damaged.
     """
     if not job.continue_from:
@@ -151,7 +152,7 @@ def _kept_in(source: Path, level_ids: Sequence[int]) -> dict[int, tuple[str | No
     """Witness and checkpoint of these levels: a worker asks for every unit, and reads the fragments of its levels."""
     if not (source / MANIFEST).is_dir():
         raise SourceUnseen(
-            f"The worker on {socket.gethostname()} finds no split at {source}, whose experts should go on: "
+            f"The worker on {socket.gethostname()} finds no split at {source}, from which to continue: "
             "use a folder that all machines of the cluster share, or leave out continue_from."
         )
     table = read_manifest(source, ["witness", "experts"], level_ids).table
@@ -160,21 +161,21 @@ def _kept_in(source: Path, level_ids: Sequence[int]) -> dict[int, tuple[str | No
 
 
 def require_same_experts(job: JobConfig) -> None:
-    """Refuse to take experts from a split whose experts cannot go on with this job.
+    """Check that experts of `job.continue_from` can continue in this job.
 
     Raises:
-        UserError: it kept no experts, was made with other settings or a larger budget, or others can write to them.
-        Failure: it is damaged.
+        UserError: the split kept no experts, has other settings or no smaller budget, or others can write to them.
+        Failure: the split is damaged.
     """
     if not job.continue_from:
         return
     path = Path(job.continue_from).expanduser()
-    require_folder(path, "go on with its experts")
+    require_folder(path, "continue its experts")
     source = require_manifest(path, ["experts"])
     require_own(source.split / EXPERTS, COPY)
     if source.table.column("experts").null_count == source.table.num_rows:
         raise UserError(
-            f"{source.split} has kept no experts: make it in another folder, with out=NAME keep_experts=true, or train "
+            f"{source.split} kept no experts: make it in another folder with out=NAME keep_experts=true, or train "
             "from the start."
         )
     config = source.config or {}
@@ -182,11 +183,11 @@ def require_same_experts(job: JobConfig) -> None:
     changes.pop("budget", None)
     if changes:
         raise UserError(
-            f"Experts of {source.split} cannot go on under other settings ({told(changes)}): "
+            f"Experts of {source.split} cannot continue with different settings ({told(changes)}): "
             "use the same ones, or leave out continue_from."
         )
     if config["budget"] >= job.env_steps:
         raise UserError(
-            f"Experts of {source.split} have had {config['budget']:,} env steps: give a larger budget than that, "
+            f"Experts of {source.split} had {config['budget']:,} env steps: give a larger budget than that, "
             f"not {job.budget}."
         )

@@ -1,7 +1,7 @@
-"""Checksums over every byte of what a unit commits, so that damage that no codec would see is found, too.
+"""Checksums over every byte that a unit commits, to find damage that no codec detects.
 
-A fragment has the SHA-256 of each shard and each checkpoint that its rows name, in its metadata, and its own in front
-of parquet's footer: readers go to places that the footer names, counted from the beginning, and never look there.
+A fragment's metadata has the SHA-256 of each shard and each checkpoint that its rows name. The fragment's own digest
+lies in front of parquet's footer: readers follow the footer's offsets, which count from the start, and skip it.
 """
 
 import hashlib
@@ -16,25 +16,23 @@ from levelproof.pipeline.store.remote import at_once, bytes_of, is_listed, is_re
 MARK = b"levelproof.sha256:"  # before a fragment's own digest
 OWN = len(MARK) + hashlib.sha256().digest_size
 BLOCK = 2**20  # bytes read at once
-TAIL = 8  # bytes at the end of parquet: how long its footer is, and PAR1
+TAIL = 8  # bytes at the end of a parquet file: the footer's length, and PAR1
 
 
 def digests_of(path: Path, known: Iterable[str] = ()) -> dict[str, str]:
-    """SHA-256 of all files below a folder, by their paths there; of a file, its own without a path.
+    """Return the SHA-256 of all files below a folder, by relative path; for a file, its own under the empty path.
 
-    Links are not followed: they, and whatever else is no ordinary file, have what no file has. On a server that lists
-    no files these are the `known` ones.
+    Links and other entries that are not regular files get a string that is no digest; links are not followed. On a
+    server that does not list files, `known` names them.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: a file cannot be read.
     """
     if is_remote(path):
         below = stored_in(path) if is_listed(path) else [path / name for name in known if _is_below(name)]
         files = [*below] or [path]
-        found = at_once(path, _digest, files)
-        return {
-            "" if file == path else file.relative_to(path).as_posix(): of for file, of in zip(files, found, strict=True)
-        }
+        names = ["" if file == path else file.relative_to(path).as_posix() for file in files]
+        return dict(zip(names, at_once(path, _digest, files), strict=True))
     if not stat.S_ISDIR(path.lstat().st_mode):
         return {"": _digest(path)}
     below = sorted(Path(folder, name) for folder, _, names in os.walk(path) for name in names)
@@ -44,25 +42,24 @@ def digests_of(path: Path, known: Iterable[str] = ()) -> dict[str, str]:
 def digests_below(
     split: Path, names: Iterable[str], carried: Mapping[str, dict[str, str]]
 ) -> dict[str, dict[str, str]]:
-    """Digests of the files of shards and checkpoints with these names: those `carried` over as they are, and those of
-    new ones from the disk.
+    """Return the digests of the files of the named shards and checkpoints: `carried` ones unchanged, new ones hashed.
 
-    Hashing a file again that stays would make any damage to it the truth.
+    Hashing a kept file again would give its damage a valid digest.
     """
-    there = {name: digests_of(split / name) for name in names if name not in carried and (split / name).exists()}
-    return dict(sorted(({name: carried[name] for name in names if name in carried} | there).items()))
+    new = {name: digests_of(split / name) for name in names if name not in carried and (split / name).exists()}
+    return dict(sorted(({name: carried[name] for name in names if name in carried} | new).items()))
 
 
 def _is_below(name: str) -> bool:
-    """Whether it is the path of nothing that is elsewhere."""
+    """Whether a relative path stays below its folder."""
     return not (name.startswith("/") or ".." in name.split("/"))
 
 
 def altered(path: Path, digests: Mapping[str, str], name: str) -> list[str]:
-    """Files of a shard, by their paths there, that have this file name and are not what their digests say.
+    """Return the relative paths of a shard's files called `name` whose digests differ.
 
     Raises:
-        OSError: one cannot be read.
+        OSError: a file cannot be read.
     """
     files = [file for file in digests if file.rpartition("/")[2] == name and _is_below(file)]
     found = at_once(path, lambda file: _digest(path / file), files)
@@ -79,13 +76,13 @@ def _digest(path: Path) -> str:
 
 
 def with_own(data: bytes) -> bytes:
-    """A parquet file with its own digest in it."""
+    """Insert a parquet file's own digest in front of its footer."""
     footer = _footer(data, len(data))
     return data[:footer] + MARK + hashlib.sha256(data).digest() + data[footer:]
 
 
 def has_own(path: Path) -> bool:
-    """Whether every byte of a parquet file is as `with_own` made it.
+    """Whether every byte of a parquet file is as `with_own` wrote it.
 
     Raises:
         OSError: it cannot be read.
@@ -105,5 +102,5 @@ def has_own(path: Path) -> bool:
 
 
 def _footer(end: bytes, size: int) -> int:
-    """Where the footer of a parquet file of so many bytes begins, as its end says; 0 where that cannot be."""
+    """Return the offset of the footer of a parquet file of `size` bytes, from its last bytes; 0 if invalid."""
     return max(0, size - TAIL - int.from_bytes(end[-TAIL:][:4], "little"))

@@ -1,6 +1,6 @@
-"""The manifest's columns: what each means, and in which versions it is. docs/columns.md is written from here.
+"""The manifest's columns, their meanings and versions; docs/columns.md is generated from here.
 
-A fragment of another version is refused with a sentence, never guessed at.
+Readers refuse a fragment of an unknown version instead of guessing.
 """
 
 from collections.abc import Sequence
@@ -10,37 +10,37 @@ import pyarrow as pa
 
 from levelproof.experts.steps import Seconds
 
-MANIFEST_VERSION, OLDEST_VERSION = 7, 6  # that is written; that is still read
+MANIFEST_VERSION, OLDEST_VERSION = 7, 6  # written; still read
 
-# Columns that tell of the run that made a row, and not of its level: in all others two runs of a job agree, bit for bit
+# Columns that depend on the run and not on the level: in all others two runs of a job agree, bit for bit
 OF_THE_RUN = ("shard", "row", "experts", "seconds")
 
-# Columns of strings that are the same in many rows
+# String columns whose values repeat in many rows
 REPETITIVE = ("size", "budget", "label", "label_reason", "witness", "shard", "experts", "config_hash", "device")
 
-# Columns of strings that hardly two rows share, before all others of strings: a dictionary of them saves nothing, and
-# reading it takes more time than all else
+# String columns that are nearly unique per row; they precede all other string columns. A dictionary of them would save
+# nothing, and reading it would take more time than everything else.
 OWN = ("content_hash", "signature")
 
 
 class ManifestColumn(NamedTuple):
-    """A column, as programs and as people know it."""
+    """A column's name, type and description."""
 
     name: str
     type: pa.DataType
     meaning: str
     unit: str = ""
-    null: str = ""  # what it says; empty: there is none
-    since: int = OLDEST_VERSION  # the manifest version
+    null: str = ""  # meaning of null; empty: the column has no nulls
+    since: int = OLDEST_VERSION  # first manifest version with it
 
     @property
     def text(self) -> str:
-        """Meaning, and what null says."""
+        """Meaning of the column and of null."""
         return f"{self.meaning}; null: {self.null}" if self.null else self.meaning
 
     @property
     def type_name(self) -> str:
-        name = lambda of: {"float": "float32"}.get(str(of), str(of))
+        name = lambda dtype: {"float": "float32"}.get(str(dtype), str(dtype))
         if pa.types.is_list(self.type):
             return f"list of {name(self.type.value_type)}"
         if pa.types.is_struct(self.type):
@@ -55,60 +55,61 @@ DESCRIBED = (
     ManifestColumn(
         "level_id",
         pa.int64(),
-        "With size, distribution and sampler version it rebuilds the level. Of a level file, made of its content hash; "
-        "of an imported trajectory, its place in the folder",
+        "Rebuilds the level, given size, distribution and sampler version. Level files: derived from the content hash; "
+        "imported trajectories: position in the folder",
     ),
-    ManifestColumn("content_hash", pa.string(), "The same for levels of the same content"),
+    ManifestColumn("content_hash", pa.string(), "Equal for levels with equal content"),
     ManifestColumn(
         "signature",
         pa.list_(pa.string()),
-        "Two hashes, one of which is the same for levels that nearly look the same",
+        "Two hashes; levels that look nearly the same share one of them",
     ),
     ManifestColumn(
         "file",
         pa.string(),
         "Absolute path of the level file, or `FOLDER/ARRAY#ROW` of an imported trajectory",
-        null="the id makes the level",
+        null="sampled from its id",
     ),
     ManifestColumn("size", pa.string(), "s, m, l, or numbers such as 8-8-8-4"),
-    ManifestColumn("budget", pa.string(), "The training budget, as it was typed"),
+    ManifestColumn("budget", pa.string(), "The training budget, as typed by the user"),
     ManifestColumn("label", pa.string(), "solved, unsolved, trivial or unsolvable"),
-    ManifestColumn("label_reason", pa.string(), "A sentence: what the label rests on"),
-    ManifestColumn("failed_by_noop", pa.bool_(), "Doing nothing lets green touch red"),
+    ManifestColumn("label_reason", pa.string(), "A sentence that says why the level has this label"),
+    ManifestColumn("failed_by_noop", pa.bool_(), "Without any action, green touches red"),
     ManifestColumn(
         "witness",
         pa.string(),
-        "Where it comes from: `most probable` or `sampled` actions of the expert, `exploration` (an episode of "
+        "Source of the witness: `most probable` or `sampled` actions of the expert, `exploration` (an episode of "
         "training), `scout` (random play before training), `search` (before training, or around another witness), "
         "`nothing` (a trivial level), `import` (another program's data)",
         null=NO_WITNESS,
     ),
-    # NaN would be above every number in SQL, so what nobody counted is null
+    # Null instead of NaN for what was not measured: in SQL, NaN is greater than every number
     ManifestColumn(
         "success_rate",
         pa.float32(),
-        "How many first episodes of the expert reach the goal with sampled actions, in attempts after its training "
-        "that decide nothing",
+        "First episodes of the expert with sampled actions that reach the goal, in attempts after its training that do "
+        "not affect the label",
         "share",
         NO_ATTEMPTS,
     ),
     ManifestColumn(
         "most_probable_succeeds",
         pa.bool_(),
-        "All finished episodes of the last evaluation with the most probable actions reach the goal",
+        "In the last evaluation, all finished episodes with the most probable actions reach the goal",
     ),
     ManifestColumn(
         "sticky_success_rate",
         pa.float32(),
-        "How many of the last evaluation's first episodes reach the goal, where an action is sometimes repeated "
-        "against the expert's will",
+        "First episodes of the last evaluation that reach the goal with sticky actions, which sometimes repeat the "
+        "last action instead of the expert's",
         "share",
         NO_ATTEMPTS,
     ),
     ManifestColumn(
         "moved_success_rate",
         pa.float32(),
-        "How many of the last evaluation's first episodes reach the goal from starts with slightly other velocities",
+        "First episodes of the last evaluation that reach the goal from perturbed starts (slightly different "
+        "velocities)",
         "share",
         NO_ATTEMPTS,
     ),
@@ -116,50 +117,50 @@ DESCRIBED = (
     ManifestColumn(
         "portability",
         pa.float32(),
-        "How many of the witness's replays from moved starts reach the goal",
+        "Replays of the witness from perturbed starts that reach the goal",
         "share",
         f"{NO_WITNESS}, or `expert.replays=0`",
     ),
     ManifestColumn(
         "steps_to_first_success",
         pa.int64(),
-        "Training steps until the expert's first success of its own, so in no environment that repeats actions",
+        "Training steps until the expert's first success, not counting environments with sticky actions",
         "env steps",
         "never",
     ),
-    ManifestColumn("env_steps", pa.int64(), "Training steps that were used, at most the budget", "env steps"),
+    ManifestColumn("env_steps", pa.int64(), "Training steps used, at most the budget", "env steps"),
     ManifestColumn(
         "evaluation_steps",
         pa.int64(),
-        "Spent on the expert's evaluations, and on the attempts of success_rate",
+        "Steps of the expert's evaluations and of the attempts of success_rate",
         "env steps",
     ),
-    ManifestColumn("scout_steps", pa.int64(), "Spent on random play before training", "env steps"),
+    ManifestColumn("scout_steps", pa.int64(), "Steps of random play before training", "env steps"),
     ManifestColumn(
-        "search_steps", pa.int64(), "Spent on the search before training and around the witness", "env steps"
+        "search_steps", pa.int64(), "Steps of the search before training and around the witness", "env steps"
     ),
-    ManifestColumn("cells", pa.int32(), "How many the search reached", "cells", "no search"),
+    ManifestColumn("cells", pa.int32(), "Cells that the search reached", "cells", "no search"),
     ManifestColumn(
         "still_grew", pa.bool_(), "The last quarter of the search still reached new cells", null="no search"
     ),
     ManifestColumn(
         "learning_curve",
         pa.list_(pa.float32()),
-        "Success rate of training for each update, of environments in which the expert alone chooses actions; an entry "
-        "is null where no episode ended",
+        "Training success rate per update, in environments without sticky actions; an entry is null if no episode "
+        "ended",
         "share",
     ),
     ManifestColumn(
         "best_return",
         pa.float32(),
-        "The best of a training episode, shaping included",
+        "The highest return of a training episode, shaping included",
         "reward",
         "no episode of training ended",
     ),
-    ManifestColumn("episodes", pa.int64(), "Episodes of training that ended", "episodes"),
-    ManifestColumn("shard", pa.string(), "Where its data is: a path below the split", null=NO_WITNESS),
-    ManifestColumn("row", pa.int32(), "Its place in the shard", null=NO_WITNESS),
-    ManifestColumn("experts", pa.string(), "File with its expert: a path below the split", null="none is kept"),
+    ManifestColumn("episodes", pa.int64(), "Training episodes that ended", "episodes"),
+    ManifestColumn("shard", pa.string(), "Path of the level's shard below the split", null=NO_WITNESS),
+    ManifestColumn("row", pa.int32(), "Index of the level in the shard", null=NO_WITNESS),
+    ManifestColumn("experts", pa.string(), "Path of the expert's file below the split", null="not kept"),
     ManifestColumn("config_hash", pa.string(), "Hash of the settings that decide results"),
     ManifestColumn(
         "versions",
@@ -169,38 +170,39 @@ DESCRIBED = (
                 pa.field("sampler", pa.int32(), nullable=False),
             ]
         ),
-        f"What made the row: {', '.join(STACK)}, and the sampler",
+        f"Versions that made the row: {', '.join(STACK)}, and the sampler",
     ),
-    ManifestColumn("device", pa.string(), "Such as `cpu: AMD EPYC`"),
-    ManifestColumn("command", pa.string(), "Makes this row again"),
+    ManifestColumn("device", pa.string(), "Device that computed the row, such as `cpu: AMD EPYC`"),
+    ManifestColumn("command", pa.string(), "Command that regenerates this row"),
     ManifestColumn(
         "seconds",
         pa.struct([pa.field(stage, pa.float32()) for stage in Seconds._fields]),
-        "What the level cost the run that made it, of a core, or of a GPU where `device` is one: sampling (and what "
-        "needs no expert), search (and scouts), training, evaluation, idle slots and rows, replay of witnesses, "
-        "writing, compiling",
+        "Time that the level cost, of a core, or of a GPU if `device` is one: sampling (and labels without an expert), "
+        "search (and scouts), training, evaluation, idle slots, replay of witnesses, writing, compiling",
         "s",
-        "nobody has counted",
+        "not measured",
         since=7,
     ),
 )
-COLUMNS = pa.schema([pa.field(of.name, of.type, nullable=bool(of.null)) for of in DESCRIBED])
+COLUMNS = pa.schema([pa.field(column.name, column.type, nullable=bool(column.null)) for column in DESCRIBED])
 VERSIONS = {
-    str(version): [of.name for of in DESCRIBED if of.since <= version]
+    str(version): [column.name for column in DESCRIBED if column.since <= version]
     for version in range(OLDEST_VERSION, MANIFEST_VERSION + 1)
 }
 
 
 def schema_of(names: Sequence[str], compact: bool = False) -> pa.Schema:
-    """Of some columns; `compact`: what is repetitive as dictionaries."""
+    """Return the schema of the named columns; `compact`: with repetitive ones as dictionaries."""
     fields = [COLUMNS.field(name) for name in names]
-    as_dictionary = pa.dictionary(pa.int32(), pa.string())
-    return pa.schema([of.with_type(as_dictionary) if compact and of.name in REPETITIVE else of for of in fields])
+    if compact:
+        as_dictionary = pa.dictionary(pa.int32(), pa.string())
+        fields = [field.with_type(as_dictionary) if field.name in REPETITIVE else field for field in fields]
+    return pa.schema(fields)
 
 
 def completed(table: pa.Table, asked: Sequence[str]) -> pa.Table:
-    """A fragment's rows with all columns that were asked for, also if it is of a version before."""
-    for of in DESCRIBED:
-        if of.name in asked and of.name not in table.column_names:
-            table = table.append_column(COLUMNS.field(of.name), pa.nulls(table.num_rows, of.type))
+    """Append the requested columns that an older version lacks, as nulls."""
+    for column in DESCRIBED:
+        if column.name in asked and column.name not in table.column_names:
+            table = table.append_column(COLUMNS.field(column.name), pa.nulls(table.num_rows, column.type))
     return table

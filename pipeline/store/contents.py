@@ -1,7 +1,7 @@
-"""What a shard of one size holds: its fields, where each lies, and the whole numbers that may stand in them.
+"""Contents of a shard of one size: its fields, their layout, and the integers that they may hold.
 
-Told by the annotations of `Level` and `Record` alone, so that a shard can be refused before anything of it is used:
-engines and pictures look things up by these numbers and check no bounds.
+Derived from the annotations of `Level` and `Record` alone, so that a shard can be refused before any of it is used:
+engines and pictures index arrays with these integers and check no bounds.
 """
 
 from collections.abc import Mapping
@@ -26,47 +26,47 @@ from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.packing import pack
 from levelproof.pipeline.store.schema import FLAT, ContentsError, Encoding, FieldSpec, field_table
 
-COUNTED = (  # fields with one entry for each thing of a kind, in the order of Size
+COUNTED = (  # fields with one entry per polygon, circle, joint and thruster, in the order of Size
     "level/model/n_vertices",
     "level/model/radius",
     "level/model/joint_active",
     "level/model/thruster_active",
 )
-FEWEST = Size(FIXED_POLYGONS, 0, 0, 0)
+SMALLEST = Size(FIXED_POLYGONS, 0, 0, 0)
 FULL = Encoding()
 
 
 @cache
 def table_for(size: Size, encoding: Encoding = FULL) -> tuple[FieldSpec, ...]:
-    """The field table of a shard of this size; by default, all the fields that any shard gives back."""
+    """Return the field table of a shard of this size; by default, all fields that a reader can ask for."""
     level, record = none_of(size)
     arrays = arrays_of(level, "level/") | arrays_of(record, "record/")
     return tuple(field_table(kept(arrays, encoding), encoding.density))
 
 
 def none_of(size: Size) -> tuple[Level, Record]:
-    """No level of this size and no record, with all their shapes and types."""
+    """Return a batch of zero levels of this size and of zero records, for their shapes and types."""
     empty = lambda buffer: np.zeros((*buffer.shape, 0), buffer.dtype)
-    level, record = (jax.tree.map(empty, buffers_of(of, size)) for of in (Level, Record))
-    in_time = lambda tree: jax.tree.map(lambda x: np.stack([x] * RECORD_STEPS), tree)  # the engine's are of one moment
+    level, record = (jax.tree.map(empty, buffers_of(kind, size)) for kind in (Level, Record))
+    in_time = lambda tree: jax.tree.map(lambda x: np.stack([x] * RECORD_STEPS), tree)  # the engine's have no time axis
     return level, replace(record, state=in_time(record.state), manifold=in_time(record.manifold))
 
 
 def level_fields(size: Size) -> list[FieldSpec]:
-    """Those that tell what a level is, without its record."""
+    """Return the fields that define a level, without its record."""
     return [field for field in table_for(size) if field.constant]
 
 
 def size_of_levels(arrays: Mapping[str, np.ndarray]) -> Size:
-    """The size of levels with these fields."""
+    """Return the size of levels with these fields."""
     return Size(*(arrays[name].shape[0] for name in COUNTED))
 
 
 @cache
 def blank_row(size: Size, encoding: Encoding) -> np.ndarray:
-    """A row of FLAT for the empty level: its fields, its state in every key frame, and zeros elsewhere.
+    """Return FLAT's row for the empty level: its fields, its state in every key frame, and zeros elsewhere.
 
-    Of rows it is stored where they differ from it (exclusive or): nearly all levels have the same scenery.
+    Rows are stored as their exclusive or with this one, which is mostly zero: nearly all levels share the scenery.
     """
     empty, arrays = arrays_of(empty_level(size, 1), "level/"), {}
     table = table_for(size, encoding)
@@ -77,35 +77,35 @@ def blank_row(size: Size, encoding: Encoding) -> np.ndarray:
 
 
 def size_in(fields: Any, encoding: Encoding) -> Size:
-    """The size whose fields, all of them, are these, as a shard's attributes have them.
+    """Return the size whose field table is `fields`, the JSON of a shard's attributes.
 
     Raises:
-        ContentsError: they are those of none.
+        ContentsError: no size has this table.
     """
     with suppress(KeyError, IndexError, TypeError):
         shapes = {field["name"]: field["shape"] for field in fields}
         size = Size(*(shapes[name][0] for name in COUNTED))
-        fits = all(type(n) is int and low <= n <= MAX_PER_KIND for low, n in zip(FEWEST, size, strict=True))
-        if fits and fields == _told(size, encoding):
+        fits = all(type(n) is int and low <= n <= MAX_PER_KIND for low, n in zip(SMALLEST, size, strict=True))
+        if fits and fields == _table_json(size, encoding):
             return size
-    raise ContentsError("its fields are those of no size")
+    raise ContentsError("its fields match no size")
 
 
 @cache
-def _told(size: Size, encoding: Encoding) -> list[dict[str, Any]]:
-    """The field table as a shard's attributes have it."""
+def _table_json(size: Size, encoding: Encoding) -> list[dict[str, Any]]:
+    """Return the field table as a shard's attributes have it."""
     return [field.as_json() for field in table_for(size, encoding)]
 
 
 def check_level_ids(level_ids: Any) -> None:
-    """Raises ContentsError where these are not the ascending ids of one or more levels."""
+    """Raise ContentsError unless these are ascending ids of one or more levels."""
     good = isinstance(level_ids, list) and len(level_ids) > 0 and all(type(x) is int for x in level_ids)
     if not good or level_ids[0] < 0 or level_ids[-1] > MAX_LEVEL_ID or level_ids != sorted(set(level_ids)):
         raise ContentsError("its level ids are not ascending ids of levels")
 
 
 def check_numbers(arrays: Mapping[str, np.ndarray], size: Size) -> None:
-    """Raises ContentsError where a whole number is one that a level or a record of this size cannot have.
+    """Raise ContentsError if an integer is out of range for a level or a record of this size.
 
     `arrays` have the level axis first.
     """
@@ -116,7 +116,7 @@ def check_numbers(arrays: Mapping[str, np.ndarray], size: Size) -> None:
 
 
 def highest(size: Size) -> dict[str, np.ndarray | int]:
-    """The largest number that may stand in each field of integers; the smallest is 0."""
+    """Return the largest valid value of each integer field; the smallest is 0."""
     return {
         "record/timestep": np.iinfo(np.int32).max,
         "record/action": np.array(CHOICES)[:, None] - 1,

@@ -1,4 +1,4 @@
-"""A folder that a user named and that appears whole or not at all."""
+"""Output folders that users name, which appear whole or not at all."""
 
 import os
 import shutil
@@ -12,24 +12,24 @@ from levelproof.pipeline.store.scratch import scratch
 
 @contextmanager
 def new_folder(out: Path, replaces: Callable[[Path], bool] = lambda _: False) -> Iterator[Path]:
-    """Where to write what shall be in `out`: a folder beside it, under a hidden name until all of it is there.
+    """Yield a hidden folder beside `out`, which is renamed to `out` when the block ends.
 
-    What an exception ends is removed. A killed process leaves `out` as it was, and the hidden folder to the next one
-    that writes `out`. A folder that is there makes way for the new one if `replaces` says that it may.
+    After an exception it is removed. A killed process leaves `out` as it was, and its hidden folder to the next process
+    that writes `out`. An existing folder is replaced if `replaces` returns True for it.
 
     Raises:
-        UserError: `out` is there and stays, or cannot be written.
+        UserError: `out` exists and may not be replaced, or cannot be written.
     """
-    there = out.is_symlink() or out.exists()
-    if there and (out.is_symlink() or not out.is_dir() or not replaces(out)):
-        raise UserError(f"There is something at {out} already: name a new folder with -o, or remove that one.")
-    whole = out.absolute()  # `gallery/` and `.` have names
+    exists = out.is_symlink() or out.exists()
+    if exists and (out.is_symlink() or not out.is_dir() or not replaces(out)):
+        raise UserError(f"{out} already exists: name a new folder with -o, or remove that one.")
+    whole = out.absolute()  # gives `gallery/` and `.` names
     replaced = whole.with_name(f".{whole.name}.{os.getpid()}.old")
     try:
         whole.parent.mkdir(parents=True, exist_ok=True)
         with scratch(whole.parent, f".{whole.name}.unfinished-") as unfinished:
             yield unfinished
-            if there:
+            if exists:
                 whole.rename(replaced)
             unfinished.rename(whole)
             shutil.rmtree(replaced, ignore_errors=True)

@@ -1,9 +1,9 @@
-"""What shards of each density keep of records, and the rest computed again: arrays from arrays.
+"""Densities: which fields of records a shard keeps, and how the others are recomputed.
 
-`full` keeps every field. `resume` keeps states, so that an episode goes on from any of them; what else there is to know
-comes of one env step from each. `witness` keeps the level, the actions, where episodes end, a key frame every so many
-env steps of an episode, and checksums of all states; the engine simulates the rest again. Where this machine's states
-are others than the checksums say, key frames are the truth, and states between them are those of this machine.
+`full` keeps every field. `resume` keeps states, so that an episode can continue from any of them; one env step from
+each gives the other fields. `witness` keeps the level, the actions, the ends of episodes, a key frame every `key_every`
+env steps of an episode, and checksums of all states; the engine simulates the rest again. If this machine's states do
+not match the checksums, each key frame resets them to the stored ones, and states in between are this machine's.
 """
 
 from collections.abc import Iterable, Mapping
@@ -28,19 +28,18 @@ STATE = "record/state/"
 KEY = "key/"  # in place of `record/`: a field of the key frames
 CHECKSUM = "checksum"  # of each run of `Encoding.key_every` rows
 
-
-Found = tuple[dict[str, np.ndarray], Int[np.ndarray, " level"]]
+FieldsAndFirst = tuple[dict[str, np.ndarray], Int[np.ndarray, " level"]]  # fields; first row that differs, or -1
 
 
 class Restored(NamedTuple):
-    """The fields that were asked for, and how far they are those that were stored."""
+    """The requested fields, and where they may differ from the stored record."""
 
     arrays: dict[str, np.ndarray]
-    unlike: Int[np.ndarray, " level"]  # the first row whose state may not be the one that was stored; -1: none
+    unlike: Int[np.ndarray, " level"]  # first row whose state may differ from the stored one; -1: none
 
 
 def kept(arrays: Mapping[str, np.ndarray], encoding: Encoding) -> dict[str, np.ndarray]:
-    """What is stored of every field (level axis last; time first but for `level/` fields)."""
+    """Return what a shard stores of all fields (level axis last; time first except in `level/` fields)."""
     if encoding.density == "full":
         return dict(arrays)
     found = {name: x for name, x in arrays.items() if name.startswith("level/") or name in MOVES}
@@ -67,7 +66,7 @@ def needed(wanted: Iterable[str], stored: Iterable[str]) -> set[str]:
 
 
 def restored(stored: Mapping[str, np.ndarray], wanted: Iterable[FieldSpec], encoding: Encoding) -> Restored:
-    """The wanted fields, from what `needed` says of them; what they do not need is not computed."""
+    """Return the wanted fields, copied or computed from the fields that `needed` names."""
     specs = {field.name: field for field in wanted}
     arrays = {name: stored[name] for name in specs if name in stored}
     if WIDE in specs and WIDE not in stored:
@@ -84,16 +83,16 @@ def restored(stored: Mapping[str, np.ndarray], wanted: Iterable[FieldSpec], enco
     return Restored({name: arrays[name] for name in specs}, unlike)
 
 
-def _from_states(stored: Mapping[str, np.ndarray], encoding: Encoding, paths: frozenset[str]) -> Found:
-    """`resume`: one env step from every state."""
+def _from_states(stored: Mapping[str, np.ndarray], encoding: Encoding, paths: frozenset[str]) -> FieldsAndFirst:
+    """Compute missing fields of `resume` with one env step from every state."""
     level, moves = _played(stored)
     states = KnownStates(tree_of(State, stored, STATE), None, np.ones_like(moves.done))
     made = resume(level, moves, states, encoding.rules, paths)
     return made.fields, _first(~made.agrees)
 
 
-def _from_actions(stored: Mapping[str, np.ndarray], encoding: Encoding, paths: frozenset[str]) -> Found:
-    """`witness`: all env steps again, and those of levels that come out differently from their key frames, too."""
+def _from_actions(stored: Mapping[str, np.ndarray], encoding: Encoding, paths: frozenset[str]) -> FieldsAndFirst:
+    """Compute missing fields of `witness` by replay; levels whose states differ are replayed from their key frames."""
     level, moves = _played(stored)
     at, there = key_rows(moves.done, encoding.key_every)
     frames = task_states(stored, KEY + "state/", np.take_along_axis(timesteps(moves.done), at, 0))
@@ -119,7 +118,7 @@ def _played(stored: Mapping[str, np.ndarray]) -> tuple[Level, Moves]:
 
 
 def task_states(arrays: Mapping[str, np.ndarray], path: str, timestep: Any) -> TaskState:
-    """States and last distances that are called so, [row, ..., level]."""
+    """Collect the states and last distances below `path`, [row, ..., level]."""
     distance: Any = arrays[path.removesuffix("state/") + "last_distance"]
     return TaskState(tree_of(State, arrays, path), timestep, distance)
 
@@ -127,9 +126,9 @@ def task_states(arrays: Mapping[str, np.ndarray], path: str, timestep: Any) -> T
 def key_rows(
     done: Bool[np.ndarray, "256 level"], every: int
 ) -> tuple[Int[np.ndarray, "key level"], Bool[np.ndarray, "key level"]]:
-    """The rows of key frames, and which of them there are: every so many env steps of an episode, its start left out.
+    """Return the rows of key frames, and a mask of which exist: every `every` env steps of an episode.
 
-    An episode starts in the level's own state.
+    The start of an episode needs none: it is the level's own state.
     """
     timestep = timesteps(done)
     key = (timestep % every == 0) & (timestep > 0)
@@ -138,23 +137,23 @@ def key_rows(
 
 
 def in_runs(sums: np.ndarray, encoding: Encoding) -> np.ndarray:
-    """The sum of each run of so many rows, as 32 bits, [run, level]."""
+    """Sum each run of `key_every` rows, modulo 2**32; [run, level]."""
     runs = RECORD_STEPS // encoding.key_every
     return sums.reshape(runs, encoding.key_every, sums.shape[-1]).sum(1, dtype=np.uint32)
 
 
 def _placed(frames: np.ndarray, at: Int[np.ndarray, "key level"]) -> np.ndarray:
-    """Key frames [key, ..., level] at their rows, with zeros elsewhere."""
+    """Scatter key frames [key, ..., level] to their rows, with zeros elsewhere."""
     rows = np.zeros((RECORD_STEPS, *frames.shape[1:]), frames.dtype)
     np.put_along_axis(rows, _along(at, frames), frames, 0)
     return rows
 
 
 def _along(at: Int[np.ndarray, "key level"], values: np.ndarray) -> np.ndarray:
-    """The same rows for each component of what has [row, ..., level]."""
+    """Reshape row indices to broadcast over the components of `values` [row, ..., level]."""
     return at.reshape(len(at), *(1,) * (values.ndim - 2), at.shape[-1])
 
 
 def _first(wrong: Bool[np.ndarray, "256 level"]) -> Int[np.ndarray, " level"]:
-    """The first row that is; -1: none is."""
+    """Return each level's first wrong row; -1: none."""
     return np.where(wrong.any(0), wrong.argmax(0), -1)

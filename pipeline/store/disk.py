@@ -1,4 +1,4 @@
-"""Files opened and written without harm to others, what is on the disk for good, and why a disk refuses."""
+"""Files opened and written without harming others, flushing to the drive, and sentences for failed writes."""
 
 import errno
 import fcntl
@@ -11,35 +11,35 @@ from pathlib import Path
 
 from levelproof.pipeline.errors import Failure, UserError
 
-# The disk refuses: whoever tries again works for nothing.
+# Errors of writes that would fail again
 REFUSALS = {
     errno.ENOSPC: "the disk is full: free some space",
-    errno.EDQUOT: "your disk quota is used up: free some space",
-    errno.EFBIG: "the disk refuses files this large: choose another folder or raise the limit",
+    errno.EDQUOT: "your disk quota is exceeded: free some space",
+    errno.EFBIG: "the disk does not allow files this large: choose another folder or raise the limit",
     errno.EROFS: "the disk is read-only: make it writable",
     errno.EACCES: "writing is not permitted: check the folder's permissions",
     errno.EPERM: "writing is not permitted: check the folder's permissions",
 }
-FAILS = {errno.EIO: "the disk fails: see `dmesg`"}  # or did once, so a unit is tried again
+FAILS = {errno.EIO: "the disk fails: see `dmesg`"}  # perhaps only once, so the unit is retried
 
 
 class NotRegular(UserError):
-    """A link, a pipe or the like is where a split has a regular file."""
+    """A link, a pipe or the like has the name of a regular file of a split."""
 
     def __init__(self, path: str | Path) -> None:
         super().__init__(
-            f"{path} must be a regular file without another name, and is a link, a pipe or the like: remove it, then "
+            f"{path} must be a regular file without other names, but is a link, a pipe or the like: remove it, then "
             "run the same command again."
         )
 
 
 def regular(path: str | Path, flags: int, mode: int = 0o666) -> int:
-    """Open a regular file, as an `opener` of `open`: for files in a split, which anyone may have made.
+    """Open a regular file of a split that others may have made; an `opener` for `open`.
 
-    It follows no link at the end of `path`, writes to no file that has another name too, and waits for no pipe.
+    It does not follow a link at the end of `path`, write to a file with a second name, or wait for a pipe.
 
     Raises:
-        NotRegular: it is another kind of file, or has another name.
+        NotRegular: it is another kind of file, or has a second name.
         OSError: it cannot be opened.
     """
     try:
@@ -59,10 +59,10 @@ def regular(path: str | Path, flags: int, mode: int = 0o666) -> int:
 
 
 def write_new(path: Path, data: bytes, mode: int = 0o666) -> None:
-    """Write a file in place of what has its name, of which no byte changes; the umask narrows `mode`.
+    """Replace what has this name by a new file, without changing the bytes of the old one; the umask narrows `mode`.
 
     Raises:
-        OSError: the disk refuses, or a folder has this name.
+        OSError: the write fails, or a folder has this name.
     """
     path.unlink(missing_ok=True)
     with open(path, "xb", opener=partial(regular, mode=mode)) as file:
@@ -71,10 +71,10 @@ def write_new(path: Path, data: bytes, mode: int = 0o666) -> None:
 
 @contextmanager
 def told_of(split: Path) -> Iterator[None]:
-    """For what writes to a split: where the disk refuses, that is said in a sentence.
+    """Turn failed writes to a split in the `with` block into a sentence.
 
     Raises:
-        Failure: the disk refuses.
+        Failure: a write fails.
     """
     try:
         yield
@@ -85,9 +85,9 @@ def told_of(split: Path) -> Iterator[None]:
 
 
 def refusal(error: OSError, folder: Path, reasons: Mapping[int, str] = REFUSALS) -> str:
-    """What the disk refuses and what to do, in a sentence without its end; empty: none of the `reasons`.
+    """Say in a sentence, without its full stop, why a write failed and what to do; empty: for none of the `reasons`.
 
-    The sentence names the file of the error, which may lie on another disk than `folder`; `folder` if it has none.
+    The sentence names the error's file, which may lie on another disk than `folder`, or else `folder`.
     """
     reason, file = reasons.get(error.errno or 0), error.filename
     where = os.fsdecode(file) if isinstance(file, str | bytes | os.PathLike) else folder
@@ -95,20 +95,20 @@ def refusal(error: OSError, folder: Path, reasons: Mapping[int, str] = REFUSALS)
 
 
 def flush(path: Path) -> None:
-    """A file, or all below a folder, to the disk; and its name, and that of the folder it is in.
+    """Flush a file, or all below a folder, with its name and that of the folder it is in.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the write fails.
     """
     for entry in [path, *path.rglob("*"), *path.parents[:2]]:
         flush_entry(entry)
 
 
 def flush_entry(path: Path) -> None:
-    """A file, or the names in a folder, to the disk.
+    """Flush a file's bytes, or the names in a folder.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the write fails.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -118,12 +118,12 @@ def flush_entry(path: Path) -> None:
 
 
 def to_drive(descriptor: int) -> None:
-    """Have what a descriptor's file holds, or the names in its folder, outlast a loss of power.
+    """Flush a descriptor's file, or the names in its folder, so that they outlast a loss of power.
 
-    On macOS `fsync` leaves it in the drive's cache, and F_FULLFSYNC does not; not every file system there has that.
+    On macOS `fsync` stops at the drive's cache and F_FULLFSYNC does not, but some file systems there lack it.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the write fails.
     """
     if full := getattr(fcntl, "F_FULLFSYNC", None):
         try:

@@ -1,6 +1,6 @@
-"""What happened in a run, as JSON lines in one small file of its own below the split's `events/`.
+"""Events of runs, as JSON lines in one small file per run below the split's `events/`.
 
-It tells whoever watches; no commit rests on it and nothing that is read of a split does, so it may be deleted.
+They are for people who watch: no commit and no reader of a split depends on them, so they may be deleted.
 """
 
 import json
@@ -20,19 +20,19 @@ from levelproof.pipeline.store.objects import get
 from levelproof.pipeline.store.remote import is_remote
 
 RUN = re.compile(rf"{EVENTS}/[0-9]{{8}}T[0-9]{{12}}-[0-9a-f]{{8}}\.jsonl")
-HALF = re.compile(rf"{EVENTS}/\.[0-9]{{8}}T[0-9]{{12}}-[0-9a-f]{{8}}\.jsonl\.[0-9]+")  # what a run that died wrote
+HALF = re.compile(rf"{EVENTS}/\.[0-9]{{8}}T[0-9]{{12}}-[0-9a-f]{{8}}\.jsonl\.[0-9]+")  # from a dead run
 KEPT = 20  # runs of a split
-MAX_BYTES = 2**22  # of a file; one of ours is a tenth of that
+MAX_BYTES = 2**22  # of a file; ours reach a tenth of that
 
-Event = Mapping[str, Any]  # `time` in s since 1970, `event`, and what belongs to it
+Event = Mapping[str, Any]  # `time` in s since 1970, `event`, and the event's data
 
 
 def new_run(split: Path) -> Path:
-    """Where a run that begins now tells its events. Names sort as runs began; the oldest runs make room.
+    """Return the path for the events of a run that begins now, and delete the oldest runs; names sort by time.
 
     Raises:
-        OSError: the disk refuses.
-        UserError, StoreFailure: the store does.
+        OSError: the write fails.
+        UserError, StoreFailure: the store's request fails.
     """
     if not is_remote(split):
         (split / EVENTS).mkdir(exist_ok=True)
@@ -42,21 +42,21 @@ def new_run(split: Path) -> Path:
 
 
 def runs_in(split: Path) -> list[Path]:
-    """The runs of a split that have told something, the latest last."""
+    """Return the event files of a split's runs, the latest last."""
     return sorted(entries(split, EVENTS, RUN, DirEntry.is_file))
 
 
 def tell(path: Path, events: Sequence[Event]) -> None:
-    """Replace a run's file as a whole. A disk or store that refuses is no reason to end the run."""
+    """Replace a run's file as a whole. A failed write does not end the run."""
     with suppress(OSError, LevelproofError):
         write(path, "".join(json.dumps(event) + "\n" for event in events).encode())
 
 
 def events_of(path: Path) -> list[dict[str, Any]]:
-    """A run's events; lines that are none are left out, and so is a file that no run can have written.
+    """Read a run's events, skipping invalid lines; none from a file larger than a run writes.
 
     Raises:
-        UserError, StoreFailure: the store refuses.
+        UserError, StoreFailure: the store's request fails.
     """
     try:
         if not is_remote(path) and path.stat().st_size > MAX_BYTES:

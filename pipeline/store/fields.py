@@ -1,4 +1,4 @@
-"""Named arrays out of nested dataclasses, and back: `Level` and `Record` as flat dictionaries of numpy arrays.
+"""Conversion between nested dataclasses, such as `Level` and `Record`, and flat dictionaries of numpy arrays.
 
 Knows nothing of files. Names are paths: `state/position`, `model/joint_anchor_a`.
 """
@@ -15,13 +15,13 @@ T = TypeVar("T")
 
 
 def arrays_of(tree: Any, path: str = "") -> dict[str, np.ndarray]:
-    """Every leaf of a nested dataclass of arrays, by its path."""
+    """Return every leaf of a nested dataclass of arrays, by its path."""
     leaves, _ = tree_flatten_with_path(tree)
     return {path + keystr(keys, simple=True, separator="/"): np.asarray(leaf) for keys, leaf in leaves}
 
 
 def tree_of(cls: type[T], arrays: Mapping[str, np.ndarray], path: str = "") -> T:
-    """The inverse of `arrays_of`; the annotations of `cls` say which fields are themselves dataclasses."""
+    """Build a `cls` from the arrays of `arrays_of`; its annotations say which fields are dataclasses."""
     hints = _hints(cls)
     values = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
@@ -45,7 +45,7 @@ def same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def unlike_fields(ours: T, theirs: T) -> dict[int, str]:
-    """The first field whose bits differ, for each level (by its index) that is not the same in both trees."""
+    """Return the first field whose bits differ, by index of each level that differs between two trees."""
     others = arrays_of(theirs)
     wrong: dict[int, str] = {}
     for name, values in arrays_of(ours).items():

@@ -1,4 +1,4 @@
-"""Single files of a split, in a folder or in a store: written in one step, and removed."""
+"""Writing (in one step) and removing single files of a split, in a folder or in a store."""
 
 import os
 import shutil
@@ -10,11 +10,11 @@ from levelproof.pipeline.store.remote import is_remote, stored_in
 
 
 def write(path: Path, data: bytes, mode: int = 0o666) -> None:
-    """Write a file in one step, in place of what was there; in a folder it gets this mode, less the umask.
+    """Write or replace a file in one step; in a folder it gets this mode, less the umask.
 
     Raises:
-        OSError: the disk refuses.
-        UserError, StoreFailure: the store does.
+        OSError: the write fails.
+        UserError, StoreFailure: the store's request fails.
     """
     if is_remote(path):
         objects.put(path, data)
@@ -25,7 +25,7 @@ def write(path: Path, data: bytes, mode: int = 0o666) -> None:
 
 
 def remove(path: Path) -> None:
-    """A file, if it is there. Raises as `write`."""
+    """Remove a file, if it exists. Raises as `write`."""
     if is_remote(path):
         objects.remove([path])
     else:
@@ -33,10 +33,10 @@ def remove(path: Path) -> None:
 
 
 def remove_data(path: Path) -> None:
-    """A shard or experts, as far as they go now: files that are open stay on NFS, and the next run tries again.
+    """Remove a shard or experts as far as possible: on NFS, open files stay until the next run tries again.
 
     Raises:
-        UserError, StoreFailure: the store refuses.
+        UserError, StoreFailure: the store's request fails.
     """
     if is_remote(path):
         objects.remove(stored_in(path) if path.suffix == ".zarr" else [path])

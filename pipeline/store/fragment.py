@@ -1,4 +1,4 @@
-"""What one fragment says, of which nothing is believed: bytes, metadata and rows are looked at before they are used."""
+"""Reading one fragment, which is untrusted: bytes, metadata and rows are checked before use."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -24,33 +24,33 @@ from levelproof.pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_
 
 FULL = (stored_as("full"),)
 DENSITIES = {stored_as(density, every) for density in get_args(Density) for every in KEYS_EVERY}
-MAX_BRACKETS = 500  # of settings, in a fragment's metadata: Python gives up on 1,000 that lie in each other
-KNOWN = {"label": {*Label}, "witness": {*Source, None}, "size": set()}  # what stands in a column; of sizes, many
+MAX_BRACKETS = 500  # in a fragment's settings: Python's JSON parser fails at a nesting depth of 1,000
+KNOWN = {"label": {*Label}, "witness": {*Source, None}, "size": set()}  # valid values; sizes are parsed instead
 
 
 @dataclass(frozen=True)
 class Fragment:
-    """What one fragment says, without its rows."""
+    """Metadata of one fragment, without its rows."""
 
     path: Path
     config_hash: str  # of `config`
-    config: dict[str, Any]  # the settings that decide results, under today's names
+    config: dict[str, Any]  # the settings that decide results, with current names
     digests: dict[str, dict[str, str]]  # of the files of each shard and checkpoint that its rows name
     rows: int
     sealed: bool
-    densities: frozenset[str]  # how its shards were to be stored (`configs.schema.stored_as`)
+    densities: frozenset[str]  # requested for its shards (`configs.schema.stored_as`)
 
 
 def read_fragment(
     path: Path, columns: Sequence[str] | None = None, level_ids: np.ndarray | None = None, compact: bool = False
 ) -> tuple[Fragment, pa.Table]:
-    """A fragment and its rows; with `level_ids` (ascending), at least those of these levels.
+    """Read a fragment and its rows; with `level_ids` (ascending), at least the rows of these levels.
 
-    `compact`: columns that are repetitive come as dictionaries.
+    `compact`: return repetitive columns as dictionaries.
 
     Raises:
-        FileNotFoundError: it is gone.
-        Failure: it is damaged, or of another version.
+        FileNotFoundError: it is missing.
+        Failure: it is damaged, or has another version.
     """
     try:
         with bounded(path) as file:
@@ -60,7 +60,8 @@ def read_fragment(
                 raise ValueError("it has no version")
             if version not in VERSIONS:
                 raise Failure(
-                    f"The fragment {path} has manifest version {version[:9]}, this program reads {MANIFEST_VERSION}: "
+                    f"The fragment {path} has manifest version {version[:9]}, but this program reads "
+                    f"{MANIFEST_VERSION}: "
                     "use the levelproof that wrote it."
                 )
             written = metadata[HASH_KEY].decode()
@@ -82,58 +83,58 @@ def read_fragment(
     except DAMAGE as error:
         raise Failure(
             f"The fragment {path} is damaged ({type(error).__name__}): "
-            + mended(path, f"run `levelproof verify {path.parent.parent} --repair` to make its levels again.")
+            + mended(path, f"run `levelproof verify {path.parent.parent} --repair` to regenerate its levels.")
         ) from error
     return fragment, table
 
 
 def _require_own_levels(level_ids: np.ndarray, path: Path) -> None:
-    """Raises ValueError where there are others than a fragment's name says."""
+    """Raise ValueError if level ids lie outside of the range in the fragment's name."""
     first, last = ids_of(path)
     if len(level_ids) and not first <= level_ids.min() <= level_ids.max() <= min(last, MAX_LEVEL_ID):
-        raise ValueError("it has other levels than its name says")
+        raise ValueError("its levels are not in the range that its name says")
 
 
 def _require_known(table: pa.Table) -> None:
-    """Raises ValueError where rows have labels, witnesses or sizes that are none."""
-    of = {name: table.column(name).unique().to_pylist() for name in table.column_names if name in KNOWN}
-    if not all(set(values) <= KNOWN[name] for name, values in of.items() if KNOWN[name]):
-        raise ValueError("it has labels or witnesses that are none")
-    for size in of.get("size", ()):
+    """Raise ValueError if rows have unknown labels, witnesses or sizes."""
+    values = {name: table.column(name).unique().to_pylist() for name in table.column_names if name in KNOWN}
+    if not all(set(column) <= KNOWN[name] for name, column in values.items() if KNOWN[name]):
+        raise ValueError("it has unknown labels or witnesses")
+    for size in values.get("size", ()):
         size_of(size)
 
 
 def _densities_in(metadata: Mapping[bytes, bytes]) -> frozenset[str]:
     found = frozenset(json.loads(metadata.get(DENSITIES_KEY, json.dumps(FULL))))
     if not found <= DENSITIES:
-        raise ValueError("it says that shards are stored as none is")
+        raise ValueError("it names an unknown density")
     return found
 
 
 def _digests_in(metadata: Mapping[bytes, bytes]) -> dict[str, dict[str, str]]:
     found = json.loads(metadata.get(DIGESTS_KEY, b"{}"))
     if not isinstance(found, dict) or not all(isinstance(files, dict) for files in found.values()):
-        raise ValueError("its digests are none")
+        raise ValueError("its digests are invalid")
     return found
 
 
 @lru_cache(maxsize=8)
 def _config_in(text: bytes, written: str) -> tuple[dict[str, Any], str]:
-    """A configuration as this version has it, and its hash: nearly always those of the fragment before.
+    """Parse a fragment's settings; return them with current names, and their hash. Most fragments repeat the last one.
 
-    `written` is the hash beside it, by the version that wrote both.
+    `written` is the hash beside them, from the version that wrote both.
     """
     config = json.loads(text)
     if not isinstance(config, dict) or text.count(b"[") + text.count(b"{") > MAX_BRACKETS:
-        raise ValueError("its settings are none")
+        raise ValueError("its settings are invalid")
     if hash_of(config) != written:
-        raise ValueError("its footer has another configuration than was written")
+        raise ValueError("its settings do not match their hash")
     config = decisive(config)
     return config, hash_of(config)
 
 
 def _with_hash(table: pa.Table, written: str, config_hash: str) -> pa.Table:
-    """Rows that name their configuration as this version does."""
+    """Replace the hash of the version that wrote the rows by the current one."""
     if written == config_hash or "config_hash" not in table.column_names:
         return table
     at = table.schema.get_field_index("config_hash")

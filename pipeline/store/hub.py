@@ -1,4 +1,4 @@
-"""Datasets on Hugging Face's hub: `hf://datasets/USER/NAME[@REVISION]/PATH`, by the hub's two endpoints for files."""
+"""Datasets on Hugging Face's hub, `hf://datasets/USER/NAME[@REVISION]/PATH`, through its two endpoints for files."""
 
 import json
 import os
@@ -16,10 +16,10 @@ from urllib.request import Request, urlopen
 from levelproof.pipeline.errors import StoreFailure, UserError
 
 ATTEMPTS = 6
-PAUSE = 0.5  # s before the second attempt, at most; twice that before each further one
+PAUSE = 0.5  # s before the second attempt, at most; doubles with each further one
 TIMEOUT = 30  # s of one attempt
 MAX_LIST = 2**25  # bytes of a page of a list; the hub's have a thousand files
-NEXT = re.compile(r'<([^<>]+)>; *rel="next"')  # of the header Link: where a long list goes on
+NEXT = re.compile(r'<([^<>]+)>; *rel="next"')  # in the header Link: the next page of a list
 
 
 class Repository(NamedTuple):
@@ -30,26 +30,26 @@ class Repository(NamedTuple):
 
 
 def split_url(parts: Sequence[str]) -> tuple[Repository, str]:
-    """What the parts of a URL behind `hf://` say: a repository, and a path in it.
+    """Split the parts of a URL after `hf://` into a repository and a path in it.
 
     Raises:
-        UserError: they say something else.
+        UserError: the URL is not of a dataset.
     """
     if len(parts) < 3 or parts[0] != "datasets":
         raise UserError(
-            f"The URL hf://{'/'.join(parts)} is none of a dataset: give one such as hf://datasets/USER/NAME/1M/s."
+            f"hf://{'/'.join(parts)} is not the URL of a dataset: give one such as hf://datasets/USER/NAME/1M/s."
         )
     name, _, revision = parts[2].partition("@")
     return Repository(f"{parts[1]}/{name}", revision or "main"), "/".join(parts[3:])
 
 
 def resolve_url(repository: Repository) -> str:
-    """Below it are the files."""
+    """Return the URL below which a repository's files lie."""
     return f"{_endpoint()}/datasets/{repository.name}/resolve/{quote(repository.revision, safe='')}"
 
 
 def sign_in() -> dict[str, Any]:
-    """Options of an HTTP client: the token of HF_TOKEN, or of `hf auth login`."""
+    """Return options of an HTTP client with the token of HF_TOKEN, or of `hf auth login`."""
     home = Path(os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface")
     token = os.environ.get("HF_TOKEN") or ""
     if not token and (home / "token").is_file():
@@ -58,10 +58,10 @@ def sign_in() -> dict[str, Any]:
 
 
 def files_below(repository: Repository, folder: str) -> dict[str, tuple[str, int]]:
-    """Of every file below a folder, its hash and its bytes; none where there is no such folder.
+    """Return the hash and the size in bytes of every file below a folder; empty if the folder does not exist.
 
     Raises:
-        UserError: there is no such repository, or it may not be read.
+        UserError: the repository does not exist, or may not be read.
         StoreFailure: the hub does not answer.
     """
     revision = quote(repository.revision, safe="")
@@ -74,10 +74,10 @@ def files_below(repository: Repository, folder: str) -> dict[str, tuple[str, int
 
 
 def _page(url: str) -> tuple[dict[str, tuple[str, int]], str]:
-    """Some files, and where there are more."""
+    """Fetch one page of a list; return its files and the URL of the next page, or an empty one."""
     request, reason = Request(url), ""
     for name, value in sign_in().get("default_headers", {}).items():
-        request.add_unredirected_header(name, value)  # for nobody but the hub
+        request.add_unredirected_header(name, value)  # redirects must not get the token
     for attempt in range(ATTEMPTS):
         try:
             with urlopen(request, timeout=TIMEOUT) as answer:
@@ -89,7 +89,7 @@ def _page(url: str) -> tuple[dict[str, tuple[str, int]], str]:
                 return {}, ""
             if error.code in (401, 403):
                 raise UserError(
-                    f"There is no dataset at {url}, or not for you: check the URL, and set HF_TOKEN if it needs one."
+                    f"There is no dataset at {url}, or you may not read it: check the URL, and set HF_TOKEN if needed."
                 ) from None
             if error.code not in (408, 429) and error.code < 500:
                 raise StoreFailure(f"The hub refuses {url} ({error.code} {error.reason}): check the URL.") from None
@@ -102,15 +102,15 @@ def _page(url: str) -> tuple[dict[str, tuple[str, int]], str]:
 
 
 def _files(text: bytes) -> dict[str, tuple[str, int]]:
-    """Of each file in a list of the hub's, its hash and its bytes. ValueError: it is no such list."""
+    """Parse one page of a list: hash and size in bytes of each file. Raises ValueError if it is invalid."""
     entries = json.loads(text)
     try:
         files = [entry for entry in entries if entry["type"] == "file"]
         found = {entry["path"]: (entry["oid"], entry["size"]) for entry in files}
     except (TypeError, KeyError) as error:
-        raise ValueError("its list of files is none") from error
+        raise ValueError("its list of files is invalid") from error
     if not all((type(path), type(oid), type(size)) == (str, str, int) for path, (oid, size) in found.items()):
-        raise ValueError("its list of files is none")
+        raise ValueError("its list of files is invalid")
     return found
 
 

@@ -1,4 +1,4 @@
-"""`job.json`: what the last command wanted of a split, and what was there before: so that a loss is seen."""
+"""`job.json`: the levels that the last command wanted and those already in the split, so that losses are noticed."""
 
 import hashlib
 import json
@@ -17,25 +17,25 @@ from levelproof.pipeline.store.objects import get
 from levelproof.pipeline.store.remote import is_remote
 
 MAX_BYTES = 2**25  # of a file; a run of level ids takes about 30
-DIGEST = "sha256"  # its key
+DIGEST = "sha256"  # JSON key
 
 
 class NoteError(ValueError):
-    """It is no such note; the message is the end of a sentence."""
+    """A note is invalid; the message is the end of a sentence."""
 
 
 @dataclass(frozen=True)
 class JobNote:
-    """What a split should have."""
+    """Levels and settings that a split should have."""
 
     command: str  # the last one
     level_ids: np.ndarray  # (run, 2): first and last of each run of ids, ascending
-    config: dict[str, Any] | None  # the settings that decide results, under today's names
-    intact: bool  # every byte is as it was written
+    config: dict[str, Any] | None  # the settings that decide results, with current names
+    intact: bool  # every byte is as written
 
 
 def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[tuple[int, int]]) -> None:
-    """Write down which runs of level ids there should be after this command, first and last of each."""
+    """Record the runs of level ids that should exist after this command, as first and last of each."""
     note = {
         "command": shlex.join(command),
         "level_ids": [list(run) for run in wanted],
@@ -46,22 +46,22 @@ def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequen
 
 
 def note_density(split: Path, density: str, key_every: int) -> None:
-    """Let the command that goes on ask for what is stored now."""
+    """Change the noted command to the density that is stored now, so that it can resume."""
     if (note := sound_note(split)) is None or shlex.split(note.command)[1:2] not in (["generate"], ["regenerate"]):
         return
-    words = [word for word in shlex.split(note.command) if word.partition("=")[0] not in ("density", "key_every")]
-    words += [f"density={density}", f"key_every={key_every}"]
-    said = json.loads(_bytes(split / JOB)) | {"command": shlex.join(words)}
-    del said[DIGEST]
-    write(split / JOB, _text(said).encode())
+    arguments = [arg for arg in shlex.split(note.command) if arg.partition("=")[0] not in ("density", "key_every")]
+    arguments += [f"density={density}", f"key_every={key_every}"]
+    content = json.loads(_bytes(split / JOB)) | {"command": shlex.join(arguments)}
+    del content[DIGEST]
+    write(split / JOB, _text(content).encode())
 
 
 def read_note(split: Path) -> JobNote:
-    """The note of a split.
+    """Read the note of a split.
 
     Raises:
         FileNotFoundError: there is none.
-        NoteError: it says nothing that can be understood.
+        NoteError: it is invalid.
     """
     data = _bytes(split / JOB)
     try:
@@ -75,9 +75,9 @@ def read_note(split: Path) -> JobNote:
         config = decisive(config) if known else None
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise NoteError(type(error).__name__) from None
-    said = {name: value for name, value in note.items() if name != DIGEST}
-    command = "".join(c if c.isprintable() else "?" for c in command)  # no terminal obeys it
-    return JobNote(command, runs, config, text == _text(said))
+    content = {name: value for name, value in note.items() if name != DIGEST}
+    command = "".join(c if c.isprintable() else "?" for c in command)  # control characters would reach terminals
+    return JobNote(command, runs, config, text == _text(content))
 
 
 def _bytes(path: Path) -> bytes:
@@ -85,7 +85,7 @@ def _bytes(path: Path) -> bytes:
         if not path.exists():
             raise FileNotFoundError(path)
         if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_BYTES:
-            raise NoteError("it is no ordinary file of a few megabytes")
+            raise NoteError("it is not a regular file of a few megabytes")
     try:
         return get(path, MAX_BYTES).data if is_remote(path) else path.read_bytes()
     except FileNotFoundError:
@@ -95,7 +95,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def sound_note(split: Path) -> JobNote | None:
-    """The note of a split as it was written; None where it is damaged or missing."""
+    """Read the note of a split; None if it is damaged or missing."""
     try:
         note = read_note(split)
     except (FileNotFoundError, NoteError):
@@ -104,6 +104,6 @@ def sound_note(split: Path) -> JobNote | None:
 
 
 def _text(note: dict[str, Any]) -> str:
-    """The whole file: one line, its digest last."""
+    """Return the whole file: one line, its digest last."""
     digest = hashlib.sha256(json.dumps(note).encode()).hexdigest()
     return json.dumps(note | {DIGEST: digest}) + "\n"

@@ -1,4 +1,4 @@
-"""Names of files and folders of a split, as docs/storage.md shows them. Knows nothing of what is in them."""
+"""Names of a split's files and folders, as docs/storage.md shows them; knows nothing of their contents."""
 
 import os
 import re
@@ -15,7 +15,7 @@ from levelproof.pipeline.urls import BUCKETS
 MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS = "manifest", "shards", "experts", "quarantine", "checkpoints"
 FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS
 WRITER_LOCK, COMMIT_LOCK, JOB = ".writer.lock", ".commit.lock", "job.json"
-EVENTS = "events"  # of runs; nothing else reads them
+EVENTS = "events"  # of runs; no commit and no reader depends on them
 DIGITS = 12  # of a level id in file names, so that names sort as ids do
 UNIT = rf"([0-9]{{{DIGITS}}})-([0-9]{{{DIGITS}}})"
 ATTEMPT = rf"{UNIT}-[0-9a-f]{{8}}"
@@ -28,15 +28,15 @@ OLD_CHECKPOINT = re.compile(rf"{CHECKPOINTS}/{UNIT}\.npz")  # written by earlier
 CHECKPOINT_BEGUN = re.compile(rf"{CHECKPOINTS}/\.{UNIT}\.(paused|npz)\.[0-9]+")
 NOTE = re.compile(rf"{QUARANTINE}/{UNIT}\.txt")  # why a unit was given up
 NOTE_BEGUN = re.compile(rf"{QUARANTINE}/\.{UNIT}\.txt\.[0-9]+")
-JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # by the process of this number
+JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # ends in the PID of its writer
 INDEX_BEGUN = re.compile(rf"{MANIFEST}/\.{re.escape(INDEX)}\.[0-9]+")
 
 
 class Attempt(NamedTuple):
-    """Where one attempt at a unit writes; no other attempt has these names, but for the fragment's."""
+    """Paths to which one attempt at a unit writes; unique to it, except the fragment's."""
 
     fragment: Path
-    begun: Path  # there before anything else of the attempt, and renamed to the fragment by its commit
+    begun: Path  # the attempt's mark: written first, and renamed to the fragment by its commit
     shard: Path
     experts: Path
 
@@ -46,7 +46,7 @@ def split_path(out: str, budget: str, size: str) -> Path:
 
 
 def unit_name(first: int, last: int) -> str:
-    """Name of the work unit whose lowest and highest level ids these are."""
+    """Name the work unit with these lowest and highest level ids."""
     return f"{first:0{DIGITS}d}-{last:0{DIGITS}d}"
 
 
@@ -65,48 +65,48 @@ def new_attempt(split: Path, unit: str) -> Attempt:
 
 
 def unit_ids(data: Path) -> tuple[int, int]:
-    """The lowest and the highest level id of the unit that made this shard or these experts, by their name."""
+    """Parse the lowest and highest level id of a unit from the name of its shard or experts."""
     first, last, _ = attempt_of(data).split("-")
     return int(first), int(last)
 
 
 def data_paths(split: Path) -> list[Path]:
-    """All shards and experts of a split, whoever names them."""
+    """List all shards and experts of a split, also those that no fragment names."""
     return [*entries(split, SHARDS, DATA, DirEntry.is_dir), *entries(split, EXPERTS, DATA, DirEntry.is_file)]
 
 
 def made_within(data: Iterable[Path], fragment: Path) -> list[Path]:
-    """Shards and experts of units that have no level beyond those that a fragment can have, all by their names."""
+    """Select shards and experts whose units lie within a fragment's range of level ids, judging by names."""
     first, last = ids_of(fragment)
     return [path for path in data if first <= unit_ids(path)[0] and unit_ids(path)[1] <= last]
 
 
 def attempt_of(path: Path) -> str:
-    """Name of the attempt that made this, by a path of `BEGUN` or `DATA`."""
+    """Parse the attempt's name from a path that matches `BEGUN` or `DATA`."""
     found = re.search(ATTEMPT, path.name)
     assert found, path
     return found[0]
 
 
 def data_path(split: Path, name: str) -> Path:
-    """Where the shard or the experts lie that a manifest names so.
+    """Return the path of the shard or experts that a manifest names.
 
     Raises:
-        Failure: that is no name of either, or links lead elsewhere from there.
+        Failure: the name is invalid, or links lead elsewhere.
     """
     path = split / name
     if not DATA.fullmatch(name):
         raise Failure(
             f"The manifest of {split} names {name[:80]!r}, which can be neither a shard nor experts of this split: "
-            "it was damaged or meant to do harm, so get the split again from where it came."
+            "it is damaged or malicious, so get the split again from its source."
         )
     if path.resolve() != split.resolve() / name:
-        raise Failure(f"The path {path} is a link to another place: put the data itself there.")
+        raise Failure(f"The path {path} leads elsewhere through a link: put the data itself there.")
     return path
 
 
 def begun_path(data: Path) -> Path:
-    """The mark of the attempt that made this shard or these experts."""
+    """Return the path of the mark of the attempt that made this shard or these experts."""
     return data.parent.parent / MANIFEST / f".{attempt_of(data)}.begun"
 
 
@@ -115,23 +115,23 @@ def checkpoint_path(split: Path, unit: str) -> Path:
 
 
 def ids_of(path: Path) -> tuple[int, int]:
-    """The lowest and the highest level id in a fragment, a checkpoint or a note of a unit, by its name."""
+    """Parse the lowest and highest level id from the name of a fragment, a checkpoint or a unit's note."""
     first, last = path.stem.split("-")
     return int(first), int(last)
 
 
 def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[..., bool]) -> dict[Path, int]:
-    """What one folder of a split, if it is there, has of these paths and of one kind (`DirEntry.is_file`, `is_dir`).
+    """List the entries of a split's folder that match `paths` and a kind (`DirEntry.is_file`, `is_dir`).
 
-    Links are of no kind, whatever they lead to. With each path goes the number by which the file system knows what
-    has this name now.
+    There are none if the folder does not exist. Links match no kind. The values identify what has a path's name now:
+    inode numbers, or hashes of what a store says.
     """
     if is_remote(split):
         if folder == MANIFEST:
-            there = {path: hash(about) for path, about in fragments_in(split / folder).items()}
+            listed = {path: hash(about) for path, about in fragments_in(split / folder).items()}
         else:
-            there = dict.fromkeys(names_in(split / folder) if split.parts[0] in BUCKETS else [], 0)
-        return {path: number for path, number in there.items() if paths.fullmatch(os.path.join(folder, path.name))}
+            listed = dict.fromkeys(names_in(split / folder) if split.parts[0] in BUCKETS else [], 0)
+        return {path: number for path, number in listed.items() if paths.fullmatch(os.path.join(folder, path.name))}
     if not (split / folder).is_dir():
         return {}
     with os.scandir(split / folder) as found:
@@ -143,7 +143,7 @@ def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[
 
 
 def fragment_of(shard: Path) -> Path:
-    """The fragment that can name this shard."""
+    """Return the path of the only fragment that can name this shard."""
     return fragment_path(shard.parent.parent, shard.stem.rpartition("-")[0])
 
 

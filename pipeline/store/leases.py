@@ -1,10 +1,10 @@
-"""The writer of a split: its name is in the split's lock file, and who works for another one commits nothing there.
+"""The writer of a split: the lock file holds its token, and workers of any other writer commit nothing.
 
-In a folder the system keeps writers apart (`locks`). In an object store a writer renews a lease, and who finds that
-silent for long enough takes it.
+In a folder the system excludes a second writer (`locks`). In an object store a writer renews a lease; another writer
+may take it after a long silence.
 
-No clock is compared with another: whoever waits measures by its own. And no time has to be right for a split to stay
-whole: a writer that was only slow finds its lease taken, and so do its workers, before they commit anything.
+Clocks are never compared: each process measures waits by its own. A split's integrity depends on no duration: a writer
+that was only slow finds its lease taken, as do its workers, before they commit anything.
 """
 
 import json
@@ -28,35 +28,35 @@ from levelproof.pipeline.store.remote import as_typed, is_remote
 
 SILENCE = 60.0  # s without a renewal after which a writer counts as dead
 RENEWAL = 5.0  # s between renewals
-SIGHT = 12.0  # s of looking on without a renewal after which no writer is said to be there; two renewals and more
-NOTICE = 2.0  # s of waiting after which people are told for what
-POLL = 0.5  # s between two looks
+WATCH = 12.0  # s without a renewal after which `is_leased` reports no writer; more than two renewals
+NOTICE = 2.0  # s of waiting before the user is told the reason
+POLL = 0.5  # s between polls
 MAX_BYTES = 2**16  # of a lock file
-RENEWALS = "renewals"  # in a lock's text: of a lease; a folder's lock, which may be copied to a store, has none
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # another one on each machine, and after each start
+RENEWALS = "renewals"  # key of leases alone: a folder's lock, which may be copied to a store, does not have it
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # differs between machines, and after each boot
 
-_served: dict[Path, str] = {}  # the writer of each split for whom this process works
+_served: dict[Path, str] = {}  # by split: token of the writer for whom this process works
 
 
 class LeaseLost(Failure):
     """Another writer has taken a split over."""
 
     def __init__(self, split: Path) -> None:
-        gone = f"was silent for {SILENCE:.0f} s" if is_remote(split) else "ended, or its folder was removed"
+        reason = f"was silent for {SILENCE:.0f} s" if is_remote(split) else "ended, or its folder was removed"
         super().__init__(
-            f"Another command has taken over {as_typed(split)}, because this one {gone}: "
-            "nothing more of this one is committed there."
+            f"Another command has taken over {as_typed(split)}, because this one {reason}: "
+            "this one commits nothing more there."
         )
 
 
 class Lease:
-    """Held until it is released, or taken by another writer."""
+    """A store's writer lease, held until it is released or another writer takes it."""
 
     def __init__(self, split: Path, say: Callable[[str], None]) -> None:
-        """Wait until nobody holds it, and take it.
+        """Wait until no writer holds the lease, and take it.
 
         Raises:
-            UserError: somebody holds it and is at work.
+            UserError: an active writer holds it.
             StoreFailure: the store does not answer.
         """
         self.token, self.lost = secrets.token_hex(8), False
@@ -66,7 +66,7 @@ class Lease:
         self._thread.start()
 
     def release(self) -> None:
-        """Let the next one have it at once; of a store that does not answer now, it is left to run out."""
+        """Free the lease for the next writer; if the store does not answer, it expires instead."""
         self._over.set()
         self._thread.join(RENEWAL)
         if not (self.lost or self._thread.is_alive()):
@@ -76,16 +76,16 @@ class Lease:
     def _keep(self) -> None:
         while not self._over.wait(RENEWAL):
             self._renewals += 1
-            with suppress(LevelproofError):  # a store that is gone is told by who has something to write
+            with suppress(LevelproofError):  # the next write of data reports a store that does not answer
                 if not self._put(self._text()):
                     self.lost = True
                     signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
                     return
 
     def _put(self, text: bytes) -> bool:
-        """Replace the lock's text; False: another writer has the lease.
+        """Replace the lock file's content; return False if another writer has the lease.
 
-        The version that the store has may be that of an older text of this writer, whose answer was lost.
+        The store may have a version that this writer does not know: that of its own request whose response was lost.
         """
         version = put_if(self._path, text, self._version)
         if version is None and (own := self._own()):
@@ -94,12 +94,12 @@ class Lease:
         return version is not None
 
     def _own(self) -> Version | None:
-        """The version that the store has, if this writer put it."""
+        """Return the store's version, if this writer put it."""
         try:
             found = get(self._path)
         except FileNotFoundError:
             return None
-        return found.version if _said(found.data).get("writer") == self.token else None
+        return found.version if _parsed(found.data).get("writer") == self.token else None
 
     def _text(self) -> bytes:
         return _about(self.token, **{RENEWALS: self._renewals}).encode()
@@ -107,11 +107,11 @@ class Lease:
 
 @contextmanager
 def leased(split: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """The split for this process, and those that work for it, to write to.
+    """Hold the lease of a split for this process and its workers.
 
     Raises:
         UserError, StoreFailure: as `Lease`.
-        LeaseLost: another one has it now.
+        LeaseLost: another writer has it now.
     """
     lease = Lease(split, say)
     try:
@@ -127,10 +127,10 @@ def leased(split: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 @contextmanager
 def named(split: Path, lock: IO[str]) -> Iterator[None]:
-    """Write down in the file of a folder's lock, which this process holds, that it is the writer now.
+    """Write a new token of this process to a folder's lock file, whose lock it holds.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the write fails.
     """
     token = secrets.token_hex(8)
     lock.truncate(0)
@@ -143,7 +143,7 @@ def named(split: Path, lock: IO[str]) -> Iterator[None]:
 
 @contextmanager
 def serving(split: Path, writer: str) -> Iterator[None]:
-    """Have this process, and those to which it hands the name, work for this writer in the `with` block."""
+    """Work for this writer in the `with` block, as do processes that get its token from `served`."""
     serve(split, writer)
     try:
         yield
@@ -152,45 +152,45 @@ def serving(split: Path, writer: str) -> Iterator[None]:
 
 
 def serve(split: Path, writer: str) -> None:
-    """Work from now on for this writer, as the process that is it says. The lock may have another one's name by now."""
+    """Work for this writer from now on. The token comes from the writer: the lock file may hold another one by now."""
     _served[split] = writer
 
 
 def served(split: Path) -> str:
-    """Name the writer of a split for whom this process works, for those that it starts; none is empty."""
+    """Return the token of the writer for whom this process works, to pass to its workers; empty: none."""
     return _served.get(split, "")
 
 
 def require_served(split: Path) -> None:
-    """Raises LeaseLost where the writer for whom this process works is not that of the split any more."""
+    """Raise LeaseLost if this process works for a writer that no longer has the split."""
     served = _served.get(split)
     if served is not None and _writer(split) != served:
         raise LeaseLost(split)
 
 
 def is_leased(split: Path, say: Callable[[str], None]) -> bool:
-    """Whether a writer holds the lease of a split: whether it renews it within SIGHT seconds, by this process's clock.
+    """Whether a writer renews the lease of a split within WATCH seconds, by this process's clock.
 
-    `say` is told what is waited for, when that takes long.
+    Passes `say` the reason for a long wait.
     """
     first, begun, notice = b"", 0.0, NOTICE
     while True:
         asked = time.monotonic()
         try:
             found = get(split / WRITER_LOCK, MAX_BYTES).data
-        except OSError:  # there is none, or what is there is none
+        except OSError:  # missing, or too large for a lock file
             return False
-        holder = _said(found)
+        holder = _parsed(found)
         if RENEWALS not in holder or _died_here(holder):
             return False
         if not first:
             first, begun = found, time.monotonic()
         elif found != first:
             return True
-        elif asked - begun > SIGHT:
+        elif asked - begun > WATCH:
             return False
         elif asked - begun > notice:
-            say(f"Looking whether a run still writes to {as_typed(split)}, which takes up to {SIGHT:.0f} s.")
+            say(f"Checking whether a run still writes to {as_typed(split)}, which takes up to {WATCH:.0f} s.")
             notice = inf
         time.sleep(POLL)
 
@@ -201,7 +201,7 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
     while True:
         try:
             found = get(path)
-            holder, version = _said(found.data), found.version
+            holder, version = _parsed(found.data), found.version
         except FileNotFoundError:
             holder, version = {}, None
         writer, now = str(holder.get("writer", "")), time.monotonic()
@@ -217,21 +217,21 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
                 return mine
         elif now - begun > NOTICE:
             say(
-                f"Waiting whether process {holder.get('pid')} on {holder.get('host')} still writes to "
-                f"{as_typed(path.parent)}: after {SILENCE:.0f} s of silence it does not."
+                f"Waiting to see whether process {holder.get('pid')} on {holder.get('host')} still writes to "
+                f"{as_typed(path.parent)}: after {SILENCE:.0f} s of silence, this command takes over."
             )
             begun = inf
         time.sleep(POLL)
 
 
 def _writer(split: Path) -> str:
-    """The name of the writer that a split has, or had last; nobody's is empty."""
+    """Return the token of a split's current or last writer; empty: none."""
     path = split / WRITER_LOCK
     try:
         data = get(path).data if is_remote(path) else _lock_text(path)
     except (FileNotFoundError, NotRegular):
         return ""
-    return str(_said(data).get("writer", "")) if data else ""
+    return str(_parsed(data).get("writer", "")) if data else ""
 
 
 def _lock_text(path: Path) -> bytes:
@@ -240,11 +240,12 @@ def _lock_text(path: Path) -> bytes:
 
 
 def _about(token: str, **more: int) -> str:
-    """A lock file's text."""
+    """Return the content of a lock file."""
     return json.dumps({"writer": token, "host": socket.gethostname(), "pid": os.getpid(), "within": _here(), **more})
 
 
-def _said(data: bytes) -> dict[str, Any]:
+def _parsed(data: bytes) -> dict[str, Any]:
+    """Parse a lock file; the writer of an invalid one is unknown."""
     try:
         found = json.loads(data)
     except ValueError:
@@ -253,9 +254,9 @@ def _said(data: bytes) -> dict[str, Any]:
 
 
 def _here() -> str:
-    """Name the start of this machine and the PID namespace, within which a PID is unique; empty if they are unknown.
+    """Name this machine's boot and the PID namespace, within which a PID is unique; empty if unknown.
 
-    Machines may share a host name, and outside of containers all of them have the same number for the namespace.
+    Machines may share a host name, and outside of containers all of them have the same namespace number.
     """
     try:
         return f"{BOOT_ID.read_text().strip()} {os.readlink('/proc/self/ns/pid')}"
@@ -264,7 +265,7 @@ def _here() -> str:
 
 
 def _died_here(holder: dict[str, Any]) -> bool:
-    """Whether a lock's text is of a process of this machine that has ended; False also if that cannot be known."""
+    """Whether the holder is a process of this machine that has ended; False if unknown."""
     pid, here = holder.get("pid"), _here()
     if not here or holder.get("within") != here or type(pid) is not int or pid == os.getpid():
         return False

@@ -1,4 +1,4 @@
-"""What attempts that died have left in a split, and what of it may go; and what was merged into sealed fragments."""
+"""Removal of what dead attempts left in a split, and of what sealed fragments supersede."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -20,7 +20,7 @@ from levelproof.pipeline.store.layout import (
     data_paths,
     entries,
 )
-from levelproof.pipeline.store.locks import nobody_commits
+from levelproof.pipeline.store.locks import without_commits
 from levelproof.pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_fragment, read_manifest
 from levelproof.pipeline.store.objects import put
 from levelproof.pipeline.store.publish import OVER, ended
@@ -28,17 +28,16 @@ from levelproof.pipeline.store.remote import is_remote
 
 
 def clean(split: Path, say: Callable[[str], None]) -> Manifest:
-    """Remove data of attempts that began and were not committed, half-written files, and what a sealed fragment has
-    taken the place of; nothing else goes.
+    """Remove data of uncommitted attempts, half-written files, and what a sealed fragment supersedes; nothing else.
 
-    Done while nobody commits: a worker of a killed run may still be about to name its shard. Data that no fragment
-    names without being left by a dead attempt stays and `say` is told: its fragment may be kept elsewhere.
+    Excludes commits, because a worker of a killed run may be about to commit its shard. Unnamed data without an
+    attempt's mark stays and is reported through `say`: its fragment may be kept elsewhere.
 
     Raises:
         Failure: a fragment is damaged.
         LockRefused: the file system has no locks.
     """
-    with nobody_commits(split, say):
+    with without_commits(split, say):
         manifest = read_manifest(split, ["label", *DATA_COLUMNS], compact=True)
         named = manifest.shards | manifest.named["experts"]
         for fragment in manifest.superseded:
@@ -65,11 +64,11 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
 
 
 def disown(data: Iterable[Path]) -> None:
-    """Note that shards or experts go with the fragments that name them: as of attempts that were never committed.
+    """Mark shards or experts as uncommitted, so that they are removed once their fragments are.
 
     Raises:
         NotRegular: a link or the like has the name of a mark.
-        OSError: the disk refuses.
+        OSError: the write fails.
     """
     marks = [begun_path(path) for path in data]
     for mark in marks:
@@ -79,7 +78,7 @@ def disown(data: Iterable[Path]) -> None:
 
 
 def drop(shard: Path) -> None:
-    """Remove a shard that `disown` was told of. What cannot go now is left to `clean`."""
+    """Remove a shard that `disown` marked. `clean` removes later what cannot be removed now."""
     remove_data(shard)
     if not shard.exists():
         remove(begun_path(shard))

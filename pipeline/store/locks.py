@@ -1,9 +1,9 @@
-"""Locks between processes, held by open files: the system frees them when a process dies, however it dies. Where a
-split is in an object store, which has no locks, `leases` and `publish` do what they do.
+"""Locks between processes, held by open files: the system frees them when a process dies, however it dies.
 
-Lock files are opened for reading and writing: NFS makes these locks out of others, and takes a shared one only of a
-file that may be read, an exclusive one only of a file that may be written. Whoever takes one gets LockRefused where
-the file system has no locks.
+Object stores have no locks: there `leases` and `publish` take their place.
+
+Lock files are opened for reading and writing: NFS emulates these locks by others, and grants a shared one only on a
+readable file, an exclusive one only on a writable file. Taking a lock raises LockRefused if the file system has none.
 """
 
 import fcntl
@@ -21,7 +21,7 @@ from levelproof.pipeline.store.publish import publishing
 from levelproof.pipeline.store.remote import is_remote
 
 PATIENCE = 1.0  # s; `is_written` holds the writer's lock for a moment
-NOTICE = 2.0  # s of waiting after which people are told for what
+NOTICE = 2.0  # s of waiting before the user is told the reason
 POLL = 0.05  # s between two tries
 
 
@@ -31,11 +31,11 @@ class LockRefused(UserError):
 
 @contextmanager
 def only_writer(split: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """Held by the one `levelproof generate` that may write to a split; `say` is told what is waited for.
+    """Hold the writer lock of a split; passes `say` the reason for a long wait.
 
     Raises:
-        UserError: another one is at work, or the lock is not a regular file.
-        LeaseLost: another one is, by now.
+        UserError: another writer is active, or the lock is not a regular file.
+        LeaseLost: another writer has taken over.
     """
     if is_remote(split):
         with leased(split, say):
@@ -50,14 +50,14 @@ def only_writer(split: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 @contextmanager
 def committing(split: Path) -> Iterator[Path]:
-    """Held while a unit writes its shard and its fragment, to the folder that it gives; many units may at once.
+    """Hold the shared commit lock while a unit writes its shard and its fragment to the yielded folder.
 
-    A writer names itself before it waits for nobody to commit (`nobody_commits`), so a worker of an earlier one has
-    either committed by then, or finds another name here.
+    A new writer writes its token before it waits for commits to end (`without_commits`), so a worker of an earlier
+    writer has either committed by then, or finds the new token here.
 
     Raises:
-        LeaseLost: the writer for whom this process works is not that of the split any more.
-        UserError, StoreFailure: as `publishing`, where the split is in a store.
+        LeaseLost: this process works for a writer that no longer has the split.
+        UserError, StoreFailure: as `publishing`, if the split is in a store.
     """
     if is_remote(split):
         with publishing(split) as folder:
@@ -70,10 +70,10 @@ def committing(split: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """Waits until no unit is between its shard and its fragment, such as one of a killed run that is still ending.
+def without_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Exclude commits: wait until no unit is between its shard and its fragment, such as one of a killed run.
 
-    `say` is told what is waited for, when that takes long. In a store nobody is waited for (`publish.ended`).
+    Passes `say` the reason for a long wait. In a store this does not wait (`publish.ended`).
     """
     if is_remote(split):
         yield
@@ -82,7 +82,7 @@ def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
     with open(path, "a+", opener=regular) as file:
         if not _taken_within(NOTICE, file):
             say(
-                f"Waiting for a worker of an earlier run, which still writes and holds {path}: "
+                f"Waiting for a worker of an earlier run that still writes and holds {path}: "
                 f"if it does not end, find it with `fuser -v {path}` on its machine and stop it."
             )
             _take(file, fcntl.LOCK_EX)
@@ -90,22 +90,22 @@ def nobody_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 
 def is_written(split: Path, say: Callable[[str], None] = lambda _: None) -> bool:
-    """Whether a `levelproof generate` is running on this split now; writes nothing, and needs to read only.
+    """Whether a `levelproof generate` is writing to this split now; needs read access only.
 
-    `say` is told what is waited for, when that takes long, as it does only in a store.
+    Passes `say` the reason for a long wait, which happens only in a store.
     """
     if is_remote(split):
         return is_leased(split, say)
     try:
         with open(split / WRITER_LOCK, opener=regular) as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except (OSError, NotRegular) as error:  # of other kinds: never written to, not ours to ask, or no lock
+    except (OSError, NotRegular) as error:  # others: never written to, unreadable, or no locks
         return isinstance(error, BlockingIOError)
     return False
 
 
 def _taken_within(seconds: float, file: IO[str]) -> bool:
-    """Whether the exclusive lock was free before these seconds were over."""
+    """Try for `seconds` to take the exclusive lock; return whether it was free."""
     end = time.monotonic() + seconds
     while not _take(file, fcntl.LOCK_EX | fcntl.LOCK_NB):
         if time.monotonic() > end:
@@ -115,14 +115,14 @@ def _taken_within(seconds: float, file: IO[str]) -> bool:
 
 
 def _take(file: IO[str], how: int) -> bool:
-    """Take a lock; False where another process holds it and `how` is not to wait."""
+    """Take a lock; return False if another process holds it and `how` has LOCK_NB."""
     try:
         fcntl.flock(file, how)
     except BlockingIOError:
         return False
     except OSError as error:
         raise LockRefused(
-            f"The file system of {file.name} refuses locks ({error.strerror}): "
+            f"The file system of {file.name} does not support locks ({error.strerror}): "
             "choose a folder on another one with out=NAME, or have it mounted with locks."
         ) from error
     return True

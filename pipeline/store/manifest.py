@@ -1,6 +1,6 @@
-"""The manifest: a parquet fragment for each work unit, or a sealed one for many, each the commit marker of its levels.
+"""The manifest: a parquet fragment per work unit, or a sealed one for many, each the commit marker of its levels.
 
-A fragment is written last and appears at once or not at all; readers see only what fragments name.
+A fragment is written last and appears whole or not at all; readers see only what fragments name.
 """
 
 import json
@@ -32,22 +32,22 @@ from levelproof.pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_
 from levelproof.pipeline.store.shown import shown
 from levelproof.pipeline.urls import require_known
 
-SHOWN = 6  # differing settings that an error lists
-# Fragments read at once: more than cores, because a shared folder takes its time for each; not many more, because what
-# reads them waits for Python's lock: of millions of rows 8 take a third longer than 4 on two cores
+MAX_SHOWN = 6  # differing settings that an error lists
+# Fragments read at once: more than cores, because shared folders have latency; not many more, because threads wait for
+# Python's lock: for millions of rows on two cores, 8 threads take a third longer than 4
 THREADS = min(max(4, os.cpu_count() or 1), 8)
-MANY = 2000  # fragments: to read so many takes seconds
-ROW_GROUP = 2**14  # rows that are read together, or not at all; fewer: quicker to find a level, slower to read them all
-ROUNDS = 20  # looks at a split that is sealed meanwhile; each takes a moment, and sealing a fragment takes seconds
+MANY = 2000  # fragments that take seconds to read, so a bar is shown
+ROW_GROUP = 2**14  # rows read together or skipped; fewer: faster to find one level, slower to read all
+MAX_LISTINGS = 20  # of a split that is being sealed; each takes a moment, sealing a fragment takes seconds
 Each = Callable[[pa.Table], pa.Table]
-DATA_COLUMNS = ("shard", "experts")  # name what lies beside the manifest
+DATA_COLUMNS = ("shard", "experts")  # paths of data outside of the manifest
 
 
 def begin_fragment(attempt: Attempt) -> None:
-    """Note on the disk that an attempt begins to write: what it leaves when it dies can be told from what others own.
+    """Write an attempt's mark to the disk: if the attempt dies, the mark identifies what it left.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the write fails.
     """
     attempt.begun.parent.mkdir(parents=True, exist_ok=True)
     attempt.begun.touch(exist_ok=False)
@@ -63,12 +63,12 @@ def write_fragment(
     densities: Iterable[str] = FULL,
     carried: Mapping[str, dict[str, str]] | None = None,
 ) -> None:
-    """Commit a unit, or many that are sealed: write their rows to the attempt's fragment, durably and in one step.
+    """Commit a unit, or several as a sealed one: write rows to the attempt's fragment, durably and in one step.
 
-    `carried` has the digests of shards and checkpoints that earlier fragments committed and that stay as they are.
+    `carried` has the digests of shards and checkpoints that earlier fragments committed and that do not change.
 
     Raises:
-        OSError: the disk refuses; no fragment is there then, or the one that was there before.
+        OSError: the write fails; an earlier fragment, if any, stays.
     """
     is_table = isinstance(rows, pa.Table)
     table: Any = rows if is_table else pa.Table.from_pylist([dict(row) for row in rows], schema=COLUMNS)
@@ -86,11 +86,11 @@ def write_fragment(
         file.write(with_own(whole.getvalue().to_pybytes()))
     flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
-    flush_entry(attempt.fragment.parent)  # the new name itself
+    flush_entry(attempt.fragment.parent)  # its new name
 
 
 def settings_metadata(config_hash: str, config: Mapping[str, Any]) -> dict[bytes, bytes]:
-    """What tells the settings, and with them the rules, in a parquet file's schema."""
+    """Return the metadata of a parquet schema that holds the settings, and with them the rules."""
     return {
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
         HASH_KEY: config_hash.encode(),
@@ -99,15 +99,15 @@ def settings_metadata(config_hash: str, config: Mapping[str, Any]) -> dict[bytes
 
 
 def fragment_paths(split: Path) -> list[Path]:
-    """All committed fragments of a split, in the order of their level ids: files with the exact name of one.
+    """List all committed fragments of a split, ordered by level ids.
 
-    Whatever else is in the folder (copies, links, what file systems and editors leave) is none.
+    Only files with a fragment's exact name count, not copies, links, or what file systems and editors leave.
     """
     return sorted(entries(split, MANIFEST, FRAGMENT, DirEntry.is_file))
 
 
 def write_index(split: Path) -> None:
-    """Write down which fragments there are, for readers of a web server that does not list them.
+    """List the fragments in a file, for readers of web servers, which do not list files.
 
     Raises: as `files.write`.
     """
@@ -124,14 +124,14 @@ class Manifest:
     """Committed rows of a split, sorted by level id; each level once."""
 
     split: Path
-    fragments: tuple[Fragment, ...]  # that were read
+    fragments: tuple[Fragment, ...]  # all that were read
     table: pa.Table
-    named: Mapping[str, frozenset[str]]  # by column (shard, experts), if it was read: what fragments name that count
-    superseded: tuple[Fragment, ...] = ()  # that do not: every level of theirs counts in another one
+    named: Mapping[str, frozenset[str]]  # by column (shard, experts), if read: paths that counting fragments name
+    superseded: tuple[Fragment, ...] = ()  # not counting: other fragments have all of their levels
 
     @property
     def counting(self) -> list[Fragment]:
-        """The fragments of which some row counts."""
+        """Fragments with at least one row in the table."""
         return [fragment for fragment in self.fragments if fragment not in self.superseded]
 
     @property
@@ -143,19 +143,19 @@ class Manifest:
         labels = self.table.column("label").combine_chunks().dictionary_encode()
         return np.array(labels.dictionary.to_pylist(), dtype=str)[labels.indices.to_numpy()]
 
-    def counts(self, of: np.ndarray) -> dict[str, int]:
-        """How many of these rows (a mask) have which label, the most frequent first."""
-        found = self.table.column("label").filter(of).value_counts().to_pylist()
-        return {of["values"]: of["counts"] for of in sorted(found, key=lambda of: -of["counts"])}
+    def counts(self, mask: np.ndarray) -> dict[str, int]:
+        """Count the labels of the rows in `mask`, the most frequent first."""
+        found = self.table.column("label").filter(mask).value_counts().to_pylist()
+        return {entry["values"]: entry["counts"] for entry in sorted(found, key=lambda entry: -entry["counts"])}
 
     @property
     def shards(self) -> frozenset[str]:
-        """Paths below the split. KeyError where the column was not read."""
+        """Paths of shards below the split. KeyError: the column was not read."""
         return self.named["shard"]
 
     @property
     def config(self) -> dict[str, Any] | None:
-        """The settings that made it; None while it is empty."""
+        """Settings that made the split; None if it is empty."""
         return self.fragments[0].config if self.fragments else None
 
     @property
@@ -171,18 +171,18 @@ def read_manifest(
     compact: bool = False,
     each: Each | None = None,
 ) -> Manifest:
-    """The manifest of a split, one row for each level that was tried; empty where nothing is committed yet.
+    """Read the manifest of a split, one row per level that was tried; empty if nothing is committed yet.
 
     Args:
         split: the folder `{out}/{budget}/{size}`.
-        columns: which to read (default: all); `level_id` is always among them.
-        level_ids: whose rows (default: all); fragments without any of them, by their names, are not opened.
-        compact: columns that are repetitive come as dictionaries: of millions of rows, a tenth of the memory.
-        each: what to keep of a fragment's rows, as they come and in threads; `level_id` has to be among it.
+        columns: columns to read (default: all); `level_id` is always included.
+        level_ids: levels to read (default: all); fragments whose name excludes all of them are not opened.
+        compact: return repetitive columns as dictionaries, which for millions of rows take a tenth of the memory.
+        each: reduces each fragment's rows, in threads; must keep `level_id`.
 
     Raises:
         UserError: there is no such column.
-        Failure: a fragment is damaged, or fragments of several configurations lie side by side.
+        Failure: a fragment is damaged, or fragments have different configurations.
     """
     split = Path(split)
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
@@ -196,9 +196,9 @@ def read_manifest(
         if fragment.config_hash != fragments[0].config_hash:
             changes = told(differences(fragments[0].config, fragment.config))
             raise Failure(
-                f"The split {split} mixes two configurations, {fragments[0].path.name} and {fragment.path.name} "
-                f"({changes}): move the fragments of one of them elsewhere, with the shards and experts that are "
-                "named after them."
+                f"The split {split} mixes the configurations of {fragments[0].path.name} and {fragment.path.name} "
+                f"({changes}): move the fragments of one of them elsewhere, with their shards and experts of the same "
+                "names."
             )
     tables, superseded = [], []
     for neighbours in _overlapping(parts):
@@ -215,22 +215,22 @@ def read_manifest(
 def _parts(
     split: Path, level_ids: np.ndarray | None, read: Callable[[Path], tuple[Fragment, pa.Table] | None]
 ) -> list[tuple[Fragment, pa.Table]]:
-    """The fragments and their rows, of these levels (ascending ids; None: of all).
+    """Read the fragments and their rows, of these levels (ascending ids; None: of all).
 
-    Who seals removes fragments after there is one that has their levels. So this looks until a look finds no other
-    sealed one, and none gone that the look before had: until then a level may have slipped from the one to the other.
+    A seal removes fragments once a sealed one has their levels, so a level may move between two fragments unseen. This
+    lists the folder again until a listing finds no new sealed fragment, and no listed one that is missing when read.
     """
     found: dict[tuple[Path, int], tuple[Fragment, pa.Table]] = {}
     with ThreadPoolExecutor(THREADS) as threads:
-        for look in range(ROUNDS):
+        for listing in range(MAX_LISTINGS):
             listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
-            new = [one for one in listed if one not in found and _wanted(one[0], level_ids)]
+            new = [entry for entry in listed if entry not in found and _wanted(entry[0], level_ids)]
             parts = list(shown(threads.map(read, (path for path, _ in new)), "fragments", len(new), MANY))
-            found |= {one: part for one, part in zip(new, parts, strict=True) if part}
-            if look and all(part and not part[0].sealed for part in parts):
-                latest = {path: part for (path, _), part in found.items()}  # of those that had one name in turn
-                return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # others are fences
-    raise Failure(f"The fragments of {split} change faster than they can be read: try again when they are at rest.")
+            found |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
+            if listing and all(part and not part[0].sealed for part in parts):
+                latest = {path: part for (path, _), part in found.items()}  # a path's file may have been replaced
+                return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # those without rows: fences
+    raise Failure(f"The fragments of {split} change faster than they can be read: try again after the writer ends.")
 
 
 def _wanted(path: Path, level_ids: np.ndarray | None) -> bool:
@@ -240,7 +240,7 @@ def _wanted(path: Path, level_ids: np.ndarray | None) -> bool:
 def _part(
     path: Path, names: Sequence[str], level_ids: np.ndarray | None, compact: bool, each: Each | None
 ) -> tuple[Fragment, pa.Table] | None:
-    """A fragment and its rows; None: it is gone."""
+    """Read a fragment and its rows; None: it is missing."""
     try:
         fragment, table = read_fragment(path, names, level_ids, compact)
     except FileNotFoundError:
@@ -256,7 +256,7 @@ def _ids(table: pa.Table) -> np.ndarray:
 
 
 def _overlapping(parts: Sequence[tuple[Fragment, pa.Table]]) -> Iterator[list[tuple[Fragment, pa.Table]]]:
-    """Groups of fragments, ascending; only those of one group can have a level in common."""
+    """Yield groups of fragments, ascending; fragments of different groups share no level."""
     within = [(_ids(table).min(), _ids(table).max(), i) for i, (_, table) in enumerate(parts) if table.num_rows]
     group, end = [], -1
     for first, last, i in sorted(within):
@@ -270,14 +270,14 @@ def _overlapping(parts: Sequence[tuple[Fragment, pa.Table]]) -> Iterator[list[tu
 
 
 def each_once(parts: Sequence[tuple[Fragment, pa.Table]]) -> tuple[pa.Table, list[Fragment]]:
-    """The rows of these fragments, ascending, each level once; and the fragments of which none is among them.
+    """Merge the rows of fragments, ascending, each level once; also return the fragments that contribute none.
 
-    What is sealed counts before what is not, and the larger before the smaller.
+    Sealed fragments take precedence, then larger ones.
     """
     ordered = sorted(parts, key=lambda part: (not part[0].sealed, -part[0].rows))
     table = pa.concat_tables([table.replace_schema_metadata(None) for _, table in ordered])
     ids = _ids(table)
-    if (np.diff(ids) > 0).all():  # nearly always, and of millions of rows this takes no time
+    if (np.diff(ids) > 0).all():  # the common case, and fast for millions of rows
         return table, []
     _, first = np.unique(ids, return_index=True)  # sorts
     ends = np.cumsum([table.num_rows for _, table in ordered])
@@ -286,17 +286,17 @@ def each_once(parts: Sequence[tuple[Fragment, pa.Table]]) -> tuple[pa.Table, lis
 
 
 def named_by(tables: Sequence[pa.Table], column: str) -> frozenset[str]:
-    """What rows name in a column: shards or experts."""
+    """Collect the paths in a column (shard or experts) of these tables."""
     return frozenset(path for table in tables for path in table.column(column).unique().to_pylist() if path)
 
 
 def data_named_by(rows: pa.Table) -> frozenset[str]:
-    """Shards and experts."""
+    """Collect the paths of shards and experts in these rows."""
     return frozenset.union(*(named_by([rows], name) for name in DATA_COLUMNS))
 
 
 def with_places(rows: pa.Table, shards: Sequence[Any], places: Sequence[Any]) -> pa.Table:
-    """The same rows, whose data are in these shards now, in these of their rows."""
+    """Replace the shards and the indices in them (`places`) at which the rows' data lie."""
     for name, values in ("shard", shards), ("row", places):
         field = COLUMNS.field(name)
         rows = rows.set_column(rows.schema.get_field_index(name), field, pa.array(values, field.type))
@@ -311,7 +311,7 @@ def require_manifest(
     compact: bool = False,
     each: Each | None = None,
 ) -> Manifest:
-    """As `read_manifest`, for questions about a split that should be there; it may have none of the levels.
+    """Read a manifest as `read_manifest`, but require a split; it may have none of the levels.
 
     Raises:
         UserError: there is no split here, or nothing is committed in it.
@@ -324,25 +324,25 @@ def require_manifest(
 
 
 def _nothing_at(split: Path) -> str:
-    """Why a folder is no split, in a sentence."""
+    """Say in a sentence why a folder is not a split."""
     require_known(split)
     here = [] if is_remote(split) else [f"{above}{MANIFEST}" for above in ("*/", "*/*/", "*/*/*/")]
     below = [found.parent for pattern in here for found in split.glob(pattern)]
     if below:
-        names = ", ".join(map(str, sorted(below)[:SHOWN]))
-        return f"{split} is no split, but the folder of {len(below)}: name one of them, such as {names}."
+        names = ", ".join(map(str, sorted(below)[:MAX_SHOWN]))
+        return f"{split} is not a split, but a folder of {len(below)}: name one of them, such as {names}."
     what = f"Nothing is committed in {split} yet" if split.is_dir() else f"There is no split at {split}"
     return f"{what}: give a folder such as data/128k/s that `levelproof generate` made."
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Settings that differ, by their dotted names; `absent` where one side does not have it."""
+    """Return old and new value of settings that differ, by dotted name; `absent` if one side lacks it."""
     a, b = flat(old), flat(new)
     names = sorted(name for name in a.keys() | b.keys() if a.get(name, "absent") != b.get(name, "absent"))
     return {name: (a.get(name, "absent"), b.get(name, "absent")) for name in names}
 
 
 def told(changes: Mapping[str, tuple[Any, Any]]) -> str:
-    """`differences` in words, the first SHOWN of them."""
-    shown = [f"{name} was {old}, now {new}" for name, (old, new) in list(changes.items())[:SHOWN]]
-    return "; ".join(shown) + (f" and {len(changes) - SHOWN} more" if len(changes) > SHOWN else "")
+    """Describe the first MAX_SHOWN of `differences`."""
+    parts = [f"{name} was {old}, now {new}" for name, (old, new) in list(changes.items())[:MAX_SHOWN]]
+    return "; ".join(parts) + (f" and {len(changes) - MAX_SHOWN} more" if len(changes) > MAX_SHOWN else "")

@@ -1,8 +1,8 @@
-"""What is damaged taken out of a split, and nothing that is sound: the rows that are lost leave their fragments.
+"""Removal of damaged rows and data from a split; everything sound stays.
 
-Each fragment is written again in one step, or removed where it has no sound row. What no row names afterwards goes
-with the next cleaning. A process that dies in between leaves a split of which less is taken out: where a fragment has
-another name than before, the one that it takes the place of counts until it is gone, for it has more rows.
+Each fragment is rewritten in one step, or removed if it has no sound row. The next cleaning removes data that no row
+names afterwards. If the process dies in between, less is removed: a fragment that is rewritten under a new name has
+fewer rows than the old one, which takes precedence until it is removed.
 """
 
 from collections.abc import Collection
@@ -29,17 +29,17 @@ from levelproof.pipeline.store.merge import Place, merge_shards
 
 
 def take_out(split: Path, lost: Collection[int], unlike: Collection[str], damaged: Collection[Path]) -> None:
-    """Take out these levels, and these fragments whole. Only who has the split locked may, while nobody commits.
+    """Remove levels, and damaged fragments whole. The caller must be the split's writer and exclude commits.
 
     Args:
-        split: with its fragments.
-        lost: levels whose rows go.
-        unlike: shards and experts of which files are damaged; levels that are not lost are copied to other shards.
-        damaged: fragments of which nothing is to be believed.
+        split: folder of the split.
+        lost: levels whose rows are removed.
+        unlike: shards and experts with damaged files; levels that are not lost are copied to new shards.
+        damaged: fragments of which nothing is trusted.
 
     Raises:
         Failure: another fragment is damaged by now, or a level that is not lost cannot be copied.
-        OSError: the disk refuses.
+        OSError: the write fails.
     """
     sound = [path for path in fragment_paths(split) if path not in damaged]
     named = {name for path in sound for name in data_named_by(read_fragment(path, DATA_COLUMNS)[1])}
@@ -58,15 +58,15 @@ def _mend(split: Path, path: Path, lost: np.ndarray, unlike: frozenset[str]) -> 
     if rows.num_rows == before.num_rows and not stale:
         return
     ids = rows.column("level_id").to_pylist()
-    # The name that its rows give it: its old one may be that of the unit in which lost levels are made again
+    # Named after its remaining rows: its old name may be that of the unit that regenerates the lost levels
     unit = unit_name(ids[0], ids[-1]) if ids else path.stem
     attempts = [new_attempt(split, unit) for _ in stale or [path]]
     for attempt in attempts if ids else ():
         begin_fragment(attempt)
     for name, attempt in zip(sorted(stale), attempts, strict=False):
         rows = _moved(split, rows, name, attempt.shard)
-    theirs = {path, attempts[-1].fragment} & {*fragment_paths(split)}  # two: somebody died between the two below
-    named = {name for of in theirs for name in data_named_by(read_fragment(of, DATA_COLUMNS)[1])}
+    theirs = {path, attempts[-1].fragment} & {*fragment_paths(split)}  # two if a process died between the writes below
+    named = {name for old in theirs for name in data_named_by(read_fragment(old, DATA_COLUMNS)[1])}
     _disown_named(split, named - data_named_by(rows))
     if ids:
         settings = fragment.config_hash, fragment.config
@@ -77,12 +77,12 @@ def _mend(split: Path, path: Path, lost: np.ndarray, unlike: frozenset[str]) -> 
 
 def _disown_named(split: Path, names: Collection[str]) -> None:
     for name in names:
-        with suppress(Failure):  # of a name that leads elsewhere: what is there is not ours
+        with suppress(Failure):  # a path that leads elsewhere is not ours
             disown([data_path(split, name)])
 
 
 def _moved(split: Path, rows: pa.Table, old: str, new: Path) -> pa.Table:
-    """The rows, of which those of one shard have been copied to a new one, one after another."""
+    """Copy the levels of one shard to a new one, and return all rows with their new places."""
     names, places, ids = (rows.column(name).to_pylist() for name in ("shard", "row", "level_id"))
     moving = [i for i, name in enumerate(names) if name == old]
     merge_shards(new, [Place(data_path(split, old), places[i], ids[i]) for i in moving])

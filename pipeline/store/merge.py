@@ -1,7 +1,7 @@
-"""A shard made of rows of other shards, chunk after chunk: each through its checksum, none decoded.
+"""Merging rows of shards into a new shard by copying chunks: each is checked by its checksum, none is decoded.
 
-Knows nothing of what a chunk holds, so every bit comes back, and memory does not grow with the shard. A file of zarr's
-sharding codec is its chunks, one after another, and an index: offset and length of each, and a CRC-32C.
+So every bit is preserved, and memory does not grow with the shard. A file of zarr's sharding codec is its chunks, one
+after another, and an index: offset and length of each, and a CRC-32C.
 """
 
 import json
@@ -19,12 +19,12 @@ from levelproof.pipeline.store.contents import ContentsError
 from levelproof.pipeline.store.disk import flush
 from levelproof.pipeline.store.shard import DAMAGE, Shard, damaged, stored_bytes
 
-FILE_BYTES = 64 * 2**20  # that a file has at least, if there is as much; larger: longer indices to read before a chunk
-MISSING = 2**64 - 1  # in an index, of a chunk that is not there
+FILE_BYTES = 64 * 2**20  # minimum of a file, if there is enough data; larger: longer indices to read before a chunk
+MISSING = 2**64 - 1  # offset and length of a missing chunk in an index
 
 
 class Place(NamedTuple):
-    """Where the trajectory of a level lies."""
+    """Shard and row that hold a level's trajectory."""
 
     shard: Path
     row: int
@@ -39,24 +39,23 @@ class _Source(NamedTuple):
 def merge_shards(
     path: Path, places: Sequence[Place], moved: Callable[[int], None] = lambda _: None, rows_a_file: int | None = None
 ) -> None:
-    """Write the trajectories at these places, in the order of their level ids, to a new shard at `path`, durably.
+    """Write trajectories, ordered by level id, to a new shard at `path`, durably.
 
     Args:
         path: of the new shard.
-        places: at least one; all of shards that hold the same fields in the same way.
-        moved: called before each shard is opened, and with the bytes of each chunk that was copied; what it raises
-            ends this.
-        rows_a_file: rows of each file; default: as few as FILE_BYTES allow, a power of two.
+        places: at least one; the shards must have equal fields and encodings.
+        moved: called with 0 before each shard is opened, and with the bytes of each copied chunk; may raise to stop.
+        rows_a_file: rows per file; default: the lowest power of two that reaches FILE_BYTES.
 
     Raises:
-        Failure: a source is damaged, or holds other fields than the first.
-        FileExistsError: `path` is there already.
-        OSError: the disk refuses.
+        Failure: a source is damaged, or its fields differ from those of the first.
+        FileExistsError: `path` exists.
+        OSError: the write fails.
     """
     documents, sources = _opened(dict.fromkeys(place.shard for place in places), moved)
     for shard, row, level_id in places:
         if sources[shard].level_ids[row : row + 1] != [level_id]:
-            raise damaged(shard, ContentsError(f"its row {row} is not level {level_id}, as the manifest says"))
+            raise damaged(shard, ContentsError(f"its row {row} is not level {level_id}, which the manifest names"))
     if rows_a_file is None:
         rows_a_file = _rows_a_file(sources)
     rows_a_file = min(rows_a_file, len(places))
@@ -81,9 +80,9 @@ def merge_shards(
 
 
 def _opened(paths: Iterable[Path], moved: Callable[[int], None]) -> tuple[dict[str, Any], dict[Path, _Source]]:
-    """The sources, and the metadata that they share, by array (the group's without a name).
+    """Open the sources; return their shared metadata by array (the group's under the empty name), and the sources.
 
-    What depends on the number of levels is zero in it.
+    Entries that depend on the number of levels are zeroed.
     """
     first, shared, sources = None, {}, {}
     for path in paths:
@@ -93,16 +92,16 @@ def _opened(paths: Iterable[Path], moved: Callable[[int], None]) -> tuple[dict[s
             files = {"": "zarr.json"} | {name: f"{name}/zarr.json" for name in shard.arrays}
             documents = {name: json.loads(read_whole(path, file)) for name, file in files.items()}
             for name in shard.arrays:
-                of = documents[name]
-                arrays[name] = Chunks(path, name, tuple(of["shape"]), np.dtype(of["data_type"]))
-                of["shape"][0] = of["chunk_grid"]["configuration"]["chunk_shape"][0] = 0
+                array = documents[name]
+                arrays[name] = Chunks(path, name, tuple(array["shape"]), np.dtype(array["data_type"]))
+                array["shape"][0] = array["chunk_grid"]["configuration"]["chunk_shape"][0] = 0
             documents[""]["attributes"]["level_ids"] = []
         except DAMAGE as error:
             raise damaged(path, error) from error
         if first is None:
             first, shared = path, documents
         elif documents != shared:
-            raise Failure(f"The shards {first} and {path} hold other fields, so they cannot be merged.")
+            raise Failure(f"The shards {first} and {path} have different fields, so they cannot be merged.")
         sources[path] = _Source(shard.level_ids, arrays)
     return shared, sources
 
@@ -114,16 +113,16 @@ def _rows_a_file(sources: dict[Path, _Source]) -> int:
 
 
 def _chunks(name: str, places: Sequence[Place], sources: dict[Path, _Source]) -> Iterator[bytes]:
-    """The encoded chunks of an array."""
-    for path, of_shard in groupby(places, lambda place: place.shard):
+    """Yield the encoded chunks of an array."""
+    for path, group in groupby(places, lambda place: place.shard):
         try:
-            yield from sources[path].arrays[name].encoded(place.row for place in of_shard)
+            yield from sources[path].arrays[name].encoded(place.row for place in group)
         except DAMAGE as error:
             raise damaged(path, error) from error
 
 
 def _write_file(path: Path, chunks: Iterable[bytes], room: int, moved: Callable[[int], None]) -> None:
-    """A file with these chunks, and an index with room for so many."""
+    """Write a file with these chunks and an index of `room` entries."""
     index = np.full((room, 2), MISSING, "<u8")
     with path.open("wb") as file:
         for i, chunk in enumerate(chunks):

@@ -1,7 +1,7 @@
-"""Files of a split in an object store, written: each at once or not at all, and some only if nobody else was first.
+"""Writing files of a split to an object store: each whole or not at all, some only if no other process was first.
 
-Any request may be made again, also one that was done and whose answer was lost: so whoever is told that somebody else
-was first looks whether it was itself. Knows nothing of what is in the files.
+Any request may be repeated, also one that succeeded but whose response was lost. So a process that fails a precondition
+checks whether its own earlier request was the first. Knows nothing of the files' contents.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ PART = 2**25  # bytes; larger files are sent in parts
 
 
 class Version(NamedTuple):
-    """Which bytes a file has: what a store is told that is to change these and no others."""
+    """Identity of a file's bytes, for conditional writes that replace these bytes and no others."""
 
     e_tag: str | None
     version: str | None
@@ -34,19 +34,19 @@ class Version(NamedTuple):
 
 
 class StoredFile(NamedTuple):
-    """A file as it is now."""
+    """A file as the store has it now."""
 
     data: bytes
     version: Version
 
 
 def get(path: Path, most: float = inf) -> StoredFile:
-    """A file as the store has it now, past any cache.
+    """Read a file from the store, past any cache.
 
     Raises:
-        FileNotFoundError: it is not there.
+        FileNotFoundError: it does not exist.
         OSError: it has more than `most` bytes.
-        UserError: there is no such bucket, or we may not.
+        UserError: there is no such bucket, or access is denied.
         StoreFailure: the store does not answer.
     """
     store, key = place(path)
@@ -57,12 +57,12 @@ def get(path: Path, most: float = inf) -> StoredFile:
 
     found = ask(path, request)
     if len(found.data) > most:
-        raise OSError(f"{as_typed(path)} is larger than it can be")
+        raise OSError(f"{as_typed(path)} is larger than {most} bytes")
     return found
 
 
 def begin_of(path: Path, most: int) -> tuple[bytes, int]:
-    """The first bytes of a file, at most so many, and the size of the whole, past any cache. Raises as `get`."""
+    """Read at most the first `most` bytes of a file, and its size, past any cache. Raises as `get`."""
     store, key = place(path)
 
     def request() -> tuple[bytes, int]:
@@ -73,16 +73,16 @@ def begin_of(path: Path, most: int) -> tuple[bytes, int]:
 
 
 def put(path: Path, data: bytes | Path) -> None:
-    """A file, or the bytes of one on this machine, whatever was there before. Raises as `get`."""
+    """Write bytes, or a file of this machine, replacing what was there. Raises as `get`."""
     store, key = place(path)
     ask(path, lambda: obstore_module().put(store, key, data, chunk_size=PART), "write")
 
 
 def put_if(path: Path, data: bytes, there: Version | None) -> Version | None:
-    """A file, if the bytes that are there are still those (None: if nothing is there).
+    """Write a file if the store still has the version `there` (None: if it has no such file).
 
     Returns:
-        Its version now; None: others were first, and nothing has changed.
+        The new version; None: another process was first, and nothing has changed.
 
     Raises: as `get`.
     """
@@ -105,39 +105,39 @@ def put_if(path: Path, data: bytes, there: Version | None) -> Version | None:
 
 
 def remove(paths: Iterable[Path]) -> None:
-    """These files of one store, as far as they are there. Raises as `get`."""
-    if places := [(path, *place(path)) for path in paths]:
-        first, store, _ = places[0]
+    """Delete these files of one store, if they exist. Raises as `get`."""
+    if located := [(path, *place(path)) for path in paths]:
+        first, store, _ = located[0]
         try:
-            ask(first, lambda: obstore_module().delete(store, [key for _, _, key in places]), "write")
-        except FileNotFoundError:  # of one of them: Google's and Microsoft's stores say so, and others may be left
-            for path, _, key in places:
+            ask(first, lambda: obstore_module().delete(store, [key for _, _, key in located]), "write")
+        except FileNotFoundError:  # Google's and Microsoft's stores stop at a missing file and may leave others
+            for path, _, key in located:
                 with suppress(FileNotFoundError):
                     ask(path, partial(obstore_module().delete, store, key), "write")
 
 
 def require_conditions(probe: Path) -> None:
-    """Prove that files can be written to a store, and that it heeds conditions; `probe` is a file for this alone.
+    """Check that a store is writable and supports preconditions, by writing the unused file `probe`.
 
     Raises:
-        UserError: they cannot, or it does not.
+        UserError: it is read-only, or does not support them.
         StoreFailure: it does not answer.
     """
     if probe.parts[0] not in BUCKETS:
         raise UserError(f"Nothing can be written to {as_typed(probe.parent)}: give a folder, or a URL of s3, gs or az.")
     try:
         first = put_if(probe, b"1", None)
-        heeded = first is not None and put_if(probe, b"2", None) is None
-        heeded = heeded and put_if(probe, b"3", first) is not None and put_if(probe, b"4", first) is None
+        supported = first is not None and put_if(probe, b"2", None) is None
+        supported = supported and put_if(probe, b"3", first) is not None and put_if(probe, b"4", first) is None
         remove([probe])
     except (NotImplementedError, obstore_module().exceptions.NotSupportedError):
-        heeded = False
+        supported = False
     except StoreFailure as failure:
-        if "(501" not in str(failure):  # in its URL there may be any number
+        if "(501" not in str(failure):  # with its bracket, because the URL may contain any number
             raise
-        heeded = False
-    if not heeded:
+        supported = False
+    if not supported:
         raise UserError(
-            f"The store of {as_typed(probe.parent)} does not heed the conditions (If-None-Match, If-Match) that keep "
-            "writers apart: make the split in a folder, and copy it there."
+            f"The store of {as_typed(probe.parent)} does not support the preconditions (If-None-Match, If-Match) that "
+            "exclude a second writer: write the split to a folder, and copy it there."
         )

@@ -1,8 +1,7 @@
-"""Where levels are that no id makes: in a level file or a record of an imported folder, and once they have a witness
-in a shard.
+"""Origins of levels that are not sampled from an id: a level file, a record of an imported folder, or a shard.
 
-The id of a level file's level is made of its content hash: it has the same random streams wherever its file lies. That
-of a record is its place in the folder.
+They are in a shard once they have a witness. A level file's id is derived from its content hash, so its random streams
+do not depend on where the file lies. A record's id is its position in the folder.
 """
 
 import os
@@ -15,19 +14,18 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.remote import absolute, as_typed
 
-ASKED = ("content_hash", "file", "size", "shard", "row")  # columns that tell a level's origin
-
+ASKED = ("content_hash", "file", "size", "shard", "row")  # columns that `origin_of` needs
 
 RECORD = re.compile(r"(.+)/([^/]+)#(0|[1-9][0-9]{0,11})")
 
 
 def can_be_noted(file: str) -> bool:
-    """Whether a row may have this as its `file`: text that can be written, and that no terminal obeys."""
+    """Whether `file` may be stored in a row: no control characters, no surrogates."""
     return not re.search("[\0-\x1f\x7f-\x9f\ud800-\udfff]", file)
 
 
 class RecordPlace(NamedTuple):
-    """Where an imported record is; as text, the `file` of its row."""
+    """Folder, array and row of an imported record; its string is the `file` of a manifest row."""
 
     folder: Path
     array: str
@@ -38,27 +36,27 @@ class RecordPlace(NamedTuple):
 
 
 def place_of(file: str) -> RecordPlace | None:
-    """The record that a row's `file` names; None: it names a level file."""
+    """Return the record that a row's `file` names; None: it names a level file."""
     found = RECORD.fullmatch(file)
-    if not found or not os.path.isdir(f"{found[1]}/{found[2]}") or os.path.exists(file):  # of any text
+    if not found or not os.path.isdir(f"{found[1]}/{found[2]}") or os.path.exists(file):  # `file` may be any string
         return None
     return RecordPlace(Path(found[1]), found[2], int(found[3]))
 
 
 class Origin(NamedTuple):
-    """Where one level is, and what it has to be."""
+    """Location of one level, and the content that it must have."""
 
     content_hash: str
-    file: str  # absolute path, or that of a record's `RecordPlace`
+    file: str  # absolute path, or the string of a `RecordPlace`
     size: str
-    split: str = ""  # absolute path, where a row has the level
-    shard: str = ""  # path below the split; empty: none has it
+    split: str = ""  # absolute path of a split with the level
+    shard: str = ""  # path below the split; empty: no shard has the level
     row: int = 0
-    level_id: int = 0  # there
+    level_id: int = 0  # in the shard
 
 
 def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:
-    """Of a row of a split's manifest, with the columns ASKED."""
+    """Return the origin of a manifest row that has the columns ASKED."""
     found = Origin(row["content_hash"], row["file"] or "", row["size"], as_typed(absolute(split)))
     if not row["shard"]:
         return found
@@ -66,29 +64,30 @@ def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:
 
 
 def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
-    """Of these levels of a split, by their ids.
+    """Return the origins of levels of a split, by level id.
 
     Raises:
-        UserError: the file of one without a shard is gone.
+        UserError: the file of a level without a shard is missing.
         Failure: a fragment is damaged.
     """
     rows = read_manifest(split, ASKED, list(level_ids)).table.to_pylist()
-    found = {row["level_id"]: origin_of(split, row) for row in rows}
-    gone = [of.file for of in found.values() if not of.shard and not place_of(of.file) and not os.path.isfile(of.file)]
-    if gone:
-        more = f" and {len(gone) - 1} more" if gone[1:] else ""
+    origins = {row["level_id"]: origin_of(split, row) for row in rows}
+    files = [origin.file for origin in origins.values() if not origin.shard]
+    missing = [file for file in files if not place_of(file) and not os.path.isfile(file)]
+    if missing:
+        more = f" and {len(missing) - 1} more" if missing[1:] else ""
         raise UserError(
-            f"No shard of {split} has the level of {gone[0]}{more}, and its file is gone: put it back, "
+            f"No shard of {split} has the level of {missing[0]}{more}, and its file is missing: put it back, "
             "or label the files where they are now with levelproof generate level_files=FOLDER."
         )
-    return found
+    return origins
 
 
 def require_same_levels(split: Path, origins: Mapping[int, Origin], done: Collection[int]) -> None:
-    """Refuse levels whose ids other ones have in the split: two contents in some ten thousand share one.
+    """Refuse levels whose ids belong to different levels in the split: among many files, two may share an id.
 
     Raises:
-        UserError: there is such a level.
+        UserError: an id collides.
         Failure: a fragment is damaged.
     """
     if not origins or not len(done):
@@ -98,6 +97,6 @@ def require_same_levels(split: Path, origins: Mapping[int, Origin], done: Collec
         here = origins[row["level_id"]]
         if row["content_hash"] != here.content_hash:
             raise UserError(
-                f"The levels of {here.file} and {row['file']} have by chance one id, {row['level_id']}: "
+                f"The levels of {here.file} and {row['file']} happen to have the same id, {row['level_id']}: "
                 "label one of them elsewhere, with out=NAME."
             )

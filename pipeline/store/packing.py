@@ -1,4 +1,4 @@
-"""Between named arrays and the packed arrays of a shard; every bit comes back. Knows nothing of files."""
+"""Conversion between named arrays and a shard's packed arrays, preserving every bit; knows nothing of files."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -9,9 +9,9 @@ from levelproof.pipeline.store.schema import ALONG_TIME, FLAT, PACKED, FieldSpec
 
 
 def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[str, np.ndarray]:
-    """Packed arrays: (level, component, 256) for what changes along time, else (level, component); FLAT (level, byte).
+    """Pack arrays: (level, component, 256) for what changes along time, else (level, component); FLAT (level, byte).
 
-    `arrays` have the level axis last, and time first but for `level/` fields.
+    `arrays` have the level axis last, and time first except in `level/` fields.
 
     Raises:
         ValueError: a small integer field holds a value that does not fit 8 bits.
@@ -30,7 +30,7 @@ def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[s
 
 
 def empty(table: Iterable[FieldSpec], names: Iterable[str], levels: int) -> dict[str, np.ndarray]:
-    """Room for these packed arrays of so many levels."""
+    """Allocate these packed arrays for `levels` levels."""
     extents = {name: sum(field.extent for field in table if field.array == name) for name in names}
     return {
         name: np.empty((levels, extent, *((RECORD_STEPS,) if name in ALONG_TIME else ())), f"u{PACKED[name] // 8}")
@@ -39,9 +39,9 @@ def empty(table: Iterable[FieldSpec], names: Iterable[str], levels: int) -> dict
 
 
 def unpack(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[str, np.ndarray]:
-    """The inverse of `pack`, with the arrays that `packed` has, but for the order of axes: level first, then time.
+    """Unpack the fields of the arrays in `packed`, with axes in the order level, time, others.
 
-    These are views where types have as many bits as they are stored with.
+    Fields that are stored with their own number of bits are views.
 
     Raises:
         ValueError: a flag is neither 0 nor 1.
@@ -63,7 +63,7 @@ def unpack(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict
 
 
 def _unsigned(values: np.ndarray, field: FieldSpec) -> np.ndarray:
-    """The same bits as unsigned integers; small integers as 8 bits."""
+    """View values as unsigned integers of the same bits; narrow small integers to 8 bits."""
     if values.dtype.itemsize * 8 == field.bits:
         return np.ascontiguousarray(values).view(f"u{field.bits // 8}")
     if values.size and not (values.min() >= 0 and values.max() < 2**field.bits):
@@ -73,6 +73,6 @@ def _unsigned(values: np.ndarray, field: FieldSpec) -> np.ndarray:
 
 def _original(values: np.ndarray, field: FieldSpec) -> np.ndarray:
     dtype = np.dtype(field.dtype)
-    if dtype.kind == "b" and values.size and values.max() > 1:  # no bool for numpy, XLA and kernels
+    if dtype.kind == "b" and values.size and values.max() > 1:  # undefined as a bool in numpy, XLA and kernels
         raise ValueError(f"{field.name} has flags that are neither 0 nor 1")
     return values.view(dtype) if dtype.itemsize == values.dtype.itemsize else values.astype(dtype)

@@ -1,8 +1,8 @@
 """Checkpoints of experts in training, from which a later process resumes them: one file per unit.
 
-A file is a line, its head, which says whose experts they are, and a numpy archive. The head alone says whether a file
-is still needed. A file goes when its levels are committed or when its bytes prove it damaged. One that cannot be read
-now (a permission, a store's time-out) stays, and whoever needs it ends with a sentence.
+A file is one line, its head, which names the experts' levels, and a numpy archive. The head alone decides whether a
+file is still needed. A file is removed when its levels are committed, or when its bytes prove damage. One that cannot
+be read now (a permission, a store's time-out) stays, and a unit that needs it fails.
 """
 
 import hashlib
@@ -44,11 +44,11 @@ from levelproof.pipeline.store.layout import (
 from levelproof.pipeline.store.provenance import versions
 from levelproof.pipeline.store.remote import as_typed, at_once, is_remote
 
-MAGIC = b"levelproof checkpoint "  # begins a head
+MAGIC = b"levelproof checkpoint "  # start of a head
 VERSION = 1  # of the format
 MAX_HEAD = 2**20  # bytes; a level id takes 12
 MALFORMED = (BadZipFile, EOFError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
-OWN = 0o600  # mode of a file: `require_own` refuses one that others can write to, whatever the umask
+OWN = 0o600  # mode of a file, under any umask: `require_own` refuses files that others can write to
 
 
 class CheckpointUnread(Failure):
@@ -56,32 +56,33 @@ class CheckpointUnread(Failure):
 
 
 class _DamagedError(Exception):
-    """The bytes of a checkpoint are not those that `save_paused` wrote."""
+    """The bytes of a checkpoint differ from what `save_paused` wrote."""
 
 
 class _Head(NamedTuple):
     """The first line of a checkpoint."""
 
     level_ids: tuple[int, ...]
-    stamp: str  # configuration and versions; under others the bits would differ
+    stamp: str  # configuration and versions; with others, results would differ
     start: int  # of the archive, in bytes
     sha256: str  # of the archive
 
 
 def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobConfig) -> None:
-    """Keep these experts of a unit, by level id, in place of those kept before; in one step.
+    """Replace a unit's checkpoint with these experts, by level id, in one step.
 
     Raises:
-        OSError, UserError, StoreFailure: the write fails; those kept before stay.
+        OSError, UserError, StoreFailure: the write fails; the earlier checkpoint stays.
     """
     rows = [paused[level_id] for level_id in sorted(paused)]
     stacked = jax.tree.map(lambda *xs: np.stack(xs), *map(_arrays, rows))
     arrays = arrays_of(stacked, "paused/") | {"level_id": np.array(sorted(paused))}
     arrays["curve"] = stacked_curves([row.expert for row in rows])
     arrays["source"] = np.array([row.found.source[0] for row in rows])
-    if evaluations := [(i, of) for i, row in enumerate(rows) for of in row.evaluations]:
-        arrays["evaluated"] = np.array([i for i, _ in evaluations])
-        arrays |= arrays_of(jax.tree.map(lambda *xs: np.stack(xs), *(of for _, of in evaluations)), "evaluation/")
+    if evaluations := [(i, evaluation) for i, row in enumerate(rows) for evaluation in row.evaluations]:
+        indices, trees = zip(*evaluations, strict=True)
+        arrays["evaluated"] = np.array(indices)
+        arrays |= arrays_of(jax.tree.map(lambda *xs: np.stack(xs), *trees), "evaluation/")
     file, path = io.BytesIO(), checkpoint_path(split, unit)
     np.savez(file, allow_pickle=False, **arrays)
     if not is_remote(split):
@@ -97,7 +98,7 @@ def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobCo
 
 
 def load_paused(split: Path, level_ids: Collection[int], job: JobConfig) -> dict[int, Paused]:
-    """Experts of these levels that checkpoints of this job and these versions hold, each at its latest.
+    """Load the latest saved expert of each level, from checkpoints of this job and these versions.
 
     Raises:
         CheckpointUnread: a checkpoint that may hold one of them cannot be read.
@@ -108,16 +109,16 @@ def load_paused(split: Path, level_ids: Collection[int], job: JobConfig) -> dict
         first, last = ids_of(path)
         if not any(first <= level_id <= last for level_id in wanted):
             continue
-        for level_id, of in _load(path, wanted, job).items():
-            if level_id not in found or _updates(of) > _updates(found[level_id]):
-                found[level_id] = of
+        for level_id, expert in _load(path, wanted, job).items():
+            if level_id not in found or _updates(expert) > _updates(found[level_id]):
+                found[level_id] = expert
     return found
 
 
 def drop_paused(split: Path, unit: str, level_ids: Collection[int]) -> None:
-    """Remove the checkpoint of a committed unit of these levels. `prune_paused` judges one that cannot be read now.
+    """Remove the checkpoint of a committed unit of these levels; leave one that cannot be read to `prune_paused`.
 
-    One that has experts of other levels stays: a unit keeps its name when levels in its middle are given back.
+    A checkpoint with experts of other levels stays: a unit keeps its name when it returns levels in its middle.
     """
     path = checkpoint_path(split, unit)
     with suppress(OSError, LevelproofError, _DamagedError):
@@ -128,7 +129,7 @@ def drop_paused(split: Path, unit: str, level_ids: Collection[int]) -> None:
 def prune_paused(split: Path, done: np.ndarray, say: Callable[[str], None]) -> None:
     """Remove checkpoints whose levels are all `done` (ascending ids), and damaged ones; call while no worker is active.
 
-    `say` is told which are damaged, and which stay because they cannot be read.
+    Reports through `say` which are damaged, and which stay because they cannot be read.
     """
     for path in entries(split, CHECKPOINTS, CHECKPOINT_BEGUN, os.DirEntry.is_file):
         remove(path)
@@ -141,13 +142,13 @@ def prune_paused(split: Path, done: np.ndarray, say: Callable[[str], None]) -> N
 
 
 def _judged(path: Path, done: np.ndarray) -> tuple[str, bool]:
-    """What is wrong with a checkpoint, if anything, and whether it can go."""
+    """Return what is wrong with a checkpoint, or an empty string, and whether to remove it."""
     first, last = ids_of(path)
     low, high = np.searchsorted(done, [first, last + 1])
     if high - low == last - first + 1:
         return "", True
     if OLD_CHECKPOINT.fullmatch(f"{CHECKPOINTS}/{path.name}"):
-        return "is of an earlier levelproof, and this one does not resume it: it stays until its levels are done", False
+        return "is from an earlier levelproof and cannot be resumed: it stays until its levels are done", False
     try:
         return "", bool(np.isin(_head(path).level_ids, done).all())
     except FileNotFoundError:
@@ -158,8 +159,8 @@ def _judged(path: Path, done: np.ndarray) -> tuple[str, bool]:
         return f"cannot be read ({_reason(error)}): it stays until its levels are done", False
 
 
-def _paths(split: Path, of: re.Pattern[str]) -> list[Path]:
-    return sorted(entries(split, CHECKPOINTS, of, os.DirEntry.is_file))
+def _paths(split: Path, pattern: re.Pattern[str]) -> list[Path]:
+    return sorted(entries(split, CHECKPOINTS, pattern, os.DirEntry.is_file))
 
 
 def _reason(error: Exception) -> str:
@@ -171,7 +172,7 @@ def _updates(paused: Paused) -> int:
 
 
 def _arrays(paused: Paused) -> Any:
-    """What of it has the same shape for every expert."""
+    """Return the parts that have the same shape for every expert."""
     expert, pending, rollouts, _, found = paused
     return expert.begun, pending, np.int64(rollouts), found._replace(source=())
 
@@ -181,13 +182,13 @@ def _stamp(job: JobConfig) -> str:
 
 
 def _load(path: Path, wanted: set[int], job: JobConfig) -> dict[int, Paused]:
-    """Those of the `wanted` experts that a checkpoint has; none if it is damaged, or of another job or version."""
+    """Load the `wanted` experts of a checkpoint; none if it is damaged, or has another job or version."""
     try:
         head = _head(path)
         if head.stamp != _stamp(job) or wanted.isdisjoint(head.level_ids):
             return {}
         data = objects.get(path).data if is_remote(path) else path.read_bytes()
-        return {level_id: of for level_id, of in _experts_in(data, path, job).items() if level_id in wanted}
+        return {level_id: expert for level_id, expert in _experts_in(data, path, job).items() if level_id in wanted}
     except (FileNotFoundError, _DamagedError):  # another worker has committed its unit
         return {}
     except StoreFailure:
@@ -204,7 +205,7 @@ def _head(path: Path) -> _Head:
 
     Raises:
         OSError, UserError, StoreFailure: it cannot be read, or others can write to it.
-        Failure: it is of another version.
+        Failure: it has another version.
         _DamagedError: it is damaged.
     """
     if is_remote(path):
@@ -215,7 +216,7 @@ def _head(path: Path) -> _Head:
 
 
 def _head_in(data: bytes, size: int, path: Path) -> _Head:
-    """The head of the checkpoint of `size` bytes that begins with `data`. Raises as `_head`."""
+    """Parse the head of a checkpoint of `size` bytes from its first bytes. Raises as `_head`."""
     line, end, _ = data.partition(b"\n")
     first, last = ids_of(path)
     try:
@@ -223,10 +224,10 @@ def _head_in(data: bytes, size: int, path: Path) -> _Head:
         if not (line.startswith(MAGIC) and end and version.isdecimal()):
             raise ValueError
         if int(version) != VERSION:
-            raise Failure(f"it has version {int(version)}, this levelproof reads {VERSION}")
-        told = json.loads(text)
-        head = _Head(tuple(told["levels"]), str(told["stamp"]), len(line) + 1, str(told["sha256"]))
-        whole = head.start + int(told["bytes"])
+            raise Failure(f"it has version {int(version)}, but this levelproof reads {VERSION}")
+        fields = json.loads(text)
+        head = _Head(tuple(fields["levels"]), str(fields["stamp"]), len(line) + 1, str(fields["sha256"]))
+        whole = head.start + int(fields["bytes"])
         if not all(type(level_id) is int and first <= level_id <= last for level_id in head.level_ids):
             raise ValueError
     except (ValueError, LookupError, TypeError, RecursionError):
@@ -237,7 +238,7 @@ def _head_in(data: bytes, size: int, path: Path) -> _Head:
 
 
 def _experts_in(data: bytes, path: Path, job: JobConfig) -> dict[int, Paused]:
-    """The experts of a whole checkpoint. Raises as `_head_in`."""
+    """Parse all experts of a whole checkpoint. Raises as `_head_in`."""
     head = _head_in(data, len(data), path)
     archive = data[head.start :]
     if hashlib.sha256(archive).hexdigest() != head.sha256:
@@ -248,23 +249,23 @@ def _experts_in(data: bytes, path: Path, job: JobConfig) -> dict[int, Paused]:
         with np.load(file, allow_pickle=False) as arrays:
             return dict(_experts({name: arrays[name] for name in arrays.files}, job))
     except MALFORMED as error:
-        raise _DamagedError("its arrays are none") from error
+        raise _DamagedError("its arrays are invalid") from error
 
 
 def _experts(arrays: dict[str, np.ndarray], job: JobConfig) -> Iterator[tuple[int, Paused]]:
-    """Raises ValueError or KeyError where arrays are none of such experts."""
-    level_ids, of = arrays["level_id"], arrays.get("evaluated", np.zeros(0, int))
+    """Yield experts by level id. Raises ValueError or KeyError if arrays do not fit this job."""
+    level_ids, evaluated = arrays["level_id"], arrays.get("evaluated", np.zeros(0, int))
     begun = begun_like(job)
     training = begun.training
     like = begun, Pending(np.bool_(0), np.bool_(0), np.int32(0)), np.int64(0), nothing_found(1)._replace(source=())
     environments, attempts = job.expert.environments, job.expert.attempts
     flags = np.zeros((RECORD_STEPS, environments), bool)
     action = np.zeros((RECORD_STEPS, training.recent.shape[1], attempts), np.int32)
-    shown = Evaluation(action, flags, flags, training.progress, training.success, training.course.over)
+    evaluation = Evaluation(action, flags, flags, training.progress, training.success, training.course.over)
     rows = unstacked(arrays, "paused/", like, len(level_ids))
-    evaluations = unstacked(arrays, "evaluation/", shown, len(of)) if len(of) else []
+    evaluations = unstacked(arrays, "evaluation/", evaluation, len(evaluated)) if len(evaluated) else []
     for i, (level_id, row) in enumerate(zip(level_ids.tolist(), rows, strict=True)):
         begun, pending, rollouts, found = row
-        mine = [evaluations[j] for j in np.flatnonzero(of == i)]
+        mine = [evaluations[j] for j in np.flatnonzero(evaluated == i)]
         found = found._replace(source=[Source(str(arrays["source"][i]))])
         yield level_id, Paused(kept(begun, arrays["curve"][i]), pending, int(rollouts), mine, found)

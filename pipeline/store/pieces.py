@@ -1,4 +1,4 @@
-"""Pieces of files that lie elsewhere, kept in a folder: bounded, shared by processes, each whole or not there."""
+"""A cache folder for pieces of remote files: bounded, shared by processes, each piece whole or absent."""
 
 import os
 import secrets
@@ -11,28 +11,28 @@ import google_crc32c
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.disk import NotRegular, regular, write_new
 
-CHECKSUM = 4  # bytes of a CRC-32C behind each piece: a machine that lost its power may have kept other bytes
-USED = 60.0  # s; a piece is marked as used once in this time
-LEFT = 0.9  # share of the bound that is left when it was exceeded
-ABANDONED = 3600.0  # s; who writes a piece for longer was killed
+CHECKSUM = 4  # bytes of a CRC-32C after each piece: a loss of power can leave other bytes
+TOUCH_INTERVAL = 60.0  # s between updates of a piece's time of use
+KEPT_SHARE = 0.9  # of the bound, to which an exceeded cache shrinks
+ABANDONED = 3600.0  # s; an older temporary file is from a killed process
 MAX_PIECE = 2**24  # bytes
-PARTS = 16  # the folder is looked through each time that this part of the bound was added
+PARTS = 16  # the folder is scanned each time that 1/PARTS of the bound was added
 
 
 class PieceCache:
-    """A folder of pieces under names that say what is in them: a name's bytes never change."""
+    """A folder of pieces whose names identify their bytes: the bytes under a name never change."""
 
     def __init__(self, folder: Path, most: int) -> None:
-        """`most` bytes are kept, a sixteenth more by each process that adds pieces."""
+        """Keep at most `most` bytes, and up to 1/PARTS more per process that adds pieces."""
         self.folder, self.most = folder, most
-        self._added = most  # the first piece looks what is there
-        self._checked: set[str] = set()  # names whose bytes this process has seen to be right
+        self._added = most  # bytes since the last scan; the first piece triggers one
+        self._checked: set[str] = set()  # names whose checksums this process has verified
 
     def has(self, name: str) -> bool:
         return (self.folder / name).exists()
 
     def read(self, name: str, first: int, last: int) -> bytes | None:
-        """Bytes of a piece; None: it is not there, or was damaged and is not there any more."""
+        """Return bytes of a piece; None: it is missing, or was damaged and is now removed."""
         path = self.folder / name
         try:
             descriptor = regular(path, os.O_RDONLY)
@@ -42,7 +42,7 @@ class PieceCache:
             about = os.fstat(descriptor)
             if about.st_size > MAX_PIECE:
                 return None
-            if time.time() - about.st_mtime > USED:
+            if time.time() - about.st_mtime > TOUCH_INTERVAL:
                 os.utime(path, follow_symlinks=False)
             if name in self._checked:
                 return os.pread(descriptor, last - first, first)
@@ -59,7 +59,7 @@ class PieceCache:
         return piece[first:last]
 
     def put(self, name: str, piece: bytes) -> None:
-        """Keep a piece, which appears at once or not at all.
+        """Add a piece, which appears whole or not at all.
 
         Raises:
             Failure: the folder cannot be written.
@@ -83,7 +83,7 @@ class PieceCache:
             self._make_room()
 
     def _make_room(self) -> None:
-        """Remove what was not used for longest, and what killed processes left half-written."""
+        """Remove the least recently used pieces, and what killed processes left half-written."""
         found, now = [], time.time()
         with os.scandir(self.folder) as entries:
             for entry in entries:
@@ -95,7 +95,7 @@ class PieceCache:
         if total <= self.most:
             return
         for _, size, path in sorted(found):
-            if total <= LEFT * self.most:
+            if total <= KEPT_SHARE * self.most:
                 break
             with suppress(FileNotFoundError):
                 os.unlink(path)

@@ -1,4 +1,4 @@
-"""What a row was made with: versions and device. Bits are promised on the same stack only."""
+"""Provenance of a row: versions and device. Equal bits are guaranteed on the same stack only."""
 
 import functools
 import platform
@@ -11,7 +11,7 @@ from levelproof.pipeline.version import __version__
 
 @functools.cache
 def versions() -> dict[str, str | int]:
-    """The manifest's `versions`."""
+    """Return the manifest's `versions`."""
     return {
         "levelproof": __version__,
         "python": platform.python_version(),
@@ -23,7 +23,7 @@ def versions() -> dict[str, str | int]:
 
 @functools.cache
 def device() -> str:
-    """The kind of device JAX computes on here, such as `cpu: AMD EPYC 7B13`."""
+    """Name the kind of device that JAX uses here, such as `cpu: AMD EPYC 7B13`."""
     import jax  # starts JAX's backend, so only on a worker
 
     first = jax.devices()[0]

@@ -1,10 +1,10 @@
-"""Attempts at units of a split in an object store: made in a folder here, then carried over, the fragment last.
+"""Attempts at units of a split in an object store: written to a local folder, then uploaded, the fragment last.
 
-An attempt (1) puts its mark, (2) looks what is at its fragment's place: nothing or a fence, a fragment without rows,
-(3) looks whether the writer for whom it works still has the lease, (4) puts its data, and (5) its fragment, if nothing
-else is at that place by now than in (2). A writer that has taken the lease looks for marks, and puts a new fence where
-a unit with a mark is not committed. So an attempt for an earlier writer is not committed after that: either its mark
-was seen, and it finds another fence than in (2); or the mark came later, and it finds another lease in (3).
+An attempt (1) writes its mark, (2) reads its fragment's path, where it expects no file or a fence (a fragment without
+rows), (3) checks that its writer still has the lease, (4) writes its data, and (5) writes its fragment, if the path
+still has what (2) found. A writer that has taken the lease lists marks, and writes a new fence for each unit with a
+mark but no commit. So no attempt of an earlier writer can commit after that: either its mark was listed, and (5) finds
+a new fence; or the mark came later, and (3) finds another lease.
 """
 
 import secrets
@@ -36,53 +36,53 @@ from levelproof.pipeline.store.objects import Version, get, put, put_if, remove
 from levelproof.pipeline.store.remote import at_once, fragments_in, is_remote
 from levelproof.pipeline.store.scratch import scratch
 
-OVER = b"over"  # in the mark of an attempt that was committed, and is no more: others have its levels
+OVER = b"over"  # content of the mark of data that was committed and then superseded
 
 
 @contextmanager
 def publishing(split: Path, replaced: Collection[Path] = ()) -> Iterator[Path]:
-    """A folder for one attempt, which is carried over when this block ends well.
+    """Yield a folder for one attempt, and upload it when the block ends without an exception.
 
-    Another attempt at the unit may be committed first: if it has the same levels, this one goes. But where fragments
-    are to be `replaced`, the new one may take the place of one of them, and of no other.
+    If another attempt at the unit was committed first and has all of its levels, this one is dropped. With `replaced`,
+    the new fragment may overwrite one of these fragments, and no other.
 
     Raises:
         LeaseLost: another writer has the split now; nothing is committed.
         Failure: another attempt was committed first, without some of the levels.
-        UserError, StoreFailure: the store refuses.
+        UserError, StoreFailure: the store's request fails.
     """
     with scratch() as folder:
         yield folder
-        _carry_over(folder, split, replaced)
+        _upload(folder, split, replaced)
 
 
-def _carry_over(folder: Path, split: Path, replaced: Collection[Path]) -> None:
+def _upload(folder: Path, split: Path, replaced: Collection[Path]) -> None:
     (fragment,) = fragment_paths(folder)
     theirs = split / fragment.relative_to(folder)
     data = [split / path.relative_to(folder) for path in data_paths(folder)]
     marks = list(dict.fromkeys(map(begun_path, data))) or [new_attempt(split, fragment.stem).begun]
     for mark in marks:
         put(mark, b"")
-    there = _at(theirs)
-    if not there.ids or theirs in replaced:
+    committed = _at(theirs)
+    if not committed.ids or theirs in replaced:
         require_served(split)
         files = [path for path in folder.rglob("*/*") if path.is_file() and path != fragment]
         at_once(split, put, [split / path.relative_to(folder) for path in files], files)
-        if put_if(theirs, fragment.read_bytes(), there.version):
+        if put_if(theirs, fragment.read_bytes(), committed.version):
             remove(marks)
             return
-        there = _at(theirs)
+        committed = _at(theirs)
     for path in data:
         remove_data(path)
     remove(marks)
-    if not there.ids or replaced:
+    if not committed.ids or replaced:
         raise LeaseLost(split)
-    if not _ids(fragment.read_bytes()) <= there.ids:
-        raise Failure(f"Another attempt was committed meanwhile as {theirs}, without some of the levels of this one.")
+    if not _ids(fragment.read_bytes()) <= committed.ids:
+        raise Failure(f"Another attempt was committed first as {theirs}, without some of the levels of this one.")
 
 
 def committed_levels(split: Path, unit: str) -> frozenset[int]:
-    """Levels that the fragment of a unit has by now, of an attempt of which nobody has heard.
+    """Return the levels of a unit's fragment, which an attempt may have committed without reporting it.
 
     Raises:
         Failure: it is damaged.
@@ -97,39 +97,39 @@ def committed_levels(split: Path, unit: str) -> frozenset[int]:
 
 
 def ended(split: Path, marks: Iterable[Path], committed: Collection[Path]) -> set[Path]:
-    """The marks of attempts that are not committed any more, whatever they do; `committed` are fragments that count.
+    """Return the marks of attempts that can no longer commit; `committed` are fragments that count.
 
     Raises:
-        UserError, StoreFailure: the store refuses.
+        UserError, StoreFailure: the store's request fails.
     """
     about = fragments_in(split / MANIFEST)
     over, by_fragment = {mark for mark in marks if mark in about and about[mark].size}, dict[Path, set[Path]]()
     for mark in set(marks) - over:
         by_fragment.setdefault(fragment_path(split, attempt_of(mark).rpartition("-")[0]), set()).add(mark)
     barred = at_once(split, lambda fragment: fragment in committed or _barred(fragment), by_fragment)
-    return over.union(*(of for of, bar in zip(by_fragment.values(), barred, strict=True) if bar))
+    return over.union(*(group for group, bar in zip(by_fragment.values(), barred, strict=True) if bar))
 
 
 def _barred(fragment: Path) -> bool:
-    """Whether a fence could be put; it cannot where somebody else was first."""
-    there = _at(fragment)
-    return not there.ids and put_if(fragment, _fence(), there.version) is not None
+    """Write a fence unless the unit is committed; return whether that succeeded before any other write."""
+    committed = _at(fragment)
+    return not committed.ids and put_if(fragment, _fence(), committed.version) is not None
 
 
-class _There(NamedTuple):
-    """What is at a fragment's place."""
+class _Committed(NamedTuple):
+    """Content of a fragment's path."""
 
-    ids: frozenset[int]  # of a fence or of nothing: none
+    ids: frozenset[int]  # empty for a fence or a missing file
     version: Version | None
 
 
-def _at(fragment: Path) -> _There:
+def _at(fragment: Path) -> _Committed:
     try:
         found = get(fragment)
     except FileNotFoundError:
-        return _There(frozenset(), None)
+        return _Committed(frozenset(), None)
     try:
-        return _There(_ids(found.data), found.version)
+        return _Committed(_ids(found.data), found.version)
     except DAMAGE:
         raise Failure(f"The fragment {fragment} is damaged: remove it, and run the same command again.") from None
 
@@ -139,10 +139,10 @@ def _ids(data: bytes) -> frozenset[int]:
 
 
 def _fence() -> bytes:
-    """A fragment without rows, other bytes each time."""
-    nobody = {"fence": secrets.token_hex(8)}
+    """Return a fragment without rows, with different bytes each time."""
+    settings = {"fence": secrets.token_hex(8)}
     with scratch() as folder:
         attempt = new_attempt(folder, unit_name(0, 0))
         begin_fragment(attempt)
-        write_fragment(attempt, [], hash_of(nobody), nobody)
+        write_fragment(attempt, [], hash_of(settings), settings)
         return attempt.fragment.read_bytes()

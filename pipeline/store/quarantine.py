@@ -1,4 +1,4 @@
-"""Why units were given up: a note for each, which goes when all of its levels are committed, by whatever units."""
+"""Notes that say why units were given up; each is removed once all of its levels are committed, by whatever units."""
 
 import os
 import re
@@ -28,10 +28,10 @@ def give_up(split: Path, level_ids: Sequence[int], reason: str) -> None:
 
 
 def given_up(split: Path, done: np.ndarray) -> dict[Path, list[tuple[int, int]]]:
-    """Notes with their levels that are not among `done` (ascending ids), as runs; none of what is done.
+    """Return the notes with levels that are not among `done` (ascending ids), with these levels as runs.
 
     Raises:
-        UserError, StoreFailure: the store refuses.
+        UserError, StoreFailure: the store's request fails.
     """
     return {note: left for note, left in _left(split, done).items() if left}
 
@@ -44,20 +44,20 @@ def drop_notes(split: Path, done: np.ndarray) -> None:
 
 
 def _left(split: Path, done: np.ndarray) -> dict[Path, list[tuple[int, int]]]:
-    """Levels of every note that are not done."""
+    """Return every note's levels that are not done, as runs."""
     notes = sorted(entries(split, QUARANTINE, NOTE, os.DirEntry.is_file))
     return dict(zip(notes, at_once(split, lambda note: _left_of(note, done), notes), strict=True))
 
 
 def _left_of(note: Path, done: np.ndarray) -> list[tuple[int, int]]:
-    """Levels of a note that are not done. It is read only where its name leaves that open."""
+    """Return a note's levels that are not done, as runs; the note is read only if its name does not decide."""
     by_name = [ids_of(note)]
     left = without(by_name, done)
     return without(_levels_in(note) or by_name, done) if left and left != by_name else left
 
 
 def _levels_in(note: Path) -> list[tuple[int, int]]:
-    """Runs of level ids in the first line of a note; none in one of an earlier version, or if it cannot be read."""
+    """Read the runs of level ids in a note's first line; none from an earlier version, or if it cannot be read."""
     try:
         if is_remote(note):
             data, _ = objects.begin_of(note, MAX_LINE)
@@ -67,5 +67,5 @@ def _levels_in(note: Path) -> list[tuple[int, int]]:
     except (OSError, LevelproofError):
         return []
     found = LEVELS.match(data.decode(errors="replace"))
-    pairs = [of.split("-") for of in found[1].split(", ")] if found else []
+    pairs = [run.split("-") for run in found[1].split(", ")] if found else []
     return [(int(first), int(last)) for first, last in pairs]

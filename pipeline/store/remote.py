@@ -1,6 +1,6 @@
 """Splits in object stores and on web servers, read in pieces through a cache on this machine.
 
-Whoever reads a split has a Path, which may stand for a URL, and only this knows where it lies.
+Readers of a split have a Path, which may stand for a URL; only this module knows where the split lies.
 """
 
 import os
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for servers that do not list
 MAX_INDEX = 2**25  # bytes of it; a name takes 34
-PIECE = 2**20  # bytes; of 4 MB, random trajectories of 10 kB would fetch four times as much
-MAX_PIECES = 8  # of one request: neighbours are fetched together
-REQUESTS = 16  # at once
-MAX_WHOLE = 2**29  # bytes of a file that is read as a whole: fragments
+PIECE = 2**20  # bytes; with 4 MB, random reads of 10 kB trajectories would fetch four times as much
+MAX_PIECES = 8  # adjacent pieces that one request fetches
+REQUESTS = 16  # concurrent
+MAX_WHOLE = 2**29  # bytes of a file that is read as a whole, such as a fragment
 CACHE_GB = "LEVELPROOF_CACHE_GB"
 RETRIES: dict[str, Any] = {
     "max_retries": 8,  # of a request that is throttled, refused, cut off or not answered; with jitter
@@ -44,21 +44,21 @@ SIGN_IN = {
     "az:": "set AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
     "hf:": "set HF_TOKEN, or run `hf auth login`",
 }
-# In what obstore says of a request that failed:
+# Patterns in obstore's messages about failed requests:
 STATUS = re.compile(r"status code: (\d{3}[A-Za-z ]*)")
 PASSING = re.compile(r"status code: (408|409|429|50[02-4])")
 NO_BUCKET = "NoSuchBucket"
-CUT_OFF, SILENT = "response body error", "HTTP error"  # of an answer that ends early, and where there is none
-CLOUD = re.compile(r"latest/api/token|computeMetadata")  # where a cloud's machines get credentials
+CUT_OFF, SILENT = "response body error", "HTTP error"  # a response ends early; there is none
+CLOUD = re.compile(r"latest/api/token|computeMetadata")  # endpoints where a cloud's machines get credentials
 COPY = {"s3:": "aws s3 sync", "gs:": "gcloud storage rsync -r", "az:": "azcopy sync", "hf:": "hf download"}
 
 T = TypeVar("T")
 
 
 class Stored(NamedTuple):
-    """What a store says of a file."""
+    """A store's metadata of a file."""
 
-    tag: str  # another one for other bytes
+    tag: str  # differs if the bytes differ
     size: int  # bytes
 
 
@@ -72,33 +72,33 @@ def is_listed(split: Path) -> bool:
 
 
 def as_typed(path: Path) -> str:
-    """A path as its user knows it."""
+    """Return a path or URL as the user typed it."""
     return "//".join([path.parts[0], "/".join(path.parts[1:])]) if is_remote(path) else str(path)
 
 
 def absolute(path: Path) -> Path:
-    """A path as processes in other folders know it; of a URL, itself."""
+    """Return a path that is valid in any working directory; URLs are unchanged."""
     return path if is_remote(path) else path.expanduser().absolute()
 
 
 def require_folder(split: Path, what: str) -> None:
-    """For what cannot be done from afar.
+    """Refuse a remote split; `what` names the action that needs a folder.
 
     Raises:
         UserError: the split is not on this machine.
     """
     if is_remote(split):
         how = COPY.get(split.parts[0], "wget -r")
-        raise UserError(f"To {what}, {as_typed(split)} has to be a folder on this machine: copy it with `{how}` first.")
+        raise UserError(f"To {what}, {as_typed(split)} must be a folder on this machine: copy it with `{how}` first.")
 
 
 def mended(path: Path, here: str) -> str:
-    """What to do about a damaged file: other things than `here` where it is not on this machine."""
+    """Say what to do about a damaged file: `here` for local files."""
     return "open the split again, and if that does not help upload it again." if is_remote(path) else here
 
 
 def at_once(path: Path, work: Callable[..., T], *items: Iterable[Any]) -> list[T]:
-    """`map`; in threads where the path is remote, so that requests do not wait for each other."""
+    """Map `work` over items; if the path is remote, in threads, so that requests overlap."""
     if not is_remote(path):
         return list(map(work, *items))
     with ThreadPoolExecutor(REQUESTS) as threads:
@@ -106,7 +106,7 @@ def at_once(path: Path, work: Callable[..., T], *items: Iterable[Any]) -> list[T
 
 
 def stored_in(folder: Path) -> dict[Path, Stored]:
-    """All files below a folder of a split, as the store has them now.
+    """List all files below a folder of a split, as the store has them now.
 
     Raises:
         UserError: there is no such bucket, or it may not be read.
@@ -127,19 +127,20 @@ def stored_in(folder: Path) -> dict[Path, Stored]:
 
 
 def names_in(folder: Path) -> list[Path]:
-    """Files and folders in a folder, as the store has them now. Raises as `stored_in`."""
+    """List the files and folders in a folder, as the store has them now. Raises as `stored_in`."""
     store, key = place(folder)
     found = ask(folder, lambda: obstore_module().list_with_delimiter(store, prefix=key))
     return [
-        folder / name[len(key) + 1 :] for name in [*found["common_prefixes"], *(of["path"] for of in found["objects"])]
+        folder / name[len(key) + 1 :]
+        for name in [*found["common_prefixes"], *(file["path"] for file in found["objects"])]
     ]
 
 
 def fragments_in(folder: Path) -> dict[Path, Stored]:
-    """What may be a fragment in the manifest's folder; what was known of the split's other files is forgotten.
+    """List the manifest's folder, and forget the known metadata of the split's other files.
 
     Raises:
-        UserError, StoreFailure: as `stored_in`; or there is no index on a web server.
+        UserError, StoreFailure: as `stored_in`; or a web server has no index.
     """
     for known in list(_known):
         if folder.parent in known.parents:
@@ -152,33 +153,33 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
         text = ask(folder / INDEX, lambda: data_of(obstore_module().get(store, key), MAX_INDEX))
     except FileNotFoundError:
         raise UserError(
-            f"There is no split at {as_typed(folder.parent)}, or its server was not told what it has: a split on a web "
+            f"There is no split at {as_typed(folder.parent)}, or it has no index: a split on a web "
             f"server needs {folder.name}/{INDEX}, which `levelproof seal` writes."
         ) from None
     return {folder / name: Stored("", 0) for name in text.decode(errors="replace").split() if "/" not in name}
 
 
 def bytes_of(path: Path, most: int = MAX_WHOLE) -> bytes:
-    """A whole file of at most so many bytes.
+    """Read a whole file of at most `most` bytes.
 
     Raises:
-        OSError: it is not there, or larger.
+        OSError: it does not exist, or is larger.
         UserError, StoreFailure: as `stored_in`.
     """
     file = RemoteFile(path)
     if file.size > most:
-        raise OSError(f"{as_typed(path)} is larger than it can be")
+        raise OSError(f"{as_typed(path)} is larger than {most} bytes")
     return b"".join(file.read([(0, file.size)]))
 
 
 class RemoteFile:
-    """One file, open for reading."""
+    """One remote file, open for reading."""
 
     def __init__(self, path: Path) -> None:
-        """Ask what is stored under this name, if it is not known yet.
+        """Look up the file's metadata, if it is not known yet.
 
         Raises:
-            FileNotFoundError: nothing.
+            FileNotFoundError: there is no such file.
             UserError, StoreFailure: as `stored_in`.
         """
         self.path, self._about = path, _look_up(path)
@@ -186,29 +187,29 @@ class RemoteFile:
         names = f"{as_typed(path)}\n{self._about.tag}\n{self.size}\n{PIECE}"
         self._name, self._cache = sha256(names.encode()).hexdigest()[:32], _cache()
 
-    def read(self, places: Sequence[tuple[int, int]]) -> Iterator[bytes]:
-        """The bytes at these places, first byte and number of bytes, in turn; requests for what is missing go first.
+    def read(self, spans: Sequence[tuple[int, int]]) -> Iterator[bytes]:
+        """Fetch missing pieces, then yield the bytes of each span (first byte, number of bytes).
 
         Raises:
             OSError: the file has changed.
-            UserError, StoreFailure: as `stored_in`; or the cache's folder cannot be written.
+            UserError, StoreFailure: as `stored_in`; or the cache folder cannot be written.
         """
-        wanted = {n for first, length in places for n in range(first // PIECE, -(-(first + length) // PIECE))}
+        wanted = {n for first, length in spans for n in range(first // PIECE, -(-(first + length) // PIECE))}
         missing = [n for n in sorted(wanted) if not self._cache.has(self._piece(n))]
         if missing:
             at_once(self.path, self._keep, _runs(missing))
-        for first, length in places:
+        for first, length in spans:
             pieces = range(first // PIECE, -(-(first + length) // PIECE))
             yield b"".join(self._part(n, max(first - n * PIECE, 0), first + length - n * PIECE) for n in pieces)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resource is held."""
 
     def _piece(self, n: int) -> str:
         return f"{self._name}-{n}"
 
     def _part(self, n: int, first: int, last: int) -> bytes:
-        """Of a piece; fetched again where others needed its place in the cache."""
+        """Return bytes of a piece, fetched again if the cache has dropped it."""
         part = self._cache.read(self._piece(n), first, min(last, PIECE))
         return self._fetch([n])[first:last] if part is None else part
 
@@ -216,10 +217,10 @@ class RemoteFile:
         self._fetch(run)
 
     def _fetch(self, run: Sequence[int]) -> bytes:
-        """Pieces that are neighbours, in one request."""
+        """Fetch adjacent pieces in one request, and cache them."""
         store, key = place(self.path)
         first, last = run[0] * PIECE, min((run[-1] + 1) * PIECE, self.size)
-        whole = (first, last) == (0, self.size)  # which servers that know no ranges give, too
+        whole = (first, last) == (0, self.size)  # also served without support for ranges
         options = {} if whole else {"range": (first, last)}
 
         def request() -> tuple[Any, bytes]:
@@ -227,7 +228,7 @@ class RemoteFile:
             return answer.meta, data_of(answer, last - first)
 
         about, data = ask(self.path, request)
-        tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's servers have others
+        tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # its file servers use other tags
         if (tag, about["size"], len(data)) != (*self._about, last - first):
             _known.pop(_folder_of(self.path), None)
             raise OSError(f"{as_typed(self.path)} has changed")
@@ -236,11 +237,11 @@ class RemoteFile:
         return data
 
 
-_known: dict[Path, dict[Path, Stored]] = {}  # by folder: of files that were looked up or listed
+_known: dict[Path, dict[Path, Stored]] = {}  # by folder: metadata of looked-up or listed files
 
 
 def _folder_of(path: Path) -> Path:
-    """What is listed to learn of a file: its shard, or the folder it is in."""
+    """Return the folder to list for a file's metadata: its shard, or its parent."""
     return next((folder for folder in path.parents if folder.suffix == ".zarr"), path.parent)
 
 
@@ -259,12 +260,12 @@ def _look_up(path: Path) -> Stored:
 
 
 def _tag(about: Any) -> str:
-    """Stores agree on a file's entity tag, but not on what is around it; servers without tags have a time."""
+    """Return a file's entity tag without its decoration, which differs by store; without a tag, its time."""
     return (about["e_tag"] or about["last_modified"].isoformat()).removeprefix("W/").strip('"')
 
 
 def _runs(numbers: Iterable[int]) -> list[list[int]]:
-    """Ascending numbers, cut where they are no neighbours, and where there are too many."""
+    """Group ascending piece numbers into runs of at most MAX_PIECES adjacent ones."""
     runs: list[list[int]] = []
     for n in numbers:
         if runs and runs[-1][-1] == n - 1 and len(runs[-1]) < MAX_PIECES:
@@ -275,7 +276,7 @@ def _runs(numbers: Iterable[int]) -> list[list[int]]:
 
 
 def place(path: Path) -> tuple["ObjectStore", str]:
-    """The store that a path is in, and its key there."""
+    """Return the store that a path is in, and its key there."""
     _require_own_process()
     if path.parts[0] in HUB:
         repository, key = hub.split_url(path.parts[1:])
@@ -300,14 +301,14 @@ def obstore_module() -> Any:
         import obstore.store
     except ImportError:
         raise UserError(
-            "Splits that are not on this machine are read with obstore: pip install 'levelproof[remote]'."
+            "Reading splits that are not on this machine needs obstore: pip install 'levelproof[remote]'."
         ) from None
     return obstore
 
 
 @lru_cache(maxsize=1)
 def _first_process() -> int:
-    """The one that uses stores, whose threads a forked process does not have."""
+    """Return the PID of the first process to use stores; forked processes lack its threads."""
     return os.getpid()
 
 
@@ -322,7 +323,7 @@ def _require_own_process() -> None:
 def _cache() -> PieceCache:
     most = os.environ.get(CACHE_GB, "10")
     if not re.fullmatch(r"\d+(\.\d+)?", most):
-        raise UserError(f"{CACHE_GB} is {most!r}: give the gigabytes to keep of splits that are read from elsewhere.")
+        raise UserError(f"{CACHE_GB} is {most!r}: give the size of the cache for remote splits in gigabytes.")
     return _cache_in(cache_folder() / "remote", int(float(most) * 1e9))
 
 
@@ -332,7 +333,7 @@ def _cache_in(folder: Path, most: int) -> PieceCache:
 
 
 def data_of(answer: Any, most: float) -> bytes:
-    """The bytes of an answer; of one that is longer than it should be, one more than so many, or a few."""
+    """Read the bytes of a response, stopping soon after `most` bytes: more bytes than that mean that it is too long."""
     found = bytearray()
     for part in answer.stream(min_chunk_size=PIECE):
         found += part
@@ -342,12 +343,13 @@ def data_of(answer: Any, most: float) -> bytes:
 
 
 def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:
-    """What a request gives. It may be made again: where an answer was cut off, which obstore itself seldom does, or
-    did not come to a request that obstore does not know to be harmless twice.
+    """Make a request, and retry it if the response is cut off or missing, in cases that obstore does not retry.
+
+    obstore seldom retries cut-off responses, and never requests that it does not know to be idempotent.
 
     Raises:
         FileNotFoundError: the store has no such file.
-        UserError: it has no such bucket, or does not let us `what`.
+        UserError: it has no such bucket, or does not allow us to `what`.
         StoreFailure: it does not answer.
     """
     exceptions, end = obstore_module().exceptions, time.monotonic() + RETRIES["retry_timeout"].total_seconds()
@@ -368,17 +370,17 @@ def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:
 
 
 def _explained(path: Path, text: str, what: str) -> LevelproofError:
-    """A sentence for what obstore says of a request that failed."""
+    """Turn obstore's message about a failed request into a sentence."""
     url, how = as_typed(path), SIGN_IN.get(path.parts[0], "copy the split to a folder first")
     if NO_BUCKET in text:
         return UserError(f"There is no bucket {path.parts[1]!r}: check {url}.")
     if CLOUD.search(text):
-        return UserError(f"There are no credentials to {what} {url} with: {how}.")
+        return UserError(f"There are no credentials to {what} {url}: {how}.")
     if "Range request not supported" in text:
-        return StoreFailure(f"The server of {url} gives no parts of files: copy the split to a folder first.")
+        return StoreFailure(f"The server of {url} does not support range requests: copy the split to a folder first.")
     found = STATUS.search(text)
-    said = found[1].strip() if found else "it does not answer" if SILENT in text else text.splitlines()[0]
-    if said.startswith(("401", "403")):
-        return UserError(f"The store does not let you {what} {url} ({said}): {how}.")
+    reason = found[1].strip() if found else "it does not answer" if SILENT in text else text.splitlines()[0]
+    if reason.startswith(("401", "403")):
+        return UserError(f"The store does not let you {what} {url} ({reason}): {how}.")
     then = "run the same command again; what is committed stays" if what == "write" else "try again"
-    return StoreFailure(f"Cannot {what} {url} ({said}): check the network and the URL, and {then}.")
+    return StoreFailure(f"Cannot {what} {url} ({reason}): check the network and the URL, and {then}.")

@@ -1,21 +1,21 @@
-"""Runs of consecutive level ids: what a job wants in a line, however many levels that are."""
+"""Runs of consecutive level ids, which describe any number of levels in one line."""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-TOLD = 4  # runs of levels in a message
+MAX_SHOWN = 4  # runs of levels in a message
 
 
 def ascending(numbers: np.ndarray) -> np.ndarray:
-    """Sorted, each once. `np.unique` hashes whole numbers, which of millions takes twenty times as long."""
+    """Sort numbers and drop duplicates. `np.unique` hashes integers, which for millions takes twenty times as long."""
     ordered = np.sort(numbers)
     return ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
 
 
 def runs(numbers: Sequence[int] | np.ndarray) -> list[tuple[int, int]]:
-    """First and last of each run of consecutive numbers, ascending."""
-    if isinstance(numbers, range) and numbers.step == 1:  # of any length, in no memory
+    """Return first and last of each run of consecutive numbers, ascending."""
+    if isinstance(numbers, range) and numbers.step == 1:  # needs no memory, whatever its length
         return [(numbers[0], numbers[-1])] if numbers else []
     ordered = ascending(np.asarray(numbers, np.int64))
     ends = np.flatnonzero(np.diff(ordered) != 1)
@@ -32,20 +32,20 @@ def inside(level_ids: np.ndarray, runs: np.ndarray) -> np.ndarray:
 
 
 def without(runs: Iterable[Sequence[int]], level_ids: np.ndarray) -> list[tuple[int, int]]:
-    """What of the runs is left when these ids (ascending) are taken out."""
+    """Remove ids (ascending) from runs; return the remaining runs."""
     left = []
     for first, last in runs:
-        there = level_ids[np.searchsorted(level_ids, first) : np.searchsorted(level_ids, last, "right")]
-        starts, ends = np.r_[first, there + 1], np.r_[there - 1, last]
+        removed = level_ids[np.searchsorted(level_ids, first) : np.searchsorted(level_ids, last, "right")]
+        starts, ends = np.r_[first, removed + 1], np.r_[removed - 1, last]
         some = starts <= ends
         left += zip(starts[some].tolist(), ends[some].tolist(), strict=True)
     return left
 
 
-def merged(*of: Iterable[Sequence[int]]) -> list[tuple[int, int]]:
-    """Runs of all the numbers in these runs, ascending."""
+def merged(*lists: Iterable[Sequence[int]]) -> list[tuple[int, int]]:
+    """Merge lists of runs into ascending, disjoint runs."""
     together: list[tuple[int, int]] = []
-    for first, last in sorted((first, last) for runs in of for first, last in runs):
+    for first, last in sorted((first, last) for runs in lists for first, last in runs):
         if together and first <= together[-1][1] + 1:
             together[-1] = together[-1][0], max(together[-1][1], last)
         else:
@@ -54,7 +54,7 @@ def merged(*of: Iterable[Sequence[int]]) -> list[tuple[int, int]]:
 
 
 def told_levels(runs: Sequence[Sequence[int]]) -> str:
-    """For people: `levels 0 to 31, 96 to 127`."""
-    of = [f"{first} to {last}" if last > first else f"{first}" for first, last in runs]
-    more = f" and {len(of) - TOLD} more runs of levels" if len(of) > TOLD else ""
-    return f"level{'s' if len(of) != 1 or runs[0][0] != runs[0][1] else ''} {', '.join(of[:TOLD])}{more}"
+    """Describe runs for a message: `levels 0 to 31, 96 to 127`."""
+    parts = [f"{first} to {last}" if last > first else f"{first}" for first, last in runs]
+    more = f" and {len(parts) - MAX_SHOWN} more runs of levels" if len(parts) > MAX_SHOWN else ""
+    return f"level{'s' if len(parts) != 1 or runs[0][0] != runs[0][1] else ''} {', '.join(parts[:MAX_SHOWN])}{more}"

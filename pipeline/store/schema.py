@@ -1,5 +1,6 @@
-"""What is written beside the manifest's columns: a fragment's metadata, how a shard stores records and where its fields
-lie. A shard of another version is refused with a sentence, never guessed at.
+"""Formats beside the manifest's columns: a fragment's metadata, a shard's encoding of records and its field table.
+
+Readers refuse a shard of another version instead of guessing.
 """
 
 import math
@@ -20,19 +21,19 @@ SHARD_VERSION = 2
 VERSION_KEY = b"levelproof.manifest_version"
 HASH_KEY = b"levelproof.config_hash"
 CONFIG_KEY = b"levelproof.config"  # the settings that decide results, as JSON
-DENSITIES_KEY = b"levelproof.densities"  # how its shards were to be stored, as JSON; see `configs.schema.stored_as`
+DENSITIES_KEY = b"levelproof.densities"  # requested for its shards, as JSON; see `configs.schema.stored_as`
 DIGESTS_KEY = b"levelproof.sha256"  # of the files of each shard and checkpoint that its rows name, as JSON
-SEALED_KEY = b"levelproof.sealed"  # there: fragments of several units were merged into this one
+SEALED_KEY = b"levelproof.sealed"  # present if several units' fragments were merged into this one
 
-# Packed arrays of a shard; the number is the bits of a component. What changes along time: (level, component, 256).
+# Packed arrays of a shard, with the bits of a component. What changes along time: (level, component, 256).
 PACKED = {"dyn32": 32, "dyn8": 8, "act": 8, "lvl32": 32, "lvl8": 8, "witness": 8}
 ALONG_TIME = ("dyn32", "dyn8", "act")
-FLAT = "witness"  # the bytes of everything, field after field: one small chunk a level where little is kept
-WIDE = "record/timestep"  # the integers that do not fit 8 bits; others count, index or enumerate things of one level
+FLAT = "witness"  # all fields as bytes, one after another: one small chunk per level for densities that keep little
+WIDE = "record/timestep"  # integers that do not fit 8 bits; others count, index or enumerate entities of one level
 
 
 class ContentsError(ValueError):
-    """A shard does not hold what it should; the message is the end of a sentence."""
+    """A shard's contents are invalid; the message is the end of a sentence."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,8 @@ class Encoding:
     """How a shard stores records."""
 
     density: Density = "full"
-    key_every: int = KEY_EVERY  # env steps of an episode between key frames; of `witness` alone
-    rules: TaskParams = DEFAULT_RULES  # by which what is not stored is computed again
+    key_every: int = KEY_EVERY  # env steps of an episode between key frames; `witness` only
+    rules: TaskParams = DEFAULT_RULES  # with which missing fields are recomputed
 
     def as_json(self) -> dict[str, Any]:
         keys = {"key_every": self.key_every} if self.density == "witness" else {}
@@ -49,18 +50,18 @@ class Encoding:
 
     @staticmethod
     def of(attributes: Mapping[str, Any]) -> "Encoding":
-        """What a shard's attributes say.
+        """Parse a shard's attributes.
 
         Raises:
-            ContentsError: nothing that this program writes.
+            ContentsError: this program never writes such attributes.
         """
         try:
             density, key_every = attributes["density"], attributes.get("key_every", KEY_EVERY)
             encoding = Encoding(density, key_every, typed(TaskParams, attributes["task"]))
         except (KeyError, TypeError, ConfigError) as error:
-            raise ContentsError("it does not say how records are stored") from error
+            raise ContentsError("its attributes do not say how records are stored") from error
         if density not in get_args(Density) or type(key_every) is not int or key_every not in KEYS_EVERY:
-            raise ContentsError("it does not say how records are stored")
+            raise ContentsError("its attributes do not say how records are stored")
         if density != "full" and encoding.rules.frame_skip > MAX_FRAME_SKIP:
             raise ContentsError(f"its env steps have more than {MAX_FRAME_SKIP} physics steps")
         return encoding
@@ -99,15 +100,15 @@ class FieldSpec:
 
 
 def bits_for(name: str, dtype: np.dtype) -> int:
-    """Bits that each number of a field is stored with."""
+    """Return the bits with which each number of a field is stored."""
     bits = 8 if dtype.kind in "bi" and name != WIDE else 32
     if bits == 32 and dtype.itemsize != 4:
-        raise TypeError(f"{name} is {dtype}: fields are of 32 bits, or bool")
+        raise TypeError(f"{name} is {dtype}: fields must be 32-bit or bool")
     return bits
 
 
 def array_for(name: str, bits: int, density: Density) -> str:
-    """Which packed array holds a field."""
+    """Return the packed array that holds a field."""
     if density == "witness":
         return FLAT
     if name == "record/action":
@@ -116,9 +117,9 @@ def array_for(name: str, bits: int, density: Density) -> str:
 
 
 def field_table(arrays: Mapping[str, np.ndarray], density: Density = "full") -> list[FieldSpec]:
-    """Where all fields lie, in the order of `arrays` (level axis last; time first but for `level/` fields).
+    """Lay out all fields, in the order of `arrays` (level axis last; time first except in `level/` fields).
 
-    In FLAT, wide numbers come first.
+    In FLAT, wide numbers come first, which aligns them.
     """
     used, table = dict.fromkeys(PACKED, 0), []
     bits = {name: bits_for(name, values.dtype) for name, values in arrays.items()}

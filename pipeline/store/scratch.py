@@ -1,8 +1,7 @@
-"""Temporary folders that no process leaves behind: each is locked while its process lives, and who needs one later
-removes those whose lock is free.
+"""Temporary folders, each locked by its process; later processes remove unlocked ones, which killed processes left.
 
-A folder has a lock file, which names its machine, and `files` for its maker. Only folders of this user and this machine
-are removed: on a file system that machines share, locks may hold on one machine alone.
+A folder has a lock file, which names its machine, and `files` for its owner. Only folders of this user and this machine
+are removed: on a shared file system, locks may be valid on one machine alone.
 """
 
 import fcntl
@@ -25,16 +24,16 @@ MAX_ABOUT = 2**12  # bytes of a lock file
 
 @contextmanager
 def scratch(parent: Path | None = None, prefix: str = PREFIX) -> Iterator[Path]:
-    """Give an empty folder that lasts for the block.
+    """Yield an empty folder that exists for the block.
 
-    The first call of a process removes what killed ones have left under this prefix.
+    The first call of a process removes what killed processes left under this prefix.
 
     Args:
         parent: of the folder (default: the system's folder for temporary files).
-        prefix: begins the folder's name; no other files have it.
+        prefix: of the folder's name; no other files may have it.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the write fails.
     """
     parent = parent or Path(gettempdir())
     _sweep_once(parent, prefix)
@@ -47,13 +46,13 @@ def scratch(parent: Path | None = None, prefix: str = PREFIX) -> Iterator[Path]:
 
 
 def _made(parent: Path, prefix: str) -> tuple[Path, int]:
-    """Make a folder; return it with the descriptor that holds its lock. One that others sweep before is given up."""
+    """Make a folder; return it with the descriptor that holds its lock. Retries if another process sweeps it first."""
     while True:
         folder = Path(mkdtemp(prefix=prefix, dir=parent))
         with suppress(FileNotFoundError):  # it was swept
             lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
             try:
-                with suppress(OSError):  # without locks no process can sweep it, either
+                with suppress(OSError):  # without locks, no process can sweep it either
                     fcntl.flock(lock, fcntl.LOCK_EX)
                 os.write(lock, json.dumps(_machine()).encode())
                 if _is_at(lock, folder / LOCK):
@@ -68,28 +67,28 @@ def _made(parent: Path, prefix: str) -> tuple[Path, int]:
 
 @cache
 def _sweep_once(parent: Path, prefix: str) -> None:
-    with suppress(OSError), os.scandir(parent) as found:  # a folder that cannot be listed keeps what is in it
+    with suppress(OSError), os.scandir(parent) as found:  # a folder that cannot be listed is not swept
         for entry in found:
             if entry.name.startswith(prefix) and entry.is_dir(follow_symlinks=False):
-                with suppress(OSError):  # others sweep, too
+                with suppress(OSError):  # other processes sweep, too
                     _sweep(Path(entry.path))
 
 
 def _sweep(folder: Path) -> None:
-    """Remove a folder if its process is dead. Raises OSError where that cannot be, or cannot be known."""
+    """Remove a folder if its process is dead. Raises OSError if that fails or cannot be known."""
     if folder.lstat().st_uid != os.getuid():
         return
     try:
         lock = os.open(folder / LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
-        folder.rmdir()  # if it is empty; a process that has just made it makes another one
+        folder.rmdir()  # if empty; a process that has just made it retries
         return
     try:
         about = os.fstat(lock)
         if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid():
             return
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        is_empty = not (folder / FILES).exists()  # its maker died before it wrote anything
+        is_empty = not (folder / FILES).exists()  # its process died before it wrote anything
         if _is_at(lock, folder / LOCK) and (is_empty or _is_here(os.read(lock, MAX_ABOUT))):
             _remove(folder)
     finally:
@@ -97,7 +96,7 @@ def _sweep(folder: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder whose lock is held. What cannot go now keeps its lock file, so that a later sweep finds it."""
+    """Remove a folder whose lock is held. If files remain, the lock file does too, so that a later sweep finds it."""
     shutil.rmtree(folder / FILES, ignore_errors=True)
     with suppress(OSError):
         if not (folder / FILES).exists():
@@ -113,7 +112,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def _machine() -> dict[str, str]:
-    """Names of this machine: the second differs after each start, the first may be another machine's, too."""
+    """Identify this machine: host names are not unique, the boot id differs after each boot."""
     try:
         boot = BOOT_ID.read_text().strip()
     except OSError:
@@ -122,9 +121,9 @@ def _machine() -> dict[str, str]:
 
 
 def _is_here(about: bytes) -> bool:
-    """Whether a lock file is of this machine."""
+    """Whether a lock file names this machine."""
     try:
         theirs = json.loads(about)
     except ValueError:
         return False
-    return isinstance(theirs, dict) and any(of and theirs.get(name) == of for name, of in _machine().items())
+    return isinstance(theirs, dict) and any(own and theirs.get(name) == own for name, own in _machine().items())

@@ -1,7 +1,7 @@
-"""Sealing: neighbouring fragments become one, and their shards one, in the order of level ids.
+"""Sealing: merging neighbouring fragments into one, and their shards into one, ordered by level id.
 
-The new data first, then the new fragment, which counts before those that it was made of; only then do these go. A
-process that dies in between leaves what `leftovers.clean` removes. Knows nothing of who seals, and when.
+The new data is written first, then the new fragment, which takes precedence over its sources; only then are these
+removed. If the process dies in between, `leftovers.clean` removes the rest.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -48,14 +48,14 @@ from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.schema import Encoding
 from levelproof.pipeline.store.shard import Shard, damaged
 
-ROWS = 100_000  # of a sealed fragment, about; more: fewer files, and more to write again when some are added
-CROWD = 1_000  # unsealed neighbours that are merged, although they have not as many rows: small files are slow to read
+ROWS = 100_000  # of a sealed fragment, about; more: fewer files, but more to rewrite when levels are added
+CROWD = 1_000  # unsealed neighbours that are merged even if they have fewer rows: many small files are slow to read
 
 
 class Piece(NamedTuple):
-    """A fragment, as a plan knows it."""
+    """A fragment's entry in a plan."""
 
-    path: Path  # whose names sort as ids do
+    path: Path  # names sort as level ids do
     rows: int
     sealed: bool
 
@@ -65,8 +65,10 @@ class Piece(NamedTuple):
 
 
 def plan(pieces: Iterable[Piece], rows: int) -> list[list[Piece]]:
-    """What to merge into fragments of about so many rows, ascending: neighbours that are unsealed, or sealed with less
-    than half of that. The last before a larger one, or of all, may have less together.
+    """Group neighbours to merge into fragments of about `rows` rows, ascending.
+
+    Only unsealed fragments, and sealed ones with less than half of `rows`, are merged. The last group, and a group
+    before a larger sealed fragment, may have fewer rows.
     """
     groups: list[list[Piece]] = [[]]
     count = 0
@@ -82,7 +84,7 @@ def plan(pieces: Iterable[Piece], rows: int) -> list[list[Piece]]:
 
 
 def due(pieces: Iterable[Piece], rows: int) -> list[Piece] | None:
-    """What a job that is under way should merge now: neighbours with enough rows, or a crowd. None: nothing yet."""
+    """Return what a running job should merge now: neighbours with enough rows, or a crowd. None: nothing yet."""
     for group in plan(pieces, rows):
         if sum(piece.rows for piece in group) >= rows:
             return group
@@ -100,11 +102,17 @@ def seal(
     density: tuple[Density, int] | None = None,
     converted: Callable[[int], None] = lambda _: None,
 ) -> Piece:
-    """Merge these fragments, and their shards of each density. Only the writer of a split may.
+    """Merge fragments, and their shards of each density. The caller must be the split's writer.
 
-    Kept experts stay where they are, unread: their digests are carried over. `moved` and `rows_a_file` are those of
-    `merge_shards`; `moved` is called before each fragment or shard is opened and before each is removed, too. With a
-    `density` and its `key_every`, all shards get that one; `converted` is called with how many levels have.
+    Kept experts are neither read nor moved: their digests are copied.
+
+    Args:
+        split: folder or store.
+        pieces: fragments to merge.
+        moved: as in `merge_shards`; also called with 0 before each fragment or shard is opened or removed.
+        rows_a_file: as in `merge_shards`.
+        density: density and `key_every` to which all shards are converted; default: keep each one's.
+        converted: called with the number of levels just converted.
 
     Returns:
         The sealed fragment.
@@ -112,28 +120,29 @@ def seal(
     Raises:
         Failure: a fragment or a shard is damaged, or the engine cannot convert it; nothing has changed.
         LeaseLost: another writer has the split now; nothing has changed.
-        OSError: the disk refuses; nothing has changed.
+        OSError: the write fails; nothing has changed.
     """
     paths = {piece.path for piece in pieces}
     if is_remote(split):
-        fragment_paths(split)  # what was known of its files is forgotten
+        fragment_paths(split)  # drops cached metadata of its files
     parts = _read(paths, moved)
     table, about = each_once(parts)[0], parts[0][0]
-    shards = {name: data_path(split, name) for name in named_by([of for _, of in parts], "shard")}
+    shards = {name: data_path(split, name) for name in named_by([rows for _, rows in parts], "shard")}
     replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
-    digests = {name: files for of, _ in parts for name, files in of.digests.items()}
+    digests = {name: files for fragment, _ in parts for name, files in fragment.digests.items()}
     _require_committed(shards, digests)
     places, between = _places(table, shards, moved), list[Path]()
-    densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(of.densities for of, _ in parts))
+    old_densities = frozenset().union(*(fragment.densities for fragment, _ in parts))
+    densities = frozenset([stored_as(*density)]) if density else old_densities
     first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
     unit, count = unit_name(first, last), 1 if density else len(places)
-    making = publishing(split, paths) if is_remote(split) else nullcontext(split)  # where the new ones are made
+    making = publishing(split, paths) if is_remote(split) else nullcontext(split)  # where new data is written
     with making as folder, _attempted(folder, unit, max(count, 1), replaced, between) as attempts:
         if density:
             places = _converted(places, density, lambda: _another(folder, unit, between), converted)
         merged = dict(zip((attempt.shard for attempt in attempts), places.values(), strict=False))
-        for shard, of in merged.items():
-            merge_shards(shard, of, moved, rows_a_file)
+        for shard, sources in merged.items():
+            merge_shards(shard, sources, moved, rows_a_file)
         require_served(folder)
         disown(replaced)
         write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, digests)
@@ -148,7 +157,7 @@ def seal(
 
 
 def _read(paths: Iterable[Path], moved: Callable[[int], None]) -> list[tuple[Fragment, pa.Table]]:
-    """Fragments with their rows, in the order of level ids."""
+    """Read fragments with their rows, ordered by level ids."""
 
     def read(path: Path) -> tuple[Fragment, pa.Table]:
         moved(0)
@@ -159,10 +168,10 @@ def _read(paths: Iterable[Path], moved: Callable[[int], None]) -> list[tuple[Fra
 
 
 def _require_committed(shards: Mapping[str, Path], digests: Mapping[str, Mapping[str, str]]) -> None:
-    """Check the metadata of shards against their digests; chunks are checked one by one, as they are copied.
+    """Check the metadata of shards against their digests; chunks are checked as they are copied.
 
     Raises:
-        Failure: some has changed, and the digest of its copy would make that the truth.
+        Failure: metadata has changed; a merged shard would have a valid digest over the change.
     """
     for name, path in shards.items():
         try:
@@ -174,13 +183,14 @@ def _require_committed(shards: Mapping[str, Path], digests: Mapping[str, Mapping
 
 
 def _places(table: pa.Table, shards: Mapping[str, Path], moved: Callable[[int], None]) -> dict[Encoding, list[Place]]:
-    """Where the trajectories of these rows lie, by how they are stored."""
+    """Return the places of these rows' trajectories, by encoding."""
     encodings = {}
     for name, path in shards.items():
         moved(0)
         encodings[name] = Shard(path).encoding
     found: dict[Encoding, list[Place]] = {}
-    for name, row, level_id in zip(*(table.column(of).to_pylist() for of in ("shard", "row", "level_id")), strict=True):
+    columns = (table.column(column).to_pylist() for column in ("shard", "row", "level_id"))
+    for name, row, level_id in zip(*columns, strict=True):
         if name:
             found.setdefault(encodings[name], []).append(Place(shards[name], row, level_id))
     return found
@@ -190,9 +200,10 @@ def _places(table: pa.Table, shards: Mapping[str, Path], moved: Callable[[int], 
 def _attempted(
     split: Path, unit: str, count: int, replaced: Sequence[Path], between: Sequence[Path]
 ) -> Iterator[list[Attempt]]:
-    """Attempts at a sealed unit, a shard each; the fragment is that of the first. If it fails, all is as before.
+    """Yield `count` attempts at a sealed unit, one per shard; the first one's fragment commits.
 
-    Shards `between` are needed meanwhile only, and those that were `replaced` go after the commit.
+    An exception in the block leaves the split as it was. Intermediate shards `between` are removed at the end of the
+    block, the `replaced` ones after the commit.
     """
     attempts = [new_attempt(split, unit) for _ in range(count)]
     try:
@@ -219,21 +230,21 @@ def _converted(
     another: Callable[[], Path],
     converted: Callable[[int], None],
 ) -> dict[Encoding, list[Place]]:
-    """Where all of them lie when those of another density are written again, in the order of level ids."""
+    """Convert trajectories of other densities to new shards; return the places of all, ordered by level id."""
     found, wanted = [], None
-    for encoding, of in places.items():
+    for encoding, sources in places.items():
         wanted = replace(encoding, density=density[0], key_every=density[1])
         if encoding.as_json() == wanted.as_json():
-            found += of
+            found += sources
             continue
-        for some in convert(of, *density, another):
+        for some in convert(sources, *density, another):
             found += some
             converted(len(some))
     return {wanted: sorted(found, key=lambda place: place.level_id)} if wanted else {}
 
 
 def _another(split: Path, unit: str, between: list[Path]) -> Path:
-    """A shard that is needed until its trajectories are merged."""
+    """Begin an intermediate shard, needed until its trajectories are merged, and return its path."""
     attempt = new_attempt(split, unit)
     begin_fragment(attempt)
     between.append(attempt.shard)
@@ -241,11 +252,11 @@ def _another(split: Path, unit: str, between: list[Path]) -> Path:
 
 
 def _moved(table: pa.Table, merged: Mapping[Path, Sequence[Place]]) -> pa.Table:
-    """The same rows, with these shards as the places of their levels, one after another."""
+    """Replace the places in these rows by those in the merged shards."""
     now = {
-        of.level_id: (f"{SHARDS}/{shard.name}", row)
+        place.level_id: (f"{SHARDS}/{shard.name}", row)
         for shard, places in merged.items()
-        for row, of in enumerate(places)
+        for row, place in enumerate(places)
     }
     found = [now.get(level_id, (None, None)) for level_id in table.column("level_id").to_pylist()]
     return with_places(table, *zip(*found, strict=True))

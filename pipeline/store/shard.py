@@ -1,6 +1,6 @@
-"""A work unit's solved levels as one zarr v3 group of packed arrays, as docs/shards.md shows them.
+"""A work unit's solved levels as one zarr v3 group of packed arrays, as docs/shards.md shows.
 
-One trajectory is one chunk: larger chunks save under 1% and cost random reads a factor of 3.
+One trajectory is one chunk: larger chunks save under 1% and slow random reads by a factor of 3.
 """
 
 import json
@@ -40,17 +40,17 @@ from levelproof.pipeline.store.remote import at_once, is_remote, mended, stored_
 from levelproof.pipeline.store.schema import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
 
 FORMAT = "levelproof.shard"
-# What reading bytes that nobody vouches for can raise
+# What reading untrusted bytes can raise
 DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError)
-PRESSED: dict[str | None, dict[str, Any]] = {  # how arrays are compressed
-    FLAT: {"clevel": 9, "shuffle": "noshuffle"},  # a few kilobytes a level, bytes of all kinds
-    # 9 saves 2% and encodes at 3 MB/s; one block a chunk saves 1%
+COMPRESSION: dict[str | None, dict[str, Any]] = {  # by array; None: all others
+    FLAT: {"clevel": 9, "shuffle": "noshuffle"},  # a few kilobytes per level, of mixed types
+    # Level 9 would save 2% but encode at 3 MB/s; one block per chunk saves 1%
     None: {"clevel": 5, "shuffle": "shuffle", "blocksize": 2**19},
 }
 
 
 class EngineDiffers(UserWarning):
-    """The engine does not give the states that were stored, on this machine."""
+    """On this machine, the engine computes states that differ from the stored ones."""
 
 
 def write_shard(
@@ -59,13 +59,13 @@ def write_shard(
     """Write `arrays` (every field, level axis last, see `pipeline.store.schema`) to a new group at `path`, durably.
 
     Raises:
-        FileExistsError: `path` is there already.
-        Failure: the engine does not give back what this density would leave out.
-        OSError: the disk refuses.
+        FileExistsError: `path` exists.
+        Failure: the engine cannot recompute what this density leaves out.
+        OSError: the write fails.
     """
     stored = kept(arrays, encoding)
     if len(stored) < len(arrays):
-        _require_given_back(level_ids, arrays, stored, encoding)
+        _require_restorable(level_ids, arrays, stored, encoding)
     table = field_table(stored, encoding.density)
     path.mkdir(parents=True)
     attributes = {
@@ -75,12 +75,12 @@ def write_shard(
         **encoding.as_json(),
         "fields": [field.as_json() for field in table],
     }
-    with zarr.config.set({"json_indent": None}):  # of a small shard, half would be blanks
+    with zarr.config.set({"json_indent": None}):  # half of a small shard would be blanks
         group = zarr.create_group(path, attributes=attributes)
         for name, values in pack(stored, table).items():
             if name == FLAT:
                 values ^= blank_row(size_of_levels(stored), encoding)
-            blosc = BloscCodec(cname="zstd", typesize=values.dtype.itemsize, **PRESSED.get(name, PRESSED[None]))
+            blosc = BloscCodec(cname="zstd", typesize=values.dtype.itemsize, **COMPRESSION.get(name, COMPRESSION[None]))
             group.create_array(
                 name,
                 data=values,
@@ -93,47 +93,47 @@ def write_shard(
     flush(path)
 
 
-def _require_given_back(
+def _require_restorable(
     level_ids: Sequence[int], arrays: Mapping[str, np.ndarray], stored: Mapping[str, np.ndarray], encoding: Encoding
 ) -> None:
-    """Raises Failure where arrays do not come back from what is stored of them."""
+    """Raise Failure if arrays cannot be recomputed from what is stored of them."""
     if encoding.rules.frame_skip > MAX_FRAME_SKIP:
         raise Failure(f"An env step has {encoding.rules.frame_skip} physics steps: store records with density=full.")
     found = restored(stored, [field for field in field_table(arrays) if field.name not in stored], encoding)
     for name, values in found.arrays.items():
         if len(wrong := np.flatnonzero(~same_bits(values, arrays[name]))):
             raise Failure(
-                f"The engine on this machine does not give {name} of level {level_ids[wrong[0]]} back, which "
-                f"density={encoding.density} would leave out: use density=full, or a machine and versions such as its "
-                "record was made with."
+                f"The engine on this machine cannot recompute {name} of level {level_ids[wrong[0]]}, which "
+                f"density={encoding.density} leaves out: use density=full, or the machine and versions that made its "
+                "record."
             )
 
 
 class Shard:
-    """One shard on disk, opened lazily for reading. What it says is checked before anything of it is given out."""
+    """One shard, opened lazily for reading. All of its contents are checked before they are returned."""
 
     def __init__(self, path: str | os.PathLike[str], size: str | None = None) -> None:
-        """Open the group at `path`, whose levels are to be of `size`, if that is known.
+        """Open the group at `path`, whose levels must have `size`, if given.
 
         Raises:
-            Failure: it is missing, damaged, no shard of that or any size, or of another version.
+            Failure: it is missing, damaged, not a shard of that size or any size, or has another version.
         """
         self.path = path = Path(path)
         try:
             about = json.loads(read_whole(path, "zarr.json"))
             if (about["zarr_format"], about["node_type"]) != (3, "group"):
-                raise ContentsError("it is no group of zarr v3")
+                raise ContentsError("it is not a zarr v3 group")
             attributes = about["attributes"]
             version = attributes.get("version")
             if attributes.get("format") != FORMAT or version != SHARD_VERSION:
                 raise Failure(
-                    f"The shard {path} has version {str(version)[:20]}, this program reads {SHARD_VERSION}: "
+                    f"The shard {path} has version {str(version)[:20]}, but this program reads {SHARD_VERSION}: "
                     "use the levelproof that wrote it."
                 )
             self.encoding = Encoding.of(attributes)
             self.size = size_in(attributes["fields"], self.encoding)
             if size not in (None, name_of(self.size)):
-                raise ContentsError(f"it has levels of size {name_of(self.size)}, and its row says {size}")
+                raise ContentsError(f"its levels have size {name_of(self.size)}, but the manifest says {size}")
             self.arrays = tuple(dict.fromkeys(field.array for field in table_for(self.size, self.encoding)))
             check_level_ids(attributes["level_ids"])
             self.level_ids: list[int] = attributes["level_ids"]
@@ -142,23 +142,23 @@ class Shard:
             raise damaged(path, error) from error
 
     def read(self, rows: Iterable[int] | None = None, fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Named arrays of `rows` (default: all), level axis last and, for `record/` fields, time first.
+        """Read named arrays of `rows` (default: all), level axis last and, for `record/` fields, time first.
+
+        Fields that are not stored are recomputed; warns with EngineDiffers if states differ from the stored ones.
 
         Args:
-            rows: rows of the shard, in the order wanted.
+            rows: rows of the shard, in any order, which the result keeps.
             fields: names to return (default: all); arrays without any of them are not read.
 
-        What is not stored is computed again; EngineDiffers is warned of where that gives other states than were stored.
-
         Raises:
-            Failure: a chunk is missing or damaged, or holds what a level or a record of this size cannot.
+            Failure: a chunk is missing or damaged, or has values that are invalid for this size.
         """
         index = range(len(self.level_ids)) if rows is None else [int(row) for row in rows]
         levels_first = read_together([(self, index)], fields)
         return {name: np.ascontiguousarray(np.moveaxis(x, 0, -1)) for name, x in levels_first.items()}
 
     def unlike(self, rows: Sequence[int]) -> np.ndarray:
-        """Of each row, the first step whose state this machine's engine does not give as it was stored; -1: none.
+        """Return each row's first step whose state differs on this machine's engine; -1: none.
 
         Raises:
             Failure: as `read`.
@@ -166,13 +166,13 @@ class Shard:
         return _read_alike([(self, rows)], table_for(self.size), [range(len(rows))]).unlike
 
     def put(self, rows: Sequence[int], packed: Mapping[str, np.ndarray], places: Sequence[int]) -> None:
-        """Decode the chunks of these rows into packed arrays, each at its place there.
+        """Decode the chunks of `rows` into packed arrays, at the positions `places`.
 
         Raises:
             ContentsError, or another of DAMAGE: a chunk is missing or damaged.
         """
         if not all(0 <= row < len(self.level_ids) for row in rows):
-            raise ContentsError(f"it has {len(self.level_ids)} rows, and others were asked for")
+            raise ContentsError(f"it has {len(self.level_ids)} rows, but others were requested")
         for name, values in packed.items():
             if name not in self._chunks:
                 shape = (len(self.level_ids), *values.shape[1:])
@@ -189,14 +189,19 @@ def read_together(
     exactly: bool = False,
     places: Sequence[Sequence[int]] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Named arrays of rows of shards of one size; level axis FIRST, then time.
+    """Read named arrays from rows of several shards of one size; level axis FIRST, then time.
 
-    The rows of each part stand at its `places` there; default: one part after another. What a shard holds along time
-    is given as a view of the packed arrays, whose time is the last axis.
+    Fields that are stored along time are views of the packed arrays, whose last axis is time.
+
+    Args:
+        parts: shards, and rows to read from each.
+        fields: names to return (default: all).
+        exactly: fail if states that the engine recomputes differ from stored ones, instead of warning.
+        places: positions of each part's rows in the result; default: one part after another.
 
     Raises:
-        Failure: a chunk is missing or damaged, or holds what a level or a record of this size cannot; or, if it has to
-            be `exactly` as it was stored, the engine gives other states on this machine.
+        Failure: a chunk is missing or damaged, or has values that are invalid for this size; or states differ, with
+            `exactly`.
     """
     wanted = None if fields is None else set(fields)
     table = [field for field in table_for(parts[0][0].size) if wanted is None or field.name in wanted]
@@ -206,19 +211,19 @@ def read_together(
     places = _one_after_another(parts) if places is None else places
     if len(by_encoding) == 1:
         found = _read_alike(parts, table, places)
-        _tell(parts, places, found.unlike, exactly)
+        _report(parts, places, found.unlike, exactly)
         return found.arrays
     alone = []
     for alike in by_encoding.values():
         mine = [parts[i] for i in alike]
         alone.append(_read_alike(mine, table, _one_after_another(mine)))
-        _tell(mine, _one_after_another(mine), alone[-1].unlike, exactly)
+        _report(mine, _one_after_another(mine), alone[-1].unlike, exactly)
     back = np.argsort(np.concatenate([places[i] for alike in by_encoding.values() for i in alike]))
-    return {name: np.concatenate([of.arrays[name] for of in alone])[back] for name in alone[0].arrays}
+    return {name: np.concatenate([found.arrays[name] for found in alone])[back] for name in alone[0].arrays}
 
 
 def _read_alike(parts: Sequence[Part], table: Sequence[FieldSpec], places: Sequence[Sequence[int]]) -> Restored:
-    """The same of shards of one encoding, with the first row of each level that is not as it was stored."""
+    """Read rows of shards of one encoding, with each level's first row whose state differs from the stored one."""
     size, encoding = parts[0][0].size, parts[0][0].encoding
     known = table_for(size, encoding)
     names = needed((field.name for field in table), (field.name for field in known))
@@ -234,7 +239,7 @@ def _read_alike(parts: Sequence[Part], table: Sequence[FieldSpec], places: Seque
         packed[FLAT] ^= blank_row(size, encoding)
     try:
         stored = _named(packed, chosen, size)
-    except ValueError:  # one of them holds what it cannot
+    except ValueError:  # find the shard with invalid values
         for (shard, _), mine in zip(parts, places, strict=True):
             with _reading(shard):
                 _named({name: x[np.asarray(mine)] for name, x in packed.items()}, chosen, size)
@@ -250,19 +255,19 @@ def _one_after_another(parts: Sequence[Part]) -> list[range]:
     return [range(end - len(rows), end) for end, (_, rows) in zip(ends, parts, strict=True)]
 
 
-def _tell(parts: Sequence[Part], places: Sequence[Sequence[int]], unlike: np.ndarray, refuse: bool) -> None:
-    """Say it where this machine's states are not those that were stored."""
+def _report(parts: Sequence[Part], places: Sequence[Sequence[int]], unlike: np.ndarray, refuse: bool) -> None:
+    """Warn, or with `refuse` fail, if this machine's states differ from the stored ones."""
     for (shard, rows), mine in zip(parts, places, strict=True) if (unlike >= 0).any() else ():
         unlike_here = unlike[np.asarray(mine, int)]
         if len(wrong := np.flatnonzero(unlike_here >= 0)):
             first = int(wrong[0])
             what = (
-                f"On this machine the engine computes other states than those that were stored of {len(wrong)} of "
-                f"{len(rows)} levels of the shard {shard.path}, of level {shard.level_ids[rows[first]]} from step "
+                f"On this machine the engine computes states that differ from the stored ones for {len(wrong)} of "
+                f"{len(rows)} levels of the shard {shard.path}, for level {shard.level_ids[rows[first]]} from step "
                 f"{unlike_here[first]} on"
             )
             if refuse:
-                raise Failure(f"{what}: read it with a machine and versions such as it was made with.")
+                raise Failure(f"{what}: read it with the machine and versions that made it.")
             warnings.warn(f"{what}: between key frames, states are this machine's own.", EngineDiffers, stacklevel=3)
 
 
@@ -281,16 +286,16 @@ def _reading(shard: Shard) -> Iterator[None]:
 
 
 def damaged(shard: Path, error: Exception) -> Failure:
-    """What to say of a shard that raised this when it was read."""
+    """Return the Failure for a shard that raised `error` when it was read."""
     reason = str(error) if isinstance(error, ContentsError) else type(error).__name__
     return Failure(
         f"The shard {shard} is missing or damaged ({reason}): "
-        + mended(shard, f"run `levelproof verify {shard.parent.parent} --repair` to make its levels again.")
+        + mended(shard, f"run `levelproof verify {shard.parent.parent} --repair` to regenerate its levels.")
     )
 
 
 def open_shard(split: Path, name: str, size: str) -> Shard:
-    """The shard that a row of the manifest of `split` names, which is to hold levels of `size`.
+    """Open the shard that a row of `split`'s manifest names, whose levels must have `size`.
 
     Raises:
         Failure: it is missing, damaged, of another size, or not in the split.
@@ -299,7 +304,7 @@ def open_shard(split: Path, name: str, size: str) -> Shard:
 
 
 def stored_bytes(path: Path) -> int:
-    """Bytes of all files of a shard; what links lead to is not its own."""
+    """Sum the bytes of all files of a shard, not following links."""
     if is_remote(path):
         return sum(about.size for about in stored_in(path).values())
     about = (os.lstat(os.path.join(at, name)) for at, _, names in os.walk(path) for name in names)

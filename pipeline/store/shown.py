@@ -1,4 +1,4 @@
-"""What people see while one thing after another is gone through."""
+"""Progress bar for loops."""
 
 from collections.abc import Iterable
 from typing import TypeVar
@@ -10,13 +10,13 @@ T = TypeVar("T")
 
 
 def shown(parts: Iterable[T], words: str, count: int | None = None, least: int = 0) -> Iterable[T]:
-    """The same, with a bar on a terminal.
+    """Iterate over `parts`, with a progress bar on a terminal.
 
     Args:
-        parts: to go through.
-        words: what they are.
-        count: how many, where they do not tell themselves.
-        least: fewer than so many take no time worth a bar.
+        parts: items.
+        words: label of the bar.
+        count: number of items, if `parts` has no length.
+        least: minimum of `count` for which a bar is shown.
     """
     if count is not None and count < least:
         return parts

@@ -20,11 +20,15 @@ from levelproof.pipeline.urls import require_known
 
 @contextmanager
 def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = None) -> Iterator[tuple[Path, Manifest]]:
-    """The job's split, locked, cleaned, and of this configuration; with what is committed. It may lie elsewhere.
+    """Lock and clean the job's split, and check its configuration; yield its path and manifest.
+
+    Args:
+        job: configuration to match.
+        say: prints what takes long or was left alone.
+        split: path (default: the job's own).
 
     Raises:
-        UserError: it cannot be written or locked, is being written, or was made with another configuration or
-            density.
+        UserError: it cannot be written or locked, is being written, or has another configuration or density.
         Failure: a fragment is damaged.
     """
     split = split or split_path(job.out, job.budget, job.size)
@@ -39,7 +43,7 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
         stored = {density for fragment in manifest.fragments for density in fragment.densities}
         if stored and job.stored not in stored:
             raise UserError(
-                f"The split {split} has {', '.join(sorted(stored))}, and this asks for {job.stored}: "
+                f"The split {split} has {', '.join(sorted(stored))}, but this command asks for {job.stored}: "
                 "use the same, or another folder with out=NAME."
             )
         yield split, manifest
@@ -47,7 +51,7 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
 
 @contextmanager
 def taken(split: Path, say: Callable[[str], None]) -> Iterator[Manifest]:
-    """The split, locked and cleaned; with what is committed.
+    """Lock and clean a split; yield its manifest.
 
     Raises:
         UserError: it cannot be written or locked, or is being written.
@@ -59,12 +63,12 @@ def taken(split: Path, say: Callable[[str], None]) -> Iterator[Manifest]:
 
 @contextmanager
 def locked(split: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """The split for this process alone to write to.
+    """Lock a split, so that this process alone writes to it.
 
     Raises:
         UserError: it cannot be written or locked, or is being written.
-        Failure: the disk refuses later.
-        StoreFailure, LeaseLost: its store does not answer, or has another writer by now.
+        Failure: a write in the block fails.
+        StoreFailure, LeaseLost: its store does not answer, or another writer has taken over.
     """
     if is_remote(split):
         require_conditions(split / f".{JOB}.{secrets.randbits(60)}")
@@ -75,12 +79,12 @@ def locked(split: Path, say: Callable[[str], None]) -> Iterator[None]:
     _require_own_folders(split)
     with told_of(split), only_writer(split, say):
         with committing(split):
-            pass  # as workers do: a file system that refuses their lock is named before anything trains
+            pass  # take the workers' lock once, to fail before anything trains if the file system has no locks
         yield
 
 
 def _make_writable(split: Path) -> None:
-    """Make the folder and prove that files can be made in it."""
+    """Create the folder and check that files can be created in it."""
     try:
         split.mkdir(parents=True, exist_ok=True)
         probe = split / f".{JOB}.{os.getpid()}"
@@ -92,11 +96,11 @@ def _make_writable(split: Path) -> None:
 
 
 def _require_own_folders(split: Path) -> None:
-    """Refuse links: what is removed from a split is looked for in these folders."""
+    """Refuse links in place of the folders from which files are removed."""
     for path in (split / name for name in (*FOLDERS, EVENTS)):
         if path.is_symlink() or (path.exists() and not path.is_dir()):
-            what = "a link" if path.is_symlink() else "no folder"
+            what = "a link" if path.is_symlink() else "not a folder"
             raise UserError(
-                f"The folders of a split must be in it, and {path} is {what}: put a folder in its place, "
+                f"A split must contain its own folders, but {path} is {what}: put a folder in its place, "
                 "or choose another one for the split with out=NAME."
             )

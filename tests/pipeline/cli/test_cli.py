@@ -117,7 +117,7 @@ def test_unknown_options_and_urls_are_not_taken_for_folders(tmp_path: Path, argu
 @pytest.mark.slow
 def test_inspect_rejects_a_folder_of_splits(made: Path) -> None:
     for above in ("data", "."):
-        assert_refused(here(["inspect", above], made), 2, f"{above} is no split", "name one of them, such as")
+        assert_refused(here(["inspect", above], made), 2, f"{above} is not a split", "name one of them, such as")
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ def test_export_parquet_selects_levels_by_where(split: Path, tmp_path: Path, cap
     assert main([*command, "label = 'solved'"]) == 0
     assert set(pq.read_table(tmp_path / "levels")["label"].to_pylist()) == {"solved"}
     assert main([*command, "label = 'solved'"]) == 2
-    assert "There is something at" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     command[command.index("-o") + 1] = str(tmp_path / "others")
     assert main([*command, "level_id < 0"]) == 2
     assert capsys.readouterr().err.startswith(f"Error: No level of {split} meets the condition level_id < 0: ")

@@ -265,8 +265,8 @@ def fragments(folder: Path) -> Target:
     def target(random: Random) -> None:
         remove(path)
         put(path, mutated(random), random)
-        checked = {**bounds.CAREFULLY, "page_checksum_verification": random.random() < 0.3}
-        with patch.object(bounds, "CAREFULLY", checked):
+        checked = {**bounds.READ_OPTIONS, "page_checksum_verification": random.random() < 0.3}
+        with patch.object(bounds, "READ_OPTIONS", checked):
             if path.is_symlink() or not path.is_file():
                 assert not fragment_paths(split)
                 return

@@ -160,7 +160,7 @@ def test_without_shard_and_file_a_level_is_gone(tmp_path: Path) -> None:
         here(["show", str(split), str(row["level_id"]), "-o", "x.png"], tmp_path), 1, "b.json", "put it back"
     )
     again = ["regenerate", f"manifest={split}", "budget=8k", "executor=inline"]
-    assert_refused(here(again, tmp_path), 2, "b.json", "its file is gone")
+    assert_refused(here(again, tmp_path), 2, "b.json", "its file is missing")
 
 
 def test_a_worker_that_does_not_see_a_file_stops_the_job(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_two_levels_with_one_id_are_told_apart(folder: Path, tmp_path: Path, mon
     row = rows_of(folder / "data/5k/s")["a.json"]
     monkeypatch.setattr("levelproof.pipeline.read.level_files.level_id_for", lambda _: row["level_id"])
     done = here(["generate", f"level_files={tmp_path / 'two/b.json'}", *WORDS], folder)
-    assert_refused(done, 2, "have by chance one id", "out=NAME")
+    assert_refused(done, 2, "happen to have the same id", "out=NAME")
 
 
 def test_units_take_levels_with_origins_as_they_come() -> None:

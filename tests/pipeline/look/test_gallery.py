@@ -157,7 +157,7 @@ def test_gallery_replaces_only_galleries(split: Path, tmp_path: Path, monkeypatc
     out = tmp_path / "gallery"
     out.mkdir()
     (out / "notes.txt").write_text("mine")
-    with pytest.raises(UserError, match=r"There is something at .* already"):
+    with pytest.raises(UserError, match=r"/.* already exists"):
         gallery(split, out, None, 1)
     assert (out / "notes.txt").read_text() == "mine"
     (out / "notes.txt").unlink()

@@ -11,7 +11,7 @@ from rich.console import Console
 from levelproof.configs.schema import Density
 from levelproof.pipeline.jobs.seal import seal_split
 from levelproof.pipeline.store.layout import JOB
-from levelproof.pipeline.store.locks import nobody_commits
+from levelproof.pipeline.store.locks import without_commits
 from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.verify.findings import Findings
@@ -269,7 +269,7 @@ def test_seal_and_repair_keep_the_digests_of_experts(tmp_path: Path) -> None:
     done = here(["verify", str(split)], tmp_path)
     assert done.returncode == 1
     assert f"The file {first} is not what was committed" in done.stdout
-    with nobody_commits(split, print):
+    with without_commits(split, print):
         take_out(split, [4], [], [])
     (path,) = fragment_paths(split)
     fragment, rows = read_fragment(path)

@@ -132,10 +132,10 @@ HOSTILE = {
     long_texts: "its rows would take more memory than those of any fragment",
     long_pages: "its rows would take more memory than those of any fragment",
     long_hashes: "its rows would take more memory than those of any fragment",
-    shortened_hashes: "it has texts that are not as they were written",
+    shortened_hashes: "strings of it are not encoded as they were written",
     long_lists: "its rows would take more memory than those of any fragment",
     many_rows: "it has more rows than any fragment of its size",
-    other_values: "it has other numbers of values than its rows",
+    other_values: "a column has not one value per row",
 }
 
 

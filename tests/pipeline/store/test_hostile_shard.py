@@ -187,7 +187,7 @@ def test_flags_are_0_or_1(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("row", [-1, len(LEVELS), 2**40])
 def test_rows_that_it_does_not_have(shard: Path, row: int) -> None:
-    with pytest.raises(Failure, match="it has 3 rows, and others were asked for"):
+    with pytest.raises(Failure, match="it has 3 rows, but others were requested"):
         Shard(shard).read([row])
 
 
@@ -224,7 +224,7 @@ def test_a_group_that_is_none(shard: Path, text: str) -> None:
 def test_another_size_than_its_row_says(shard: Path) -> None:
     assert open_shard(shard.parents[1], NAME, "s").size == Shard(shard).size
     with pytest.raises(
-        Failure, match=r"has levels of size s, and its row says m\): run `levelproof verify .* --repair`"
+        Failure, match=r"its levels have size s, but the manifest says m\): run `levelproof verify .* --repair`"
     ):
         open_shard(shard.parents[1], NAME, "m")
 
@@ -273,11 +273,11 @@ def test_names_of_data_and_links_on_the_way(tmp_path: Path) -> None:
     assert data_path(tmp_path / "link", NAME) == tmp_path / "link" / NAME  # the user's own
     (tmp_path / "elsewhere").mkdir()
     (split / "shards").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(Failure, match="is a link to another place"):
+    with pytest.raises(Failure, match="leads elsewhere through a link"):
         data_path(split, NAME)
     (split / "experts").mkdir()
     (split / experts).symlink_to("/etc")
-    with pytest.raises(Failure, match="is a link to another place"):
+    with pytest.raises(Failure, match="leads elsewhere through a link"):
         data_path(split, experts)
 
 

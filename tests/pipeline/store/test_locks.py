@@ -20,7 +20,7 @@ from levelproof.pipeline.jobs.worker import Worker
 from levelproof.pipeline.store import leases, locks
 from levelproof.pipeline.store.layout import COMMIT_LOCK
 from levelproof.pipeline.store.leases import LeaseLost
-from levelproof.pipeline.store.locks import LockRefused, committing, is_written, nobody_commits, only_writer
+from levelproof.pipeline.store.locks import LockRefused, committing, is_written, without_commits, only_writer
 from levelproof.pipeline.store.split import writing
 from tests.pace import patience
 from tests.pipeline.command import ROOT, heed_ctrl_c, start
@@ -30,7 +30,7 @@ from tests.pipeline.made import made_job
 def test_commits_do_not_wait_for_each_other(tmp_path: Path) -> None:
     with committing(tmp_path), committing(tmp_path):
         pass
-    with nobody_commits(tmp_path, print):
+    with without_commits(tmp_path, print):
         pass
 
 
@@ -94,7 +94,7 @@ def test_locks_exclude_on_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
         with committing(tmp_path):
             pass
-        with nobody_commits(tmp_path, then_end_it):
+        with without_commits(tmp_path, then_end_it):
             assert worker.returncode == 0
     assert len(said) == 1
 

@@ -154,7 +154,7 @@ def test_any_damaged_byte_of_a_fragment_is_seen_or_harmless(tmp_path: Path, job:
 def test_a_fragment_that_is_none_is_named(tmp_path: Path, job: JobConfig, content: bytes) -> None:
     path = commit(tmp_path, job, [0])
     path.write_bytes(content)
-    with pytest.raises(Failure, match=r"is damaged .* run `levelproof verify .* --repair` to make its levels again"):
+    with pytest.raises(Failure, match=r"is damaged .* run `levelproof verify .* --repair` to regenerate its levels"):
         read_manifest(tmp_path)
 
 
@@ -184,7 +184,7 @@ def test_what_was_written_before_seconds_were_counted_is_read(tmp_path: Path, jo
 def test_two_configurations_in_one_split_are_named(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [0])
     commit(tmp_path, made_job("data", "expert.width=64"), [1])
-    with pytest.raises(Failure, match=r"mixes two configurations.*expert.width was 32, now 64.*with the shards"):
+    with pytest.raises(Failure, match=r"mixes the configurations.*expert.width was 32, now 64.*with their shards"):
         read_manifest(tmp_path)
 
 

@@ -175,7 +175,7 @@ def test_a_checkpoint_of_another_version_stays(split: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"checkpoint 1 ", b"checkpoint 2 ", 1))
     newer, old = pruned(split, 7)
     assert f"{path} cannot be read (it has version 2, this levelproof reads 1)" in newer
-    assert f"{older} is of an earlier levelproof, and this one does not resume it" in old
+    assert f"{older} is from an earlier levelproof and cannot be resumed" in old
     with pytest.raises(CheckpointUnread, match="version 2"):
         load_paused(split, range(8), JOB)
     assert pruned(split, *range(3, 8)) == []

@@ -429,9 +429,9 @@ def test_no_clock_decides_whether_a_store_s_split_is_written(
         assert not is_written(THERE, said.append)
         assert not said, "each of these is known at once"
         put(THERE / WRITER_LOCK, left_by_a_killed_writer(within="another machine"))
-        patched.setattr(leases, "SIGHT", 0.3)
+        patched.setattr(leases, "WATCH", 0.3)
         assert not is_written(THERE, said.append)
-        assert said == ["Looking whether a run still writes to s3://bucket/data/128k/s, which takes up to 0 s."]
+        assert said == ["Checking whether a run still writes to s3://bucket/data/128k/s, which takes up to 0 s."]
 
 
 @pytest.mark.parametrize(("every", "how"), [(0, ""), (2, "lost")])
@@ -493,7 +493,7 @@ def test_a_store_that_heeds_no_conditions_is_refused(server: Server, tmp_path: P
     with serving(careless) as other, pytest.MonkeyPatch.context() as patched:
         patched.setenv("AWS_ENDPOINT_URL", other.url)
         forget()
-        with pytest.raises(UserError, match="does not heed the conditions"):
+        with pytest.raises(UserError, match="does not support the preconditions"):
             drive(OUT)
 
 

@@ -236,7 +236,7 @@ def test_a_store_that_dies_is_one_sentence_in_bounded_time(bucket: Bucket, monke
         ("s3://bucket/data/none", {}, UserError, "There is no split at s3://bucket/data/none"),
         ("s3://nobody/data/s", {}, UserError, "There is no bucket 'nobody': check s3://nobody/data/s"),
         ("s3://bucket/data/s", {"AWS_ENDPOINT_URL": f"http://{HOST}:1"}, StoreFailure, r"\(it does not answer\)"),
-        ("hf://models/user/name", {}, UserError, "hf://models/user/name/manifest is none of a dataset"),
+        ("hf://models/user/name", {}, UserError, "hf://models/user/name/manifest is not the URL of a dataset"),
         ("s3://bucket/data/s", {"LEVELPROOF_CACHE_GB": "much"}, UserError, "LEVELPROOF_CACHE_GB is 'much'"),
     ],
 )

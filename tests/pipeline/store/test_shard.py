@@ -121,7 +121,7 @@ def test_any_damaged_byte_is_seen(shard: Path, array: str) -> None:
     whole = file.read_bytes()
     for at in range(0, len(whole), max(1, len(whole) // 7)):
         file.write_bytes(whole[:at] + bytes([whole[at] ^ 0x40]) + whole[at + 1 :])
-        with pytest.raises(Failure, match=r"missing or damaged .* run `levelproof verify .* --repair` to make"):
+        with pytest.raises(Failure, match=r"missing or damaged .* run `levelproof verify .* --repair` to regenerate"):
             Shard(shard).read()
     file.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(Failure, match="missing or damaged"):

@@ -56,7 +56,7 @@ def test_another_density_is_refused(tmp_path: Path, job: JobConfig) -> None:
         committed(job, split)
     words = ["density=witness", "key_every=16"]
     with (
-        pytest.raises(UserError, match="has density=full, and this asks for density=witness key_every=16: use"),
+        pytest.raises(UserError, match="has density=full, but this command asks for density=witness key_every=16: use"),
         writing(made_job(str(tmp_path / "data"), *words), print),
     ):
         pass
