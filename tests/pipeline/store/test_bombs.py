@@ -35,7 +35,7 @@ def split(tmp_path: Path) -> Path:
     return made_split(tmp_path, [[Label.SOLVED, Label.SOLVED]])
 
 
-def test_metadata_of_a_gigabyte(split: Path) -> None:
+def test_shard_refuses_huge_metadata(split: Path) -> None:
     (shard,) = (split / "shards").iterdir()
     for name in ("dyn32/zarr.json", "zarr.json"):
         with (shard / name).open("r+b") as file:
@@ -43,7 +43,7 @@ def test_metadata_of_a_gigabyte(split: Path) -> None:
         assert f"its {name} is larger than any shard" in refused(shard)
 
 
-def test_experts_that_are_packed_pickled_or_a_folder(tmp_path: Path) -> None:
+def test_load_experts_refuses_compressed_pickled_files_and_folders(tmp_path: Path) -> None:
     job, path = made_job(), tmp_path / "experts.npz"
     np.savez_compressed(path, level_id=np.zeros(10**7, np.int64))
     assert path.stat().st_size < 10**6
@@ -64,7 +64,7 @@ def test_experts_that_are_packed_pickled_or_a_folder(tmp_path: Path) -> None:
         load_experts(path, job)
 
 
-def test_level_ids_of_experts_that_are_none(tmp_path: Path) -> None:
+def test_load_experts_refuses_invalid_level_ids(tmp_path: Path) -> None:
     for level_ids, curves in ((7, [[0.0]]), ([0.5], [[0.0]]), ([1], [0.0]), ([1, 2], [[0.0]])):
         np.savez(tmp_path / "experts.npz", level_id=np.array(level_ids), curve=np.array(curves))
         with pytest.raises(Failure, match="cannot be read"):
@@ -72,7 +72,7 @@ def test_level_ids_of_experts_that_are_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [b"[[]]", b'{"a": 7}', b"[" * 100_000, b"7"])
-def test_digests_that_are_none(split: Path, text: bytes) -> None:
+def test_read_fragment_refuses_invalid_digests(split: Path, text: bytes) -> None:
     (path,) = fragment_paths(split)
     table = pq.read_table(path)
     pq.write_table(table.replace_schema_metadata(table.schema.metadata | {b"levelproof.sha256": text}), path)
@@ -80,7 +80,7 @@ def test_digests_that_are_none(split: Path, text: bytes) -> None:
         read_fragment(path)
 
 
-def test_an_index_that_lies_about_a_chunk(split: Path) -> None:
+def test_shard_refuses_an_index_with_a_huge_chunk(split: Path) -> None:
     """A file with a hole of a terabyte, of which a chunk claims to be all."""
     from google_crc32c import value
 

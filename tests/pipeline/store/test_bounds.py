@@ -139,14 +139,14 @@ HOSTILE = {
 }
 
 
-def test_texts_that_no_rows_share_stand_in_no_dictionary(good: Path) -> None:
+def test_write_fragment_writes_unique_strings_without_dictionaries(good: Path) -> None:
     group = pq.read_metadata(good).row_group(0)
     columns = [group.column(i) for i in range(group.num_columns)]
     texts = [column for column in columns if column.physical_type == "BYTE_ARRAY"]
     assert {of.path_in_schema.partition(".")[0] for of in texts if not of.has_dictionary_page} == {*OWN}
 
 
-def test_what_becomes_large_is_refused_before_it_does(good: Path, tmp_path: Path) -> None:
+def test_read_fragment_refuses_bombs_before_decompressing_them(good: Path, tmp_path: Path) -> None:
     paths = []
     for number, make in enumerate(HOSTILE):
         paths.append(tmp_path / str(number) / good.name)
@@ -165,7 +165,7 @@ def test_what_becomes_large_is_refused_before_it_does(good: Path, tmp_path: Path
     assert grown < MOST
 
 
-def test_answers_that_would_end_the_process_are_not_asked_for(good: Path) -> None:
+def test_read_fragment_survives_lying_size_statistics(good: Path) -> None:
     """Of size statistics with too many numbers in them, pyarrow's `column` is an exception that nobody catches."""
     data = good.read_bytes()
     start, end = footer_of(data).start, footer_of(data).stop
@@ -180,7 +180,7 @@ def test_answers_that_would_end_the_process_are_not_asked_for(good: Path) -> Non
     good.write_bytes(data)
 
 
-def test_a_footer_and_its_pages_are_read_as_arrow_reads_them(good: Path) -> None:
+def test_footer_in_and_pages_in_agree_with_arrow(good: Path) -> None:
     data = good.read_bytes()
     footer, about = footer_in(data[footer_of(data)]), pq.read_metadata(good)
     assert (footer.rows, footer.made_by) == (about.num_rows, about.created_by)
@@ -195,7 +195,7 @@ def test_a_footer_and_its_pages_are_read_as_arrow_reads_them(good: Path) -> None
             assert sum(page.bytes for page in pages) <= of.total_uncompressed_size
 
 
-def test_a_fragment_without_rows_is_read(good: Path, tmp_path: Path) -> None:
+def test_read_fragment_accepts_no_rows(good: Path, tmp_path: Path) -> None:
     empty = pq.read_table(good).slice(0, 0)
     pq.write_table(empty, tmp_path / good.name, compression="zstd", write_page_checksum=True)
     assert read_fragment(tmp_path / good.name)[1].num_rows == 0

@@ -37,7 +37,7 @@ def some_experts(job: JobConfig) -> list[Kept]:
     return [Kept(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(UNITS)]
 
 
-def test_each_unit_s_experts_come_back_bit_for_bit(tmp_path: Path) -> None:
+def test_load_experts_restores_each_units_experts_bit_for_bit(tmp_path: Path) -> None:
     job = made_job("data", *SETTINGS)
     kept = some_experts(job)
     for i in range(UNITS):
@@ -49,7 +49,7 @@ def test_each_unit_s_experts_come_back_bit_for_bit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("over", [False, True])
-def test_experts_from_before_there_were_causes_come_back(tmp_path: Path, over: bool) -> None:
+def test_load_experts_accepts_ends_stored_as_a_bool(tmp_path: Path, over: bool) -> None:
     """Whether training stopped for good was a bit; larger types than today's are refused."""
     job, kept = made_job("data", *SETTINGS), some_experts(made_job("data", *SETTINGS))[0]
 
@@ -67,7 +67,7 @@ def test_experts_from_before_there_were_causes_come_back(tmp_path: Path, over: b
 
 
 @pytest.mark.parametrize("source", [Source.SEARCH, Source.SAMPLED])
-def test_an_expert_that_solved_its_level_begins_again_whoever_s_the_witness_is(
+def test_experts_for_skips_experts_that_solved_their_level(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: Source
 ) -> None:
     """One whose witness was made steady, too; one that did not, whose witness is what was found before, goes on."""
@@ -82,7 +82,7 @@ def test_an_expert_that_solved_its_level_begins_again_whoever_s_the_witness_is(
     assert experts_for(job, [0, 1, 2]).keys() == {1}
 
 
-def test_a_worker_reads_the_fragments_of_its_levels_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_experts_for_reads_only_fragments_of_its_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     split, read = made_split(tmp_path, [[Label.SOLVED] * 2] * 4), []
 
     def noted(path: Path, columns: Sequence[str], *how: Any) -> object:
@@ -94,7 +94,7 @@ def test_a_worker_reads_the_fragments_of_its_levels_only(tmp_path: Path, monkeyp
     assert read == [("000000000002-000000000003", {"level_id", "witness", "experts"})]
 
 
-def test_a_source_that_is_not_there_is_not_taken_for_one_without_experts(tmp_path: Path) -> None:
+def test_experts_for_refuses_a_missing_source(tmp_path: Path) -> None:
     source = tmp_path / "data/5k/s"
     job = made_job("data", "budget=10k", f"continue_from={source}")
     with pytest.raises(SourceUnseen, match=rf"finds no split at {source}, .* a folder that all machines .* share"):

@@ -20,7 +20,7 @@ def split(tmp_path: Path) -> Path:
     return made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]])
 
 
-def test_every_byte_of_a_fragment_counts(split: Path) -> None:
+def test_has_own_detects_any_changed_byte(split: Path) -> None:
     (path,) = fragment_paths(split)
     assert has_own(path)
     whole = path.read_bytes()
@@ -34,14 +34,14 @@ def test_every_byte_of_a_fragment_counts(split: Path) -> None:
     assert not has_own(path)
 
 
-def test_it_is_parquet_for_everybody(split: Path) -> None:
+def test_fragments_with_digests_are_plain_parquet(split: Path) -> None:
     (path,) = fragment_paths(split)
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
         assert file.read().column("level_id").to_pylist() == [0, 1]
     assert duckdb.sql(f"SELECT level_id, label FROM '{path}' ORDER BY 1").fetchall() == [(0, "solved"), (1, "unsolved")]
 
 
-def test_it_has_the_digests_of_the_shards_that_it_commits(split: Path) -> None:
+def test_fragments_have_the_digests_of_their_shards(split: Path) -> None:
     """In coreutils' words, too."""
     fragment, rows = read_fragment(*fragment_paths(split))
     name = rows.column("shard")[0].as_py()
@@ -52,7 +52,7 @@ def test_it_has_the_digests_of_the_shards_that_it_commits(split: Path) -> None:
     subprocess.run(["sha256sum", "--check", "--strict"], cwd=shard, input=listed, text=True, check=True)
 
 
-def test_names_lengths_and_links_count(split: Path) -> None:
+def test_digests_of_depends_on_names_lengths_and_links(split: Path) -> None:
     fragment, _ = read_fragment(*fragment_paths(split))
     ((name, digests),) = fragment.digests.items()
     shard = split / name

@@ -95,7 +95,7 @@ def changed(shard: Shard, change: Callable[[dict[str, np.ndarray]], None]) -> Sh
     return Shard(shard.path)
 
 
-def test_played_records_have_what_there_is_to_get_wrong() -> None:
+def test_played_records_cover_the_difficult_cases() -> None:
     done, contacts = played()["record/done"], played()["record/state/contact_active"]
     assert done.any()
     assert not done.all(1).any()
@@ -105,7 +105,7 @@ def test_played_records_have_what_there_is_to_get_wrong() -> None:
 
 
 @pytest.mark.parametrize("encoding", [Encoding("resume"), WITNESS, Encoding("witness", 8), Encoding("witness", 256)])
-def test_every_density_gives_every_bit_back(tmp_path: Path, encoding: Encoding) -> None:
+def test_every_density_restores_every_bit(tmp_path: Path, encoding: Encoding) -> None:
     """And full, made of what it gave, is the full that was: files and all."""
     full, other = write(tmp_path, Encoding()), write(tmp_path, encoding)
     assert Shard(other.path).encoding == encoding
@@ -122,12 +122,12 @@ def files(shard: Path) -> dict[str, bytes]:
 @pytest.mark.campaign
 @pytest.mark.parametrize("size", ["m", "l"])
 @pytest.mark.parametrize("encoding", [Encoding("resume"), WITNESS], ids=lambda of: of.density)
-def test_every_density_gives_every_bit_back_of_larger_levels(tmp_path: Path, size: str, encoding: Encoding) -> None:
+def test_every_density_restores_every_bit_of_larger_levels(tmp_path: Path, size: str, encoding: Encoding) -> None:
     assert_same(write(tmp_path, encoding, played(size)).read(), played(size))
 
 
 @pytest.mark.parametrize("density", ["resume", "witness"])
-def test_rows_and_fields_as_they_are_asked_for(tmp_path: Path, density: Any) -> None:
+def test_read_returns_the_requested_rows_and_fields(tmp_path: Path, density: Any) -> None:
     shard = write(tmp_path, Encoding(density))
     assert_same(
         shard.read([2, 0, 2], FREE), {name: played()[name][..., [2, 0, 2]] for name in played() if name in FREE}
@@ -138,7 +138,7 @@ def test_rows_and_fields_as_they_are_asked_for(tmp_path: Path, density: Any) -> 
     assert {name: x.shape for name, x in nothing.items()} == {name: (*x.shape[:-1], 0) for name, x in played().items()}
 
 
-def test_the_engine_is_not_started_for_what_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_does_not_start_the_engine_for_stored_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shards = [write(tmp_path, Encoding("resume")), write(tmp_path, WITNESS)]
 
     def start(*_: Any) -> None:
@@ -152,14 +152,14 @@ def test_the_engine_is_not_started_for_what_is_stored(tmp_path: Path, monkeypatc
         shards[1].read(fields=["record/reward"])
 
 
-def test_contacts_are_not_written_down_where_nobody_asks_for_them(tmp_path: Path, monkeypatch: Any) -> None:
+def test_read_records_contacts_only_on_request(tmp_path: Path, monkeypatch: Any) -> None:
     shard, asked = write(tmp_path, WITNESS), []
     monkeypatch.setattr(density, "resume", lambda *words: asked.append(words[-1]) or resume.resume(*words))
     shard.read(fields=["record/state/position", "record/action"])
     assert asked == [{"state/position"}]
 
 
-def test_shards_of_all_densities_are_read_together(tmp_path: Path) -> None:
+def test_read_together_mixes_densities(tmp_path: Path) -> None:
     full, resumed, witness = (write(tmp_path, Encoding(density)) for density in ("full", "resume", "witness"))
     found = read_together([(witness, [1]), (full, [0, 3]), (resumed, [2]), (witness, [2])])
     assert_same(
@@ -184,7 +184,7 @@ def keyed() -> tuple[int, int]:
     return level, int(at[0, level])
 
 
-def test_another_machine_is_told_and_key_frames_bring_its_states_back(tmp_path: Path, keyed: tuple[int, int]) -> None:
+def test_read_warns_of_differing_states_and_resets_at_key_frames(tmp_path: Path, keyed: tuple[int, int]) -> None:
     """What was stored on it differs from what the engine gives here, by one unit in the last place."""
     level, row = keyed
     here, told = played()["record/state/position"], f"for level {IDS[level]} from step {row} on"
@@ -202,7 +202,7 @@ def test_another_machine_is_told_and_key_frames_bring_its_states_back(tmp_path: 
     shard.read([level], ["record/done"])  # nothing is said where nothing is simulated
 
 
-def test_a_checksum_that_differs_is_told(tmp_path: Path) -> None:
+def test_read_warns_of_a_differing_checksum(tmp_path: Path) -> None:
     def change(stored: dict[str, np.ndarray]) -> None:
         stored[CHECKSUM][3, 2] ^= 1
 
@@ -211,7 +211,7 @@ def test_a_checksum_that_differs_is_told(tmp_path: Path) -> None:
         assert_same(shard.read(), played())
 
 
-def test_ends_of_episodes_that_differ_are_told(tmp_path: Path) -> None:
+def test_read_warns_of_differing_episode_ends(tmp_path: Path) -> None:
     """They are those that were stored, and what the engine thinks of them is not asked."""
     for encoding, run in ((Encoding("resume"), 1), (WITNESS, 32)):
         shard = write(tmp_path, encoding)
@@ -228,7 +228,7 @@ def test_ends_of_episodes_that_differ_are_told(tmp_path: Path) -> None:
             assert not shard.read()["record/done"][row, level]
 
 
-def test_any_bit_of_any_state_changes_its_checksum() -> None:
+def test_checksum_depends_on_every_bit_of_a_state() -> None:
     states = task_states(played(), "record/state/", played()["record/timestep"])
     rows = np.arange(256)[:, None]
     before = checksum(states, rows)
@@ -244,7 +244,7 @@ def test_any_bit_of_any_state_changes_its_checksum() -> None:
                 raw[at] ^= 1 << bit
 
 
-def test_checksums_are_those_that_the_docs_describe() -> None:
+def test_checksum_follows_the_docs() -> None:
     """Word by word, in whole numbers of any length."""
     states = task_states(played(), "record/state/", played()["record/timestep"])
     row, level, total = 7, 1, 0
@@ -261,12 +261,12 @@ def test_checksums_are_those_that_the_docs_describe() -> None:
     assert checksum(states, np.arange(256)[:, None])[row, level] == total % 2**32
 
 
-def test_timesteps_come_from_the_ends_of_episodes() -> None:
+def test_timesteps_follow_from_episode_ends() -> None:
     assert same_bits(timesteps(played()["record/done"]), played()["record/timestep"]).all()
 
 
 @pytest.mark.parametrize("density", ["resume", "witness"])
-def test_what_would_not_come_back_is_not_left_out(tmp_path: Path, density: Any) -> None:
+def test_write_shard_refuses_records_that_cannot_be_recomputed(tmp_path: Path, density: Any) -> None:
     """A record of another machine, or one that was changed."""
     fields = {name: x.copy() for name, x in played().items()}
     fields["record/reward"][200, 2] += 1
@@ -276,7 +276,7 @@ def test_what_would_not_come_back_is_not_left_out(tmp_path: Path, density: Any) 
 
 
 @pytest.mark.campaign
-def test_other_rules_are_those_of_the_shard(tmp_path: Path) -> None:
+def test_read_recomputes_with_the_shards_rules(tmp_path: Path) -> None:
     rules = TaskParams(frame_skip=3, max_timesteps=40, dense_reward_scale=0.5)
     fields = played("s", rules)
     with pytest.raises(Failure, match="cannot recompute"):
@@ -307,7 +307,7 @@ def witness(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", ABOUT)
-def test_a_shard_that_says_otherwise_is_refused(witness: Path, tmp_path: Path, name: str) -> None:
+def test_shard_refuses_invalid_encodings(witness: Path, tmp_path: Path, name: str) -> None:
     path = Path(shutil.copytree(witness, tmp_path / NAME))
     document = json.loads((path / "zarr.json").read_text())
     document["attributes"] |= ABOUT[name]
@@ -320,7 +320,7 @@ def test_a_shard_that_says_otherwise_is_refused(witness: Path, tmp_path: Path, n
     assert len(sentence) < 600
 
 
-def test_arrays_of_other_shapes_are_refused(witness: Path, tmp_path: Path) -> None:
+def test_shard_refuses_arrays_of_wrong_shapes(witness: Path, tmp_path: Path) -> None:
     """Whatever the field table says: a key frame less, or checksums of other runs."""
     for cut in (4, -4):
         path = Path(shutil.copytree(witness, tmp_path / str(cut) / NAME))
@@ -334,7 +334,7 @@ def test_arrays_of_other_shapes_are_refused(witness: Path, tmp_path: Path) -> No
             Shard(path).read(fields=["record/action"])
 
 
-def test_worlds_without_sense_end(tmp_path: Path) -> None:
+def test_read_ends_for_senseless_states(tmp_path: Path) -> None:
     """Numbers that no engine makes, in key frames too."""
 
     def change(stored: dict[str, np.ndarray]) -> None:
@@ -348,7 +348,7 @@ def test_worlds_without_sense_end(tmp_path: Path) -> None:
         shard.read()
 
 
-def test_tables_of_all_densities_and_distances_lie_side_by_side() -> None:
+def test_field_tables_have_no_overlaps_in_any_encoding() -> None:
     for encoding in (Encoding("resume"), *(Encoding("witness", every) for every in KEYS_EVERY)):
         table = table_for(SIZES["m"], encoding)
         for array in dict.fromkeys(field.array for field in table):
@@ -357,7 +357,7 @@ def test_tables_of_all_densities_and_distances_lie_side_by_side() -> None:
     assert field_table(made_fields("m")) == list(table_for(SIZES["m"]))
 
 
-def test_density_is_a_setting_that_decides_no_result() -> None:
+def test_density_does_not_change_the_config_hash() -> None:
     jobs = [compose_job(words) for words in ([], ["density=witness", "key_every=8"])]
     assert jobs[0].density == "full"
     assert jobs[0].hash == jobs[1].hash
@@ -367,7 +367,7 @@ def test_density_is_a_setting_that_decides_no_result() -> None:
         compose_job(["density=witness", "task.frame_skip=65"])
 
 
-def test_trees_of_states_are_those_of_records() -> None:
+def test_state_fields_match_those_of_records() -> None:
     """What checksums are made of, in the order of the dataclasses."""
     record = tree_of(Record, played(), "record/")
     states = task_states(played(), "record/state/", played()["record/timestep"])
@@ -379,7 +379,7 @@ def test_trees_of_states_are_those_of_records() -> None:
     assert isinstance(tree_of(Level, played(), "level/"), Level)
 
 
-def test_conversion_takes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_convert_writes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever densities they come from, in the order of places."""
     monkeypatch.setattr(convert, "LEVELS", 2)
     witness, full = write(tmp_path, WITNESS), write(tmp_path, Encoding())
@@ -394,7 +394,7 @@ def test_conversion_takes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: py
         assert_same(shard.read([place.row]), {name: x[..., i : i + 1] for name, x in played().items()})
 
 
-def test_states_of_another_machine_are_not_converted(tmp_path: Path, keyed: tuple[int, int]) -> None:
+def test_convert_refuses_differing_states(tmp_path: Path, keyed: tuple[int, int]) -> None:
     """What they were cannot be told from this machine's."""
     level, row = keyed
     shard = changed(write(tmp_path, WITNESS), lambda stored: ulp(stored, "key/state/position", 0, level))
@@ -431,7 +431,7 @@ def assert_whole(split: Path, density: str) -> None:
     assert len(fragment_paths(split)) == len(read_manifest(split).fragments)
 
 
-def test_a_split_becomes_another_density_and_the_same_again(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_seal_converts_a_split_and_back(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert levelproof("seal", split, "--rows", 2, "--density", "witness", "--key-every", 16) == 0
     assert_whole(split, "witness")
     (fragment, *_) = read_manifest(split).fragments
@@ -448,7 +448,7 @@ def test_a_split_becomes_another_density_and_the_same_again(split: Path, capsys:
 
 
 @pytest.mark.parametrize("step", ["write_shard", "merge_shards", "write_fragment"])
-def test_a_conversion_that_fails_changes_nothing(split: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+def test_failed_conversion_changes_nothing(split: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, "full")
 
@@ -457,7 +457,7 @@ def test_a_conversion_that_fails_changes_nothing(split: Path, monkeypatch: pytes
     assert_whole(split, "full")
 
 
-def test_a_split_of_two_densities_is_read_and_becomes_one(split: Path) -> None:
+def test_seal_unifies_a_split_of_two_densities(split: Path) -> None:
     first, _ = read_manifest(split, []).fragments
     seal.seal(split, [seal.Piece.of(first)], density=("resume", 32))
     rows = read_manifest(split).table

@@ -60,7 +60,7 @@ def kept_experts() -> dict[int, Kept]:
 
 
 @pytest.mark.parametrize(("code", "words"), [(errno.ENOSPC, "the disk is full: free"), (errno.EIO, "the disk fails")])
-def test_what_the_disk_refuses_is_said_in_a_sentence(tmp_path: Path, code: int, words: str) -> None:
+def test_told_of_explains_failed_writes(tmp_path: Path, code: int, words: str) -> None:
     with pytest.raises(Failure, match=f"^Cannot write to {tmp_path}, {words}.* same command again"), told_of(tmp_path):
         raise OSError(code, "refused")
     with pytest.raises(FileNotFoundError), told_of(tmp_path):
@@ -68,7 +68,7 @@ def test_what_the_disk_refuses_is_said_in_a_sentence(tmp_path: Path, code: int, 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a file that even root cannot write to")
-def test_the_file_that_cannot_be_written_is_named_and_not_the_split(tmp_path: Path) -> None:
+def test_told_of_names_the_file_that_cannot_be_written(tmp_path: Path) -> None:
     elsewhere = Path("/proc/sys/kernel/version")
     words = f"^Cannot write to {elsewhere}, writing is not permitted.* same command again"
     with pytest.raises(Failure, match=words), told_of(tmp_path):
@@ -79,20 +79,20 @@ def test_the_file_that_cannot_be_written_is_named_and_not_the_split(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_experts_on_a_full_disk(tiny: Path) -> None:
+def test_save_experts_fails_on_a_full_disk(tiny: Path) -> None:
     with pytest.raises(OSError, match="No space left") as refused:
         save_experts(new_attempt(tiny, unit_name(0, 0)).experts, kept_experts())
     assert refused.value.errno == errno.ENOSPC
 
 
-def test_a_shard_on_a_full_disk(tiny: Path) -> None:
+def test_write_shard_fails_on_a_full_disk(tiny: Path) -> None:
     fields = arrays_of(made_level("s", 3), "level/") | arrays_of(made_record("s", 3), "record/")
     with pytest.raises(OSError, match="No space left") as refused:
         write_shard(new_attempt(tiny, unit_name(0, 0)).shard, [0, 1, 2], fields)
     assert refused.value.errno == errno.ENOSPC
 
 
-def test_a_fragment_on_a_full_disk(tiny: Path) -> None:
+def test_write_fragment_fails_on_a_full_disk(tiny: Path) -> None:
     job, paths = made_job(), new_attempt(tiny, unit_name(0, 0))
     begin_fragment(paths)
     with pytest.raises(OSError, match="No space left"):
@@ -104,7 +104,7 @@ def test_a_fragment_on_a_full_disk(tiny: Path) -> None:
 
 
 @pytest.mark.parametrize("has_it", [True, False], ids=["the file system can", "it cannot"])
-def test_macos_flushes_the_drive_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_it: bool) -> None:
+def test_flush_reaches_the_drive_on_macos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_it: bool) -> None:
     """No such system is at hand: what it has beside Linux is put in its place."""
     flushed: dict[str, set[Path]] = {"drive": set(), "fsync": set()}
     fsync, control = os.fsync, fcntl.fcntl
@@ -133,7 +133,7 @@ def test_macos_flushes_the_drive_itself(tmp_path: Path, monkeypatch: pytest.Monk
     assert not flushed["fsync" if has_it else "drive"]
 
 
-def test_a_drive_that_fails_is_not_asked_for_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flush_does_not_fall_back_when_the_drive_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: Any) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
@@ -143,16 +143,14 @@ def test_a_drive_that_fails_is_not_asked_for_less(tmp_path: Path, monkeypatch: p
         flush_entry(tmp_path)
 
 
-def test_one_function_alone_flushes() -> None:
+def test_only_to_drive_calls_fsync() -> None:
     """Whoever calls `fsync` elsewhere leaves data in the drive's cache on macOS."""
     calls = {path.name for path in (ROOT / "pipeline").rglob("*.py") if "fsync(" in path.read_text()}
     assert calls == {"disk.py"}
 
 
 @pytest.mark.slow
-def test_experts_are_on_the_disk_before_the_fragment_names_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commit_flushes_experts_before_the_fragment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flushed: set[Path] = set()
     fsync = os.fsync
 

@@ -10,7 +10,7 @@ from levelproof.pipeline.store.layout import EVENTS
 from levelproof.pipeline.store.split import locked
 
 
-def test_a_run_s_file_is_replaced_and_old_runs_make_room(tmp_path: Path) -> None:
+def test_tell_replaces_a_runs_file_and_new_run_removes_old_ones(tmp_path: Path) -> None:
     (tmp_path / EVENTS).mkdir()
     foreign = tmp_path / EVENTS / "mine.txt"
     foreign.touch()
@@ -30,11 +30,11 @@ def test_a_run_s_file_is_replaced_and_old_runs_make_room(tmp_path: Path) -> None
     }
 
 
-def test_a_disk_that_refuses_ends_no_run(tmp_path: Path) -> None:
+def test_tell_ignores_failed_writes(tmp_path: Path) -> None:
     tell(tmp_path / "gone" / "run.jsonl", [{"time": 1.0, "event": "started"}])
 
 
-def test_what_is_no_event_is_left_out(tmp_path: Path) -> None:
+def test_events_of_skips_invalid_lines(tmp_path: Path) -> None:
     path = tmp_path / "run.jsonl"
     deep = "[" * 100_000
     path.write_bytes(b'\xff\n{"time": 1.0, "event": "progress"}\n{"time": "now", "event": 3}\n3\n' + deep.encode())
@@ -43,7 +43,7 @@ def test_what_is_no_event_is_left_out(tmp_path: Path) -> None:
     assert events_of(path) == events_of(tmp_path / "none") == []
 
 
-def test_a_link_is_refused(tmp_path: Path) -> None:
+def test_locked_refuses_a_linked_events_folder(tmp_path: Path) -> None:
     (tmp_path / "split").mkdir()
     (tmp_path / "split" / EVENTS).symlink_to(tmp_path)
     with pytest.raises(UserError, match="is a link"), locked(tmp_path / "split", print):

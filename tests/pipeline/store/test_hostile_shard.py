@@ -79,7 +79,7 @@ FIELDS: dict[str, Callable[[list[dict[str, Any]]], Any]] = {
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_fields_that_are_not_those_of_a_size(shard: Path, name: str) -> None:
+def test_shard_refuses_fields_that_match_no_size(shard: Path, name: str) -> None:
     document = json.loads((shard / "zarr.json").read_text())
     FIELDS[name](document["attributes"]["fields"])
     (shard / "zarr.json").write_text(json.dumps(document))
@@ -104,7 +104,7 @@ def test_fields_that_are_not_those_of_a_size(shard: Path, name: str) -> None:
         None,
     ],
 )
-def test_level_ids_that_are_none(shard: Path, level_ids: Any) -> None:
+def test_shard_refuses_invalid_level_ids(shard: Path, level_ids: Any) -> None:
     document = json.loads((shard / "zarr.json").read_text())
     document["attributes"]["level_ids"] = level_ids
     (shard / "zarr.json").write_text(json.dumps(document))
@@ -124,7 +124,7 @@ ARRAYS: dict[str, Callable[[np.ndarray], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("name", ARRAYS)
-def test_arrays_that_do_not_have_what_the_fields_need(shard: Path, name: str) -> None:
+def test_shard_refuses_arrays_that_do_not_fit_the_fields(shard: Path, name: str) -> None:
     group = zarr.open_group(shard, mode="r+")
     old = group["dyn32"]
     assert isinstance(old, zarr.Array)
@@ -135,7 +135,7 @@ def test_arrays_that_do_not_have_what_the_fields_need(shard: Path, name: str) ->
     refused(shard)
 
 
-def test_a_group_in_place_of_an_array(shard: Path) -> None:
+def test_shard_refuses_a_group_in_place_of_an_array(shard: Path) -> None:
     zarr.open_group(shard, mode="r+").create_group("dyn32", overwrite=True)
     refused(shard)
 
@@ -155,7 +155,7 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_numbers_that_a_kernel_would_look_up(tmp_path: Path, name: str) -> None:
+def test_shard_refuses_out_of_range_indices(tmp_path: Path, name: str) -> None:
     fields = made_fields("s", len(LEVELS))
     fields[name][..., -1] = NUMBERS[name]
     path = tmp_path / NAME
@@ -164,7 +164,7 @@ def test_numbers_that_a_kernel_would_look_up(tmp_path: Path, name: str) -> None:
     Shard(path).read(fields=["level/density"])
 
 
-def test_what_numbers_may_be_depends_on_the_binding(tmp_path: Path) -> None:
+def test_action_range_depends_on_the_binding(tmp_path: Path) -> None:
     """A motor's entry of an action has a third choice, a thruster's has not."""
     for row, good in ((0, True), (4, False)):
         fields = made_fields("s", len(LEVELS))
@@ -178,7 +178,7 @@ def test_what_numbers_may_be_depends_on_the_binding(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["record/done", "level/model/active"])
-def test_flags_are_0_or_1(tmp_path: Path, name: str) -> None:
+def test_shard_refuses_flags_other_than_0_and_1(tmp_path: Path, name: str) -> None:
     fields = made_fields("s", len(LEVELS))
     fields[name].view(np.uint8)[..., 0] = 2
     write_shard(tmp_path / NAME, LEVELS, fields)
@@ -186,13 +186,13 @@ def test_flags_are_0_or_1(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("row", [-1, len(LEVELS), 2**40])
-def test_rows_that_it_does_not_have(shard: Path, row: int) -> None:
+def test_read_refuses_missing_rows(shard: Path, row: int) -> None:
     with pytest.raises(Failure, match="it has 3 rows, but others were requested"):
         Shard(shard).read([row])
 
 
 @pytest.mark.parametrize("inside", ["zarr.json", "dyn32", "dyn32/zarr.json", "dyn32/c", "dyn32/c/0/0/0"])
-def test_links_are_not_followed(shard: Path, tmp_path: Path, inside: str) -> None:
+def test_shard_does_not_follow_links(shard: Path, tmp_path: Path, inside: str) -> None:
     elsewhere = tmp_path / "elsewhere"
     (shard / inside).rename(elsewhere)
     before = stored_bytes(shard)
@@ -202,13 +202,13 @@ def test_links_are_not_followed(shard: Path, tmp_path: Path, inside: str) -> Non
 
 
 @pytest.mark.parametrize("inside", ["zarr.json", "dyn32/zarr.json", "dyn32/c/0/0/0"])
-def test_a_pipe_is_not_waited_for(shard: Path, inside: str) -> None:
+def test_shard_does_not_wait_for_a_pipe(shard: Path, inside: str) -> None:
     (shard / inside).unlink()
     os.mkfifo(shard / inside)
     refused(shard)
 
 
-def test_metadata_that_hides_in_the_group_is_not_looked_at(shard: Path) -> None:
+def test_shard_ignores_consolidated_metadata(shard: Path) -> None:
     """Zarr's consolidated metadata would describe arrays that are not there."""
     zarr.consolidate_metadata(shard)
     (shard / "dyn8/zarr.json").write_text("{}")
@@ -216,12 +216,12 @@ def test_metadata_that_hides_in_the_group_is_not_looked_at(shard: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{" * 100_000, '{"zarr_format": 2}', "\0"])
-def test_a_group_that_is_none(shard: Path, text: str) -> None:
+def test_shard_refuses_an_invalid_group(shard: Path, text: str) -> None:
     (shard / "zarr.json").write_text(text)
     refused(shard)
 
 
-def test_another_size_than_its_row_says(shard: Path) -> None:
+def test_open_shard_refuses_another_size(shard: Path) -> None:
     assert open_shard(shard.parents[1], NAME, "s").size == Shard(shard).size
     with pytest.raises(
         Failure, match=r"its levels have size s, but the manifest says m\): run `levelproof verify .* --repair`"
@@ -229,7 +229,7 @@ def test_another_size_than_its_row_says(shard: Path) -> None:
         open_shard(shard.parents[1], NAME, "m")
 
 
-def test_the_table_is_that_of_the_dataclasses(shard: Path) -> None:
+def test_field_table_matches_the_dataclasses(shard: Path) -> None:
     table = {place.name: place for place in table_for(Shard(shard).size)}
     assert table["record/state/position"].shape == (7, 2)
     assert table["level/model/vertices"].shape == (5, 4, 2)
@@ -258,13 +258,13 @@ def test_the_table_is_that_of_the_dataclasses(shard: Path) -> None:
         "manifest/" + NAME[7:],
     ],
 )
-def test_names_that_lead_elsewhere(tmp_path: Path, name: str) -> None:
+def test_data_path_refuses_names_outside_of_the_split(tmp_path: Path, name: str) -> None:
     with pytest.raises(Failure, match=r"which can be neither a shard nor experts of this split") as raised:
         data_path(tmp_path, name)
     assert "\n" not in str(raised.value)
 
 
-def test_names_of_data_and_links_on_the_way(tmp_path: Path) -> None:
+def test_data_path_refuses_links_inside_of_the_split(tmp_path: Path) -> None:
     split, experts = tmp_path / "s", NAME.replace(".zarr", ".npz").replace("shards", "experts")
     split.mkdir()
     assert data_path(split, NAME) == split / NAME
@@ -282,7 +282,7 @@ def test_names_of_data_and_links_on_the_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_commands_refuse_it_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_refuse_hostile_shards_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     split = made_split(tmp_path, [[Label.SOLVED, Label.SOLVED]])
     (name,) = read_manifest(split).shards
     fields = Shard(split / name).read() | {"level/model/joint_a": np.full((1, 2), 200, np.int32)}
@@ -297,7 +297,7 @@ def test_commands_refuse_it_in_one_sentence(tmp_path: Path, capsys: pytest.Captu
     assert out.count("level/model/joint_a has numbers that size s cannot have") == 1
 
 
-def test_no_command_looks_at_other_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_do_not_leave_the_split(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Not even for how much is in them."""
     split = made_split(tmp_path / "data", [[Label.SOLVED]])
     (tmp_path / "secret").write_bytes(b"x" * 1000)
@@ -317,7 +317,7 @@ def test_no_command_looks_at_other_folders(tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [np.nan, np.inf, -3e38])
-def test_worlds_without_sense_are_drawn_or_refused(tmp_path: Path, number: float) -> None:
+def test_pictures_draw_or_refuse_senseless_states(tmp_path: Path, number: float) -> None:
     split = made_split(tmp_path, [[Label.SOLVED]])
     (name,) = read_manifest(split).shards
     shard = Shard(split / name)

@@ -22,7 +22,7 @@ def split(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_what_was_wanted(split: Path) -> None:
+def test_read_note_returns_what_was_noted(split: Path) -> None:
     note = read_note(split)
     assert note.command == "levelproof regenerate 'where=label = '\"'\"'solved'\"'\"''"
     assert note.level_ids.tolist() == [[0, 7], [9, 9]]
@@ -30,7 +30,7 @@ def test_what_was_wanted(split: Path) -> None:
     assert note.intact
 
 
-def test_the_command_asks_for_what_is_stored(split: Path) -> None:
+def test_note_density_changes_the_command(split: Path) -> None:
     note_density(split, "witness", 16)
     note_density(split, "resume", 32)
     note = read_note(split)
@@ -43,7 +43,7 @@ def test_the_command_asks_for_what_is_stored(split: Path) -> None:
     assert read_note(split).command == "levelproof import there"
 
 
-def test_every_byte_counts(split: Path) -> None:
+def test_read_note_detects_any_changed_byte(split: Path) -> None:
     whole = (split / JOB).read_bytes()
     for at in range(0, len(whole), 13):
         (split / JOB).write_bytes(whole[:at] + bytes([whole[at] ^ 1 << at % 7]) + whole[at + 1 :])
@@ -54,20 +54,20 @@ def test_every_byte_counts(split: Path) -> None:
         assert not read_note(split).intact
 
 
-def test_one_of_other_settings_than_its_hash_says_is_not_believed(split: Path) -> None:
+def test_read_note_drops_settings_that_do_not_match_their_hash(split: Path) -> None:
     text = (split / JOB).read_text()
     (split / JOB).write_text(text.replace('"budget": 131072', '"budget": 131073').replace("128000", "128001"))
     assert read_note(split).config is None
 
 
 @pytest.mark.parametrize("text", ["", "[]", "7", "[" * 100_000, '{"command": 1, "level_ids": []}', "\0", '"\ud800"'])
-def test_what_says_nothing(tmp_path: Path, text: str) -> None:
+def test_read_note_refuses_invalid_notes(tmp_path: Path, text: str) -> None:
     (tmp_path / JOB).write_bytes(text.encode(errors="surrogatepass"))
     with pytest.raises(NoteError):
         read_note(tmp_path)
 
 
-def test_what_may_never_end(split: Path) -> None:
+def test_read_note_refuses_pipes_and_large_files(split: Path) -> None:
     (split / JOB).unlink()
     os.mkfifo(split / JOB)
     with pytest.raises(NoteError):
@@ -83,12 +83,12 @@ def test_what_may_never_end(split: Path) -> None:
         read_note(split)
 
 
-def test_a_terminal_does_not_obey_it(split: Path) -> None:
+def test_read_note_replaces_control_characters(split: Path) -> None:
     note_job(split, made_job(), ["\x1b[2J"], [])
     assert read_note(split).command == "'?[2J'"
 
 
-def test_the_settings_of_an_earlier_version_take_their_form_of_today(tmp_path: Path) -> None:
+def test_read_note_updates_settings_of_earlier_versions(tmp_path: Path) -> None:
     job = made_job()
     before = job.results | {"expert": plain(job.expert) | {"slots": 8}}
     note = {"command": "levelproof generate", "level_ids": [[0, 7]], "config_hash": hash_of(before), "config": before}

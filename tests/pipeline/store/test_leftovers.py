@@ -49,7 +49,7 @@ def dead(split: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return attempt
 
 
-def test_levels_that_an_attempt_of_which_nobody_has_heard_has_committed_are_left_out(tmp_path: Path) -> None:
+def test_commit_skips_levels_of_an_unreported_commit(tmp_path: Path) -> None:
     """It gave some of its levels back, and its word of that was lost: the unit was handed out again as it had been."""
     said: list[str] = []
     for ids in [[0, 3], [0, 1, 2, 3], [0, 1, 2, 3]]:
@@ -68,7 +68,7 @@ def said() -> list[str]:
     return []
 
 
-def test_what_a_dead_attempt_left_goes_and_what_is_committed_stays(split: Path, dead: str, said: list[str]) -> None:
+def test_clean_removes_what_a_dead_attempt_left(split: Path, dead: str, said: list[str]) -> None:
     note = split / "quarantine/.000000000004-000000000005.txt.123"
     note.parent.mkdir()
     half = {split / ".job.json.123", split / "manifest/.index.txt.123", note}
@@ -82,7 +82,7 @@ def test_what_a_dead_attempt_left_goes_and_what_is_committed_stays(split: Path, 
 
 
 @pytest.mark.usefixtures("dead")
-def test_what_others_put_there_stays(split: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_clean_keeps_files_of_others(split: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     clean(split, print)
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     (elsewhere / "mine").touch()
@@ -108,7 +108,7 @@ def test_what_others_put_there_stays(split: Path, tmp_path_factory: pytest.TempP
     assert (elsewhere / "mine").exists()
 
 
-def test_data_of_a_fragment_that_is_kept_elsewhere_stays_and_is_told(split: Path, said: list[str]) -> None:
+def test_clean_reports_unnamed_data_without_a_mark(split: Path, said: list[str]) -> None:
     committed(split, 2)
     moved = fragment_paths(split)[0]
     (shard,) = (split / "shards").glob(f"{moved.stem}-*")
@@ -120,7 +120,7 @@ def test_data_of_a_fragment_that_is_kept_elsewhere_stays_and_is_told(split: Path
     assert f"No fragment names {shard}: delete" in sentence
 
 
-def test_a_copy_made_while_a_unit_was_committed_is_whole(split: Path) -> None:
+def test_clean_keeps_a_copy_made_during_a_commit(split: Path) -> None:
     """The copy has both the mark that the attempt began and the fragment that it became."""
     (shard,) = (split / "shards").iterdir()
     begun = split / f"manifest/.{attempt_of(shard)}.begun"
@@ -130,9 +130,7 @@ def test_a_copy_made_while_a_unit_was_committed_is_whole(split: Path) -> None:
     assert not begun.exists()
 
 
-def test_what_cannot_be_removed_now_is_removed_by_the_next_run(
-    split: Path, dead: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_clean_retries_failed_removals(split: Path, dead: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(shutil, "rmtree", lambda path, ignore_errors: None)
         clean(split, print)
@@ -141,7 +139,7 @@ def test_what_cannot_be_removed_now_is_removed_by_the_next_run(
     assert not [path for path in everything(split) if dead in path.name]
 
 
-def test_a_damaged_fragment_stops_the_cleaning(split: Path, dead: str) -> None:
+def test_clean_stops_at_a_damaged_fragment(split: Path, dead: str) -> None:
     """What it names is named by it alone."""
     fragment_paths(split)[0].write_bytes(b"x")
     before = everything(split)
@@ -150,7 +148,7 @@ def test_a_damaged_fragment_stops_the_cleaning(split: Path, dead: str) -> None:
     assert everything(split) == before
 
 
-def test_cleaning_waits_for_a_commit_under_way(split: Path, dead: str) -> None:
+def test_clean_waits_for_a_running_commit(split: Path, dead: str) -> None:
     """A worker that outlives its killed run may be between its shard and its fragment."""
     with ThreadPoolExecutor() as other:
         with committing(split):

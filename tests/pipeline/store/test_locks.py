@@ -20,23 +20,21 @@ from levelproof.pipeline.jobs.worker import Worker
 from levelproof.pipeline.store import leases, locks
 from levelproof.pipeline.store.layout import COMMIT_LOCK
 from levelproof.pipeline.store.leases import LeaseLost
-from levelproof.pipeline.store.locks import LockRefused, committing, is_written, without_commits, only_writer
+from levelproof.pipeline.store.locks import LockRefused, committing, is_written, only_writer, without_commits
 from levelproof.pipeline.store.split import writing
 from tests.pace import patience
 from tests.pipeline.command import ROOT, heed_ctrl_c, start
 from tests.pipeline.made import made_job
 
 
-def test_commits_do_not_wait_for_each_other(tmp_path: Path) -> None:
+def test_committing_is_shared(tmp_path: Path) -> None:
     with committing(tmp_path), committing(tmp_path):
         pass
     with without_commits(tmp_path, print):
         pass
 
 
-def test_a_worker_of_an_earlier_command_commits_nothing_beside_the_next(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_committing_refuses_workers_of_an_earlier_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not even into a folder that was made anew."""
     monkeypatch.setattr(leases, "_served", {})
     worker = Path(os.path.relpath(tmp_path))  # as another process has it
@@ -100,7 +98,7 @@ def test_locks_exclude_on_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("refused", [fcntl.LOCK_SH, fcntl.LOCK_EX])
-def test_a_file_system_without_locks_is_named_at_once(
+def test_writing_refuses_a_file_system_without_locks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: int
 ) -> None:
     flock = fcntl.flock
@@ -118,7 +116,7 @@ def test_a_file_system_without_locks_is_named_at_once(
         pytest.fail("something would have trained")
 
 
-def test_a_worker_whose_file_system_has_no_locks_stops_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_without_locks_stop_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any) -> None:
         raise LockRefused("no locks here")
 
@@ -128,7 +126,7 @@ def test_a_worker_whose_file_system_has_no_locks_stops_the_run(tmp_path: Path, m
     assert ended == UnitOutcome(unit, reason=ended.reason, fatal="no locks here")
 
 
-def test_waiting_for_a_worker_of_an_earlier_run_is_told_and_can_be_stopped(tmp_path: Path) -> None:
+def test_without_commits_reports_its_wait_and_can_be_stopped(tmp_path: Path) -> None:
     split = tmp_path / "data/5k/s"
     split.mkdir(parents=True)
     with committing(split):

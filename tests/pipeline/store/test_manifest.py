@@ -46,7 +46,7 @@ def commit(split: Path, job: JobConfig, level_ids: list[int], label: Label = Lab
     return attempt.fragment
 
 
-def test_rows_come_back_sorted_with_every_column(tmp_path: Path, job: JobConfig) -> None:
+def test_read_manifest_sorts_rows_and_returns_every_column(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [16, 17], Label.UNSOLVED)
     commit(tmp_path, job, [0, 3])
     manifest = read_manifest(tmp_path)
@@ -66,7 +66,7 @@ def test_rows_come_back_sorted_with_every_column(tmp_path: Path, job: JobConfig)
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_of_many_fragments_people_see_how_many_are_read(
+def test_read_manifest_shows_a_bar_for_many_fragments(
     tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch, terminal: bool
 ) -> None:
     seen = io.StringIO()
@@ -80,13 +80,13 @@ def test_of_many_fragments_people_see_how_many_are_read(
     assert ("fragments" in seen.getvalue()) == terminal
 
 
-def test_the_issue_s_columns_are_there() -> None:
+def test_columns_include_the_required_ones() -> None:
     asked = "level_id size budget label label_reason success_rate steps_to_goal steps_to_first_success env_steps"
     asked += " learning_curve shard row config_hash versions device"
     assert set(asked.split()) <= set(COLUMNS.names)
 
 
-def test_a_level_counts_once_and_all_its_shards_are_kept(tmp_path: Path, job: JobConfig) -> None:
+def test_read_manifest_counts_a_level_once(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [0, 1, 2])
     commit(tmp_path, job, [2, 3])
     manifest = read_manifest(tmp_path)
@@ -94,18 +94,18 @@ def test_a_level_counts_once_and_all_its_shards_are_kept(tmp_path: Path, job: Jo
     assert len(manifest.shards) == 2
 
 
-def test_columns_asked_for_are_enough(tmp_path: Path, job: JobConfig) -> None:
+def test_read_manifest_reads_only_requested_columns(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [0])
     assert read_manifest(tmp_path, ["label"]).table.column_names == ["level_id", "label"]
 
 
-def test_a_column_that_is_none_is_named(tmp_path: Path, job: JobConfig) -> None:
+def test_read_manifest_names_an_unknown_column(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [0])
     with pytest.raises(UserError, match="There is no column 'lable': the manifest has level_id, "):
         read_manifest(tmp_path, ["lable"])
 
 
-def test_nothing_committed_is_an_empty_manifest(tmp_path: Path) -> None:
+def test_read_manifest_is_empty_before_any_commit(tmp_path: Path) -> None:
     manifest = read_manifest(tmp_path)
     assert len(manifest.level_ids) == 0
     assert manifest.config is None
@@ -115,7 +115,7 @@ def test_nothing_committed_is_an_empty_manifest(tmp_path: Path) -> None:
         require_manifest(tmp_path / "nowhere")
 
 
-def test_what_is_no_fragment_is_not_read(tmp_path: Path, job: JobConfig) -> None:
+def test_read_manifest_ignores_other_files(tmp_path: Path, job: JobConfig) -> None:
     """A half-written one, a copy, what a notebook, a desktop and NFS leave, folders and links."""
     path = commit(tmp_path, job, [0])
     begin_fragment(new_attempt(tmp_path, unit_name(1, 1)))
@@ -129,7 +129,7 @@ def test_what_is_no_fragment_is_not_read(tmp_path: Path, job: JobConfig) -> None
     assert read_manifest(tmp_path).level_ids.tolist() == [0]
 
 
-def test_a_failed_write_commits_nothing(tmp_path: Path, job: JobConfig) -> None:
+def test_failed_write_fragment_commits_nothing(tmp_path: Path, job: JobConfig) -> None:
     attempt = new_attempt(tmp_path, unit_name(0, 0))
     begin_fragment(attempt)
     with pytest.raises((pa.ArrowException, ValueError, TypeError)):
@@ -137,7 +137,7 @@ def test_a_failed_write_commits_nothing(tmp_path: Path, job: JobConfig) -> None:
     assert list(tmp_path.rglob("*.*")) == [attempt.begun]
 
 
-def test_any_damaged_byte_of_a_fragment_is_seen_or_harmless(tmp_path: Path, job: JobConfig) -> None:
+def test_read_manifest_detects_damaged_bytes_or_is_unaffected(tmp_path: Path, job: JobConfig) -> None:
     path = commit(tmp_path, job, [0, 1])
     before, whole = read_manifest(tmp_path).table.to_pylist(), path.read_bytes()
     seen = 0
@@ -151,14 +151,14 @@ def test_any_damaged_byte_of_a_fragment_is_seen_or_harmless(tmp_path: Path, job:
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1", b"not parquet at all, but long enough to look at" * 9])
-def test_a_fragment_that_is_none_is_named(tmp_path: Path, job: JobConfig, content: bytes) -> None:
+def test_read_manifest_names_an_invalid_fragment(tmp_path: Path, job: JobConfig, content: bytes) -> None:
     path = commit(tmp_path, job, [0])
     path.write_bytes(content)
     with pytest.raises(Failure, match=r"is damaged .* run `levelproof verify .* --repair` to regenerate its levels"):
         read_manifest(tmp_path)
 
 
-def test_another_version_is_refused(tmp_path: Path, job: JobConfig) -> None:
+def test_read_manifest_refuses_another_version(tmp_path: Path, job: JobConfig) -> None:
     path = commit(tmp_path, job, [0])
     table = pq.read_table(path)
     metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"9"}
@@ -167,7 +167,7 @@ def test_another_version_is_refused(tmp_path: Path, job: JobConfig) -> None:
         read_manifest(tmp_path)
 
 
-def test_what_was_written_before_seconds_were_counted_is_read(tmp_path: Path, job: JobConfig) -> None:
+def test_read_manifest_accepts_the_version_without_seconds(tmp_path: Path, job: JobConfig) -> None:
     path = commit(tmp_path, job, [0, 1])
     table = pq.read_table(path)
     metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"6"}
@@ -181,7 +181,7 @@ def test_what_was_written_before_seconds_were_counted_is_read(tmp_path: Path, jo
         read_manifest(tmp_path)
 
 
-def test_two_configurations_in_one_split_are_named(tmp_path: Path, job: JobConfig) -> None:
+def test_read_manifest_refuses_two_configurations(tmp_path: Path, job: JobConfig) -> None:
     commit(tmp_path, job, [0])
     commit(tmp_path, made_job("data", "expert.width=64"), [1])
     with pytest.raises(Failure, match=r"mixes the configurations.*expert.width was 32, now 64.*with their shards"):
@@ -194,12 +194,12 @@ def test_differences_name_old_and_new() -> None:
     assert told({f"s{i}": (i, -i) for i in range(8)}).endswith("s5 was 5, now -5 and 2 more")
 
 
-def test_units_have_names_that_sort_as_their_ids() -> None:
+def test_unit_names_sort_as_ids() -> None:
     names = [unit_name(first, first + 1) for first in (0, 9, 10, 999_999, 10**9)]
     assert all(a < b for a, b in itertools.pairwise(names))
 
 
-def test_rows_of_some_levels_take_the_fragments_that_cover_them(
+def test_read_manifest_opens_only_fragments_that_cover_the_levels(
     tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = {tuple(ids): commit(tmp_path, job, list(ids)) for ids in ((0, 1, 2), (2, 5), (6, 7), (9, 20), (30,))}

@@ -28,7 +28,7 @@ def of_all(parts: list[Path]) -> list[Place]:
 
 
 @pytest.mark.parametrize("rows_a_file", [1, 4, 15, None])
-def test_every_bit_comes_back(tmp_path: Path, parts: list[Path], rows_a_file: int | None) -> None:
+def test_merge_shards_preserves_every_bit(tmp_path: Path, parts: list[Path], rows_a_file: int | None) -> None:
     once, again = tmp_path / "once.zarr", tmp_path / "again.zarr"
     merge_shards(once, of_all(parts)[::2], rows_a_file=rows_a_file)
     merge_shards(
@@ -45,7 +45,7 @@ def test_every_bit_comes_back(tmp_path: Path, parts: list[Path], rows_a_file: in
     assert last == expected["record/action"].T[14, 0, :1].tolist()
 
 
-def test_its_files_are_few_and_plain_zarr(tmp_path: Path, parts: list[Path]) -> None:
+def test_merge_shards_writes_few_plain_zarr_files(tmp_path: Path, parts: list[Path]) -> None:
     path = tmp_path / "merged.zarr"
     merge_shards(path, of_all(parts), rows_a_file=4)
     array = zarr.open_array(path, path="dyn32", mode="r")
@@ -56,7 +56,7 @@ def test_its_files_are_few_and_plain_zarr(tmp_path: Path, parts: list[Path]) -> 
     assert (np.asarray(array[:]) == whole).all()
 
 
-def test_damage_is_seen_and_not_passed_on(tmp_path: Path, parts: list[Path]) -> None:
+def test_merge_shards_refuses_damage(tmp_path: Path, parts: list[Path]) -> None:
     file = parts[1] / "act/c/0/0/0"
     whole = file.read_bytes()
     for at in (7, len(whole) // 2, len(whole) - 20, len(whole) - 1):
@@ -71,7 +71,7 @@ def test_damage_is_seen_and_not_passed_on(tmp_path: Path, parts: list[Path]) -> 
         merge_shards(tmp_path / "gone.zarr", of_all(parts))
 
 
-def test_shards_of_other_fields_are_not_merged(tmp_path: Path, parts: list[Path]) -> None:
+def test_merge_shards_refuses_different_fields(tmp_path: Path, parts: list[Path]) -> None:
     other = tmp_path / "m.zarr"
     write_shard(other, [20], made_fields("m", 1))
     with pytest.raises(Failure, match="have different fields"):
@@ -81,12 +81,12 @@ def test_shards_of_other_fields_are_not_merged(tmp_path: Path, parts: list[Path]
 @pytest.mark.parametrize(
     "wrong", [Place(Path("5.zarr"), 1, 5), Place(Path("5.zarr"), 5, 10), Place(Path("5.zarr"), -1, 9)]
 )
-def test_a_row_that_is_of_another_level_is_refused(tmp_path: Path, parts: list[Path], wrong: Place) -> None:
+def test_merge_shards_refuses_a_row_of_another_level(tmp_path: Path, parts: list[Path], wrong: Place) -> None:
     with pytest.raises(Failure, match=rf"row {wrong.row} is not level {wrong.level_id}, which the manifest names"):
         merge_shards(tmp_path / "merged.zarr", [wrong._replace(shard=tmp_path / wrong.shard)])
 
 
-def test_a_file_of_a_merged_shard_that_is_gone_is_seen_by_who_needs_it(tmp_path: Path, parts: list[Path]) -> None:
+def test_read_refuses_a_missing_file_of_a_merged_shard(tmp_path: Path, parts: list[Path]) -> None:
     path = tmp_path / "merged.zarr"
     merge_shards(path, of_all(parts), rows_a_file=4)
     (path / "lvl32/c/1/0").unlink()

@@ -62,7 +62,7 @@ def same(one: dict[int, Paused], two: dict[int, Paused]) -> None:
         jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-def test_what_is_kept_comes_back(split: Path, kept: dict[int, Paused]) -> None:
+def test_load_paused_restores_every_bit(split: Path, kept: dict[int, Paused]) -> None:
     same(load_paused(split, range(8), JOB), kept)
     same(load_paused(split, [7, 9], JOB), {7: kept[7]})
     assert load_paused(split, [5, 8], JOB) == {}
@@ -76,18 +76,18 @@ def test_drop_keeps_experts_of_levels_that_were_cut_from_the_unit(split: Path, k
     same(load_paused(split, range(8), JOB), kept)
 
 
-def test_of_two_the_one_that_came_further_counts(split: Path, kept: dict[int, Paused]) -> None:
+def test_load_paused_prefers_the_later_checkpoint(split: Path, kept: dict[int, Paused]) -> None:
     save_paused(split, unit_name(0, 4), {3: kept[7]}, JOB)
     same(load_paused(split, range(8), JOB), {3: kept[7], 7: kept[7]})
 
 
-def test_of_other_settings_or_versions_none_goes_on(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_paused_ignores_other_settings_and_versions(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert load_paused(split, range(8), replace(JOB, budget="8k")) == {}
     monkeypatch.setattr(store, "versions", lambda: {"jax": "another"})
     assert load_paused(split, range(8), JOB) == {}
 
 
-def test_what_is_damaged_is_nothing(split: Path) -> None:
+def test_load_paused_ignores_damaged_checkpoints(split: Path) -> None:
     path = checkpoint_path(split, UNIT)
     whole = path.read_bytes()
     for damaged in (b"", whole[: len(whole) // 2], whole.replace(b"level_id", b"level_di"), b"x" * 100):
@@ -95,7 +95,7 @@ def test_what_is_damaged_is_nothing(split: Path) -> None:
         assert load_paused(split, range(8), JOB) == {}
 
 
-def test_what_no_level_needs_goes(split: Path) -> None:
+def test_prune_removes_checkpoints_of_committed_levels(split: Path) -> None:
     path = checkpoint_path(split, UNIT)
     (split / "checkpoints" / f".{path.name}.17").touch()
     said: list[str] = []
@@ -127,7 +127,7 @@ def test_save_keeps_other_users_out_under_any_umask(tmp_path: Path, kept: dict[i
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="the system has no such users")
-def test_a_checkpoint_that_others_can_write_to_stays(split: Path, kept: dict[int, Paused]) -> None:
+def test_prune_keeps_a_checkpoint_that_others_can_write_to(split: Path, kept: dict[int, Paused]) -> None:
     path = checkpoint_path(split, UNIT)
     path.chmod(0o664)
     (said,) = pruned(split, 7)
@@ -141,7 +141,7 @@ def test_a_checkpoint_that_others_can_write_to_stays(split: Path, kept: dict[int
     assert not path.exists(), "its levels are committed"
 
 
-def test_a_damaged_checkpoint_is_removed_with_a_sentence(split: Path) -> None:
+def test_prune_removes_and_reports_a_damaged_checkpoint(split: Path) -> None:
     path = checkpoint_path(split, UNIT)
     whole = path.read_bytes()
     for damaged in (
@@ -168,7 +168,7 @@ def test_prune_reads_heads_alone(split: Path) -> None:
     assert load_paused(split, range(8), JOB) == {}, "its bytes have changed"
 
 
-def test_a_checkpoint_of_another_version_stays(split: Path) -> None:
+def test_prune_keeps_a_checkpoint_of_another_version(split: Path) -> None:
     path = checkpoint_path(split, UNIT)
     older = path.with_suffix(".npz")
     older.write_bytes(b"PK of an earlier version")
@@ -200,7 +200,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     remote._store.cache_clear()
 
 
-def test_a_checkpoint_in_a_store_survives_its_time_outs(
+def test_checkpoints_in_a_store_survive_time_outs(
     server: Server, kept: dict[int, Paused], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     split = Path("s3://bucket/data/5k/s")

@@ -26,7 +26,7 @@ def stored_bytes(folder: Path) -> int:
     steps=st.lists(st.tuples(st.sampled_from(["put", "read", "flip", "cut"]), st.integers(0, 7), st.booleans())),
     most=st.integers(0, 200),
 )
-def test_a_piece_is_right_or_not_there(steps: list, most: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_piece_cache_returns_right_bytes(steps: list, most: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("cache")
     caches = [PieceCache(folder, most) for _ in range(2)]  # two processes
     for what, n, which in steps:
@@ -45,7 +45,7 @@ def test_a_piece_is_right_or_not_there(steps: list, most: int, tmp_path_factory:
             assert not path.exists()
 
 
-def test_what_was_used_last_stays(tmp_path: Path) -> None:
+def test_piece_cache_keeps_recently_used_pieces(tmp_path: Path) -> None:
     cache = PieceCache(tmp_path, 10 * (100 + CHECKSUM))
     for n in range(10):
         cache.put(str(n), bytes(100))
@@ -60,7 +60,7 @@ def test_what_was_used_last_stays(tmp_path: Path) -> None:
     assert not {"1", "2"} & left
 
 
-def test_what_a_killed_process_left_is_no_piece_and_goes(tmp_path: Path) -> None:
+def test_piece_cache_removes_what_a_killed_process_left(tmp_path: Path) -> None:
     (tmp_path / ".name-0.0a1b2c3d").write_bytes(bytes(500))
     os.utime(tmp_path / ".name-0.0a1b2c3d", (0, 0))
     cache = PieceCache(tmp_path, 400)
@@ -69,7 +69,7 @@ def test_what_a_killed_process_left_is_no_piece_and_goes(tmp_path: Path) -> None
     assert [path.name for path in tmp_path.iterdir()] == ["name-0"]
 
 
-def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+def test_piece_cache_explains_an_unwritable_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(Failure, match=r"Cannot write to the cache folder .* LEVELPROOF_CACHE_DIR"):
         PieceCache(tmp_path / "file" / "cache", 100).put("name", b"x")

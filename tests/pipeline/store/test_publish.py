@@ -107,7 +107,7 @@ def require_whole(here: Path) -> None:
     ("every", "how"),
     [(0, ""), (3, "busy"), (4, "lost"), pytest.param(4, "cut", marks=pytest.mark.campaign)],
 )
-def test_a_store_gets_what_a_folder_gets(server: Server, here: Path, every: int, how: str) -> None:
+def test_store_gets_what_a_folder_gets(server: Server, here: Path, every: int, how: str) -> None:
     server.spoil(every, how)
     drive(OUT)
     server.spoil(0)
@@ -117,7 +117,7 @@ def test_a_store_gets_what_a_folder_gets(server: Server, here: Path, every: int,
     assert not [line for line in server.log[count:] if line.startswith("PUT") and "/shards/" in line]
 
 
-def test_a_store_that_is_slow_is_asked_again(server: Server, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_requests_to_a_slow_store_are_retried(server: Server, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(remote.PATIENCE, "timeout", timedelta(seconds=patience(0.5)))
     forget()
     server.spoil(25, "slow")
@@ -143,7 +143,7 @@ def requests_of_a_run(server: Server) -> int:
 
 
 @pytest.mark.parametrize("some", [1, pytest.param(8, marks=pytest.mark.campaign)])
-def test_a_store_that_is_gone_is_one_sentence_and_the_same_command_goes_on(
+def test_generate_resumes_after_the_store_fails(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, some: int
 ) -> None:
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
@@ -162,7 +162,7 @@ def test_a_store_that_is_gone_is_one_sentence_and_the_same_command_goes_on(
 
 
 @pytest.mark.campaign
-def test_a_driver_killed_at_any_request(server: Server, here: Path) -> None:
+def test_generate_resumes_after_a_kill_at_any_request(server: Server, here: Path) -> None:
     requests = requests_of_a_run(server)
     for request in sorted(random.Random(0).sample(range(1, requests), 5)):
         begun = server.count
@@ -199,7 +199,7 @@ STEPS = {  # requests of an attempt, by what they have in them, and which of tho
     "step",
     ["look", "fragment", *(pytest.param(x, marks=pytest.mark.campaign) for x in ("mark", "lease", "data", "end"))],
 )
-def test_a_worker_whose_writer_is_replaced_meanwhile_commits_before_or_never(
+def test_workers_of_a_replaced_writer_commit_before_or_never(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     """Paused before any of its requests until another writer has taken over and cleaned up."""
@@ -232,7 +232,7 @@ def test_a_worker_whose_writer_is_replaced_meanwhile_commits_before_or_never(
 
 
 @ALSO_MOTO
-def test_a_sealed_split_is_as_before(server: Server, here: Path, tmp_path: Path) -> None:
+def test_seal_preserves_a_split_in_a_store(server: Server, here: Path, tmp_path: Path) -> None:
     drive(OUT)
     done = command(["seal", str(THERE)], tmp_path)
     assert done.returncode == 0, done.stderr
@@ -241,7 +241,7 @@ def test_a_sealed_split_is_as_before(server: Server, here: Path, tmp_path: Path)
 
 
 @pytest.mark.campaign
-def test_a_store_that_is_gone_while_a_split_is_sealed(
+def test_seal_resumes_after_the_store_fails(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
@@ -272,7 +272,7 @@ def assert_sealed(here: Path) -> None:
 
 
 @ALSO_MOTO
-def test_of_two_attempts_at_a_unit_one_is_committed(server: Server) -> None:
+def test_one_of_two_attempts_at_a_unit_is_committed(server: Server) -> None:
     with ThreadPoolExecutor() as threads:
         for ended in [threads.submit(commit_made, THERE, WorkUnit((0, 1))) for _ in range(3)]:
             ended.result()
@@ -282,9 +282,7 @@ def test_of_two_attempts_at_a_unit_one_is_committed(server: Server) -> None:
     assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
 
 
-def test_levels_that_an_attempt_of_which_nobody_has_heard_has_committed_are_left_out(
-    server: Server, here: Path
-) -> None:
+def test_commit_to_a_store_skips_levels_of_an_unreported_commit(server: Server, here: Path) -> None:
     """It gave some of its levels back, and its word of that was lost: the unit was handed out again as it had been."""
     commit_made(THERE, WorkUnit((0, 3)))
     commit_made(THERE, WorkUnit((0, 1, 2, 3)))
@@ -296,7 +294,7 @@ def test_levels_that_an_attempt_of_which_nobody_has_heard_has_committed_are_left
 
 
 @pytest.mark.parametrize(("first", "last"), [(4, 44), (40, None)], ids=["the first page's header", "its end"])
-def test_a_fragment_that_is_damaged_is_one_sentence(server: Server, first: int, last: int | None) -> None:
+def test_publishing_names_a_damaged_fragment(server: Server, first: int, last: int | None) -> None:
     commit_made(THERE, WorkUnit((0, 1)))
     (path,) = fragment_paths(THERE)
     data = bytearray(get(path).data)
@@ -306,7 +304,7 @@ def test_a_fragment_that_is_damaged_is_one_sentence(server: Server, first: int, 
         commit_made(THERE, WorkUnit((0, 1)))
 
 
-def test_a_second_writer_is_refused_while_the_first_renews_its_lease(
+def test_lease_refuses_a_second_writer_while_it_is_renewed(
     server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(leases, "RENEWAL", 0.05)
@@ -334,7 +332,7 @@ def interruptible() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_a_writer_that_is_silent_is_waited_for_and_replaced_and_notices(
+def test_lease_of_a_silent_writer_is_taken_and_the_writer_notices(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(leases, "SILENCE", 0.3)
@@ -357,7 +355,7 @@ def left_by_a_killed_writer(**other: Any) -> bytes:
     return json.dumps(text | {"pid": ended_process.pid} | other).encode()
 
 
-def test_a_lease_of_a_dead_process_is_taken_at_once_on_its_own_machine_only(
+def test_lease_of_a_dead_process_is_taken_at_once_on_its_machine_only(
     server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Not on another one of the same host name, which outside of containers has the same PID namespace, too."""
@@ -379,9 +377,7 @@ def test_a_lease_of_a_dead_process_is_taken_at_once_on_its_own_machine_only(
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_a_writer_keeps_its_lease_when_answers_to_renewals_are_lost(
-    server: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lease_survives_lost_responses_to_renewals(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.1))
     monkeypatch.setattr(leases, "RENEWAL", 0.05)
     try:
@@ -404,7 +400,7 @@ def await_renewals(count: Callable[[], int], more: int) -> None:
 
 
 @pytest.mark.parametrize("day", ["Thu, 01 Jan 1981 00:00:00 GMT", "Fri, 01 Jan 2038 00:00:00 GMT"])
-def test_no_clock_decides_whether_a_store_s_split_is_written(
+def test_is_leased_compares_no_clocks(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, day: str
 ) -> None:
     """The store's, by which a lease was put on this `day`, or this machine's."""
@@ -435,7 +431,7 @@ def test_no_clock_decides_whether_a_store_s_split_is_written(
 
 
 @pytest.mark.parametrize(("every", "how"), [(0, ""), (2, "lost")])
-def test_google_s_store_gets_what_a_folder_gets(
+def test_google_store_gets_what_a_folder_gets(
     server: Server, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int, how: str
 ) -> None:
     """Which says of a file that is removed again that it is not there."""
@@ -455,7 +451,7 @@ def test_google_s_store_gets_what_a_folder_gets(
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(("every", "how"), [(0, ""), (3, "busy"), (4, "lost"), (4, "cut")])
-def test_azure_s_store_gets_what_a_folder_gets(
+def test_azure_store_gets_what_a_folder_gets(
     server: Server, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int, how: str
 ) -> None:
     azurite = os.environ.get("LEVELPROOF_TEST_AZURITE")
@@ -480,12 +476,12 @@ def test_azure_s_store_gets_what_a_folder_gets(
 
 
 @pytest.mark.parametrize("out", ["https://host/data", "hf://datasets/me/data"])
-def test_what_is_no_store_is_refused(out: str) -> None:
+def test_generate_refuses_read_only_urls(out: str) -> None:
     with pytest.raises(UserError, match=rf"Nothing can be written to {out}/128k/s: give a folder, or a URL of s3"):
         drive(out)
 
 
-def test_a_store_that_heeds_no_conditions_is_refused(server: Server, tmp_path: Path) -> None:
+def test_generate_refuses_a_store_without_preconditions(server: Server, tmp_path: Path) -> None:
     heeding = bucket_of(tmp_path / "s3")
     careless = lambda method, path, headers, body: heeding(
         method, path, {name: x for name, x in headers.items() if not name.startswith("if-")}, body
@@ -497,9 +493,7 @@ def test_a_store_that_heeds_no_conditions_is_refused(server: Server, tmp_path: P
             drive(OUT)
 
 
-def test_a_store_that_is_busy_is_not_said_to_heed_no_conditions(
-    server: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_require_conditions_reports_a_busy_store_as_busy(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever numbers there are in the name of the file that it is tried with."""
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
     server.spoil(1)
@@ -508,7 +502,7 @@ def test_a_store_that_is_busy_is_not_said_to_heed_no_conditions(
 
 
 @ALSO_MOTO
-def test_a_fence_is_nothing_to_readers_and_the_next_unit_takes_its_place(server: Server, here: Path) -> None:
+def test_fences_are_invisible_to_readers_and_replaced_by_units(server: Server, here: Path) -> None:
     mark = new_attempt(THERE, unit_name(0, 1)).begun
     put(mark, b"")
     assert ended(THERE, [mark], []) == {mark}
@@ -523,7 +517,7 @@ def test_a_fence_is_nothing_to_readers_and_the_next_unit_takes_its_place(server:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("server", ["moto"], indirect=True)
-def test_generate_into_a_store_is_generate_into_a_folder(server: Server, tmp_path: Path) -> None:
+def test_generate_writes_the_same_to_a_store_and_a_folder(server: Server, tmp_path: Path) -> None:
     generate = ["generate", *TINY, "keep_experts=true"]
     assert command([*generate, "executor=inline"], tmp_path).returncode == 0
     done = run([*generate, f"out={OUT}", "workers=1"], tmp_path)
@@ -542,7 +536,7 @@ def test_generate_into_a_store_is_generate_into_a_folder(server: Server, tmp_pat
     assert "0 problems" in verified.stdout
 
 
-def test_events_of_runs_lie_in_the_store_and_the_oldest_make_room(server: Server) -> None:
+def test_new_run_removes_the_oldest_events_in_a_store(server: Server) -> None:
     for number in range(KEPT + 1):
         tell(new_run(THERE), [{"time": float(number), "event": "started"}])
     assert sorted(of["time"] for run in runs_in(THERE) for of in events_of(run)) == list(range(1, KEPT + 1))

@@ -13,7 +13,7 @@ from levelproof.pipeline.store.quarantine import drop_notes, give_up, given_up
 from tests.pipeline.made import made_split
 
 
-def test_given_up_names_the_levels_that_are_not_done(tmp_path: Path) -> None:
+def test_given_up_returns_levels_that_are_not_done(tmp_path: Path) -> None:
     give_up(tmp_path, (3, 4, 9), "Failed 3 times")
     note = quarantine_path(tmp_path, unit_name(3, 9))
     assert note.read_text() == "Levels: 3-4, 9-9\nFailed 3 times"
@@ -27,7 +27,7 @@ def test_given_up_names_the_levels_that_are_not_done(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "Failed 3 times", "Levels: 3-\n", "Levels: 3-4, x\n", "\xff"])
-def test_a_note_without_levels_has_those_of_its_name(tmp_path: Path, text: str) -> None:
+def test_given_up_takes_levels_from_names_of_notes_without_levels(tmp_path: Path, text: str) -> None:
     note = quarantine_path(tmp_path, unit_name(3, 5))
     note.parent.mkdir()
     note.write_text(text, encoding="latin-1")
@@ -36,7 +36,7 @@ def test_a_note_without_levels_has_those_of_its_name(tmp_path: Path, text: str) 
     assert not note.exists()
 
 
-def test_status_calls_no_committed_level_given_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_does_not_list_committed_levels_as_given_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     split = made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED], [Label.SOLVED, Label.SOLVED]])
     give_up(split, range(2), "Failed 3 times")
     give_up(split, range(2, 6), "Failed 3 times")

@@ -70,7 +70,7 @@ PLANTED: dict[str, Callable[[Path, Path], object]] = {
 
 @pytest.mark.parametrize("lock", [WRITER_LOCK, COMMIT_LOCK])
 @pytest.mark.parametrize("kind", PLANTED)
-def test_a_lock_that_is_not_a_regular_file_is_refused(split: Path, profile: Path, lock: str, kind: str) -> None:
+def test_seal_refuses_an_irregular_lock(split: Path, profile: Path, lock: str, kind: str) -> None:
     (split / lock).unlink(missing_ok=True)
     PLANTED[kind](split / lock, profile)
     assert_refused(here(["seal", str(split)], split), 2, f"{split / lock} must be a regular file", "remove it")
@@ -84,7 +84,7 @@ def test_a_lock_that_is_not_a_regular_file_is_refused(split: Path, profile: Path
 
 
 @pytest.mark.parametrize("kind", PLANTED)
-def test_a_lock_that_is_replaced_ends_its_workers(split: Path, profile: Path, kind: str) -> None:
+def test_workers_end_when_their_lock_is_replaced(split: Path, profile: Path, kind: str) -> None:
     with only_writer(split, print):
         (split / WRITER_LOCK).unlink()
         PLANTED[kind](split / WRITER_LOCK, profile)
@@ -94,7 +94,7 @@ def test_a_lock_that_is_replaced_ends_its_workers(split: Path, profile: Path, ki
 
 
 @pytest.mark.parametrize("kind", ["link", "link to nothing", "hard link", "pipe", "socket"])
-def test_a_temporary_file_replaces_what_has_its_name(split: Path, profile: Path, kind: str) -> None:
+def test_temporary_files_replace_what_has_their_name(split: Path, profile: Path, kind: str) -> None:
     names = [f".{JOB}.{os.getpid()}", f"{MANIFEST}/.{INDEX}.{os.getpid()}"]
     for name in names:
         PLANTED[kind](split / name, profile)
@@ -110,7 +110,7 @@ def test_a_temporary_file_replaces_what_has_its_name(split: Path, profile: Path,
 
 
 @pytest.mark.parametrize("kind", ["link", "link to nothing", "pipe"])
-def test_a_mark_that_is_not_a_regular_file_is_refused(split: Path, profile: Path, kind: str) -> None:
+def test_seal_refuses_an_irregular_mark(split: Path, profile: Path, kind: str) -> None:
     before = profile.stat().st_mtime_ns
     (shard,) = data_paths(split)
     PLANTED[kind](begun_path(shard), profile)
@@ -120,7 +120,7 @@ def test_a_mark_that_is_not_a_regular_file_is_refused(split: Path, profile: Path
     assert data_paths(split) == [shard]
 
 
-def test_a_file_is_not_emptied_before_it_is_known_to_be_regular(tmp_path: Path, profile: Path) -> None:
+def test_regular_truncates_only_regular_files(tmp_path: Path, profile: Path) -> None:
     (tmp_path / "name").hardlink_to(profile)
     with pytest.raises(NotRegular, match="name must be a regular file"), open(tmp_path / "name", "wb", opener=regular):
         pass
@@ -131,7 +131,7 @@ def test_a_file_is_not_emptied_before_it_is_known_to_be_regular(tmp_path: Path, 
     assert (tmp_path / "name").read_bytes() == b"new"
 
 
-def test_a_piece_of_the_cache_is_no_link(tmp_path: Path, profile: Path) -> None:
+def test_piece_cache_does_not_follow_links(tmp_path: Path, profile: Path) -> None:
     cache = PieceCache(tmp_path / "cache", 1000)
     cache.put("name", b"piece")
     (tmp_path / "cache/name").rename(tmp_path / "piece")

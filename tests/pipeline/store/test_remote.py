@@ -122,7 +122,7 @@ def data_requests(server: Server) -> list[str]:
     return [line for line in server.log if line.startswith("GET") and "list-type" not in line]
 
 
-def test_a_path_stands_for_a_url() -> None:
+def test_paths_represent_urls() -> None:
     for url in ("s3://bucket/data/s", "gs://b", "https://host:80/a", "hf://datasets/user/name@v1/1M/s"):
         assert remote.is_remote(Path(url))
         assert remote.as_typed(Path(url)) == url
@@ -133,7 +133,7 @@ def test_a_path_stands_for_a_url() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(size=st.integers(0, 5000), most=st.sampled_from([0, 700, 10**6]), data=st.data())
-def test_any_places_of_a_file(size: int, most: int, data: st.DataObject, tmp_path_factory: Any) -> None:
+def test_remote_file_reads_any_spans(size: int, most: int, data: st.DataObject, tmp_path_factory: Any) -> None:
     content = np.random.default_rng(size).bytes(size)
     store, folder = MemoryStore(), tmp_path_factory.mktemp("cache")
     obstore.put(store, "shards/x.zarr/c/0", content)
@@ -149,12 +149,12 @@ def test_any_places_of_a_file(size: int, most: int, data: st.DataObject, tmp_pat
             assert list(file.read(places)) == [content[first : first + length] for first, length in places]
 
 
-def test_a_split_in_s3_reads_as_in_its_folder(bucket: Bucket, split: Path) -> None:
+def test_split_in_s3_reads_as_its_folder(bucket: Bucket, split: Path) -> None:
     require_same(S3, split, fields=None)
     assert data_requests(bucket.server)
 
 
-def test_a_split_in_s3_opens_as_its_folder_does(bucket: Bucket, split: Path) -> None:
+def test_split_in_s3_opens_as_its_folder(bucket: Bucket, split: Path) -> None:
     there, here = (levelproof.open(path, where="label = 'solved'", validation=0.0) for path in (S3, split))
     assert there.manifest.equals(here.manifest)
     words: dict[str, Any] = {"batch_size": 3, "seed": 0, "observation": None, "fields": ["record/state/position"]}
@@ -167,7 +167,7 @@ def test_a_split_in_s3_opens_as_its_folder_does(bucket: Bucket, split: Path) -> 
     ).all()
 
 
-def test_the_second_time_nothing_is_fetched(bucket: Bucket, split: Path) -> None:
+def test_second_read_fetches_nothing(bucket: Bucket, split: Path) -> None:
     require_same(S3, split)
     forget()
     bucket.server.log.clear()
@@ -176,7 +176,7 @@ def test_the_second_time_nothing_is_fetched(bucket: Bucket, split: Path) -> None
     assert data_requests(bucket.server) == []
 
 
-def test_one_trajectory_fetches_pieces_and_not_its_shard(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_trajectory_fetches_pieces_not_its_shard(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote, "PIECE", 2**12)
     monkeypatch.setattr(remote, "MAX_PIECES", 1)
     rows = witnessed(S3)
@@ -186,7 +186,7 @@ def test_one_trajectory_fetches_pieces_and_not_its_shard(bucket: Bucket, monkeyp
     assert 2**12 * len(data_requests(bucket.server)) < whole / 4
 
 
-def test_what_changed_is_fetched_again(bucket: Bucket, split: Path, tmp_path: Path) -> None:
+def test_changed_files_are_fetched_again(bucket: Bucket, split: Path, tmp_path: Path) -> None:
     require_same(S3, split)
     other = Path(shutil.copytree(split, tmp_path / "s"))
     shard = sorted((other / "shards").iterdir())[0]
@@ -202,7 +202,7 @@ def test_what_changed_is_fetched_again(bucket: Bucket, split: Path, tmp_path: Pa
     require_same(S3, split)
 
 
-def test_a_file_that_changes_between_two_pieces_is_noticed(bucket: Bucket, split: Path) -> None:
+def test_read_detects_a_file_that_changes_between_pieces(bucket: Bucket, split: Path) -> None:
     key, path = "data/s/shards/x", S3 / "shards/x"
     bucket.put(key, bytes(3 * PIECE))
     file = remote.RemoteFile(path)
@@ -214,12 +214,12 @@ def test_a_file_that_changes_between_two_pieces_is_noticed(bucket: Bucket, split
 
 
 @pytest.mark.parametrize("how", ["busy", "cut"])
-def test_a_store_that_throttles_or_cuts_off_gives_the_right_bits(bucket: Bucket, split: Path, how: str) -> None:
+def test_read_survives_throttling_and_cut_off_responses(bucket: Bucket, split: Path, how: str) -> None:
     bucket.server.spoil(3, how)
     require_same(S3, split)
 
 
-def test_a_store_that_dies_is_one_sentence_in_bounded_time(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_fails_in_bounded_time_when_the_store_dies(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = witnessed(S3)
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.5))
     remote._store.cache_clear()
@@ -240,7 +240,7 @@ def test_a_store_that_dies_is_one_sentence_in_bounded_time(bucket: Bucket, monke
         ("s3://bucket/data/s", {"LEVELPROOF_CACHE_GB": "much"}, UserError, "LEVELPROOF_CACHE_GB is 'much'"),
     ],
 )
-def test_what_is_not_there_is_one_sentence(
+def test_read_explains_missing_splits_and_stores(
     bucket: Bucket,
     monkeypatch: pytest.MonkeyPatch,
     url: str,
@@ -254,13 +254,13 @@ def test_what_is_not_there_is_one_sentence(
         require_manifest(Path(url))
 
 
-def test_credentials_that_are_missing_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_explains_missing_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_METADATA_ENDPOINT", f"http://{HOST}:1")  # where they would be on Amazon's machines
     with pytest.raises(UserError, match=r"no credentials to read s3://.*AWS_ACCESS_KEY_ID.*AWS_SKIP_SIGNATURE"):
         read_manifest(S3)
 
 
-def test_credentials_that_do_not_suffice_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_explains_denied_access(monkeypatch: pytest.MonkeyPatch) -> None:
     with serving(lambda *_: Answer(403, {}, b"<Error><Code>AccessDenied</Code></Error>")) as server:
         for name, value in {**KEYS, "endpoint_url": server.url}.items():
             monkeypatch.setenv(f"AWS_{name}".upper(), value)
@@ -268,7 +268,7 @@ def test_credentials_that_do_not_suffice_are_one_sentence(monkeypatch: pytest.Mo
             read_manifest(S3)
 
 
-def test_a_split_in_google_s_store(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_google_store_reads_as_the_folder(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(split, tmp_path / "gs/bucket/s")
     with serving(bucket_of(tmp_path / "gs")) as server:
         account = {"client_email": "", "private_key": "", "private_key_id": "", "disable_oauth": True}
@@ -286,7 +286,7 @@ def test_a_split_in_google_s_store(split: Path, tmp_path: Path, monkeypatch: pyt
     ],
     ids=["sealed", "witness", "resume"],
 )
-def test_who_has_a_split_open_that_is_sealed_goes_on(
+def test_open_split_survives_a_seal(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     """The manifest is listed again, the shards are others, and of any density."""
@@ -302,7 +302,7 @@ def test_who_has_a_split_open_that_is_sealed_goes_on(
         assert all(same_bits(found[name], true[name]).all() for name in true)
 
 
-def test_what_is_longer_than_it_can_be_is_not_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_stops_at_the_maximum_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What tells of a run: its note, its lease, its events."""
     (tmp_path / "s").mkdir()
     note_job(tmp_path / "s", made_job(), ["levelproof", "generate"], [(0, 7)])
@@ -328,7 +328,7 @@ def test_what_is_longer_than_it_can_be_is_not_read_to_its_end(tmp_path: Path, mo
         assert events_of(there / "run.jsonl") == []
 
 
-def test_a_server_that_lies_about_sizes_is_one_sentence() -> None:
+def test_read_explains_wrong_sizes_from_a_server() -> None:
     def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
         if path.endswith("index.txt"):
             return Answer(200, {}, b"000000000000-000000000001.parquet\n../../x.parquet\n")
@@ -339,7 +339,7 @@ def test_a_server_that_lies_about_sizes_is_one_sentence() -> None:
 
 
 @pytest.mark.campaign
-def test_processes_share_a_cache_and_may_be_killed(bucket: Bucket, split: Path) -> None:
+def test_processes_share_a_cache_and_survive_kills(bucket: Bucket, split: Path) -> None:
     code = (
         "import sys, hashlib\nfrom pathlib import Path\nfrom levelproof.pipeline.read.rows import read_rows\n"
         "from levelproof.pipeline.store.manifest import read_manifest\nsplit = Path(sys.argv[1])\n"
@@ -366,7 +366,7 @@ def test_processes_share_a_cache_and_may_be_killed(bucket: Bucket, split: Path) 
     assert begin("s3://bucket/data/s").communicate()[0] == true
 
 
-def test_a_split_on_a_web_server(split: Path, tmp_path: Path) -> None:
+def test_split_on_a_web_server_reads_as_its_folder(split: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(split, tmp_path / "www" / "s"))
     with serving(files_of(tmp_path / "www")) as server:
         there = Path(f"{server.url}/s")
@@ -388,7 +388,7 @@ def test_a_split_on_a_web_server(split: Path, tmp_path: Path) -> None:
         require_same(there, folder)
 
 
-def test_a_split_on_the_hub(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_split_on_the_hub_reads_as_its_folder(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(split, tmp_path / "repository" / "1M" / "s")
     there = Path("hf://datasets/user/name/1M/s")
     with serving(hub_of(tmp_path / "repository", "user/name", "secret", page=2)) as server:
@@ -409,7 +409,7 @@ def test_a_split_on_the_hub(split: Path, tmp_path: Path, monkeypatch: pytest.Mon
             require_manifest(Path("hf://datasets/user/name/2M/s"))
 
 
-def test_a_hub_whose_lists_are_cut_off_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_below_explains_cut_off_lists(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where they come in chunks, an answer that ends early is an error of HTTP's, and none of the system's."""
     with serving(lambda *_: Answer(200, {"Transfer-Encoding": "chunked"}, b"ff\r\n[")) as server:
         monkeypatch.setenv("HF_ENDPOINT", server.url)
@@ -418,9 +418,7 @@ def test_a_hub_whose_lists_are_cut_off_is_one_sentence(monkeypatch: pytest.Monke
         assert len(server.log) == hub.ATTEMPTS
 
 
-def test_commands_that_read_take_urls_and_others_say_what_they_need(
-    bucket: Bucket, split: Path, tmp_path: Path
-) -> None:
+def test_commands_that_read_accept_urls_and_others_refuse_them(bucket: Bucket, split: Path, tmp_path: Path) -> None:
     there, here = (json.loads(command(["inspect", str(path), "--json"], tmp_path).stdout) for path in (S3, split))
     assert there.pop("split") == "s3://bucket/data/s"
     assert here.pop("split") == str(split)
@@ -432,7 +430,7 @@ def test_commands_that_read_take_urls_and_others_say_what_they_need(
         assert_refused(refused, 2, "copy it with `aws s3 sync` first")
 
 
-def test_a_forked_process_is_told_how_to_start(tmp_path: Path) -> None:
+def test_forked_processes_are_refused(tmp_path: Path) -> None:
     """Its threads would not be there: it would wait forever, and so would the process that it is of."""
     code = (
         "import os\nfrom pathlib import Path\nfrom levelproof.pipeline.store import remote\n"
@@ -449,7 +447,7 @@ def test_a_forked_process_is_told_how_to_start(tmp_path: Path) -> None:
     assert not done.stderr
 
 
-def test_without_obstore_a_sentence_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_explains_missing_obstore(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(UserError, match=r"pip install 'levelproof\[remote\]'"):
         read_manifest(S3)

@@ -74,7 +74,7 @@ def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_scratch_removes_the_folders_of_killed_processes_alone(parent: Path) -> None:
+def test_scratch_removes_only_folders_of_killed_processes(parent: Path) -> None:
     with process(PUBLISH, parent) as (killed, gone), process(PUBLISH, parent) as (_, alive):
         killed.kill()
         killed.wait(patience(COMMAND_SECONDS))
@@ -106,7 +106,7 @@ def left(folder: Path, machine: dict[str, str] | None = None) -> Path:
     return folder
 
 
-def test_sweep_leaves_what_is_not_of_a_dead_process_here(
+def test_sweep_keeps_folders_not_of_a_dead_local_process(
     parent: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     elsewhere = tmp_path_factory.mktemp("elsewhere")
@@ -130,7 +130,7 @@ def test_sweep_leaves_what_is_not_of_a_dead_process_here(
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only an administrator gives files away")
-def test_sweep_leaves_folders_of_other_users(parent: Path) -> None:
+def test_sweep_keeps_folders_of_other_users(parent: Path) -> None:
     folder = left(parent / f"{PREFIX}theirs")
     os.chown(folder, 12345, 12345)
     with scratch():
@@ -138,7 +138,7 @@ def test_sweep_leaves_folders_of_other_users(parent: Path) -> None:
     assert (folder / FILES / "file").exists()
 
 
-def test_sweep_removes_what_died_while_it_was_made_or_before_a_restart(parent: Path) -> None:
+def test_sweep_removes_half_made_folders_and_those_before_a_reboot(parent: Path) -> None:
     (parent / f"{PREFIX}empty").mkdir()
     (parent / f"{PREFIX}unlocked").mkdir()
     (parent / f"{PREFIX}unlocked" / LOCK).touch()
@@ -147,7 +147,7 @@ def test_sweep_removes_what_died_while_it_was_made_or_before_a_restart(parent: P
         assert [*parent.iterdir()] == [folder.parent]
 
 
-def test_processes_that_make_and_sweep_at_once_keep_their_own(parent: Path) -> None:
+def test_concurrent_processes_keep_their_own_folders(parent: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(parent)}
 
     def crowd(_: int) -> subprocess.CompletedProcess[str]:

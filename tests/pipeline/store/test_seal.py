@@ -78,7 +78,7 @@ def assert_tidy(split: Path, fragments: int) -> None:
 
 
 @pytest.mark.parametrize(("rows", "fragments"), [(4, 3), (6, 2), (100, 1)])
-def test_rows_and_bits_stay_the_same(split: Path, made: Path, rows: int, fragments: int) -> None:
+def test_seal_preserves_rows_and_bits(split: Path, made: Path, rows: int, fragments: int) -> None:
     for group in plan(pieces(split), rows):
         seal(split, group, rows_a_file=2)
     assert whole(split) == whole(made)
@@ -103,7 +103,7 @@ def test_seal_refuses_a_shard_with_altered_metadata(split: Path) -> None:
     assert {path: path.is_file() and path.read_bytes() for path in split.rglob("*")} == before
 
 
-def test_a_plan_merges_neighbours_and_leaves_what_is_large() -> None:
+def test_plan_merges_neighbours_and_keeps_large_fragments() -> None:
     def piece(first: int, rows: int, sealed: bool) -> Piece:
         return Piece(fragment_path(Path(), unit_name(first, first + rows - 1)), rows, sealed)
 
@@ -120,7 +120,7 @@ def test_a_plan_merges_neighbours_and_leaves_what_is_large() -> None:
     assert due([few, *crowd], 2 * CROWD) == crowd
 
 
-def test_a_command_whose_folder_another_one_has_seals_nothing_there(split: Path, made: Path) -> None:
+def test_seal_refuses_after_another_writer_took_over(split: Path, made: Path) -> None:
     """It was removed and made again, by another path to it as another process has it."""
     same = Path(os.path.relpath(split))
     with only_writer(split, print):
@@ -135,9 +135,7 @@ def test_a_command_whose_folder_another_one_has_seals_nothing_there(split: Path,
     assert_tidy(split, 1)
 
 
-def test_units_commit_meanwhile_and_afterwards_into_the_same_range(
-    split: Path, made: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_units_commit_into_the_range_of_a_seal(split: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job = made_job(str(split.parents[1]), "size=s")
     expected = whole(made)
     write = sealing.write_fragment
@@ -211,7 +209,7 @@ def sealed(split: Path, rows: int) -> None:
         max_size=7,
     )
 )
-def test_any_sequence_of_commits_seals_and_kills(made: Path, tmp_path: Path, steps: list[tuple[str, int]]) -> None:
+def test_seal_survives_any_commits_and_kills(made: Path, tmp_path: Path, steps: list[tuple[str, int]]) -> None:
     split, there = tmp_path / "split", set()
     shutil.rmtree(split, ignore_errors=True)
     for folder in ("manifest", "shards"):
@@ -231,7 +229,7 @@ def test_any_sequence_of_commits_seals_and_kills(made: Path, tmp_path: Path, ste
     assert_tidy(split, bool(there))
 
 
-def test_readers_at_work_go_on(split: Path, made: Path) -> None:
+def test_active_readers_survive_a_seal(split: Path, made: Path) -> None:
     """They see every level all the time, each once, and read its data wherever it lies by then."""
     expected, ended = whole(made), threading.Event()
 
@@ -259,9 +257,7 @@ def test_readers_at_work_go_on(split: Path, made: Path) -> None:
     assert_tidy(split, 1)
 
 
-def test_a_look_at_the_folder_in_the_middle_of_a_seal_is_not_the_last(
-    split: Path, made: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_read_manifest_lists_again_during_a_seal(split: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What was sealed is listed too late, what it was made of not any more: names are not read all at once."""
     seal(split, pieces(split))
     listed, torn = manifest.entries, [True]
@@ -269,14 +265,14 @@ def test_a_look_at_the_folder_in_the_middle_of_a_seal_is_not_the_last(
     assert read_manifest(split, []).level_ids.tolist() == list(whole(made))
 
 
-def test_a_row_of_a_damaged_shard_is_not_looked_for_elsewhere(split: Path) -> None:
+def test_read_does_not_search_other_shards_for_damaged_rows(split: Path) -> None:
     row = next(row for row in read_manifest(split).table.to_pylist() if row["shard"])
     shutil.rmtree(split / row["shard"])
     with pytest.raises(Failure, match="missing or damaged"):
         read_row(split, row)
 
 
-def test_what_is_damaged_is_not_sealed(split: Path, made: Path) -> None:
+def test_seal_refuses_damaged_shards(split: Path, made: Path) -> None:
     shard = sorted((split / "shards").iterdir())[1]
     file = shard / "act/c/0/0/0"
     file.write_bytes(b"x" + file.read_bytes()[1:])
@@ -286,7 +282,7 @@ def test_what_is_damaged_is_not_sealed(split: Path, made: Path) -> None:
     assert sorted(split.rglob("*")) == before
 
 
-def test_shards_of_several_densities_stay_apart(split: Path, made: Path) -> None:
+def test_seal_keeps_encodings_apart(split: Path, made: Path) -> None:
     shard = next(iter((split / "shards").iterdir()))
     document = json.loads((shard / "zarr.json").read_text())
     document["attributes"]["task"]["frame_skip"] = 3  # another encoding of the same fields
@@ -302,7 +298,7 @@ def test_shards_of_several_densities_stay_apart(split: Path, made: Path) -> None
         assert len(read_manifest(split).shards) == 2
 
 
-def test_a_full_disk_changes_nothing(split: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seal_on_a_full_disk_changes_nothing(split: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -319,7 +315,7 @@ class Stopped(Exception):
     """The seal is asked to end."""
 
 
-def test_a_seal_that_is_stopped_while_it_opens_or_removes_files_loses_nothing(split: Path, made: Path) -> None:
+def test_seal_stopped_at_any_file_loses_nothing(split: Path, made: Path) -> None:
     fragment = fragment_path(split, unit_name(0, 2 * UNITS - 1))
     for committed in (False, True):
         asked = [0]

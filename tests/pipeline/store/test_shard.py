@@ -42,7 +42,7 @@ def shard(tmp_path: Path, fields: dict[str, np.ndarray]) -> Path:
 
 @settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(size=st.sampled_from(sorted(SIZES)), seed=st.integers(0, 2**32))
-def test_every_bit_of_every_field_comes_back(tmp_path: Path, size: str, seed: int) -> None:
+def test_read_restores_every_bit_of_every_field(tmp_path: Path, size: str, seed: int) -> None:
     fields = made_fields(size, len(LEVELS), seed)
     path = tmp_path / f"{size}-{seed}.zarr"
     if not path.exists():
@@ -54,14 +54,14 @@ def test_every_bit_of_every_field_comes_back(tmp_path: Path, size: str, seed: in
 
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from(sorted(SIZES)), st.integers(0, 2**32))
-def test_packing_is_undone_by_unpacking(size: str, seed: int) -> None:
+def test_unpack_inverts_pack(size: str, seed: int) -> None:
     fields = made_fields(size, len(LEVELS), seed)
     table = field_table(fields)
     levels_first = unpack(pack(fields, table), table)
     assert_same({name: np.moveaxis(x, 0, -1) for name, x in levels_first.items()}, fields)
 
 
-def test_places_do_not_overlap_and_leave_no_gaps(fields: dict[str, np.ndarray]) -> None:
+def test_field_table_has_no_overlaps_or_gaps(fields: dict[str, np.ndarray]) -> None:
     table = field_table(fields)
     for name, packed in pack(fields, table).items():
         taken = [range(place.first, place.first + place.count) for place in table if place.array == name]
@@ -69,19 +69,19 @@ def test_places_do_not_overlap_and_leave_no_gaps(fields: dict[str, np.ndarray]) 
         assert packed.shape[2:] == ((RECORD_STEPS,) if name in ALONG_TIME else ())
 
 
-def test_a_value_that_does_not_fit_is_refused(fields: dict[str, np.ndarray]) -> None:
+def test_pack_refuses_values_that_do_not_fit(fields: dict[str, np.ndarray]) -> None:
     fields = fields | {"record/action": np.full_like(fields["record/action"], 300)}
     with pytest.raises(ValueError, match="record/action has values from 300"):
         pack(fields, field_table(fields))
 
 
-def test_trees_come_back_from_their_fields() -> None:
+def test_tree_of_inverts_arrays_of() -> None:
     level, record = made_level(), made_record()
     assert_same(arrays_of(tree_of(Level, arrays_of(level))), arrays_of(level))
     assert_same(arrays_of(tree_of(Record, arrays_of(record, "record/"), "record/")), arrays_of(record))
 
 
-def test_same_bits_tells_zero_from_minus_zero_and_knows_nan() -> None:
+def test_same_bits_distinguishes_signed_zeros_and_accepts_nan() -> None:
     a = np.array([[0.0, np.nan, 1.0]], np.float32)
     assert same_bits(a, a.copy()).all()
     assert same_bits(a, -a).tolist() == [False, False, False]
@@ -89,24 +89,24 @@ def test_same_bits_tells_zero_from_minus_zero_and_knows_nan() -> None:
 
 
 @pytest.mark.parametrize("rows", [[0], [2, 0], [1, 1], [0, 1, 2], []])
-def test_rows_are_read_in_the_order_asked_for(shard: Path, fields: dict[str, np.ndarray], rows: list[int]) -> None:
+def test_read_keeps_the_requested_order(shard: Path, fields: dict[str, np.ndarray], rows: list[int]) -> None:
     assert_same(Shard(shard).read(rows), {name: values[..., rows] for name, values in fields.items()})
 
 
-def test_only_the_fields_asked_for_are_read(shard: Path, fields: dict[str, np.ndarray]) -> None:
+def test_read_opens_only_arrays_of_requested_fields(shard: Path, fields: dict[str, np.ndarray]) -> None:
     (shard / "dyn32/c/0/0/0").unlink()  # not needed for what follows
     found = Shard(shard).read(fields=["record/action", "level/role"])
     assert_same(found, {name: fields[name] for name in ("level/role", "record/action")})
 
 
-def test_it_is_plain_zarr_that_others_can_read(shard: Path) -> None:
+def test_shards_are_plain_zarr(shard: Path) -> None:
     group = zarr.open_group(shard, mode="r")
     assert {name for name, _ in group.arrays()} == {"dyn32", "dyn8", "act", "lvl32", "lvl8"}
     assert group["act"].shape == (len(LEVELS), 6, RECORD_STEPS)  # type: ignore[union-attr]
     assert group.attrs["format"] == "levelproof.shard"
 
 
-def test_an_attempt_never_writes_over_another(shard: Path, fields: dict[str, np.ndarray]) -> None:
+def test_write_shard_never_overwrites(shard: Path, fields: dict[str, np.ndarray]) -> None:
     with pytest.raises(FileExistsError):
         write_shard(shard, LEVELS, fields)
 
@@ -116,7 +116,7 @@ def test_stored_bytes_counts_every_file(shard: Path) -> None:
 
 
 @pytest.mark.parametrize("array", ["dyn32", "dyn8", "act", "lvl32", "lvl8"])
-def test_any_damaged_byte_is_seen(shard: Path, array: str) -> None:
+def test_read_detects_any_damaged_byte(shard: Path, array: str) -> None:
     file = next(path for path in (shard / array / "c").rglob("*") if path.is_file())
     whole = file.read_bytes()
     for at in range(0, len(whole), max(1, len(whole) // 7)):
@@ -129,13 +129,13 @@ def test_any_damaged_byte_is_seen(shard: Path, array: str) -> None:
 
 
 @pytest.mark.parametrize("file", ["zarr.json", "dyn8/zarr.json", "dyn8/c/0/0/0"])
-def test_a_missing_file_is_seen(shard: Path, file: str) -> None:
+def test_read_detects_a_missing_file(shard: Path, file: str) -> None:
     (shard / file).unlink()
     with pytest.raises(Failure, match="missing or damaged"):
         Shard(shard).read()
 
 
-def test_another_version_is_refused(shard: Path) -> None:
+def test_shard_refuses_another_version(shard: Path) -> None:
     attributes = shard / "zarr.json"
     attributes.write_text(attributes.read_text().replace('"version": 2', '"version": 3'))
     with pytest.raises(Failure, match="has version 3, this program reads 2"):

@@ -32,14 +32,14 @@ def committed(job: JobConfig, split: Path) -> None:
     commit(job, split, WorkUnit((0, 1)), made_result([0, 1], [Label.SOLVED, Label.UNSOLVED]))
 
 
-def test_the_folder_is_made_and_its_path_is_budget_and_size(tmp_path: Path, job: JobConfig) -> None:
+def test_writing_creates_the_folder_of_budget_and_size(tmp_path: Path, job: JobConfig) -> None:
     with writing(job, print) as (split, manifest):
         assert split == tmp_path / "data/128k/s"
         assert split.is_dir()
         assert len(manifest.level_ids) == 0
 
 
-def test_another_configuration_is_refused_with_every_difference(tmp_path: Path, job: JobConfig) -> None:
+def test_writing_refuses_another_configuration_and_lists_differences(tmp_path: Path, job: JobConfig) -> None:
     with writing(job, print) as (split, _):
         committed(job, split)
     other = made_job(str(tmp_path / "data"), "expert.width=64", "task.frame_skip=3")
@@ -50,7 +50,7 @@ def test_another_configuration_is_refused_with_every_difference(tmp_path: Path, 
         pass
 
 
-def test_another_density_is_refused(tmp_path: Path, job: JobConfig) -> None:
+def test_writing_refuses_another_density(tmp_path: Path, job: JobConfig) -> None:
     """Or whoever forgets to say it again would get a split of two."""
     with writing(job, print) as (split, _):
         committed(job, split)
@@ -62,14 +62,14 @@ def test_another_density_is_refused(tmp_path: Path, job: JobConfig) -> None:
         pass
 
 
-def test_more_levels_are_no_other_configuration(tmp_path: Path, job: JobConfig) -> None:
+def test_writing_accepts_more_levels(tmp_path: Path, job: JobConfig) -> None:
     with writing(job, print) as (split, _):
         committed(job, split)
     with writing(made_job(str(tmp_path / "data"), "levels=128", "unit=7", "workers=1"), print) as (_, manifest):
         assert len(manifest.level_ids) == 2
 
 
-def test_a_split_with_the_hash_of_an_earlier_version_goes_on(tmp_path: Path, job: JobConfig) -> None:
+def test_writing_resumes_a_split_with_an_earlier_hash(tmp_path: Path, job: JobConfig) -> None:
     """Hashes covered how many experts train side by side, and how often the host looks at a search."""
     before = job.results | {"expert": plain(job.expert) | {"slots": 8}, "search": plain(job.search)}
     assert hash_of(before) != job.hash
@@ -93,7 +93,7 @@ def test_a_split_with_the_hash_of_an_earlier_version_goes_on(tmp_path: Path, job
 
 
 @pytest.mark.parametrize("place", ["data", "data/128k", "data/128k/s"])
-def test_a_file_in_the_way_is_named(tmp_path: Path, job: JobConfig, place: str) -> None:
+def test_writing_names_a_file_in_its_way(tmp_path: Path, job: JobConfig, place: str) -> None:
     path = tmp_path / place
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch()
@@ -104,7 +104,7 @@ def test_a_file_in_the_way_is_named(tmp_path: Path, job: JobConfig, place: str) 
         pass
 
 
-def test_one_writer_at_a_time(job: JobConfig) -> None:
+def test_writing_refuses_a_second_writer(job: JobConfig) -> None:
     with writing(job, print) as (split, _):
         assert is_written(split)
         with pytest.raises(UserError, match="Another `levelproof generate` is writing"), writing(job, print):
@@ -115,7 +115,7 @@ def test_one_writer_at_a_time(job: JobConfig) -> None:
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_a_folder_that_leads_out_of_the_split_is_refused(tmp_path: Path, job: JobConfig, name: str) -> None:
+def test_writing_refuses_linked_folders(tmp_path: Path, job: JobConfig, name: str) -> None:
     split, elsewhere = tmp_path / "data/128k/s", tmp_path / "elsewhere"
     split.mkdir(parents=True)
     mine = elsewhere / "000000000000-000000000001-5f0c2a9b"
