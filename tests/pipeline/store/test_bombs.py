@@ -1,4 +1,4 @@
-"""Small files that would become large, and files that never end: one sentence each, in little memory."""
+"""Small files that decompress to large ones, and endless files: each is refused in one sentence, in little memory."""
 
 import tracemalloc
 import zipfile
@@ -15,16 +15,16 @@ from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
 from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.made import made_job, made_split
 
-MOST = 2**27  # bytes
+MAX_MEMORY = 2**27  # bytes
 
 
 def refused(shard: Path) -> str:
-    """What is said of it, before much memory is taken."""
+    """Return the message that refuses a shard, and check that refusing took little memory."""
     tracemalloc.start()
     try:
         with pytest.raises(Failure) as raised:
             Shard(shard).read()
-        assert tracemalloc.get_traced_memory()[1] < MOST
+        assert tracemalloc.get_traced_memory()[1] < MAX_MEMORY
     finally:
         tracemalloc.stop()
     return str(raised.value)
@@ -58,7 +58,7 @@ def test_load_experts_refuses_compressed_pickled_files_and_folders(tmp_path: Pat
     with pytest.raises(Failure, match="cannot be read"):
         load_experts(path, job)
     path.unlink()
-    path.mkdir()  # as Orbax keeps checkpoints
+    path.mkdir()  # as Orbax stores checkpoints
     (path / "_METADATA").write_text("{}")
     with pytest.raises(Failure, match="it is not a file"):
         load_experts(path, job)
@@ -81,7 +81,7 @@ def test_read_fragment_refuses_invalid_digests(split: Path, text: bytes) -> None
 
 
 def test_shard_refuses_an_index_with_a_huge_chunk(split: Path) -> None:
-    """A file with a hole of a terabyte, of which a chunk claims to be all."""
+    """A sparse file of a terabyte, which one chunk claims to fill."""
     from google_crc32c import value
 
     (shard,) = (split / "shards").iterdir()

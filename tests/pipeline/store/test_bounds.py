@@ -1,4 +1,4 @@
-"""Fragments whose footers and pages lie: one sentence each, in little memory, and the process goes on."""
+"""Fragments whose footers and pages lie: each is refused in one sentence, in little memory, without a crash."""
 
 import json
 import re
@@ -23,7 +23,7 @@ from levelproof.pipeline.store.thrift import footer_in, pages_in
 from tests.pipeline.command import ROOT
 from tests.pipeline.made import made_split
 
-MOST = 100 * 2**20  # bytes that reading all of them may take besides those of reading a good one
+MOST = 100 * 2**20  # bytes that reading all of them may take beyond those of reading a good one
 PEAK = """
 import json, resource, sys
 from pathlib import Path
@@ -50,7 +50,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def with_column(good: Path, name: str, values: pa.Array, use_dictionary: bool = True, **how: Any) -> bytes:
-    """The fragment with as many rows as there are values in one of its columns."""
+    """Return the fragment's bytes with one column replaced, repeating its first row to match."""
     table = pq.read_table(good)
     rows = table.take(np.zeros(len(values), int))
     at = COLUMNS.names.index(name)
@@ -65,32 +65,32 @@ def footer_of(data: bytes) -> slice:
 
 
 def varint(number: int, length: int = 0) -> bytes:
-    """A number in zigzag, in at least so many bytes."""
-    number, found = number << 1, b""
-    while number > 127 or len(found) < length - 1:
-        found += bytes([number & 127 | 128])
+    """Encode a number as a zigzag varint of at least `length` bytes."""
+    number, encoded = number << 1, b""
+    while number > 127 or len(encoded) < length - 1:
+        encoded += bytes([number & 127 | 128])
         number >>= 7
-    return found + bytes([number])
+    return encoded + bytes([number])
 
 
 def with_other_numbers(data: bytes, change: Callable[[int], int], where: slice, numbers: set[int]) -> bytes:
-    """Numbers of at least three bytes changed wherever they stand, in as many bytes as they have."""
+    """Change all occurrences of numbers that take at least three bytes, keeping their lengths."""
     part = data[where]
     for number in numbers:
-        if len(told := varint(number)) > 2:
-            part = part.replace(told, varint(change(number), len(told)))
+        if len(encoded := varint(number)) > 2:
+            part = part.replace(encoded, varint(change(number), len(encoded)))
     assert part != data[where]
     return data[: where.start] + part + data[where.stop :]
 
 
 def long_texts(good: Path) -> bytes:
-    """A dictionary of one text of 1.2 MB, which each of 100 rows names."""
+    """A dictionary of one string of 1.2 MB, to which 100 rows refer."""
     text = pa.chunked_array([pa.array(["x" * 1_200_000]).take(np.zeros(10, int))] * 10)
     return with_column(good, "label_reason", text)
 
 
 def long_pages(good: Path) -> bytes:
-    """120 MB of the same byte, and a footer that says nothing of them."""
+    """120 MB of one byte, with wrong sizes in the footer."""
     text = pa.array([f"{i:03d}" + "x" * 1_200_000 for i in range(10)] * 10)
     data = with_column(good, "label_reason", text, use_dictionary=False)
     about = pq.read_metadata(BytesIO(data)).row_group(0)
@@ -99,30 +99,30 @@ def long_pages(good: Path) -> bytes:
 
 
 def long_hashes(good: Path) -> bytes:
-    """120 MB of hashes that stand in no dictionary."""
+    """120 MB of hashes without a dictionary."""
     text = pa.array([f"{i:03d}" + "x" * 1_200_000 for i in range(10)] * 10)
     return with_column(good, "content_hash", text, use_dictionary=False)
 
 
 def shortened_hashes(good: Path) -> bytes:
-    """The same in an encoding that writes down how each differs from the one before."""
+    """120 MB of hashes, delta-encoded."""
     text = pa.array(["x" * 1_200_000] * 100)
     return with_column(good, "content_hash", text, False, column_encoding={"content_hash": "DELTA_BYTE_ARRAY"})
 
 
 def long_lists(good: Path) -> bytes:
-    """A learning curve of millions of zeros, of which a page takes a few bytes."""
+    """A learning curve of millions of zeros, whose pages take a few bytes."""
     curve = pa.ListArray.from_arrays([0, 6_000_000], pa.array(np.zeros(6_000_000, np.float32)))
     return with_column(good, "learning_curve", curve)
 
 
 def many_rows(good: Path) -> bytes:
-    """Many times the same row."""
+    """One row repeated many times."""
     return with_column(good, "label", pa.array(["solved"]).take(np.zeros(100_000, int)))
 
 
 def other_values(good: Path) -> bytes:
-    """A footer with fewer values than there are."""
+    """A footer that counts too few values."""
     hashes = [f"{number:064x}" for number in np.random.default_rng(0).integers(0, 2**62, 20_000)]
     data = with_column(good, "content_hash", pa.array(hashes))
     return with_other_numbers(data, lambda n: n - 1, footer_of(data), {20_000})
@@ -143,7 +143,8 @@ def test_write_fragment_writes_unique_strings_without_dictionaries(good: Path) -
     group = pq.read_metadata(good).row_group(0)
     columns = [group.column(i) for i in range(group.num_columns)]
     texts = [column for column in columns if column.physical_type == "BYTE_ARRAY"]
-    assert {of.path_in_schema.partition(".")[0] for of in texts if not of.has_dictionary_page} == {*OWN}
+    without = [column for column in texts if not column.has_dictionary_page]
+    assert {column.path_in_schema.partition(".")[0] for column in without} == {*OWN}
 
 
 def test_read_fragment_refuses_bombs_before_decompressing_them(good: Path, tmp_path: Path) -> None:
@@ -166,7 +167,7 @@ def test_read_fragment_refuses_bombs_before_decompressing_them(good: Path, tmp_p
 
 
 def test_read_fragment_survives_lying_size_statistics(good: Path) -> None:
-    """Of size statistics with too many numbers in them, pyarrow's `column` is an exception that nobody catches."""
+    """With too many numbers in size statistics, pyarrow's `column` raises a C++ exception that ends the process."""
     data = good.read_bytes()
     start, end = footer_of(data).start, footer_of(data).stop
     lists = [found.end() for found in re.finditer(rb"[\x19\x29\x39]\x26", data[start:end])]  # of two numbers

@@ -1,4 +1,4 @@
-"""Checkpoints of experts, of several units one after another in one process."""
+"""Checkpoints of experts, from several units in one process."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +27,7 @@ SETTINGS = ("expert.width=8", "expert.environments=24", "expert.attempts=8")
 
 
 def some_experts(job: JobConfig) -> list[Kept]:
-    """Of any bits."""
+    """Make experts with random bits."""
     ids = np.arange(UNITS, dtype=np.int32)
     levels = sample_levels(ids, SIZES["s"], job.distribution)
     rng = np.random.default_rng(0)
@@ -50,7 +50,7 @@ def test_load_experts_restores_each_units_experts_bit_for_bit(tmp_path: Path) ->
 
 @pytest.mark.parametrize("over", [False, True])
 def test_load_experts_accepts_ends_stored_as_a_bool(tmp_path: Path, over: bool) -> None:
-    """Whether training stopped for good was a bit; larger types than today's are refused."""
+    """Earlier versions stored the end of training as a bool; types larger than today's are refused."""
     job, kept = made_job("data", *SETTINGS), some_experts(made_job("data", *SETTINGS))[0]
 
     def saved(value: np.generic) -> Path:
@@ -70,7 +70,7 @@ def test_load_experts_accepts_ends_stored_as_a_bool(tmp_path: Path, over: bool) 
 def test_experts_for_skips_experts_that_solved_their_level(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: Source
 ) -> None:
-    """One whose witness was made steady, too; one that did not, whose witness is what was found before, goes on."""
+    """So even if a search replaced its witness; an expert that did not solve its level continues."""
     job = made_job("data", *SETTINGS, f"continue_from={tmp_path}")
     experts = {}
     for i, kept in enumerate(some_experts(job)[:2]):

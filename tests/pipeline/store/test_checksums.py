@@ -1,4 +1,4 @@
-"""A fragment vouches for itself and for what it commits: no byte of either changes unseen."""
+"""Digests detect any changed byte of a fragment and of the data that it commits."""
 
 import json
 import subprocess
@@ -42,7 +42,7 @@ def test_fragments_with_digests_are_plain_parquet(split: Path) -> None:
 
 
 def test_fragments_have_the_digests_of_their_shards(split: Path) -> None:
-    """In coreutils' words, too."""
+    """And `sha256sum` agrees."""
     fragment, rows = read_fragment(*fragment_paths(split))
     name = rows.column("shard")[0].as_py()
     shard = data_path(split, name)

@@ -1,4 +1,4 @@
-"""Densities: the same bits come back from each, and what is computed again is held to checksums and key frames."""
+"""Densities: each restores the same bits, and recomputed states are checked against checksums and key frames."""
 
 import errno
 import json
@@ -54,7 +54,7 @@ FREE = ("record/action", "record/done", "record/goal", "record/timestep", "level
 
 @cache
 def played(size: str = "s", rules: TaskParams = DEFAULT_RULES) -> dict[str, np.ndarray]:
-    """Every field of records that the engine made, of random play with episodes of many lengths."""
+    """Return every field of simulated records of random play, with episodes of many lengths."""
     count = len(IDS)
     levels = jax.tree.map(np.asarray, sample_levels(np.arange(count, dtype=np.int32), SIZES[size], Distribution()))
     action = np.repeat(np.random.default_rng(3).integers(0, 2, (32, 6, count)), 8, axis=0).astype(np.int32)
@@ -82,7 +82,7 @@ def silence_is_wanted() -> Iterator[None]:
 
 
 def changed(shard: Shard, change: Callable[[dict[str, np.ndarray]], None]) -> Shard:
-    """A shard with right checksums whose stored numbers somebody has changed."""
+    """Change a shard's stored numbers and write it with valid checksums."""
     table = table_for(shard.size, shard.encoding)
     group = zarr.open_group(shard.path, mode="r+")
     packed = {name: np.asarray(group[name][:]) for name in shard.arrays}  # type: ignore[index]
@@ -106,7 +106,7 @@ def test_played_records_cover_the_difficult_cases() -> None:
 
 @pytest.mark.parametrize("encoding", [Encoding("resume"), WITNESS, Encoding("witness", 8), Encoding("witness", 256)])
 def test_every_density_restores_every_bit(tmp_path: Path, encoding: Encoding) -> None:
-    """And full, made of what it gave, is the full that was: files and all."""
+    """And a full shard written from the result has the same files as the original."""
     full, other = write(tmp_path, Encoding()), write(tmp_path, encoding)
     assert Shard(other.path).encoding == encoding
     assert_same(other.read(), played())
@@ -169,7 +169,7 @@ def test_read_together_mixes_densities(tmp_path: Path) -> None:
 
 
 def ulp(stored: dict[str, np.ndarray], name: str, key: int, level: int) -> None:
-    """The next number, of the last body."""
+    """Change one number of the last body to the next float."""
     x = stored[name][key, ..., level]
     flat = x.reshape(-1).view(np.uint32).copy()
     flat[np.flatnonzero(flat)[-1]] += 1
@@ -178,28 +178,28 @@ def ulp(stored: dict[str, np.ndarray], name: str, key: int, level: int) -> None:
 
 @pytest.fixture
 def keyed() -> tuple[int, int]:
-    """A level with a key frame, and the frame's row."""
+    """Return a level with a key frame, and the frame's row."""
     at, there = key_rows(played()["record/done"], 32)
     level = int(np.flatnonzero(there[0])[0])
     return level, int(at[0, level])
 
 
 def test_read_warns_of_differing_states_and_resets_at_key_frames(tmp_path: Path, keyed: tuple[int, int]) -> None:
-    """What was stored on it differs from what the engine gives here, by one unit in the last place."""
+    """The stored key frame differs from the engine's state by one unit in the last place."""
     level, row = keyed
-    here, told = played()["record/state/position"], f"for level {IDS[level]} from step {row} on"
+    here, warning = played()["record/state/position"], f"for level {IDS[level]} from step {row} on"
     shard = changed(write(tmp_path, WITNESS), lambda stored: ulp(stored, "key/state/position", 0, level))
-    for fields in (None, ["record/state/position"]):  # whatever is asked for
-        with pytest.warns(EngineDiffers, match=rf"1 of 4 levels of the shard .*, {told}"):
+    for fields in (None, ["record/state/position"]):  # with any request
+        with pytest.warns(EngineDiffers, match=rf"1 of 4 levels of the shard .*, {warning}"):
             found = shard.read(fields=fields)["record/state/position"]
         differs = found.view(np.uint32) != here.view(np.uint32)
         assert not np.delete(differs, level, -1).any()
         assert not differs[:row].any()
-        assert differs[row].sum() == 1  # the key frame is the truth
-        assert differs[row + 1 :].any()  # and the engine goes on from there
+        assert differs[row].sum() == 1  # the key frame is returned as stored
+        assert differs[row + 1 :].any()  # and the engine continues from it
         np.testing.assert_allclose(found[row + 1], here[row + 1], atol=1e-4)
     assert shard.unlike([0, 1, 2, 3]).tolist() == [row if i == level else -1 for i in range(4)]
-    shard.read([level], ["record/done"])  # nothing is said where nothing is simulated
+    shard.read([level], ["record/done"])  # no simulation, no warning
 
 
 def test_read_warns_of_a_differing_checksum(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_read_warns_of_a_differing_checksum(tmp_path: Path) -> None:
 
 
 def test_read_warns_of_differing_episode_ends(tmp_path: Path) -> None:
-    """They are those that were stored, and what the engine thinks of them is not asked."""
+    """The stored ends are returned, whatever the engine computes."""
     for encoding, run in ((Encoding("resume"), 1), (WITNESS, 32)):
         shard = write(tmp_path, encoding)
         done = played()["record/done"]
@@ -245,7 +245,7 @@ def test_checksum_depends_on_every_bit_of_a_state() -> None:
 
 
 def test_checksum_follows_the_docs() -> None:
-    """Word by word, in whole numbers of any length."""
+    """Word by word, in Python's integers."""
     states = task_states(played(), "record/state/", played()["record/timestep"])
     row, level, total = 7, 1, 0
     words = np.concatenate([
@@ -267,7 +267,7 @@ def test_timesteps_follow_from_episode_ends() -> None:
 
 @pytest.mark.parametrize("density", ["resume", "witness"])
 def test_write_shard_refuses_records_that_cannot_be_recomputed(tmp_path: Path, density: Any) -> None:
-    """A record of another machine, or one that was changed."""
+    """Such as a record of another machine, or a changed one."""
     fields = {name: x.copy() for name, x in played().items()}
     fields["record/reward"][200, 2] += 1
     with pytest.raises(Failure, match=f"cannot recompute record/reward of level 12, .*density={density} leaves"):
@@ -321,7 +321,7 @@ def test_shard_refuses_invalid_encodings(witness: Path, tmp_path: Path, name: st
 
 
 def test_shard_refuses_arrays_of_wrong_shapes(witness: Path, tmp_path: Path) -> None:
-    """Whatever the field table says: a key frame less, or checksums of other runs."""
+    """Whatever the field table says: one key frame too few, or checksums of other runs."""
     for cut in (4, -4):
         path = Path(shutil.copytree(witness, tmp_path / str(cut) / NAME))
         group = zarr.open_group(path, mode="r+")
@@ -335,7 +335,7 @@ def test_shard_refuses_arrays_of_wrong_shapes(witness: Path, tmp_path: Path) -> 
 
 
 def test_read_ends_for_senseless_states(tmp_path: Path) -> None:
-    """Numbers that no engine makes, in key frames too."""
+    """Numbers that no engine produces, in key frames too."""
 
     def change(stored: dict[str, np.ndarray]) -> None:
         for name, x in stored.items():
@@ -368,7 +368,7 @@ def test_density_does_not_change_the_config_hash() -> None:
 
 
 def test_state_fields_match_those_of_records() -> None:
-    """What checksums are made of, in the order of the dataclasses."""
+    """Checksums cover these fields, in the order of the dataclasses."""
     record = tree_of(Record, played(), "record/")
     states = task_states(played(), "record/state/", played()["record/timestep"])
     assert list(arrays_of(states)) == [
@@ -380,14 +380,14 @@ def test_state_fields_match_those_of_records() -> None:
 
 
 def test_convert_writes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever densities they come from, in the order of places."""
+    """In the order of places, from any densities."""
     monkeypatch.setattr(convert, "LEVELS", 2)
     witness, full = write(tmp_path, WITNESS), write(tmp_path, Encoding())
-    places = [Place(of.path, row, IDS[row]) for of, row in ((full, 0), (witness, 1), (witness, 2))]
+    places = [Place(shard.path, row, IDS[row]) for shard, row in ((full, 0), (witness, 1), (witness, 2))]
     paths = iter(tmp_path / f"{i}.zarr" for i in range(9))
     found = list(convert.convert(places, "resume", 32, lambda: next(paths)))
-    assert [[place.level_id for place in of] for of in found] == [IDS[:2], IDS[2:3]]
-    for place in (place for of in found for place in of):
+    assert [[place.level_id for place in group] for group in found] == [IDS[:2], IDS[2:3]]
+    for place in (place for group in found for place in group):
         shard = Shard(place.shard)
         assert (shard.encoding.density, shard.level_ids[place.row]) == ("resume", place.level_id)
         i = IDS.index(place.level_id)
@@ -395,7 +395,7 @@ def test_convert_writes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: pyte
 
 
 def test_convert_refuses_differing_states(tmp_path: Path, keyed: tuple[int, int]) -> None:
-    """What they were cannot be told from this machine's."""
+    """The stored states cannot be recomputed on this machine."""
     level, row = keyed
     shard = changed(write(tmp_path, WITNESS), lambda stored: ulp(stored, "key/state/position", 0, level))
     with pytest.raises(Failure, match=f"states that differ from the stored ones for 1 of 1 .* {row} on: read"):
@@ -405,7 +405,7 @@ def test_convert_refuses_differing_states(tmp_path: Path, keyed: tuple[int, int]
 
 @pytest.fixture
 def split(tmp_path: Path) -> Path:
-    """Of two units, each with two of the records."""
+    """Return a split of two units, each with two of the records."""
     fields, job = played(), made_job(str(tmp_path / "data"), "size=s")
     path = split_path(job.out, job.budget, job.size)
     path.mkdir(parents=True)
@@ -427,7 +427,7 @@ def assert_whole(split: Path, density: str) -> None:
     assert_same(read_rows(split, rows), played())
     assert {Shard(split / name).encoding.density for name in rows["shard"].to_pylist()} == {density}
     shards = {f"shards/{path.name}" for path in (split / "shards").iterdir()}
-    assert shards == set(rows["shard"].to_pylist())  # and nothing else is there
+    assert shards == set(rows["shard"].to_pylist())  # and no other shards exist
     assert len(fragment_paths(split)) == len(read_manifest(split).fragments)
 
 

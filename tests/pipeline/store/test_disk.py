@@ -1,4 +1,4 @@
-"""A disk that is full refuses every writer in the same way; what is flushed."""
+"""Writes to a full disk fail alike everywhere; flushing."""
 
 import errno
 import fcntl
@@ -39,7 +39,7 @@ FULLFSYNC = 51  # macOS's number of F_FULLFSYNC
 
 @pytest.fixture
 def tiny(tmp_path: Path) -> Iterator[Path]:
-    """A real file system with 32 KiB."""
+    """Mount a real file system of 32 KiB."""
     folder = tmp_path / "tiny"
     folder.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=32k", "tmpfs", str(folder)]
@@ -105,7 +105,7 @@ def test_write_fragment_fails_on_a_full_disk(tiny: Path) -> None:
 
 @pytest.mark.parametrize("has_it", [True, False], ids=["the file system can", "it cannot"])
 def test_flush_reaches_the_drive_on_macos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_it: bool) -> None:
-    """No such system is at hand: what it has beside Linux is put in its place."""
+    """Emulates on Linux what macOS has in addition."""
     flushed: dict[str, set[Path]] = {"drive": set(), "fsync": set()}
     fsync, control = os.fsync, fcntl.fcntl
 
@@ -144,7 +144,7 @@ def test_flush_does_not_fall_back_when_the_drive_fails(tmp_path: Path, monkeypat
 
 
 def test_only_to_drive_calls_fsync() -> None:
-    """Whoever calls `fsync` elsewhere leaves data in the drive's cache on macOS."""
+    """Any other caller of `fsync` would leave data in the drive's cache on macOS."""
     calls = {path.name for path in (ROOT / "pipeline").rglob("*.py") if "fsync(" in path.read_text()}
     assert calls == {"disk.py"}
 

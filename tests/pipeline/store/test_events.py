@@ -1,4 +1,4 @@
-"""Files of events: few, replaced as a whole, and harmless whatever is in them."""
+"""Event files: few, replaced as a whole, and harmless whatever their contents."""
 
 from pathlib import Path
 
@@ -19,14 +19,14 @@ def test_tell_replaces_a_runs_file_and_new_run_removes_old_ones(tmp_path: Path) 
     path = new_run(tmp_path)
     tell(path, [{"time": 1.0, "event": "started"}])
     tell(path, [{"time": 1.0, "event": "started"}, {"time": 2.0, "event": "ended"}])
-    (tmp_path / EVENTS / f".{path.name}.123").touch()  # of one that died
+    (tmp_path / EVENTS / f".{path.name}.123").touch()  # of a dead run
     last = new_run(tmp_path)
     tell(last, [])
-    assert [of["event"] for of in events_of(path)] == ["started", "ended"]
+    assert [event["event"] for event in events_of(path)] == ["started", "ended"]
     assert len(runs_in(tmp_path)) == KEPT
     assert {entry.name for entry in (tmp_path / EVENTS).iterdir()} == {
         "mine.txt",
-        *(of.name for of in runs_in(tmp_path)),
+        *(run.name for run in runs_in(tmp_path)),
     }
 
 
@@ -38,7 +38,7 @@ def test_events_of_skips_invalid_lines(tmp_path: Path) -> None:
     path = tmp_path / "run.jsonl"
     deep = "[" * 100_000
     path.write_bytes(b'\xff\n{"time": 1.0, "event": "progress"}\n{"time": "now", "event": 3}\n3\n' + deep.encode())
-    assert [of["event"] for of in events_of(path)] == ["progress"]
+    assert [event["event"] for event in events_of(path)] == ["progress"]
     path.write_bytes(b"x" * 2**23)
     assert events_of(path) == events_of(tmp_path / "none") == []
 

@@ -1,4 +1,4 @@
-"""Shards that nobody vouches for: each is refused in one sentence before anything of it is used."""
+"""Untrusted shards: each is refused in one sentence before any of it is used."""
 
 import json
 import os
@@ -165,7 +165,7 @@ def test_shard_refuses_out_of_range_indices(tmp_path: Path, name: str) -> None:
 
 
 def test_action_range_depends_on_the_binding(tmp_path: Path) -> None:
-    """A motor's entry of an action has a third choice, a thruster's has not."""
+    """Motors have a third choice in an action, thrusters do not."""
     for row, good in ((0, True), (4, False)):
         fields = made_fields("s", len(LEVELS))
         fields["record/action"][:, row] = 2
@@ -209,7 +209,7 @@ def test_shard_does_not_wait_for_a_pipe(shard: Path, inside: str) -> None:
 
 
 def test_shard_ignores_consolidated_metadata(shard: Path) -> None:
-    """Zarr's consolidated metadata would describe arrays that are not there."""
+    """Zarr's consolidated metadata would describe missing arrays."""
     zarr.consolidate_metadata(shard)
     (shard / "dyn8/zarr.json").write_text("{}")
     refused(shard)
@@ -298,7 +298,7 @@ def test_commands_refuse_hostile_shards_in_one_sentence(tmp_path: Path, capsys: 
 
 
 def test_commands_do_not_leave_the_split(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Not even for how much is in them."""
+    """Not even to measure folder sizes."""
     split = made_split(tmp_path / "data", [[Label.SOLVED]])
     (tmp_path / "secret").write_bytes(b"x" * 1000)
     (path,) = fragment_paths(split)

@@ -1,4 +1,4 @@
-"""What the last command wanted: read again as it was written, and no byte of it changes unseen."""
+"""Notes of the last command: read as written, with any changed byte detected."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Cleaning: what dead attempts left goes, and nothing else, whatever it is called."""
+"""Cleaning removes what dead attempts left, and nothing else, whatever its name."""
 
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +20,7 @@ from tests.pipeline.made import made_job, made_result
 
 @pytest.fixture
 def split(tmp_path: Path) -> Path:
-    """With levels 0 and 1 committed."""
+    """Return a split with levels 0 and 1 committed."""
     committed(tmp_path, 0)
     return tmp_path
 
@@ -32,7 +32,7 @@ def committed(split: Path, first: int) -> None:
 
 @pytest.fixture
 def dead(split: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """An attempt that died between its shard and its fragment; its name."""
+    """Let an attempt die between its shard and its fragment; return its name."""
 
     def die(*_: object, **__: object) -> None:
         raise MemoryError
@@ -50,7 +50,7 @@ def dead(split: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def test_commit_skips_levels_of_an_unreported_commit(tmp_path: Path) -> None:
-    """It gave some of its levels back, and its word of that was lost: the unit was handed out again as it had been."""
+    """An attempt returned some of its levels, but its report was lost, so the whole unit was assigned again."""
     said: list[str] = []
     for ids in [[0, 3], [0, 1, 2, 3], [0, 1, 2, 3]]:
         commit(made_job(), tmp_path, WorkUnit(tuple(ids)), made_result(ids, [Label.SOLVED] * len(ids)))
@@ -102,7 +102,7 @@ def test_clean_keeps_files_of_others(split: Path, tmp_path_factory: pytest.TempP
     for name in (f"experts/{attempt}.npz", f"shards/{attempt}.zarr", "manifest/.linked"):
         (split / name).symlink_to(elsewhere)
     before = everything(split)
-    (split / f"manifest/.{attempt}.begun").touch()  # it is the links that keep their target from going
+    (split / f"manifest/.{attempt}.begun").touch()  # only the links protect their targets
     assert clean(split, print).level_ids.tolist() == [0, 1]
     assert everything(split) == before
     assert (elsewhere / "mine").exists()
@@ -140,7 +140,7 @@ def test_clean_retries_failed_removals(split: Path, dead: str, monkeypatch: pyte
 
 
 def test_clean_stops_at_a_damaged_fragment(split: Path, dead: str) -> None:
-    """What it names is named by it alone."""
+    """Only that fragment names its data."""
     fragment_paths(split)[0].write_bytes(b"x")
     before = everything(split)
     with pytest.raises(Failure, match="is damaged"):

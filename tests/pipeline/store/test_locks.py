@@ -1,4 +1,4 @@
-"""Locks: on file systems of several kinds, and what people are told while they wait."""
+"""Locks on several kinds of file systems, and messages during waits."""
 
 import errno
 import fcntl
@@ -35,9 +35,9 @@ def test_committing_is_shared(tmp_path: Path) -> None:
 
 
 def test_committing_refuses_workers_of_an_earlier_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not even into a folder that was made anew."""
+    """Not even to a folder that was deleted and created again."""
     monkeypatch.setattr(leases, "_served", {})
-    worker = Path(os.path.relpath(tmp_path))  # as another process has it
+    worker = Path(os.path.relpath(tmp_path))  # another process may know it by this path
     with only_writer(tmp_path, print):
         leases.serve(worker, leases.served(tmp_path))
     with committing(worker):
@@ -52,7 +52,7 @@ def test_committing_refuses_workers_of_an_earlier_writer(tmp_path: Path, monkeyp
         tmp_path.mkdir()
 
 
-# NFS makes locks of byte ranges out of `flock`: so does this process, which holds one until its input ends.
+# NFS implements `flock` by byte-range locks; so does this process, which holds one until its input ends
 HOLDER = """
 import fcntl, pathlib, sys
 fcntl.flock = fcntl.lockf

@@ -1,4 +1,4 @@
-"""Fragments: committed at once or not at all, damage is seen, each level counts once."""
+"""Fragments: commits are atomic, damage is detected, each level counts once."""
 
 import io
 import itertools
@@ -116,7 +116,7 @@ def test_read_manifest_is_empty_before_any_commit(tmp_path: Path) -> None:
 
 
 def test_read_manifest_ignores_other_files(tmp_path: Path, job: JobConfig) -> None:
-    """A half-written one, a copy, what a notebook, a desktop and NFS leave, folders and links."""
+    """Half-written fragments, copies, what notebooks, desktops and NFS leave, folders and links."""
     path = commit(tmp_path, job, [0])
     begin_fragment(new_attempt(tmp_path, unit_name(1, 1)))
     for name in ("all.parquet", f"{path.stem} (copy).parquet", ".DS_Store", ".nfs0000000000003a1b00000002"):
@@ -212,7 +212,7 @@ def test_read_manifest_opens_only_fragments_that_cover_the_levels(
     monkeypatch.setattr(manifest_file, "read_fragment", noted)
     for level_ids, rows, units in (
         ([2], [2], [(0, 1, 2), (2, 5)]),
-        ([3, 12], [], [(2, 5), (9, 20)]),  # inside, and not there
+        ([3, 12], [], [(2, 5), (9, 20)]),  # in range, but missing
         ([7, 30], [7, 30], [(6, 7), (30,)]),
         ([8, 31, -4], [], []),
         ([], [], []),
@@ -222,5 +222,5 @@ def test_read_manifest_opens_only_fragments_that_cover_the_levels(
         assert found.level_ids.tolist() == rows
         assert sorted(opened) == sorted(paths[unit] for unit in units)
     with pytest.raises(KeyError):
-        _ = found.shards  # not read: not known, and never empty
+        _ = found.shards  # not read, so unknown instead of empty
     assert require_manifest(tmp_path, [], [8]).table.num_rows == 0

@@ -1,4 +1,4 @@
-"""Shards merged without decoding: every bit comes back, in few files, and damage is not passed on."""
+"""Merging shards without decoding: every bit is preserved, in few files, and damage is refused."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from tests.pipeline.made import made_fields
 
 @pytest.fixture
 def parts(tmp_path: Path) -> list[Path]:
-    """Three shards, of levels 0 to 4, 5 to 9 and 10 to 14."""
+    """Write three shards, of levels 0 to 4, 5 to 9 and 10 to 14."""
     paths = [tmp_path / f"{first}.zarr" for first in (0, 5, 10)]
     for seed, path in enumerate(paths):
         first = 5 * seed
@@ -37,7 +37,7 @@ def test_merge_shards_preserves_every_bit(tmp_path: Path, parts: list[Path], row
     assert Shard(once).level_ids == list(range(0, 15, 2))
     assert Shard(again).level_ids == [2, 3, 14]
     whole = [Shard(path).read() for path in parts]
-    expected = {name: np.concatenate([of[name] for of in whole], -1) for name in whole[0]}
+    expected = {name: np.concatenate([fields[name] for fields in whole], -1) for name in whole[0]}
     for shard, levels in (once, range(0, 15, 2)), (again, [2, 3, 14]):
         for name, values in Shard(shard).read().items():
             assert same_bits(values, expected[name][..., levels]).all(), name

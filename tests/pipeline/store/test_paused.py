@@ -1,4 +1,4 @@
-"""Experts in training on the disk: they come back bit for bit, and only what is damaged or finished is removed."""
+"""Saved experts in training: restored bit for bit, and removed only if damaged or finished."""
 
 import os
 from collections.abc import Iterator
@@ -107,7 +107,7 @@ def test_prune_removes_checkpoints_of_committed_levels(split: Path) -> None:
 
 
 def pruned(split: Path, *done: int) -> list[str]:
-    """What `prune_paused` says of the only checkpoint."""
+    """Return what `prune_paused` reports about the only checkpoint."""
     said: list[str] = []
     prune_paused(split, np.array(done), said.append)
     return said
@@ -184,7 +184,7 @@ def test_prune_keeps_a_checkpoint_of_another_version(split: Path) -> None:
 
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
-    """A store with an empty bucket, and a process that waits a second for its answers."""
+    """Start a store with an empty bucket, whose responses this process awaits for a second."""
     monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=1))
     monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})

@@ -1,4 +1,4 @@
-"""Pieces on the disk: the bytes that were put there or none, within the bound, whatever processes and disks do."""
+"""Piece cache: returns the bytes that were put or none, within its bound, whatever processes and disks do."""
 
 import os
 from pathlib import Path
@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.pieces import CHECKSUM, PARTS, PieceCache
 
-LONGEST = 40  # bytes of a piece
+MAX_LENGTH = 40  # bytes of a piece
 
 
 def piece(n: int) -> bytes:
-    return bytes((n * 7 + i) % 256 for i in range(1 + (n * 13) % LONGEST))
+    return bytes((n * 7 + i) % 256 for i in range(1 + (n * 13) % MAX_LENGTH))
 
 
 def stored_bytes(folder: Path) -> int:
@@ -33,11 +33,11 @@ def test_piece_cache_returns_right_bytes(steps: list, most: int, tmp_path_factor
         name, whole = f"name-{n}", piece(n)
         if what == "put":
             caches[which].put(name, whole)
-            assert stored_bytes(folder) <= most + 2 * (most // PARTS + LONGEST + CHECKSUM)
+            assert stored_bytes(folder) <= most + 2 * (most // PARTS + MAX_LENGTH + CHECKSUM)
         elif what == "read":
             found = caches[which].read(name, n % 3, len(whole))
             assert found in (None, whole[n % 3 :])
-        elif (path := folder / name).exists():  # a disk that lost something; then the processes start again
+        elif (path := folder / name).exists():  # the disk lost bytes; then the processes restart
             data = path.read_bytes()
             path.write_bytes(data[:-1] if what == "cut" else bytes([data[0] ^ 1]) + data[1:])
             caches = [PieceCache(folder, most) for _ in range(2)]

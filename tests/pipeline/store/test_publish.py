@@ -1,4 +1,4 @@
-"""A split written to an object store: the same as in a folder, whatever the store, the writers and the workers do."""
+"""Splits written to an object store equal those in a folder, whatever the store, the writers and the workers do."""
 
 import json
 import os
@@ -40,7 +40,7 @@ THERE = Path(OUT) / SPLIT
 
 @pytest.fixture(scope="module")
 def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same job in a folder."""
+    """Run the same job into a folder."""
     out = tmp_path_factory.mktemp("here")
     drive(str(out))
     return out / SPLIT
@@ -55,7 +55,7 @@ ALSO_MOTO = pytest.mark.parametrize(
 def server(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moto: Any
 ) -> Iterator[Server]:
-    """A store with an empty bucket, a process without patience, and nothing known of any store."""
+    """Start a store with an empty bucket, with short time-outs and no cached metadata."""
     monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=patience(2)))
     monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
@@ -75,7 +75,7 @@ def server(
 
 @pytest.fixture
 def moto() -> Iterator[Any]:
-    """Starts a process that serves S3, if it is called."""
+    """Return a function that starts a process that serves S3."""
     with ExitStack() as stack:
         yield lambda: stack.enter_context(s3_process())
 
@@ -93,7 +93,7 @@ def forget() -> None:
 
 
 def require_whole(here: Path) -> None:
-    """All is there, and nothing else."""
+    """Check that the split is complete, with nothing else beside it."""
     manifest = require_same_content(THERE, here)
     left = {path.relative_to(THERE).as_posix() for path in remote.stored_in(THERE)}
     fragments = {name for name in left if FRAGMENT.fullmatch(name)}
@@ -127,7 +127,7 @@ def test_requests_to_a_slow_store_are_retried(server: Server, here: Path, monkey
 
 
 def dies_at(server: Server, request: int) -> None:
-    """The store is gone from this request on."""
+    """Let the store fail from this request on."""
     begun = server.count
     server.meanwhile = lambda count: server.spoil(1, "gone") if count - begun >= request else None
 
@@ -178,7 +178,7 @@ def test_generate_resumes_after_a_kill_at_any_request(server: Server, here: Path
 
 
 def taken_over(split: Path) -> Lease:
-    """By another writer, which cleans up as it does in a process of its own."""
+    """Take the split over as another writer, which cleans it as in its own process."""
     lease = Lease(split, print)
     clean(split, print)
     return lease
@@ -186,7 +186,7 @@ def taken_over(split: Path) -> Lease:
 
 STEPS = {  # requests of an attempt, by what they have in them, and which of those it is
     "mark": ("begun", 1),
-    "look": (".parquet", 2),  # the first asks what an attempt of which nobody has heard has committed
+    "look": (".parquet", 2),  # the first checks for an unreported commit
     "lease": (".writer.lock", 1),
     "data": ("/shards/", 1),
     "fragment": ("PUT /bucket/data/128k/s/manifest/0", 1),
@@ -202,7 +202,7 @@ STEPS = {  # requests of an attempt, by what they have in them, and which of tho
 def test_workers_of_a_replaced_writer_commit_before_or_never(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
-    """Paused before any of its requests until another writer has taken over and cleaned up."""
+    """The worker pauses before one of its requests until another writer has taken over and cleaned up."""
     monkeypatch.setattr(leases, "RENEWAL", 1000.0)
     monkeypatch.setattr(leases, "SILENCE", -1.0)
     with leases.leased(THERE, print):
@@ -283,7 +283,7 @@ def test_one_of_two_attempts_at_a_unit_is_committed(server: Server) -> None:
 
 
 def test_commit_to_a_store_skips_levels_of_an_unreported_commit(server: Server, here: Path) -> None:
-    """It gave some of its levels back, and its word of that was lost: the unit was handed out again as it had been."""
+    """An attempt returned some of its levels, but its report was lost, so the whole unit was assigned again."""
     commit_made(THERE, WorkUnit((0, 3)))
     commit_made(THERE, WorkUnit((0, 1, 2, 3)))
     commit_made(THERE, WorkUnit((0, 1, 2, 3)))
@@ -325,7 +325,7 @@ def test_lease_refuses_a_second_writer_while_it_is_renewed(
 
 @pytest.fixture
 def interruptible() -> Iterator[None]:
-    """Also where the tests are a job in the background, which ignores Ctrl-C."""
+    """Let Ctrl-C interrupt, also if the tests run as a background job, which ignores it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -348,7 +348,7 @@ def test_lease_of_a_silent_writer_is_taken_and_the_writer_notices(
 
 
 def left_by_a_killed_writer(**other: Any) -> bytes:
-    """A lease's text; its process has ended, on this machine but for what is `other`."""
+    """Return a lease of a process that has ended, on this machine except for the `other` entries."""
     with subprocess.Popen(["true"]) as ended_process:
         pass
     text = json.loads(leases._about("theirs", renewals=7))
@@ -358,14 +358,14 @@ def left_by_a_killed_writer(**other: Any) -> bytes:
 def test_lease_of_a_dead_process_is_taken_at_once_on_its_machine_only(
     server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Not on another one of the same host name, which outside of containers has the same PID namespace, too."""
+    """Not on another machine with the same host name, which outside of containers has the same PID namespace, too."""
     monkeypatch.setattr(leases, "NOTICE", 0.0)
     said: list[str] = []
     put(THERE / WRITER_LOCK, left_by_a_killed_writer())
     Lease(THERE, said.append).release()
     assert not said
     monkeypatch.setattr(leases, "SILENCE", 0.3)
-    for boot_id in ("a55af8d1-3d1c-4b2c-8a5e-5f0c2a9b0001", None):  # of the other machine; None: it cannot be known
+    for boot_id in ("a55af8d1-3d1c-4b2c-8a5e-5f0c2a9b0001", None):  # of the other machine; None: unknown
         put(THERE / WRITER_LOCK, left_by_a_killed_writer())
         with monkeypatch.context() as elsewhere:
             (tmp_path / "boot_id").write_text(boot_id or "")
@@ -383,8 +383,8 @@ def test_lease_survives_lost_responses_to_renewals(server: Server, monkeypatch: 
     try:
         lease = Lease(THERE, print)
         for _ in range(2):
-            server.spoil(1, "lost")  # done, without an answer
-            await_renewals(lambda: lease._renewals, 3)  # of which at least two were given up
+            server.spoil(1, "lost")  # succeeds, but the response is lost
+            await_renewals(lambda: lease._renewals, 3)  # at least two of them failed
             server.spoil(0)
             await_renewals(lambda: json.loads(get(THERE / WRITER_LOCK).data)["renewals"], 3)
     except KeyboardInterrupt:
@@ -403,7 +403,7 @@ def await_renewals(count: Callable[[], int], more: int) -> None:
 def test_is_leased_compares_no_clocks(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, day: str
 ) -> None:
-    """The store's, by which a lease was put on this `day`, or this machine's."""
+    """Neither the store's, which dates the lease by `day`, nor this machine's."""
     monkeypatch.setattr(leases, "RENEWAL", 0.1)
     monkeypatch.setattr(leases, "NOTICE", 0.0)
     bucket, said = bucket_of(tmp_path / "s3"), list[str]()
@@ -434,7 +434,7 @@ def test_is_leased_compares_no_clocks(
 def test_google_store_gets_what_a_folder_gets(
     server: Server, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int, how: str
 ) -> None:
-    """Which says of a file that is removed again that it is not there."""
+    """This store reports an error if a deleted file is deleted again."""
     account = {"client_email": "", "private_key": "", "private_key_id": "", "disable_oauth": True}
     (tmp_path / "account.json").write_text(json.dumps(account | {"gcs_base_url": server.url}))
     monkeypatch.setenv("GOOGLE_SERVICE_ACCOUNT", str(tmp_path / "account.json"))
@@ -467,7 +467,7 @@ def test_azure_store_gets_what_a_folder_gets(
         between.spoil(0)
         require_same_content(split, here)
         count = between.count
-        drive("az://bucket/data")  # all is there
+        drive("az://bucket/data")  # everything is done already
         assert not [line for line in between.log[count:] if line.startswith("PUT") and "/shards/" in line]
         between.spoil(1, "gone")
         forget()
@@ -494,7 +494,7 @@ def test_generate_refuses_a_store_without_preconditions(server: Server, tmp_path
 
 
 def test_require_conditions_reports_a_busy_store_as_busy(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever numbers there are in the name of the file that it is tried with."""
+    """Whatever digits the name of the probe file contains."""
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
     server.spoil(1)
     with pytest.raises(StoreFailure, match=r"Cannot write .*501 \(503 Service Unavailable\)"):
@@ -539,4 +539,4 @@ def test_generate_writes_the_same_to_a_store_and_a_folder(server: Server, tmp_pa
 def test_new_run_removes_the_oldest_events_in_a_store(server: Server) -> None:
     for number in range(KEPT + 1):
         tell(new_run(THERE), [{"time": float(number), "event": "started"}])
-    assert sorted(of["time"] for run in runs_in(THERE) for of in events_of(run)) == list(range(1, KEPT + 1))
+    assert sorted(event["time"] for run in runs_in(THERE) for event in events_of(run)) == list(range(1, KEPT + 1))

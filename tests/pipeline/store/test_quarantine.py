@@ -1,4 +1,4 @@
-"""Notes of units that were given up: they go with their levels, whatever units commit these."""
+"""Notes of units that were given up: removed once their levels are committed, by whatever units."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Files that a command opens in a split that it did not make: whatever has their names, nothing else is written to."""
+"""Files that a command opens in a split of others: whatever has their names, no other file is written."""
 
 import contextlib
 import os
@@ -28,7 +28,7 @@ MINE = b"export PATH"
 
 @pytest.fixture(autouse=True)
 def _no_hang() -> Iterator[None]:
-    """What waits for a pipe fails."""
+    """Fail instead of waiting for a pipe."""
 
     def expire(*_: Any) -> None:
         raise TimeoutError("it hangs")
@@ -42,7 +42,7 @@ def _no_hang() -> Iterator[None]:
 
 @pytest.fixture
 def profile(tmp_path: Path) -> Path:
-    """A file of the user's own outside of the split."""
+    """Write a file of the user outside of the split."""
     path = tmp_path / "profile"
     path.write_bytes(MINE)
     return path

@@ -1,4 +1,4 @@
-"""A split that lies elsewhere reads as the same split in a folder, or one sentence says why not."""
+"""Remote splits read as the same split in a folder, or fail with one sentence."""
 
 import json
 import os
@@ -53,7 +53,7 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Small pieces, a cache of its own, little patience, and nothing known of any store."""
+    """Use small pieces, an empty cache, short time-outs and no cached metadata."""
     monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(remote, "PIECE", PIECE)
     monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=patience(2)))
@@ -65,14 +65,14 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def forget() -> None:
-    """What a process knows, as if another one began."""
+    """Drop what this process knows of stores, as if it had just started."""
     remote._known.clear()
     remote._store.cache_clear()
     remote._cache_in.cache_clear()
 
 
 class Bucket(NamedTuple):
-    """A bucket behind a server that counts and spoils requests."""
+    """A bucket behind a server that counts requests and can make them fail."""
 
     server: Server
     put: Callable[[str, bytes], Any]  # under a key
@@ -80,7 +80,7 @@ class Bucket(NamedTuple):
 
 @pytest.fixture(scope="module", params=["little", pytest.param("moto", marks=pytest.mark.campaign)])
 def made_bucket(split: Path, request: pytest.FixtureRequest, tmp_path_factory: Any) -> Iterator[Bucket]:
-    """With the split in it: of the few lines of S3 that readers need, or of moto in a process."""
+    """Serve a bucket with the split: from a minimal S3 server, or from moto in a process."""
     if request.param == "little":
         folder = tmp_path_factory.mktemp("s3")
         shutil.copytree(split, folder / "bucket/data/s")
@@ -110,7 +110,7 @@ def witnessed(split: Path) -> pa.Table:
 
 
 def require_same(there: Path, here: Path, fields: Sequence[str] | None = FIELDS) -> None:
-    """Manifest and records, bit for bit."""
+    """Compare manifest and records, bit for bit."""
     assert read_manifest(there).table.equals(read_manifest(here).table)
     rows = witnessed(there).take([7, 0, 3, 1, 6, 0])
     found, true = read_rows(there, rows, fields), read_rows(here, rows, fields)
@@ -255,7 +255,7 @@ def test_read_explains_missing_splits_and_stores(
 
 
 def test_read_explains_missing_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("AWS_METADATA_ENDPOINT", f"http://{HOST}:1")  # where they would be on Amazon's machines
+    monkeypatch.setenv("AWS_METADATA_ENDPOINT", f"http://{HOST}:1")  # the endpoint for credentials on Amazon's machines
     with pytest.raises(UserError, match=r"no credentials to read s3://.*AWS_ACCESS_KEY_ID.*AWS_SKIP_SIGNATURE"):
         read_manifest(S3)
 
@@ -289,7 +289,7 @@ def test_google_store_reads_as_the_folder(split: Path, tmp_path: Path, monkeypat
 def test_open_split_survives_a_seal(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
-    """The manifest is listed again, the shards are others, and of any density."""
+    """The manifest is listed again and names new shards, of any density."""
     source = split if words[0] == "--rows" else played_split(tmp_path / "played")
     copy = Path(shutil.copytree(source, tmp_path / "s3/bucket/data/s"))
     with serving(bucket_of(tmp_path / "s3")) as server:
@@ -303,7 +303,7 @@ def test_open_split_survives_a_seal(
 
 
 def test_read_stops_at_the_maximum_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What tells of a run: its note, its lease, its events."""
+    """For a split's note, lease and events."""
     (tmp_path / "s").mkdir()
     note_job(tmp_path / "s", made_job(), ["levelproof", "generate"], [(0, 7)])
     lock, renewals = tmp_path / "s" / WRITER_LOCK, count()
@@ -410,7 +410,7 @@ def test_split_on_the_hub_reads_as_its_folder(split: Path, tmp_path: Path, monke
 
 
 def test_files_below_explains_cut_off_lists(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where they come in chunks, an answer that ends early is an error of HTTP's, and none of the system's."""
+    """With chunked encoding, a response that ends early raises HTTPException instead of OSError."""
     with serving(lambda *_: Answer(200, {"Transfer-Encoding": "chunked"}, b"ff\r\n[")) as server:
         monkeypatch.setenv("HF_ENDPOINT", server.url)
         with pytest.raises(StoreFailure, match=r"The hub does not answer at .*IncompleteRead"):
@@ -431,7 +431,7 @@ def test_commands_that_read_accept_urls_and_others_refuse_them(bucket: Bucket, s
 
 
 def test_forked_processes_are_refused(tmp_path: Path) -> None:
-    """Its threads would not be there: it would wait forever, and so would the process that it is of."""
+    """It lacks the threads of its parent: both would wait forever."""
     code = (
         "import os\nfrom pathlib import Path\nfrom levelproof.pipeline.store import remote\n"
         "remote.place(Path('s3://bucket/data'))\n"

@@ -21,7 +21,7 @@ def test_inside_selects_ids_in_runs(wanted: set[int], there: set[int]) -> None:
 
 
 def test_inside_is_fast_for_half_a_million_runs() -> None:
-    """Every other level of a million: a look at every run for every level would take days."""
+    """Every other level of a million: checking every run for every level would take days."""
     ids = np.arange(1_000_000)
     assert inside(ids, np.stack([ids[::2], ids[::2]], 1)).sum() == 500_000
 

@@ -1,4 +1,4 @@
-"""Temporary folders of killed processes go, and those of live ones stay."""
+"""Temporary folders of killed processes are removed, and those of live ones stay."""
 
 import json
 import os
@@ -51,7 +51,7 @@ for i in range(int(sys.argv[1])):
 
 @contextmanager
 def process(program: str, temporary: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], Path]]:
-    """A process that runs this program until it is killed, and the folder that it has made."""
+    """Start a process that runs this program until it is killed, and return the folder that it made."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)}
     command = [sys.executable, "-c", program, *arguments]
     with subprocess.Popen(
@@ -68,7 +68,7 @@ def process(program: str, temporary: Path, *arguments: str) -> Iterator[tuple[su
 
 @pytest.fixture
 def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder for temporary files, of a process that has not swept it yet."""
+    """Return a folder for temporary files that this process has not swept yet."""
     monkeypatch.setattr(module, "gettempdir", lambda: str(tmp_path))
     module._sweep_once.cache_clear()
     return tmp_path
@@ -99,7 +99,7 @@ def test_new_folder_removes_what_a_killed_export_left(parent: Path) -> None:
 
 
 def left(folder: Path, machine: dict[str, str] | None = None) -> Path:
-    """A folder as a killed process leaves it."""
+    """Make a folder as a killed process leaves it."""
     (folder / FILES).mkdir(parents=True)
     (folder / FILES / "file").touch()
     (folder / LOCK).write_text(json.dumps(module._machine() if machine is None else machine))

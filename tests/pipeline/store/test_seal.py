@@ -1,4 +1,4 @@
-"""Sealing: the same rows and bits in fewer files, whoever reads, commits or dies meanwhile."""
+"""Sealing keeps rows and bits in fewer files, whatever processes read, commit or die concurrently."""
 
 import errno
 import json
@@ -61,7 +61,7 @@ def pieces(split: Path) -> list[Piece]:
 
 
 def whole(split: Path) -> dict[int, tuple]:
-    """The rows, but for where their data are, and every bit of their data."""
+    """Return the rows, without their places, and every bit of their data."""
     found = {}
     for row in read_manifest(split).table.to_pylist():
         data = Shard(split / row["shard"]).read([row["row"]]) if row["shard"] else {}
@@ -71,7 +71,7 @@ def whole(split: Path) -> dict[int, tuple]:
 
 
 def assert_tidy(split: Path, fragments: int) -> None:
-    """So many fragments, the shards that they name, and nothing else."""
+    """Check that there are this many fragments and only the shards that they name."""
     assert len(fragment_paths(split)) == fragments
     assert len(list((split / "manifest").iterdir())) == fragments
     assert {f"shards/{path.name}" for path in (split / "shards").iterdir()} == read_manifest(split).shards
@@ -121,7 +121,7 @@ def test_plan_merges_neighbours_and_keeps_large_fragments() -> None:
 
 
 def test_seal_refuses_after_another_writer_took_over(split: Path, made: Path) -> None:
-    """It was removed and made again, by another path to it as another process has it."""
+    """The folder was deleted and created again, through another path, as another process would."""
     same = Path(os.path.relpath(split))
     with only_writer(split, print):
         shutil.rmtree(split)
@@ -152,7 +152,7 @@ def test_units_commit_into_the_range_of_a_seal(split: Path, made: Path, monkeypa
         seal(split, pieces(split))
     assert whole(split) == expected
     assert len(fragment_paths(split)) == 2
-    seal(split, pieces(split))  # its range is that of the one before, whose place it takes
+    seal(split, pieces(split))  # it has the range of the earlier one and replaces it
     assert whole(split) == expected
     assert_tidy(split, 1)
 
@@ -161,7 +161,7 @@ WRITES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 
 
 def killed(split: Path, step: int) -> bool:
-    """Whether who cleans and seals is killed before it has changed the files of a split so many times."""
+    """Clean and seal in a process that is killed after this many changes to the split; return whether it was."""
     if child := os.fork():
         status, end = None, time.monotonic() + patience(COMMAND_SECONDS)
         while status is None:
@@ -176,7 +176,7 @@ def killed(split: Path, step: int) -> bool:
     def count(event: str, arguments: tuple) -> None:
         changes = event in WRITES or (event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
         path = str(arguments[0]) if changes else ""
-        ours = str(split) in path or not path.startswith("/")  # what is in a folder that goes, goes by its name alone
+        ours = str(split) in path or not path.startswith("/")  # rmtree deletes a folder's contents by bare names
         if changes and ours and next(left, None) is None:
             os.kill(os.getpid(), signal.SIGKILL)
 
@@ -230,7 +230,7 @@ def test_seal_survives_any_commits_and_kills(made: Path, tmp_path: Path, steps: 
 
 
 def test_active_readers_survive_a_seal(split: Path, made: Path) -> None:
-    """They see every level all the time, each once, and read its data wherever it lies by then."""
+    """They see every level once at any time, and read its data wherever it lies."""
     expected, ended = whole(made), threading.Event()
 
     def read() -> int:
@@ -238,7 +238,7 @@ def test_active_readers_survive_a_seal(split: Path, made: Path) -> None:
         while not ended.is_set():
             rows = read_manifest(split).table.to_pylist()
             assert [row["level_id"] for row in rows] == list(expected)
-            time.sleep(0.01)  # the data may go elsewhere meanwhile
+            time.sleep(0.01)  # the data may move now
             for row in rows:
                 if row["shard"]:
                     data = read_row(split, row)
@@ -258,7 +258,7 @@ def test_active_readers_survive_a_seal(split: Path, made: Path) -> None:
 
 
 def test_read_manifest_lists_again_during_a_seal(split: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was sealed is listed too late, what it was made of not any more: names are not read all at once."""
+    """A listing is not atomic: it may miss the sealed fragment and the removed sources."""
     seal(split, pieces(split))
     listed, torn = manifest.entries, [True]
     monkeypatch.setattr(manifest, "entries", lambda *of: {} if torn and torn.pop() else listed(*of))
@@ -312,7 +312,7 @@ def test_seal_on_a_full_disk_changes_nothing(split: Path, made: Path, monkeypatc
 
 
 class Stopped(Exception):
-    """The seal is asked to end."""
+    """Raised to stop the seal."""
 
 
 def test_seal_stopped_at_any_file_loses_nothing(split: Path, made: Path) -> None:

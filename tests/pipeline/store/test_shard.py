@@ -1,4 +1,4 @@
-"""Shards: every bit comes back, damage is seen, and only what was asked for is read."""
+"""Shards: every bit is restored, damage is detected, and only requested arrays are read."""
 
 from pathlib import Path
 
@@ -94,7 +94,7 @@ def test_read_keeps_the_requested_order(shard: Path, fields: dict[str, np.ndarra
 
 
 def test_read_opens_only_arrays_of_requested_fields(shard: Path, fields: dict[str, np.ndarray]) -> None:
-    (shard / "dyn32/c/0/0/0").unlink()  # not needed for what follows
+    (shard / "dyn32/c/0/0/0").unlink()  # not needed below
     found = Shard(shard).read(fields=["record/action", "level/role"])
     assert_same(found, {name: fields[name] for name in ("level/role", "record/action")})
 

@@ -51,7 +51,7 @@ def test_writing_refuses_another_configuration_and_lists_differences(tmp_path: P
 
 
 def test_writing_refuses_another_density(tmp_path: Path, job: JobConfig) -> None:
-    """Or whoever forgets to say it again would get a split of two."""
+    """Otherwise a forgotten setting would give a split of two densities."""
     with writing(job, print) as (split, _):
         committed(job, split)
     words = ["density=witness", "key_every=16"]
@@ -70,7 +70,7 @@ def test_writing_accepts_more_levels(tmp_path: Path, job: JobConfig) -> None:
 
 
 def test_writing_resumes_a_split_with_an_earlier_hash(tmp_path: Path, job: JobConfig) -> None:
-    """Hashes covered how many experts train side by side, and how often the host looks at a search."""
+    """Earlier hashes covered the number of slots and the interval of the search's host syncs."""
     before = job.results | {"expert": plain(job.expert) | {"slots": 8}, "search": plain(job.search)}
     assert hash_of(before) != job.hash
     with writing(job, print) as (split, _):
