@@ -10,7 +10,7 @@ from typing import Any, Literal
 from levelproof.configs.convert import flat, plain
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count, parse_duration
-from levelproof.experts.config import ExpertConfig, ScoutConfig, StopConfig, check_budget
+from levelproof.experts.config import ExpertConfig, StopConfig, check_budget
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION
@@ -50,6 +50,7 @@ WITHOUT_EFFECT = frozenset(
     }
 )
 RENAMED: Mapping[str, str] = {}  # names of settings in earlier versions, with a dot: those of today
+REMOVED: Mapping[str, Any] = {"scout.rounds": 0}  # settings of earlier versions: the value that matches this version
 # In the results of levels that no id makes, where those of random levels have their distribution
 FROM_FILES, FROM_RECORDS = "files", "import"
 OF_RECORDS = ("size", "budget", "task", "sampler_version")  # what decides results where nobody searches or trains
@@ -77,8 +78,7 @@ class JobConfig:
     log: Literal["none", "tensorboard", "wandb"] = "none"  # scalars of a run, for TensorBoard or Weights & Biases
     distribution: Distribution = field(default_factory=Distribution)  # what random levels are like
     task: TaskParams = field(default_factory=TaskParams)  # what a level asks for
-    scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first
-    search: SearchConfig = field(default_factory=SearchConfig)  # who looks where scouts find nothing
+    search: SearchConfig = field(default_factory=SearchConfig)  # the search before an expert trains
     expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
     stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot
 
@@ -131,7 +131,7 @@ class JobConfig:
     @property
     def procedure(self) -> Procedure:
         """How its levels get their labels."""
-        return Procedure(self.scout, self.search, self.expert, self.stop)
+        return Procedure(self.search, self.expert, self.stop)
 
     @property
     def stored(self) -> str:
@@ -181,7 +181,8 @@ def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) 
     """Keep the settings that decide results, under today's names, whichever version wrote them down.
 
     Splits record the `JobConfig.results` of the version that made them. Readers compare what this returns of them, so
-    a setting that loses its effect or takes another name leaves a split the same.
+    a setting that loses its effect, takes another name or is removed leaves a split the same. A removed setting with a
+    value that this version cannot reproduce is kept, so that the configurations differ.
 
     Args:
         settings: nested, as JSON has them.
@@ -192,6 +193,8 @@ def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) 
     """
     kept: dict[str, Any] = {}
     for name, value in flat(settings).items():
+        if REMOVED.get(name, ...) == value:
+            continue
         if (now := renamed.get(name, name)) not in WITHOUT_EFFECT:
             *groups, last = now.split(".")
             group = kept

@@ -20,7 +20,7 @@ class Network(StrEnum):
 class Rule(StrEnum):
     """When a level leaves its slot."""
 
-    NONE = "none"  # no expert is trained: labels rest on scout and search
+    NONE = "none"  # no expert is trained: labels rest on the search
     BUDGET = "budget"  # every expert gets its whole budget
     SOLVED = "solved"  # until its evaluation succeeds
     HALVING = "halving"  # until its evaluation succeeds or, at a rung, its learning does not move
@@ -107,16 +107,6 @@ class ExpertConfig:
     def record_rollouts(self) -> int:
         """Rollouts that a record takes."""
         return -(-RECORD_STEPS // self.horizon)
-
-
-@dataclass(frozen=True)
-class ScoutConfig:
-    """How long a level is scouted before its expert trains (hashable: pass as a static argument)."""
-
-    rounds: int = 0  # of 16,384 env steps of persistent random play, until one has a success; 0: none
-
-    def __post_init__(self) -> None:
-        require(self, ("rounds",), 0)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ class Source(StrEnum):
     MOST_PROBABLE = "most probable"  # the expert's most probable actions
     SAMPLED = "sampled"  # actions sampled from the expert's policy in its evaluation
     EXPLORATION = "exploration"  # actions of an episode of training
-    SCOUT = "scout"  # persistent random play before training
+    SCOUT = "scout"  # random play before training, in splits of earlier versions
     SEARCH = "search"  # exploration from archived states, before training, or around another witness
     NOTHING = "nothing"  # a trivial level's
     IMPORT = "import"  # of another program's data
@@ -42,7 +42,7 @@ MADE_BY = {
     Source.SCOUT: "actions of random play",
     Source.SEARCH: "actions of the search",
 }
-UNTRAINED = "neither random play nor the search reached the goal, and no expert was asked for"
+UNTRAINED = "no search reached the goal, and no expert was asked for"
 DIVERGED = "stopped being finite"  # in the reasons of levels whose experts diverged
 WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that stand on a witness
 TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels of levels that could use an expert
@@ -73,7 +73,7 @@ class Verdict:
     episodes: int = 0  # of training
     portability: float | None = None  # share of the witness's replays from moved starts that reach the goal
     evaluation_steps: int = 0  # env steps
-    scout_steps: int = 0  # env steps
+    scout_steps: int = 0  # 0; earlier versions played at random before training
     search_steps: int = 0  # env steps
     cells: int | None = None  # that the search reached; None: there was none
     still_grew: bool | None = None  # whether its archive did, at its end

@@ -1,6 +1,6 @@
 """What levels cost: seconds of a worker, and with it of its core or its GPU, by what they were for.
 
-Levels run side by side. What belongs to all levels of a unit alike is parted evenly; scouts and search, training and
+Levels run side by side. What belongs to all levels of a unit alike is parted evenly; search, training and
 evaluation in proportion to env steps. What was compiled is apart: it is paid once a worker, whatever it makes.
 """
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from levelproof.experts.config import ExpertConfig, ScoutConfig, StopConfig
+from levelproof.experts.config import ExpertConfig, StopConfig
 from levelproof.experts.search.config import SearchConfig
 
 
@@ -10,7 +10,6 @@ from levelproof.experts.search.config import SearchConfig
 class Procedure:
     """Who looks, who trains and when that ends (hashable)."""
 
-    scout: ScoutConfig = field(default_factory=ScoutConfig)  # who looks first, if anybody
-    search: SearchConfig = field(default_factory=SearchConfig)  # who looks where scouts find nothing
+    search: SearchConfig = field(default_factory=SearchConfig)  # the search before an expert trains
     expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
     stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot

@@ -6,7 +6,6 @@ from typing import NamedTuple
 class EnvSteps(NamedTuple):
     """Of all lanes."""
 
-    scouted: int = 0
     searched: int = 0
     trained: int = 0
     evaluated: int = 0
@@ -15,14 +14,14 @@ class EnvSteps(NamedTuple):
     @property
     def shown(self) -> int:
         """Those that a progress bar counts."""
-        return self.scouted + self.searched + self.trained
+        return self.searched + self.trained
 
 
 class Seconds(NamedTuple):
     """Of a worker that was busy, and with it of its core or its GPU."""
 
     sampling: float = 0.0  # or reading levels, and deciding those that need no expert
-    search: float = 0.0  # of scouts, too
+    search: float = 0.0
     training: float = 0.0
     evaluation: float = 0.0
     idle: float = 0.0  # of slots and of rows of the search that had no level

@@ -1,4 +1,4 @@
-"""What is known of levels before their experts train: successes, and what it took to look for them."""
+"""What is known of levels before their experts train: successes, and the env steps of the search for them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,109 +9,85 @@ from jaxtyping import Bool, Int
 
 from levelproof.experts.labels import Source
 from levelproof.experts.ledger import Ledger
-from levelproof.experts.procedure import Procedure
-from levelproof.experts.search.scout import scout
 from levelproof.experts.search.search import Searching
 from levelproof.experts.search.stage import Searched
 from levelproof.experts.witness.success import Success, no_success
-from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.task.rules import TaskParams
 
-STILL = 0.75  # of a search: a cell that is new after so much of it says that more of it would find more
+STILL_GREW_AFTER = 0.75  # share of a search: a new cell after it suggests that a longer search would find more
 
 
 class Found(NamedTuple):
-    """On the host, level first."""
+    """Results of the search, on the host, level first."""
 
     success: Success
-    source: list[Source]  # of the success; where there is none, of the one that training may find
-    scout_steps: Int[np.ndarray, " level"]
-    search_steps: Int[np.ndarray, " level"]  # 0: it was not searched
-    cells: Int[np.ndarray, " level"]  # that its search reached
-    still_grew: Bool[np.ndarray, " level"]  # its archive, at the end of its search
+    source: list[Source]  # of the success, or of the one that training may find
+    search_steps: Int[np.ndarray, " level"]  # 0: not searched
+    cells: Int[np.ndarray, " level"]  # that the search reached
+    still_grew: Bool[np.ndarray, " level"]  # whether the archive was growing when the search ended
 
 
 def nothing_found(count: int) -> Found:
-    """Of levels in which nobody has looked."""
+    """Return an empty `Found` for levels that were not searched."""
     zeros = np.zeros(count, np.int64)
-    return Found(no_success(count), [Source.EXPLORATION] * count, zeros, zeros.copy(), zeros.copy(), zeros.astype(bool))
+    return Found(no_success(count), [Source.EXPLORATION] * count, zeros, zeros.copy(), zeros.astype(bool))
 
 
 def row_of(found: Found, index: int) -> Found:
-    """Of one of its levels."""
+    """Select one level."""
     arrays = jax.tree.map(lambda x: x[index : index + 1], found._replace(source=()))
     return arrays._replace(source=[found.source[index]])
 
 
 def joined(parts: Sequence[Found], order: Int[np.ndarray, " level"]) -> Found:
-    """Of the levels of all parts one after another, in another order."""
+    """Concatenate the parts, then reorder their levels."""
     arrays = jax.tree.map(lambda *xs: np.concatenate(xs)[order], *(part._replace(source=()) for part in parts))
     source = [source for part in parts for source in part.source]
     return arrays._replace(source=[source[i] for i in order])
 
 
 class Looking:
-    """Levels in which scouts have looked, and in which a search goes on where they found nothing."""
+    """Levels whose search runs in the search slots that all units of a worker share."""
 
-    def __init__(
-        self,
-        levels: Level,
-        level_ids: Int[np.ndarray, " level"],
-        procedure: Procedure,
-        rules: TaskParams,
-        searching: Searching,
-    ) -> None:
+    def __init__(self, levels: Level, level_ids: Int[np.ndarray, " level"], searching: Searching) -> None:
         """
         Args:
-            levels: on the host.
+            levels: the levels, on the host.
             level_ids: their ids, the seeds of all randomness.
-            procedure: how long to look.
-            rules: of the task.
-            searching: where levels are searched, perhaps beside others.
+            searching: where levels are searched, perhaps beside those of other units.
         """
-        scouted = scout(levels, level_ids, procedure.scout, rules)
-        source = [Source.SCOUT if length else Source.EXPLORATION for length in scouted.success.length]
-        self.found = nothing_found(len(level_ids))._replace(
-            success=scouted.success, source=source, scout_steps=scouted.env_steps
-        )
-        self._left = np.flatnonzero(scouted.success.length == 0)
-        some = take(levels, self._left), level_ids[self._left]
+        self.found = nothing_found(len(level_ids))
         self._searching = searching
-        self._sought = searching.submit(*some) if procedure.search.env_steps and len(self._left) else None
+        self._sought = searching.submit(levels, level_ids) if searching.config.env_steps and len(level_ids) else None
         self.ledger = Ledger(len(level_ids))  # of the search, once it has ended
 
     @property
     def env_steps(self) -> int:
-        """So far, of scouts and search."""
-        searched = self._sought.env_steps if self._sought else int(self.found.search_steps.sum())
-        return int(self.found.scout_steps.sum()) + searched
+        """Env steps searched so far."""
+        return self._sought.env_steps if self._sought else int(self.found.search_steps.sum())
 
     @property
     def waiting(self) -> Int[np.ndarray, " index"]:
-        """Indices of its levels whose search has not begun."""
-        return self._left[self._searching.waiting(self._sought)] if self._sought else self._left[:0]
+        """Indices of the levels whose search has not begun."""
+        return np.array(self._searching.waiting(self._sought) if self._sought else [], int)
 
     def withdraw(self, indices: Int[np.ndarray, " index"]) -> None:
-        """Do not search levels whose search has not begun."""
+        """Skip the search of these levels, which must not have begun."""
         if self._sought:
-            self._searching.withdraw(self._sought, np.flatnonzero(np.isin(self._left, indices)).tolist())
+            self._searching.withdraw(self._sought, indices.tolist())
 
     def ended(self) -> bool:
-        """Whether nothing is left to search: then `found` has what came of it."""
+        """Return whether no level is left to search; if so, `found` and `ledger` hold the results."""
         if self._sought and not self._sought.left:
             self._take(self._searching.result(self._sought))
-            self.ledger.take(self._sought.ledger, self._left)
+            self.ledger = self._sought.ledger
             self._sought = None
         return self._sought is None
 
     def _take(self, searched: Searched) -> None:
-        """Put in what the search found."""
-        found, left = self.found, self._left
-        put = lambda whole, part: whole.__setitem__(left, part)
-        jax.tree.map(put, found.success, searched.success)
-        put(found.search_steps, searched.env_steps + searched.varied)
-        put(found.cells, searched.cells)
-        put(found.still_grew, searched.grew > STILL * np.asarray(searched.env_steps))
-        for i in left[np.asarray(searched.success.length) > 0]:
-            found.source[i] = Source.SEARCH
+        found = self.found
+        found.success.action[:], found.success.length[:] = searched.success
+        found.source[:] = [Source.SEARCH if length else Source.EXPLORATION for length in found.success.length]
+        found.search_steps[:] = searched.env_steps + searched.varied
+        found.cells[:] = searched.cells
+        found.still_grew[:] = searched.grew > STILL_GREW_AFTER * np.asarray(searched.env_steps)

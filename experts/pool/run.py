@@ -1,4 +1,4 @@
-"""From levels to verdicts: they are decided without an expert, or scouted, trained and judged."""
+"""From levels to verdicts: they are decided without an expert, or searched, trained and judged."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -73,7 +73,7 @@ class TrainingRun:
         self._order = np.argsort(np.r_[np.flatnonzero(new), np.flatnonzero(~new)])  # of new ones and others, as left
         with self.ledger.timing("search"):
             self._looked = self.left[new]
-            self.looking = Looking(*self._some(self._looked), pool.procedure, pool.rules, pool.searching)
+            self.looking = Looking(*self._some(self._looked), pool.searching)
         self.submission: Submission | None = None  # of those that an expert is asked for
         self._gone: set[int] = set()  # ids of levels that others label
         self.look()
@@ -151,7 +151,7 @@ class TrainingRun:
         with lap() as took:
             result = self._judged(submission, trained, attempted)
         looks = np.zeros(len(self.level_ids), np.int64)
-        looks[self.left] = submission.found.scout_steps + submission.found.search_steps
+        looks[self.left] = submission.found.search_steps
         self.ledger.share("search", looks)
         if len(submission.level_ids):
             self.ledger.take(submission.ledger, self.left)
@@ -229,7 +229,6 @@ def with_looks(verdict: Verdict, found: Found, index: int, reworked: int) -> Ver
     searched = int(found.search_steps[index])
     return replace(
         verdict,
-        scout_steps=int(found.scout_steps[index]),
         search_steps=searched + reworked,
         cells=int(found.cells[index]) if searched else None,
         still_grew=bool(found.still_grew[index]) if searched else None,
@@ -252,7 +251,6 @@ def spent_on(verdicts: list[Verdict], submission: Submission, config: ExpertConf
     """What the levels of a submission took, and the slots that had none."""
     total = lambda name: sum(getattr(verdict, name) for verdict in verdicts)
     return EnvSteps(
-        total("scout_steps"),
         total("search_steps"),
         submission.trained_rollouts * config.steps_per_update,
         total("evaluation_steps"),

@@ -35,7 +35,7 @@ class Searching:
     """
 
     def __init__(self, config: SearchConfig, rules: TaskParams) -> None:
-        self._config, self._rules = config, rules
+        self.config, self._rules = config, rules
         self._exploring, self._varying = Stage(side_by_side(config)), Stage(side_by_side(config))
 
     def submit(self, levels: Level, level_ids: Int[np.ndarray, " level"]) -> Sought:
@@ -46,7 +46,7 @@ class Searching:
             level_ids: their ids, the seeds of all randomness.
         """
         level_ids, rules = np.asarray(level_ids, np.int32), self._rules
-        config = self._scaled = self._config.scaled(levels.model.size.bodies)
+        config = self._scaled = self.config.scaled(levels.model.size.bodies)
         begin = partial(explore.begin, config=config.endless, rules=rules)
         of_one = jax.eval_shape(begin, take(levels, ONE), jnp.array(ONE))
         empty = lambda x: np.zeros((len(level_ids), *x.shape[1:]), x.dtype)
@@ -70,7 +70,7 @@ class Searching:
     def wants(self) -> int:
         """Levels by which so many would wait that no row is empty for a while."""
         stage = self._exploring
-        return max(0, AHEAD * len(stage.at) - len(stage.waiting)) if self._config.env_steps else 0
+        return max(0, AHEAD * len(stage.at) - len(stage.waiting)) if self.config.env_steps else 0
 
     def step(self) -> bool:
         """Search on for `config.rounds` rounds; whether there was anything to search.
@@ -88,7 +88,7 @@ class Searching:
     def result(self, sought: Sought) -> Searched:
         """What was found, once none is left to search: successes that replay, made shorter."""
         assert not sought.left
-        found, width = sought.known, side_by_side(self._config)
+        found, width = sought.known, side_by_side(self.config)
         indices = np.flatnonzero(found.success.length)
         for block in blocks(len(indices), width):
             some = indices[block]

@@ -38,7 +38,7 @@ class Training(NamedTuple):
     train_state: TrainState
     progress: Progress
     course: Course
-    success: Success  # the first: a scout's or a search's, else training's
+    success: Success  # the first: the search's, else training's
     recent: Int[Array, "time 6 environment"]  # the last actions, enough for an episode that ends in the next rollout
 
 

@@ -34,7 +34,7 @@ class Evaluation(NamedTuple):
     done: Bool[np.ndarray, "256 environment"]
     goal: Bool[np.ndarray, "256 environment"]
     progress: Progress  # of training until then
-    success: Success  # the first: a scout's or a search's, else training's
+    success: Success  # the first: the search's, else training's
     over: int | Int[np.ndarray, ""] | Int[Array, ""]  # the Cause for which training stopped for good
 
 

@@ -1,4 +1,4 @@
-"""Successes: the actions of an episode that reached the goal, of scout, search or training."""
+"""Successes: the actions of an episode that reached the goal, of search or training."""
 
 from typing import NamedTuple
 

@@ -50,7 +50,7 @@ class Stream(IntEnum):
     LEVEL = 0  # the sampler
     EXPERT = 1  # initial networks, exploration, minibatches
     EVALUATION = 2  # the record that labels the level
-    SCOUT = 3  # random play before training
+    SCOUT = 3  # reserved: random play before training, in earlier versions
     SEARCH = 4  # exploration of a search
     PORTABILITY = 5  # the perturbed starts from which witnesses are replayed
     SUCCESS_RATE = 6  # attempts of an expert whose training has ended

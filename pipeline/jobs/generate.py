@@ -136,7 +136,6 @@ def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
     rows = manifest.table.filter(np.isin(manifest.level_ids, made))
     steps, label = (rows.column(name).to_numpy() for name in ("env_steps", "label"))
     shares = {
-        "of scouts": spent.scouted,
         "of searches": spent.searched,
         "of training that solved its level": steps[label == Label.SOLVED].sum(),
         "of training that did not": steps[label == Label.UNSOLVED].sum(),

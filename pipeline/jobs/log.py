@@ -16,7 +16,7 @@ from levelproof.pipeline.store.remote import is_remote
 LIBRARIES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 FOLDER, PROJECT = "log", "levelproof"
 # Env steps of these kinds took the seconds of these stages
-STAGES = {"search": ("scouted", "searched"), "training": ("trained",), "evaluation": ("evaluated",)}
+STAGES = {"search": ("searched",), "training": ("trained",), "evaluation": ("evaluated",)}
 
 
 class ScalarWriter(Protocol):

@@ -12,7 +12,12 @@ from levelproof.pipeline.look.things import ENTITIES
 
 NAMES = 33  # characters; column where the text of a line begins
 REASONS = 4  # shown per label; the rest are only counted
-STEPS = {"scout_steps": "scouts", "search_steps": "search", "env_steps": "training", "evaluation_steps": "evaluation"}
+STEPS = {
+    "scout_steps": "random play",
+    "search_steps": "search",
+    "env_steps": "training",
+    "evaluation_steps": "evaluation",
+}
 
 
 def print_facts(facts: Mapping[str, Any], shown: Sequence[str], console: Console) -> None:

@@ -79,8 +79,8 @@ DESCRIBED = (
         "witness",
         pa.string(),
         "Source of the witness: `most probable` or `sampled` actions of the expert, `exploration` (an episode of "
-        "training), `scout` (random play before training), `search` (before training, or around another witness), "
-        "`nothing` (a trivial level), `import` (another program's data)",
+        "training), `search` (before training, or around another witness), `nothing` (a trivial level), `import` "
+        "(another program's data), `scout` (earlier versions only: random play before training)",
         null=NO_WITNESS,
     ),
     # Null instead of NaN for what was not measured: in SQL, NaN is greater than every number
@@ -135,7 +135,9 @@ DESCRIBED = (
         "Steps of the expert's evaluations and of the attempts of success_rate",
         "env steps",
     ),
-    ManifestColumn("scout_steps", pa.int64(), "Steps of random play before training", "env steps"),
+    ManifestColumn(
+        "scout_steps", pa.int64(), "Steps of random play before training, in earlier versions; now 0", "env steps"
+    ),
     ManifestColumn(
         "search_steps", pa.int64(), "Steps of the search before training and around the witness", "env steps"
     ),
@@ -178,7 +180,7 @@ DESCRIBED = (
         "seconds",
         pa.struct([pa.field(stage, pa.float32()) for stage in Seconds._fields]),
         "Time that the level cost, of a core, or of a GPU if `device` is one: sampling (and labels without an expert), "
-        "search (and scouts), training, evaluation, idle slots, replay of witnesses, writing, compiling",
+        "search, training, evaluation, idle slots, replay of witnesses, writing, compiling",
         "s",
         "not measured",
         since=7,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from levelproof.configs.schema import JobConfig
+from levelproof.configs.schema import REMOVED, JobConfig
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.disk import told_of, write_new
 from levelproof.pipeline.store.layout import EVENTS, FOLDERS, JOB, split_path
@@ -35,10 +35,11 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
     require_known(split)
     with taken(split, say) as manifest:
         if manifest.config_hash not in (None, job.hash):
-            changes = told(differences(manifest.config or {}, job.results))
+            changes = differences(manifest.config or {}, job.results)
+            same = "the version of levelproof that made it" if changes.keys() & REMOVED else "the same settings"
             raise UserError(
-                f"The split {split} was made with another configuration ({changes}): "
-                "use the same settings, or another folder with out=NAME."
+                f"The split {split} was made with another configuration ({told(changes)}): "
+                f"use {same}, or another folder with out=NAME."
             )
         stored = {density for fragment in manifest.fragments for density in fragment.densities}
         if stored and job.stored not in stored:

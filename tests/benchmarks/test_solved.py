@@ -102,7 +102,7 @@ def test_an_ablation_changes_one_thing() -> None:
     assert VARIANTS["default"].procedure == Procedure()
     reference = VARIANTS["reference"].procedure
     assert (reference.expert.horizon, reference.expert.learning_rate, reference.expert.rehearsals) == (64, 3e-4, 0)
-    assert (reference.stop.rule, reference.scout.rounds) == (Rule.BUDGET, 0)
+    assert (reference.stop.rule, reference.search.env_steps) == (Rule.BUDGET, 0)
 
 
 def test_the_original_is_judged_as_its_reimplementation() -> None:

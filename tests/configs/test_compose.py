@@ -151,6 +151,12 @@ def test_settings_of_an_earlier_version_take_the_names_of_today() -> None:
         decisive({"a": 1, "a.b": 2})
 
 
+def test_decisive_drops_removed_settings_that_match_this_version() -> None:
+    results = compose_job([]).results
+    assert decisive(results | {"scout": {"rounds": 0}}) == results
+    assert decisive(results | {"scout": {"rounds": 4}}) == results | {"scout": {"rounds": 4}}
+
+
 @pytest.mark.parametrize(
     "overrides",
     [

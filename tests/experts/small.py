@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
 from levelproof.levelgen.task.rules import DEFAULT_RULES
@@ -19,4 +19,4 @@ WHOLE = StopConfig(rule=Rule.BUDGET)
 
 def untouched(stopping: StopConfig, config: ExpertConfig = CONFIG) -> Procedure:
     """Experts of levels in which nobody looked before."""
-    return Procedure(ScoutConfig(rounds=0), SearchConfig(env_steps=0), config, stopping)
+    return Procedure(SearchConfig(env_steps=0), config, stopping)

@@ -67,7 +67,7 @@ def test_the_second_signal_interrupts_what_heeds_the_first() -> None:
 @pytest.mark.slow
 def test_the_driver_ends_rounds_to_stop(tmp_path: Path) -> None:
     """A worker hears of nothing else before the end of its round."""
-    alone = ("scout.rounds=0", "search.env_steps=0", "stop.rule=budget")  # so that experts train long
+    alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long
     command = ["generate", "levels=8", "unit=1", "budget=100M", "workers=1", *alone]
     process = start(command, tmp_path, module="tests.pipeline.long_rounds")
     at_work = "ray::WorkerActor.work"

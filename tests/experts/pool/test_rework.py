@@ -5,14 +5,14 @@ from functools import cache
 
 import jax
 import numpy as np
+import pytest
 
 from benchmarks.alone import label
-from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Source
 from levelproof.experts.pool.rework import rework
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
-from levelproof.experts.search.scout import scout
 from levelproof.experts.verdict.judge import Witness, repeating
 from levelproof.experts.verdict.portability import survival
 from levelproof.experts.witness.success import Success
@@ -21,11 +21,11 @@ from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
+from tests.experts.random_play import random_successes, searched_randomly
 
-IDS = np.array([3, 107], np.int32)  # of size s: what scouts find of the other survives next to nothing
+IDS = np.array([3, 107], np.int32)  # of size s: random play of the second survives almost nothing
 STEADY, FRAGILE = 0, 1
-ONCE = ScoutConfig(rounds=1)
-PROCEDURE = Procedure(ONCE, SearchConfig(env_steps=0), ExpertConfig(), StopConfig(rule=Rule.NONE))
+PROCEDURE = Procedure(SearchConfig(env_steps=0), ExpertConfig(), StopConfig(rule=Rule.NONE))
 
 
 @cache
@@ -35,13 +35,13 @@ def levels() -> Level:
 
 @cache
 def witnesses() -> list[Witness]:
-    success = scout(levels(), IDS, ONCE, DEFAULT_RULES).success
-    found = [of for pair in zip(*success, strict=True) for of in repeating(Success(*pair), Source.SCOUT)]
+    pairs = zip(*random_successes(levels(), IDS), strict=True)
+    found = [of for pair in pairs for of in repeating(Success(*pair), Source.SCOUT)]
     shares = survival(levels(), IDS, found, 32, DEFAULT_RULES).tolist()
     return [of._replace(portability=share) for of, share in zip(found, shares, strict=True)]
 
 
-def test_a_fragile_witness_becomes_steady_and_no_other_is_touched() -> None:
+def test_rework_changes_only_fragile_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
     (same, better), env_steps = rework(levels(), IDS, witnesses(), PROCEDURE, DEFAULT_RULES)
     before = witnesses()[FRAGILE]
     assert same is witnesses()[STEADY]
@@ -60,6 +60,7 @@ def test_a_fragile_witness_becomes_steady_and_no_other_is_touched() -> None:
     np.testing.assert_array_equal(again.action, better.action)
     assert (again.steps, again.portability, steps[0]) == (better.steps, better.portability, env_steps[FRAGILE])
 
+    searched_randomly(monkeypatch)
     result = label(levels(), IDS, 4096, PROCEDURE)
     verdicts = result.verdicts
     assert [of.search_steps for of in verdicts] == env_steps.tolist()

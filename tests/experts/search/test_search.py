@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Label, Source
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.search.explore import NEARER, Search, _explore, begin, draw, explore, under_way
 from levelproof.experts.search.near import FAR
 from levelproof.experts.search.play import arena, fresh_walk, play
-from levelproof.experts.search.scout import STEPS_PER_ROUND
 from levelproof.experts.search.search import AHEAD, Searching, side_by_side
 from levelproof.experts.search.shorten import shorten
 from levelproof.experts.search.stage import Searched
@@ -324,10 +323,10 @@ def test_settings_that_cannot_be(wrong: dict) -> None:
         SearchConfig(**wrong)
 
 
-def test_a_label_rests_on_what_was_found() -> None:
-    """Scouts first, a search where they find nothing; and every env step is counted."""
+def test_label_without_expert_rests_on_the_search() -> None:
+    """Every env step is counted."""
     some = np.array([0, 1, 2])
-    procedure = Procedure(ScoutConfig(rounds=1), CONFIG, ExpertConfig(), StopConfig(rule=Rule.NONE))
+    procedure = Procedure(CONFIG, ExpertConfig(), StopConfig(rule=Rule.NONE))
     result = label(take(levels(), some), IDS[some], 2048, procedure)
     searched = found().env_steps + found().varied
     for i, verdict in zip(some, result.verdicts, strict=True):
@@ -335,6 +334,6 @@ def test_a_label_rests_on_what_was_found() -> None:
         assert verdict.label is (Label.SOLVED if length else Label.UNSOLVED)
         assert verdict.witness is (Source.SEARCH if length else None)
         assert verdict.steps_to_goal == (length or None)
-        assert (verdict.scout_steps, verdict.search_steps) == (STEPS_PER_ROUND, searched[i])
+        assert verdict.search_steps == searched[i]
         assert verdict.cells == found().cells[i]
-    assert result.spent == EnvSteps(scouted=3 * STEPS_PER_ROUND, searched=int(searched[some].sum()))
+    assert result.spent == EnvSteps(searched=int(searched[some].sum()))

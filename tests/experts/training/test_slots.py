@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Label, Source
-from levelproof.experts.pool.found import Looking
+from levelproof.experts.pool.found import nothing_found
 from levelproof.experts.pool.pool import Pool, Submission, capacity_of
 from levelproof.experts.pool.queue import empty_queue, enter
-from levelproof.experts.search.search import Searching
 from levelproof.experts.training import advance as advance_module
 from levelproof.experts.training.advance import advance
 from levelproof.experts.training.progress import NEVER
@@ -25,6 +24,7 @@ from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
+from tests.experts.random_play import random_successes
 from tests.experts.small import CONFIG, IDS, SHAPED, WHOLE, untouched
 
 SOLVED = StopConfig(rule=Rule.SOLVED, successes=2, share=0.6, wait=2048)
@@ -189,8 +189,7 @@ def test_going_on_equals_having_trained_through(levels: Level, stopping: StopCon
 
 def test_a_success_before_training_is_rehearsed_from_the_first_update(levels: Level, whole: list[Trained]) -> None:
     """It ends at its goal, so the first of its episodes does; and those lanes do not count as the expert's own."""
-    looks = replace(untouched(WHOLE), scout=ScoutConfig(rounds=1))
-    found = Looking(levels, IDS, looks, DEFAULT_RULES, Searching(looks.search, DEFAULT_RULES)).found
+    found = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))
     trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=found)
     assert 0 < (found.success.length > 0).sum() < len(IDS)
     for i, of in enumerate(trained):

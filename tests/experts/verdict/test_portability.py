@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
-from levelproof.experts.config import ExpertConfig, Rule, ScoutConfig, StopConfig
+from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Label, Source
 from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
-from levelproof.experts.search.scout import scout
 from levelproof.experts.verdict import portability
 from levelproof.experts.verdict.judge import Witness, repeating
 from levelproof.experts.verdict.portability import LATE, choose, moved, survival
@@ -22,12 +21,12 @@ from levelproof.levelgen.batching import repeat, take
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
+from tests.experts.random_play import random_successes, searched_randomly
 
 REPLAYS = 8
-ROBUST, FRAGILE = 0, 2  # indices: what scouts find of the first survives everything, of the other next to nothing
+ROBUST, FRAGILE = 0, 2  # indices: random play of the first survives everything, of the other almost nothing
 IDS = np.array([3, 2, 107, 100, 9, 1], np.int32)  # of size s; the last is trivial
 FOUND = 5
-ONCE = ScoutConfig(rounds=1)
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +36,9 @@ def levels() -> Level:
 
 @pytest.fixture(scope="module")
 def witnesses(levels: Level) -> list[Witness]:
-    """What scouts find of all but the last."""
+    """Successes of random play in all but the last level."""
     at = np.arange(FOUND)
-    success = scout(take(levels, at), IDS[at], ONCE, DEFAULT_RULES).success
+    success = random_successes(take(levels, at), IDS[at])
     each = zip(success.action, success.length, strict=True)
     return [witness for pair in each for witness in repeating(Success(*pair), Source.SCOUT)]
 
@@ -151,16 +150,19 @@ def test_a_level_with_two_ways_has_the_portable_one(levels: Level, witnesses: li
     assert chosen == good._replace(portability=1.0)
 
 
-def labelled(levels: Level, replays: int) -> UnitResult:
+def labelled(monkeypatch: pytest.MonkeyPatch, levels: Level, replays: int) -> UnitResult:
     procedure = Procedure(
-        ONCE, SearchConfig(env_steps=0, steady=0), ExpertConfig(replays=replays), StopConfig(rule=Rule.NONE)
+        SearchConfig(env_steps=0, steady=0), ExpertConfig(replays=replays), StopConfig(rule=Rule.NONE)
     )
+    searched_randomly(monkeypatch)
     return label(levels, IDS, 4096, procedure)
 
 
-def test_every_witness_has_its_portability_and_nothing_else_has(levels: Level, shares: np.ndarray) -> None:
-    verdicts = labelled(levels, REPLAYS).verdicts
+def test_verdict_has_portability_if_it_has_a_witness(
+    monkeypatch: pytest.MonkeyPatch, levels: Level, shares: np.ndarray
+) -> None:
+    verdicts = labelled(monkeypatch, levels, REPLAYS).verdicts
     assert [verdict.portability for verdict in verdicts[:FOUND]] == shares.tolist()
     assert verdicts[FOUND].label is Label.TRIVIAL
     assert verdicts[FOUND].portability is not None
-    assert {verdict.portability for verdict in labelled(levels, 0).verdicts} == {None}
+    assert {verdict.portability for verdict in labelled(monkeypatch, levels, 0).verdicts} == {None}

@@ -13,13 +13,11 @@ import jax
 import numpy as np
 import pytest
 
-from levelproof.experts.config import ScoutConfig
-from levelproof.experts.search.scout import scout
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
-from levelproof.levelgen.task.rules import DEFAULT_RULES
+from tests.experts.random_play import random_successes
 from tests.experts.small import IDS
 
 ROOT = Path(__file__).parents[3]
@@ -48,11 +46,11 @@ def digest(arrays: Any) -> str:
 
 
 def results() -> Iterator[str]:
-    """Yield digests of draws from every stream, of levels, and of what scouts find in them, a line each."""
+    """Yield digests of draws from every stream, of levels, and of random play in them, a line each."""
     yield digest(jax.jit(lambda: {stream: {f: DRAWS[f](key_for(5, stream)) for f in DRAWS} for stream in Stream})())
     levels = sample_levels(IDS, SIZES["s"])
     yield " ".join(content_hashes(levels))
-    yield digest(scout(levels, IDS, ScoutConfig(rounds=1), DEFAULT_RULES).success)
+    yield digest(random_successes(levels, IDS))
 
 
 @pytest.mark.parametrize("name", DRAWS)
@@ -64,7 +62,7 @@ def test_callers_jax_flag_leaves_draws_unchanged(name: str) -> None:
         np.testing.assert_array_equal(usual, np.asarray(jax.jit(draw)(key)))
 
 
-def test_environment_variables_leave_levels_and_scouts_unchanged() -> None:
+def test_environment_variables_leave_levels_and_random_play_unchanged() -> None:
     command = [sys.executable, "-m", "tests.levelgen.identity.test_flags"]
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     environment = os.environ | FLAGS | ({"JAX_COMPILATION_CACHE_DIR": folder} if folder else {})

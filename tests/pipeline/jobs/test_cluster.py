@@ -230,7 +230,7 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
     memory: dict[str, Any] = {"object_store_memory": 80 * 2**20}
     machines = Cluster(initialize_head=True, head_node_args=memory | {"num_cpus": 0, "include_dashboard": False})
     try:
-        alone = ("scout.rounds=0", "search.env_steps=0")  # so that experts leave levels to go on with
+        alone = "search.env_steps=0"  # so that experts leave levels to go on with
         endless = ("generate", "levels=1k", "unit=1", "budget=5k", "keep_experts=true", *alone)
         process = start(endless, tmp_path, address=str(machines.address))
         until((tmp_path / SPLIT / JOB).exists, process)
@@ -298,7 +298,7 @@ def test_prometheus_gets_the_progress_from_ray(tmp_path: Path) -> None:
 @pytest.mark.campaign
 @pytest.mark.slow
 def test_a_worker_that_stalls_is_given_up_and_another_does_its_levels(tmp_path: Path) -> None:
-    alone = ("scout.rounds=0", "search.env_steps=0", "stop.rule=budget")  # so that experts train long
+    alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long
     command = ["generate", f"levels={LEVELS}", "unit=1", "budget=1M", "workers=1", *alone]
     process = start([str(LEVELS), str(patience(STALLED)), *command], tmp_path, module="tests.pipeline.fragile")
     split, at_work = tmp_path / "data/1M/s", "ray::Fragile.work"

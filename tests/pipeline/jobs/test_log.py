@@ -21,7 +21,7 @@ STATE = {
     "done": 4,
     "solved": 3,
     "env_steps": 900,
-    "spent": {"scouted": 100, "searched": 200, "trained": 600, "evaluated": 0, "idle": 0},
+    "spent": {"searched": 300, "trained": 600, "evaluated": 0, "idle": 0},
     "seconds": {"search": 2.0, "training": 3.0, "evaluation": 0.0},
     "rate": 90,
     "failures": 1,

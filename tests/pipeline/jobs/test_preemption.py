@@ -16,7 +16,7 @@ from tests.pipeline.command import heed_ctrl_c, here, run, start, until
 from tests.pipeline.made import lasting
 
 LEVELS = 4
-ALONE = ("scout.rounds=0", "search.env_steps=0", "stop.rule=budget", "expert.replays=0")  # so that experts train long
+ALONE = ("search.env_steps=0", "stop.rule=budget", "expert.replays=0")  # so that experts train long
 SETTINGS = [f"levels={LEVELS}", f"unit={LEVELS}", "budget=256k", *ALONE]
 COMMAND = ["generate", *SETTINGS, "workers=1", "checkpoint=1s"]
 SPLIT = Path("data/256k/s")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from levelproof.configs.schema import JobConfig
-from levelproof.experts.config import ScoutConfig
 from levelproof.experts.labels import WITNESSED
 from levelproof.experts.pool import pool as pool_module
 from levelproof.experts.search.config import SearchConfig
@@ -30,7 +29,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def job() -> JobConfig:
-    return made_job("data", "budget=5k", "scout.rounds=1")
+    return made_job("data", "budget=5k")
 
 
 def outcomes(worker: Worker, units: list[WorkUnit]) -> dict[WorkUnit, UnitOutcome]:
@@ -69,7 +68,7 @@ def test_units_are_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
     assert manifest.level_ids.tolist() == list(range(6))
     assert sum(summary.levels for summary in summaries) == 6
     assert sum(summary.solved for summary in summaries) == manifest.labels.tolist().count("solved")
-    columns = {"scouted": "scout_steps", "trained": "env_steps", "evaluated": "evaluation_steps"}
+    columns = {"searched": "search_steps", "trained": "env_steps", "evaluated": "evaluation_steps"}
     for spent, column in columns.items():
         total = sum(manifest.table[column].to_pylist())
         assert sum(getattr(summary.spent, spent) for summary in summaries) == total > 0
@@ -86,7 +85,7 @@ def test_units_are_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
         assert min(cost.values()) >= 0 < min(cost["sampling"], cost["replay"], cost["writing"])
         assert (cost["training"] > 0) == (row["env_steps"] > 0)
         assert (cost["evaluation"] > 0) == (row["evaluation_steps"] > 0)
-        assert (cost["search"] > 0) == (row["scout_steps"] + row["search_steps"] > 0)
+        assert (cost["search"] > 0) == (row["search_steps"] > 0)
     for unit in UNITS:
         totals = [round.totals[unit] for round in rounds if unit in round.totals]
         assert totals == sorted(totals)
@@ -111,7 +110,7 @@ def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: J
 def test_levels_given_back_and_levels_left_undecided_are_made_by_another_to_the_same_bits(
     tmp_path: Path, job: JobConfig
 ) -> None:
-    job = replace(job, scout=ScoutConfig(0), search=SearchConfig(env_steps=0))
+    job = replace(job, search=SearchConfig(env_steps=0))
     unit = WorkUnit(range(16))
     (tmp_path / "cut").mkdir()
     (tmp_path / "alone").mkdir()
@@ -139,7 +138,7 @@ def test_levels_given_back_and_levels_left_undecided_are_made_by_another_to_the_
 
 
 def test_levels_that_wait_for_their_search_are_made_by_another_to_the_same_bits(tmp_path: Path, job: JobConfig) -> None:
-    job, unit = replace(job, scout=ScoutConfig(0)), WorkUnit(range(16))
+    unit = WorkUnit(range(16))
     for name in ("cut", "alone"):
         (tmp_path / name).mkdir()
     outcomes(Worker(job, tmp_path / "alone"), [unit])
@@ -157,7 +156,7 @@ def test_levels_that_wait_for_their_search_are_made_by_another_to_the_same_bits(
 
 
 def test_experts_that_are_kept_go_on_where_they_were(tmp_path: Path, job: JobConfig) -> None:
-    job = replace(job, scout=ScoutConfig(0), search=SearchConfig(env_steps=0), checkpoint="1h")
+    job = replace(job, search=SearchConfig(env_steps=0), checkpoint="1h")
     unit = WorkUnit(range(8))
     for name in ("alone", "kept"):
         (tmp_path / name).mkdir()

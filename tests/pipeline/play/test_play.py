@@ -14,7 +14,8 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from levelproof.experts.config import RECORD_STEPS, ScoutConfig, StopConfig
+from levelproof.experts.config import RECORD_STEPS, StopConfig
+from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.witness.witness import replay, succeeds
 from levelproof.levelgen.files.level_file import from_document, write_level_file
 from levelproof.pipeline.errors import UserError
@@ -28,7 +29,7 @@ from tests.pace import patience
 from tests.pipeline.command import assert_refused, here
 
 ANSWER_SECONDS = 120  # s; limit for an answer
-QUICK = replace(untouched(StopConfig()), scout=ScoutConfig(rounds=4))
+QUICK = replace(untouched(StopConfig()), search=SearchConfig(env_steps=65_536))
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """A split opened for writing: one writer, one configuration, folders of its own."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -69,17 +70,24 @@ def test_writing_accepts_more_levels(tmp_path: Path, job: JobConfig) -> None:
         assert len(manifest.level_ids) == 2
 
 
-def test_writing_resumes_a_split_with_an_earlier_hash(tmp_path: Path, job: JobConfig) -> None:
-    """Earlier hashes covered the number of slots and the interval of the search's host syncs."""
-    before = job.results | {"expert": plain(job.expert) | {"slots": 8}, "search": plain(job.search)}
-    assert hash_of(before) != job.hash
+def written_with(job: JobConfig, config: dict[str, Any]) -> Path:
+    """Write a split whose fragment stores `config`, as an earlier version did."""
     with writing(job, print) as (split, _):
         committed(job, split)
     (path,) = fragment_paths(split)
-    rows = [row | {"config_hash": hash_of(before)} for row in read_fragment(path)[1].to_pylist()]
+    rows = [row | {"config_hash": hash_of(config)} for row in read_fragment(path)[1].to_pylist()]
     attempt = new_attempt(split, path.stem)
     begin_fragment(attempt)
-    write_fragment(attempt, rows, hash_of(before), before)
+    write_fragment(attempt, rows, hash_of(config), config)
+    return split
+
+
+def test_writing_resumes_a_split_with_the_hash_of_an_earlier_version(tmp_path: Path, job: JobConfig) -> None:
+    """Hashes covered the number of experts side by side, the host syncs of a search, and scouts."""
+    before = job.results | {"expert": plain(job.expert) | {"slots": 8}, "search": plain(job.search)}
+    before["scout"] = {"rounds": 0}
+    assert hash_of(before) != job.hash
+    split = written_with(job, before)
     other = made_job(job.out, "expert.width=64")
     with pytest.raises(UserError, match=r"\(expert.width was 32, now 64\)"), writing(other, print):
         pass
@@ -90,6 +98,14 @@ def test_writing_resumes_a_split_with_an_earlier_hash(tmp_path: Path, job: JobCo
         manifest = read_manifest(split, compact=compact)
         assert manifest.level_ids.tolist() == [0, 1, 2, 3]
         assert set(manifest.table.column("config_hash").to_pylist()) == {job.hash} == {manifest.config_hash}
+
+
+def test_writing_refuses_a_split_made_with_removed_settings(tmp_path: Path, job: JobConfig) -> None:
+    split = written_with(job, job.results | {"scout": {"rounds": 4}})
+    message = r"\(scout.rounds was 4, now absent\): use the version of levelproof that made it, or another folder"
+    with pytest.raises(UserError, match=message), writing(job, print):
+        pass
+    assert read_manifest(split).level_ids.tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("place", ["data", "data/128k", "data/128k/s"])
