@@ -9,7 +9,7 @@ from levelproof.experts.labels import Label
 from levelproof.experts.pool.pool import NOTHING_BEGUN, Pool
 from levelproof.experts.pool.run import TrainingRun, UnitResult
 from levelproof.experts.procedure import Procedure
-from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 
@@ -24,7 +24,7 @@ def label(
     procedure: Procedure,
     rules: TaskParams = DEFAULT_RULES,
     tell: Tell = lambda *_: None,
-    begun: Mapping[int, Kept] = NOTHING_BEGUN,
+    begun: Mapping[int, KeptExpert] = NOTHING_BEGUN,
 ) -> UnitResult:
     """Label levels; `budget` are env steps that each expert may use, `tell` is called after each rollout.
 

@@ -20,7 +20,7 @@ from levelproof.experts.policy import network_of
 from levelproof.experts.pool.pool import slot_count
 from levelproof.experts.training import ppo
 from levelproof.experts.training.ppo import LevelConstants, Samples
-from levelproof.experts.training.rollout import Manner, rollout, start
+from levelproof.experts.training.rollout import ActionRule, rollout, start
 from levelproof.experts.training.slots import empty_slots
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import SIZES, Level
@@ -59,7 +59,7 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
     experts = jax.tree.map(jnp.copy, experts)  # `advance` uses its slots up
     lanes, network = config.environments * count, network_of(levels.size, config)
     no = jnp.zeros(lanes, bool)
-    manner = Manner(no, jnp.zeros(lanes), no, jnp.zeros((256, len(CHOICES), count), jnp.int8))
+    manner = ActionRule(no, jnp.zeros(lanes), no, jnp.zeros((256, len(CHOICES), count), jnp.int8))
     keys, acting = jax.random.split(jax.random.key(0), count), start(repeat(levels, config.environments))
     ours = config.horizon, DEFAULT_RULES
     act = jax.jit(lambda params, acting: rollout(network, params, levels, acting, keys, manner, *ours))

@@ -1,4 +1,4 @@
-"""What an expert is, how it learns, when it stops and what counts as a witness."""
+"""Settings of an expert: its network, its training, when it stops, and what counts as a witness."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -6,15 +6,15 @@ from enum import StrEnum
 from levelproof.physics.bounds import require
 
 RECORD_STEPS = 256  # env steps of a record, with automatic reset inside
-MAX_DOUBLINGS = 6  # of the wait between evaluations
+MAX_DOUBLINGS = 6  # of the interval between failed evaluations
 MAX_COUNTED = 2**31 - 1  # env steps and updates are counted in 32 bits on the device
 
 
 class Network(StrEnum):
-    """What an expert sees, and through which network."""
+    """Observation and network of an expert."""
 
-    FLAT = "flat"  # all features side by side
-    ENTITY = "entity"  # a set of things; their order does not matter
+    FLAT = "flat"  # all features in one vector
+    ENTITY = "entity"  # a set of entities; their order does not matter
 
 
 class Rule(StrEnum):
@@ -23,11 +23,11 @@ class Rule(StrEnum):
     NONE = "none"  # no expert is trained: labels rest on the search
     BUDGET = "budget"  # every expert gets its whole budget
     SOLVED = "solved"  # until its evaluation succeeds
-    HALVING = "halving"  # until its evaluation succeeds or, at a rung, its learning does not move
+    HALVING = "halving"  # until its evaluation succeeds, or its return stops growing between rungs
 
 
 class Choice(StrEnum):
-    """Which successes of its evaluations can be a level's witness."""
+    """Successes of an evaluation that can become a level's witness."""
 
     RECORD = "record"  # attempts whose every finished episode reached the goal, automatic reset and all
     SHORTEST = "shortest"  # the shortest successful episodes of any attempt, repeated to fill the record
@@ -38,38 +38,40 @@ class ExpertConfig:
     """Hyperparameters of one expert (hashable: pass as a static argument)."""
 
     # network
-    network: Network = Network.FLAT  # what an expert sees, and through which network
+    network: Network = Network.FLAT  # observation and network of an expert
     width: int = 32  # units of a hidden layer
-    depth: int = 2  # hidden layers of the policy and of the value function, which share none
-    encoding: int = 16  # units of the first hidden layer of an entity network, of each kind of thing
+    depth: int = 2  # hidden layers of the policy, and as many of the value function
+    encoding: int = 16  # units of the first hidden layer of an entity network, for each kind of entity
     # experience
-    environments: int = 32  # lanes an expert acts in
+    environments: int = 32  # lanes of an expert
     horizon: int = 64  # env steps in each lane between updates
-    dense_reward_scale: float = 0.2  # 1/m; shaping while training, in place of task.dense_reward_scale
-    rehearsals: int = 8  # lanes that repeat the first success of training, once there is one
-    persistence: float = 0.9  # probability that these lanes repeat their last action, before
+    dense_reward_scale: float = 0.2  # 1/m, of the shaping reward in training; replaces task.dense_reward_scale
+    rehearsals: int = 8  # lanes that repeat the first success, once there is one
+    persistence: float = 0.9  # until then, probability that these lanes repeat their last action
     # PPO (Schulman et al. 2017, arXiv:1707.06347)
-    epochs: int = 4  # passes over the experience of an update
+    epochs: int = 4  # passes over the samples of an update
     minibatches: int = 4  # updates of the weights in an epoch
     learning_rate: float = 2e-3  # Adam's step size
     adam_epsilon: float = 1e-5  # Adam's epsilon
-    max_gradient_norm: float = 1.0  # global norm that one expert's gradient is cut to
-    discount: float = 0.995  # of rewards, per env step
-    gae_lambda: float = 0.9  # of advantages (Schulman et al. 2016, arXiv:1506.02438)
-    clip: float = 0.2  # of the probability ratio, and of the value's change, to either side
-    value_weight: float = 0.5  # of the value function's loss
-    entropy_weight: float = 0.01  # of the policy's entropy, which the loss rewards
-    imitation_weight: float = 2.0  # of the log-probability of rehearsed actions, which the loss rewards
-    # evaluation: each lane rolls out one record
-    attempts: int = 16  # lanes as they are: the first by the most probable actions, the others sampled
-    sticky_attempts: int = 8  # lanes where an action is sometimes repeated against the expert's will
-    moved_attempts: int = 8  # lanes that start with other velocities
+    max_gradient_norm: float = 1.0  # maximum global norm of an expert's gradient
+    discount: float = 0.995  # discount factor of rewards, per env step
+    gae_lambda: float = 0.9  # lambda of advantage estimates (Schulman et al. 2016, arXiv:1506.02438)
+    clip: float = 0.2  # maximum change of the probability ratio, and of the value, in either direction
+    value_weight: float = 0.5  # weight of the value function's loss
+    entropy_weight: float = 0.01  # weight of the policy's entropy, a bonus in the loss
+    imitation_weight: float = 2.0  # weight of the log-probability of rehearsed actions, a bonus in the loss
+    # evaluation: one record per lane
+    attempts: int = 16  # unperturbed lanes: the first takes the most probable actions, the others sample
+    sticky_attempts: int = 8  # lanes in which the last action sometimes replaces the expert's
+    moved_attempts: int = 8  # lanes that start with perturbed velocities
     # witness
-    witness: Choice = Choice.RECORD  # which successes of its evaluations can be a level's witness
-    exploration: bool = True  # of trained levels, a success found otherwise is a witness where evaluation has none
-    replays: int = 32  # of each candidate, from starts moved by a rounding error; 0: the first candidate is the witness
+    witness: Choice = Choice.RECORD  # successes of an evaluation that can become a level's witness
+    exploration: bool = True  # trained levels: if no evaluation succeeds, accept a success from search or training
+    replays: int = (
+        32  # per candidate, from starts perturbed by a rounding error; 0: the first candidate becomes the witness
+    )
     # machine
-    slots: int = 0  # experts that train side by side in one program; 0: as many as suit the device
+    slots: int = 0  # experts that train side by side in one program; 0: chosen by device
 
     def __post_init__(self) -> None:
         at_least_one = ("width", "depth", "encoding", "environments", "horizon", "epochs", "minibatches", "attempts")
@@ -84,28 +86,28 @@ class ExpertConfig:
             )
         if self.rehearsals >= self.environments:
             raise ValueError(
-                f"rehearsals is {self.rehearsals}: it must be below environments = {self.environments}, so that in "
-                "some the expert chooses its own actions"
+                f"rehearsals is {self.rehearsals}: it must be below environments = {self.environments}, so that the "
+                "expert chooses the actions in some of them"
             )
         lanes = self.attempts + self.sticky_attempts + self.moved_attempts
         if lanes > self.environments:
             raise ValueError(
-                f"attempts, sticky_attempts and moved_attempts are {lanes} together: "
-                f"they must not be above environments = {self.environments}"
+                f"attempts, sticky_attempts and moved_attempts add up to {lanes}: "
+                f"their sum must not exceed environments = {self.environments}"
             )
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps of one expert between updates."""
+        """Env steps of one expert per update."""
         return self.environments * self.horizon
 
     def updates_in(self, env_steps: int) -> int:
-        """How many updates so many env steps are, at least one."""
+        """Return the number of updates in these env steps, at least 1."""
         return max(1, env_steps // self.steps_per_update)
 
     @property
     def record_rollouts(self) -> int:
-        """Rollouts that a record takes."""
+        """Number of rollouts in a record."""
         return -(-RECORD_STEPS // self.horizon)
 
 
@@ -115,13 +117,15 @@ class StopConfig:
 
     rule: Rule = Rule.HALVING  # when a level leaves its slot
     successes: int = 1  # attempts of an evaluation that must succeed for a level to be solved
-    share: float = 0.25  # of an update's finished episodes that must reach the goal before an evaluation is worth it
-    wait: int = 2048  # env steps of training between an evaluation that failed and the next; doubles each time
-    polish: int = 0  # env steps of training after a level is solved, for a shorter way to the goal
-    steady: int = 65_536  # env steps of training after a level is solved, for a steadier witness; 0: none
-    first_rung: int = 2048  # env steps of training at the first rung; each is twice the one before
-    gain: float = 0.05  # by which the best return must have grown since the rung before
-    fruitless: int = 163_840  # env steps of training after which an expert leaves that never reached the goal; 0: none
+    share: float = 0.25  # of an update's finished episodes that must reach the goal to trigger an evaluation
+    wait: int = 2048  # env steps of training between a failed evaluation and the next; doubles each time
+    polish: int = 0  # env steps of training after a level is solved, to shorten its witness; 0: none
+    steady: int = 65_536  # env steps of training after a level is solved, if its witness is fragile; 0: none
+    first_rung: int = 2048  # env steps of training at the first rung; each rung doubles them
+    gain: float = 0.05  # minimum growth of the best return between rungs
+    fruitless: int = (
+        163_840  # env steps of training after which an expert that never reached the goal leaves; 0: no limit
+    )
 
     def __post_init__(self) -> None:
         require(self, ("successes", "first_rung"), 1)
@@ -130,27 +134,27 @@ class StopConfig:
 
 
 def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> None:
-    """Refuse a budget that experts cannot use.
+    """Raise ValueError if experts cannot use the budget.
 
     Args:
         budget: env steps of one expert.
-        config: what an expert is.
-        stopping: when a level leaves.
+        config: settings of an expert.
+        stopping: settings that say when a level leaves.
 
     Raises:
-        ValueError: it does not suffice for one update, or counts of it do not fit.
+        ValueError: it is too small for one update, or its counters overflow.
     """
     if budget < config.steps_per_update:
         raise ValueError(
             f"budget is {budget}: one update of an expert takes {config.steps_per_update} env steps "
-            f"({config.environments} environments x {config.horizon}), so give at least that many"
+            f"({config.environments} environments x {config.horizon}): give at least that many"
         )
     if budget > MAX_COUNTED:
-        raise ValueError(f"budget is {budget}: an expert can count no more than {MAX_COUNTED} env steps")
+        raise ValueError(f"budget is {budget}: the maximum is {MAX_COUNTED} env steps")
     if stopping.rule in (Rule.SOLVED, Rule.HALVING) and stopping.successes > config.attempts:
         raise ValueError(
-            f"stop.successes is {stopping.successes}: with expert.attempts={config.attempts} give at most "
-            f"{config.attempts}, or more attempts"
+            f"stop.successes is {stopping.successes}, more than expert.attempts={config.attempts}: lower it, or raise "
+            "expert.attempts"
         )
     updates = config.updates_in(budget)
     waits = {
@@ -162,6 +166,6 @@ def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> Non
     for name, longest in waits.items():
         if updates + longest > MAX_COUNTED:
             raise ValueError(
-                f"stop.{name} is {getattr(stopping, name)}: with a budget of {budget}, updates would have to be "
-                f"counted beyond {MAX_COUNTED}, so give less"
+                f"stop.{name} is {getattr(stopping, name)}: with a budget of {budget}, the update count would exceed "
+                f"{MAX_COUNTED}: lower it"
             )

@@ -1,4 +1,4 @@
-"""Labels, each with its reason and the evidence for it."""
+"""Labels of levels, with their reasons and evidence."""
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
@@ -12,8 +12,8 @@ class Label(StrEnum):
 
     SOLVED = "solved"  # a witness was replayed and reached the goal
     UNSOLVED = "unsolved"  # at this budget; no statement about larger ones
-    TRIVIAL = "trivial"  # solved by doing nothing: that is its witness, and no expert was trained
-    UNSOLVABLE = "unsolvable"  # by a proof; no expert was trained
+    TRIVIAL = "trivial"  # doing nothing solves it and is its witness; no expert was trained
+    UNSOLVABLE = "unsolvable"  # proved; no expert was trained
 
 
 class Source(StrEnum):
@@ -23,15 +23,15 @@ class Source(StrEnum):
     SAMPLED = "sampled"  # actions sampled from the expert's policy in its evaluation
     EXPLORATION = "exploration"  # actions of an episode of training
     SCOUT = "scout"  # random play before training, in splits of earlier versions
-    SEARCH = "search"  # exploration from archived states, before training, or around another witness
-    NOTHING = "nothing"  # a trivial level's
-    IMPORT = "import"  # of another program's data
+    SEARCH = "search"  # search before training, or around another witness
+    NOTHING = "nothing"  # doing nothing, in a trivial level
+    IMPORT = "import"  # actions from another program's data
 
 
 class Cause(IntEnum):
     """Why an expert stopped training for good."""
 
-    NONE = 0  # it did not: more budget would continue it
+    NONE = 0  # it has not: a larger budget would continue it
     RUNG = 1  # the best return had not grown; in experts kept by earlier versions, any cause
     FRUITLESS = 2  # no success of its own after `stop.fruitless` env steps
     DIVERGED = 3  # its parameters were no longer finite
@@ -44,11 +44,9 @@ MADE_BY = {
 }
 UNTRAINED = "no search reached the goal, and no expert was asked for"
 DIVERGED = "stopped being finite"  # in the reasons of levels whose experts diverged
-WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that stand on a witness
-TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels of levels that could use an expert
-
-
-BY_EXPERT = frozenset({Source.MOST_PROBABLE, Source.SAMPLED})  # witnesses that an expert's policy found
+WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that need a witness
+TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels of levels that need an expert
+BY_EXPERT = frozenset({Source.MOST_PROBABLE, Source.SAMPLED})  # sources of witnesses from an expert's policy
 
 
 @dataclass(frozen=True)
@@ -59,11 +57,11 @@ class Verdict:
     label_reason: str
     failed_by_noop: bool  # doing nothing lets green touch red
     witness: Source | None = None
-    success_rate: float = nan  # of sampled attempts after training, first episodes; NaN: no expert made any
-    # of the last evaluation; NaN: there were no such attempts
-    most_probable_succeeds: bool = False  # every episode of the attempt that takes the most probable actions
-    sticky_success_rate: float = nan  # of attempts where an action is sometimes repeated, first episodes
-    moved_success_rate: float = nan  # of attempts that start with slightly other velocities, first episodes
+    success_rate: float = nan  # of sampled attempts after training, first episodes; NaN: no attempts
+    # of the last evaluation; NaN: no such attempts
+    most_probable_succeeds: bool = False  # in every episode of the attempt with the most probable actions
+    sticky_success_rate: float = nan  # of attempts with sticky actions, first episodes
+    moved_success_rate: float = nan  # of attempts from perturbed velocities, first episodes
     steps_to_goal: int | None = None  # env steps of the witness's first episode
     steps_to_first_success: int | None = None  # env steps of training
     env_steps: int = 0  # of training
@@ -71,12 +69,12 @@ class Verdict:
     learning_curve: list[float] = field(default_factory=list)
     best_return: float = -inf  # of training's episodes, shaping included; -inf: none ended
     episodes: int = 0  # of training
-    portability: float | None = None  # share of the witness's replays from moved starts that reach the goal
+    portability: float | None = None  # share of the witness's replays from perturbed starts that reach the goal
     evaluation_steps: int = 0  # env steps
     scout_steps: int = 0  # 0; earlier versions played at random before training
     search_steps: int = 0  # env steps
-    cells: int | None = None  # that the search reached; None: there was none
-    still_grew: bool | None = None  # whether its archive did, at its end
+    cells: int | None = None  # that the search reached; None: not searched
+    still_grew: bool | None = None  # whether the archive was still growing when the search ended
 
 
 def solved_reason(source: Source, episodes: int) -> str:
@@ -88,10 +86,10 @@ def unsolved_reason(attempts: int, reached: bool, over: Cause, env_steps: int) -
     """Say why a level is unsolved.
 
     Args:
-        attempts: of the last evaluation.
+        attempts: number of attempts in the last evaluation.
         reached: whether the expert itself reached the goal in training.
-        over: why its training stopped, if that was for good.
-        env_steps: of its training.
+        over: why its training stopped for good.
+        env_steps: env steps of its training.
     """
     before = "the expert reached the goal in training" if reached else "the expert never reached the goal in training"
     why = {
@@ -126,7 +124,7 @@ def untrained(
     steps_to_goal: int | None = None,
     portability: float | None = None,
 ) -> Verdict:
-    """The verdict on a level without an expert. Where none is needed, doing nothing counts as the evaluation."""
+    """Return the verdict on a level without an expert. If none is needed, doing nothing counts as its evaluation."""
     verdict = Verdict(
         label, label_reason, failed_by_noop, witness, steps_to_goal=steps_to_goal, portability=portability
     )

@@ -1,7 +1,7 @@
-"""What levels cost: seconds of a worker, and with it of its core or its GPU, by what they were for.
+"""Costs of levels: seconds of a worker, and so of its core or GPU, by stage.
 
-Levels run side by side. What belongs to all levels of a unit alike is parted evenly; search, training and
-evaluation in proportion to env steps. What was compiled is apart: it is paid once a worker, whatever it makes.
+Levels run side by side. Stages that serve all levels of a unit are split evenly; search, training and evaluation in
+proportion to env steps. Compiling is counted separately, because a worker pays it once, whatever it makes.
 """
 
 import time
@@ -15,23 +15,23 @@ from jaxtyping import Int
 
 from levelproof.experts.steps import Seconds
 
-COMPILING = "/jax/core/compile/"  # what JAX's events of tracing, lowering and compiling begin with
+COMPILING = "/jax/core/compile/"  # prefix of JAX's tracing, lowering and compiling events
 
 
 @dataclass
 class Lap:
-    """What a stretch of work took, s."""
+    """Duration of some work, s."""
 
-    seconds: float = 0.0  # without compiling
+    seconds: float = 0.0  # compiling excluded
     compiling: float = 0.0
 
 
 class _Compiled:
-    """Seconds that JAX has compiled in this process; of what is traced within another trace, the outer one counts."""
+    """Seconds that JAX has spent compiling in this process; of nested traces only the outer one counts."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
-        self._last: list[tuple[float, float]] = []  # beginning and duration of the latest, none within another
+        self._last: list[tuple[float, float]] = []  # begin and duration of the latest events, none nested
         monitoring.register_event_duration_secs_listener(self._note)
 
     def _note(self, event: str, duration_secs: float, **_: object) -> None:
@@ -49,7 +49,7 @@ _compiled = _Compiled()
 
 @contextmanager
 def lap() -> Iterator[Lap]:
-    """Times what is done meanwhile; what runs on a device has to have come back to the host by its end."""
+    """Time the `with` block, which must wait for its device results."""
     of, begun, compiled = Lap(), time.perf_counter(), _compiled.seconds
     yield of
     of.compiling = _compiled.seconds - compiled
@@ -57,65 +57,66 @@ def lap() -> Iterator[Lap]:
 
 
 class Ledger:
-    """The account of some levels."""
+    """Seconds of each level, by stage (a field of `Seconds`)."""
 
     def __init__(self, count: int) -> None:
         self._of = {stage: np.zeros(count) for stage in Seconds._fields}
 
     @contextmanager
     def timing(self, stage: str) -> Iterator[None]:
-        """What is done meanwhile is this stage's (a field of `Seconds`), and evenly all levels'."""
+        """Time the `with` block; charge it evenly to all levels."""
         with lap() as took:
             yield
         self.add(stage, took)
 
     def add(self, stage: str, took: Lap) -> None:
-        """Part it evenly between the levels."""
+        """Charge a lap evenly to all levels."""
         for of, seconds in (stage, took.seconds), ("compiling", took.compiling):
             self._of[of] += seconds / max(len(self._of[of]), 1)
 
     def put(self, stage: str, index: int, seconds: float) -> None:
-        """Add to one level."""
+        """Charge seconds to one level."""
         self._of[stage][index] += seconds
 
     def take(self, other: "Ledger", indices: Int[np.ndarray, " index"]) -> None:
-        """Add the account of these of the levels."""
+        """Add another ledger, whose levels have these indices here."""
         for stage, theirs in other._of.items():
             self._of[stage][indices] += theirs
 
     def share(self, stage: str, steps: Int[np.ndarray, " level"]) -> None:
-        """Part what a stage took in proportion to the env steps that each level had of it."""
+        """Redistribute a stage's seconds in proportion to each level's env steps."""
         values = self._of[stage]
         if steps.sum():
             values[:] = values.sum() * (steps / steps.sum())
 
     def only(self, indices: Int[np.ndarray, " index"]) -> "Ledger":
-        """The account of these levels; what was done in vain for the others is theirs, too."""
+        """Return the ledger of these levels; they share the seconds spent on the others."""
         some = Ledger(len(indices))
         for stage, values in self._of.items():
             some._of[stage] = values[indices] + (values.sum() - values[indices].sum()) / max(len(indices), 1)
         return some
 
     def of(self, index: int) -> Seconds:
-        """A level's."""
+        """Return one level's seconds."""
         return Seconds(*(float(values[index]) for values in self._of.values()))
 
     def total(self) -> Seconds:
         return Seconds(*(float(values.sum()) for values in self._of.values()))
 
 
-class Steps:
-    """Parts what a pool's steps take between slots that train and slots that are evaluated.
+class StepCosts:
+    """Splits the time of a pool's steps between training and evaluated slots.
 
-    Every slot plays the same number of env steps; what an update takes beyond them is the slope of a line through the
-    steps so far, by least squares: on a CPU slots that do not train are skipped, on a GPU they cost the same.
+    A step of n slots, x of which train, takes about y = n * play + x * update seconds: every slot plays the same
+    number of env steps. The slope of a least-squares line through (x, y) estimates the update; on a GPU, where slots
+    that do not train cost the same, it is near 0.
     """
 
     def __init__(self) -> None:
-        self._sums = np.zeros(5)  # of 1, training slots x, seconds y, x x, x y
+        self._sums = np.zeros(5)  # sums of 1, x, y, x x and x y
 
-    def part(self, seconds: float, training: int, slots: int) -> tuple[float, float]:
-        """Of a step of all slots that took so long, the part of each that trains, and of each other one."""
+    def split(self, seconds: float, training: int, slots: int) -> tuple[float, float]:
+        """Return the seconds of each training slot and of each other slot in a step of `seconds` s."""
         x, y = training, seconds
         self._sums += 1, x, y, x * x, x * y
         n, xs, ys, xx, xy = self._sums

@@ -1,4 +1,4 @@
-"""An expert's policy: what to do (multi-discrete logits) and what to expect (value), from what it sees of a state."""
+"""An expert's policy: multi-discrete logits and a value, from its observation of a state."""
 
 from typing import Any
 
@@ -16,12 +16,12 @@ from levelproof.levelgen.task.observe.flat import dynamic_features
 from levelproof.physics.types import Size
 
 ActorCritic = FlatNetwork | EntityNetwork
-Constant = Any  # what is constant within one level, as the network's `constant` lays it out
-FIRSTS = np.cumsum([0, *CHOICES[:-1]]).tolist()  # of each entry's logits
+Constant = Any  # constant features of one level, as the network's `constant` lays them out
+FIRSTS = np.cumsum([0, *CHOICES[:-1]]).tolist()  # first logit of each entry
 
 
 def network_of(size: Size, config: ExpertConfig) -> ActorCritic:
-    """The network that a configuration asks for."""
+    """Return the configured network."""
     match config.network:
         case Network.FLAT:
             return FlatNetwork(size, config.width, config.depth)
@@ -30,31 +30,31 @@ def network_of(size: Size, config: ExpertConfig) -> ActorCritic:
 
 
 def initial(key: Key[Array, ""], network: ActorCritic, constant: Constant) -> Params:
-    """Parameters of an expert that has seen nothing; `constant` gives shapes only."""
+    """Return initial parameters of an expert; `constant` gives shapes only."""
     return network.init(key, constant, jnp.zeros((len(dynamic_features(network.size)), 1)))
 
 
 def forward(
     network: ActorCritic, params: Params, constant: Constant, moving: Float[Array, "dynamic lane"]
 ) -> tuple[Float[Array, "logit lane"], Float[Array, " lane"]]:
-    """Logits and value of one expert.
+    """Return logits and value of one expert.
 
     Args:
-        network: its shape.
-        params: its parameters.
-        constant: of its level.
-        moving: the rows that change, `levelgen.task.observe.flat.state_features`.
+        network: the network's shape.
+        params: the network's parameters.
+        constant: constant features of the level.
+        moving: features that change, `levelgen.task.observe.flat.state_features`.
     """
     return network.apply(params, constant, moving)  # type: ignore[return-value]
 
 
 def _entries(logits: Float[Array, "logit lane"]) -> list[Float[Array, "choice lane"]]:
-    """Log-probabilities of each action entry's choices."""
+    """Return log-probabilities of each action entry's choices."""
     return [jax.nn.log_softmax(logits[k : k + n], axis=0) for k, n in zip(FIRSTS, CHOICES, strict=True)]
 
 
 def sample(logits: Float[Array, "logit lane"], uniform: Float[Array, "6 lane"]) -> Int[Array, "6 lane"]:
-    """Actions by inversion: `uniform` is in [0, 1), one number per entry (a third of what Gumbel noise needs)."""
+    """Sample actions by inversion: `uniform` in [0, 1) has one number per entry, a third of what Gumbel noise needs."""
     actions = []
     for entry, u in zip(_entries(logits), uniform, strict=True):
         up_to = jnp.cumsum(jnp.exp(entry[:-1]), axis=0)
@@ -63,14 +63,14 @@ def sample(logits: Float[Array, "logit lane"], uniform: Float[Array, "6 lane"]) 
 
 
 def most_probable(logits: Float[Array, "logit lane"]) -> Int[Array, "6 lane"]:
-    """The first of each entry's most probable choices."""
+    """Return each entry's most probable choice, the first if several tie."""
     return jnp.stack([jnp.argmax(entry, axis=0).astype(jnp.int32) for entry in _entries(logits)])
 
 
 def log_probability(
     logits: Float[Array, "logit lane"], action: Int[Array, "6 lane"], live: Bool[Array, "6 lane"]
 ) -> Float[Array, " lane"]:
-    """Of what matters of an action: entries are independent, and those that nothing obeys do not count."""
+    """Return the log-probability of an action's live entries, which are independent."""
     total = jnp.zeros(logits.shape[-1])
     for entry, chosen, counts in zip(_entries(logits), action, live, strict=True):
         total += jnp.where(counts, sum(jnp.where(chosen == k, row, 0.0) for k, row in enumerate(entry)), 0.0)
@@ -78,6 +78,6 @@ def log_probability(
 
 
 def entropy(logits: Float[Array, "logit lane"], live: Bool[Array, "6 lane"]) -> Float[Array, " lane"]:
-    """Sum over the entries that something obeys, nats."""
+    """Return the entropy of the live entries, nats."""
     entries = zip(_entries(logits), live, strict=True)
     return -sum(jnp.where(counts, (jnp.exp(entry) * entry).sum(0), 0.0) for entry, counts in entries)  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""How a level gets its label: everything that decides it but the rules of the task and the budget."""
+"""How a level gets its label: all settings that decide it, except the task's rules and the budget."""
 
 from dataclasses import dataclass, field
 
@@ -8,8 +8,8 @@ from levelproof.experts.search.config import SearchConfig
 
 @dataclass(frozen=True)
 class Procedure:
-    """Who looks, who trains and when that ends (hashable)."""
+    """Settings of search, training and stopping (hashable)."""
 
     search: SearchConfig = field(default_factory=SearchConfig)  # the search before an expert trains
-    expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
+    expert: ExpertConfig = field(default_factory=ExpertConfig)  # the expert
     stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot

@@ -1,37 +1,37 @@
-"""Env steps and seconds by what they were for. Knows nothing of JAX: they travel to whoever shows progress."""
+"""Env steps and seconds by purpose. Imports no JAX, because the driver receives them to show progress."""
 
 from typing import NamedTuple
 
 
 class EnvSteps(NamedTuple):
-    """Of all lanes."""
+    """Env steps of all lanes."""
 
     searched: int = 0
     trained: int = 0
     evaluated: int = 0
-    idle: int = 0  # in slots that had no level
+    idle: int = 0  # in empty slots
 
     @property
     def shown(self) -> int:
-        """Those that a progress bar counts."""
+        """Env steps that a progress bar counts."""
         return self.searched + self.trained
 
 
 class Seconds(NamedTuple):
-    """Of a worker that was busy, and with it of its core or its GPU."""
+    """Seconds of a busy worker, and so of its core or GPU."""
 
-    sampling: float = 0.0  # or reading levels, and deciding those that need no expert
+    sampling: float = 0.0  # sampling or reading levels, and deciding those that need no expert
     search: float = 0.0
     training: float = 0.0
     evaluation: float = 0.0
-    idle: float = 0.0  # of slots and of rows of the search that had no level
-    replay: float = 0.0  # of witnesses: choosing, recording and checking them
-    writing: float = 0.0  # of shards, experts and rows; not of the fragment itself
-    compiling: float = 0.0  # or reading what was compiled before
+    idle: float = 0.0  # of empty slots, and of empty search slots
+    replay: float = 0.0  # choosing, recording and checking witnesses
+    writing: float = 0.0  # shards, experts and rows; not the fragment itself
+    compiling: float = 0.0  # compiling, or reading compiled programs
 
     @property
     def working(self) -> float:
-        """Seconds that grow with the number of levels: all but those idle or compiling."""
+        """Seconds that grow with the number of levels: all but idle and compiling."""
         return self.sampling + self.search + self.training + self.evaluation + self.replay + self.writing
 
 

@@ -179,7 +179,7 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
     witness = next(iter(judge.candidates_of([evaluation], Source.EXPLORATION, config)), None)
     of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))
     episodes = int(seen["done"][:, of_witness].sum())
-    return judge.verdict_of(judge.Trained([], [evaluation]), witness, episodes, config, failed_by_noop)
+    return judge.verdict_of(judge.TrainedLevel([], [evaluation]), witness, episodes, config, failed_by_noop)
 
 
 def first_success(goal: Bool[np.ndarray, "step environment"]) -> int:

@@ -54,7 +54,7 @@ KINDS = (  # in the order of the flat view
 )
 
 
-class Things(NamedTuple):
+class Entities(NamedTuple):
     """All things of a kind, and what is constant about them."""
 
     rows: Float[Array, "row thing level"]  # 0 where it moves
@@ -62,7 +62,7 @@ class Things(NamedTuple):
     ends: Float[Array, "end thing movable level"]  # one-hot: the movable bodies that each is fixed to
 
 
-Constant = tuple[Things, ...]  # of all KINDS; without the level axis where there is one level
+Constant = tuple[Entities, ...]  # of all KINDS; without the level axis where there is one level
 
 
 class Encoder(nn.Module):
@@ -72,7 +72,7 @@ class Encoder(nn.Module):
     kind: Kind
 
     @nn.compact
-    def __call__(self, things: Things, moving: Float[Array, "moving thing lane"]) -> Float[Array, "unit lane"]:
+    def __call__(self, things: Entities, moving: Float[Array, "moving thing lane"]) -> Float[Array, "unit lane"]:
         """`moving` lacks the floor, the first of the polygons, which never moves."""
         kernel = self.param("kernel", orthogonal(HIDDEN_GAIN), (self.units, len(things.rows)))
         bias = self.param("bias", nn.initializers.zeros, (self.units,))
@@ -124,7 +124,7 @@ class EntityNetwork(nn.Module):
             gravity = jnp.broadcast_to(features[-1], (1, count, lanes))
             rows = jnp.concatenate([block[:, : kind.own_rows].swapaxes(0, 1), at_ends, gravity])
             weight = active / jnp.maximum(active.sum(0), 1)
-            things.append(Things(rows, weight, one_hot[:, :, FIXED_POLYGONS:].swapaxes(0, 1)))
+            things.append(Entities(rows, weight, one_hot[:, :, FIXED_POLYGONS:].swapaxes(0, 1)))
             seen += count * width
         return tuple(things)
 

@@ -10,14 +10,14 @@ from jaxtyping import Bool, Int
 from levelproof.experts.labels import Source
 from levelproof.experts.ledger import Ledger
 from levelproof.experts.search.search import Searching
-from levelproof.experts.search.stage import Searched
+from levelproof.experts.search.stage import SearchResult
 from levelproof.experts.witness.success import Success, no_success
 from levelproof.levelgen.level import Level
 
 STILL_GREW_AFTER = 0.75  # share of a search: a new cell after it suggests that a longer search would find more
 
 
-class Found(NamedTuple):
+class SearchFindings(NamedTuple):
     """Results of the search, on the host, level first."""
 
     success: Success
@@ -27,26 +27,26 @@ class Found(NamedTuple):
     still_grew: Bool[np.ndarray, " level"]  # whether the archive was growing when the search ended
 
 
-def nothing_found(count: int) -> Found:
-    """Return an empty `Found` for levels that were not searched."""
+def nothing_found(count: int) -> SearchFindings:
+    """Return an empty `SearchFindings` for levels that were not searched."""
     zeros = np.zeros(count, np.int64)
-    return Found(no_success(count), [Source.EXPLORATION] * count, zeros, zeros.copy(), zeros.astype(bool))
+    return SearchFindings(no_success(count), [Source.EXPLORATION] * count, zeros, zeros.copy(), zeros.astype(bool))
 
 
-def row_of(found: Found, index: int) -> Found:
+def row_of(found: SearchFindings, index: int) -> SearchFindings:
     """Select one level."""
     arrays = jax.tree.map(lambda x: x[index : index + 1], found._replace(source=()))
     return arrays._replace(source=[found.source[index]])
 
 
-def joined(parts: Sequence[Found], order: Int[np.ndarray, " level"]) -> Found:
+def joined(parts: Sequence[SearchFindings], order: Int[np.ndarray, " level"]) -> SearchFindings:
     """Concatenate the parts, then reorder their levels."""
     arrays = jax.tree.map(lambda *xs: np.concatenate(xs)[order], *(part._replace(source=()) for part in parts))
     source = [source for part in parts for source in part.source]
     return arrays._replace(source=[source[i] for i in order])
 
 
-class Looking:
+class LevelSearch:
     """Levels whose search runs in the search slots that all units of a worker share."""
 
     def __init__(self, levels: Level, level_ids: Int[np.ndarray, " level"], searching: Searching) -> None:
@@ -84,7 +84,7 @@ class Looking:
             self._sought = None
         return self._sought is None
 
-    def _take(self, searched: Searched) -> None:
+    def _take(self, searched: SearchResult) -> None:
         found = self.found
         found.success.action[:], found.success.length[:] = searched.success
         found.source[:] = [Source.SEARCH if length else Source.EXPLORATION for length in found.success.length]

@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-from levelproof.experts.pool.found import Found
+from levelproof.experts.pool.found import SearchFindings
 from levelproof.experts.training.slots import Pending
-from levelproof.experts.verdict.judge import Evaluation, Kept
+from levelproof.experts.verdict.judge import Evaluation, KeptExpert
 
 
 class Paused(NamedTuple):
@@ -13,8 +13,8 @@ class Paused(NamedTuple):
     An evaluation that was under way begins again.
     """
 
-    expert: Kept
+    expert: KeptExpert
     pending: Pending
     evaluated_rollouts: int  # of evaluations that have ended
     evaluations: list[Evaluation]  # those that solved the level
-    found: Found  # before it trained: of one level
+    found: SearchFindings  # before it trained: of one level

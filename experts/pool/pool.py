@@ -16,20 +16,20 @@ import numpy as np
 from jaxtyping import Int
 
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig, check_budget
-from levelproof.experts.ledger import Lap, Ledger, Steps, lap
+from levelproof.experts.ledger import Lap, Ledger, StepCosts, lap
 from levelproof.experts.policy import Params
-from levelproof.experts.pool.found import Found, nothing_found, row_of
+from levelproof.experts.pool.found import SearchFindings, nothing_found, row_of
 from levelproof.experts.pool.paused import Paused
 from levelproof.experts.pool.queue import GROUP, empty_queue, enter
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.search import Searching
 from levelproof.experts.training.advance import advance, train_on
-from levelproof.experts.training.slots import Begun, LevelQueue, Mode, Pending, Report, Slots, empty_slots
+from levelproof.experts.training.slots import ExpertState, LevelQueue, Mode, Pending, Report, Slots, empty_slots
 from levelproof.experts.training.stop import rules_of
 from levelproof.experts.verdict.judge import (
     Evaluation,
-    Kept,
-    Trained,
+    KeptExpert,
+    TrainedLevel,
     Witness,
     candidates_of,
     shortest_first,
@@ -43,7 +43,7 @@ from levelproof.levelgen.task.rules import TaskParams
 IN_CACHE = 128  # lanes: their physics and one minibatch fit the cache of a core
 QUEUED_PER_SLOT = 4  # levels: with those in the slots, and while the next group does not fit yet, enough wait
 T = TypeVar("T")
-NOTHING_BEGUN: Mapping[int, Kept] = MappingProxyType({})
+NOTHING_BEGUN: Mapping[int, KeptExpert] = MappingProxyType({})
 NONE_PAUSED: Mapping[int, Paused] = MappingProxyType({})
 
 
@@ -62,8 +62,8 @@ class Submission:
         self,
         levels: Level,
         level_ids: Int[np.ndarray, " level"],
-        found: Found,
-        begun: Mapping[int, Kept],
+        found: SearchFindings,
+        begun: Mapping[int, KeptExpert],
         keep: bool,
         paused: Mapping[int, Paused],
     ) -> None:
@@ -72,7 +72,7 @@ class Submission:
         self.begun = {**begun, **{i: of.expert for i, of in paused.items()}}
         self.curves = [list(self.begun[i].curve) if i in self.begun else [] for i in range(count)]
         self.evaluations = [list(paused[i].evaluations) if i in paused else [] for i in range(count)]
-        self.experts: list[Kept | None] = [None] * count
+        self.experts: list[KeptExpert | None] = [None] * count
         self.candidates: list[list[Witness]] = [[] for _ in range(count)]
         self.policies: list[Params | None] = [None] * count
         self.under_way = set(range(count))
@@ -83,10 +83,10 @@ class Submission:
             [paused[i].evaluated_rollouts if i in paused else 0 for i in range(count)], int
         )
 
-    def trained(self, config: ExpertConfig) -> list[Trained]:
+    def trained(self, config: ExpertConfig) -> list[TrainedLevel]:
         evaluated = (self.evaluated_rollouts * config.steps_per_update).tolist()
         of = self.curves, self.evaluations, self.experts, self.candidates, evaluated, self.policies
-        return [Trained(*level) for level in zip(*of, strict=True)]
+        return [TrainedLevel(*level) for level in zip(*of, strict=True)]
 
 
 class Pool:
@@ -107,14 +107,14 @@ class Pool:
         self._at: dict[int, tuple[Submission, int]] = {}
         self._coming: deque[tuple[Submission, Sequence[int]]] = deque()  # levels that wait for room in the queue
         self._submissions: list[Submission] = []  # not finished
-        self._steps = Steps()
+        self._steps = StepCosts()
 
     def submit(
         self,
         levels: Level,
         level_ids: Int[np.ndarray, " level"],
-        found: Found | None = None,
-        begun: Mapping[int, Kept] = NOTHING_BEGUN,
+        found: SearchFindings | None = None,
+        begun: Mapping[int, KeptExpert] = NOTHING_BEGUN,
         keep: bool = False,
         paused: Mapping[int, Paused] = NONE_PAUSED,
     ) -> Submission:
@@ -203,7 +203,7 @@ class Pool:
                 of,
                 i,
                 Paused(
-                    Kept(expert_of(self._slots, number, self.config), list(of.curves[i])),
+                    KeptExpert(expert_of(self._slots, number, self.config), list(of.curves[i])),
                     Pending(evaluating & due, evaluating & final, deadline),
                     int(of.evaluated_rollouts[i]) - (int(part) if evaluating else 0),
                     list(of.evaluations[i]),
@@ -233,7 +233,7 @@ class Pool:
                 self._note(slot, seen, submission, i)
         self._leave(seen, {slot: level for slot, level in zip(busy, levels, strict=True) if seen.left[slot]})
         trains = (seen.mode[busy] == Mode.TRAIN).tolist()
-        training, evaluation = self._steps.part(took.seconds, sum(trains), len(seen.mode))
+        training, evaluation = self._steps.split(took.seconds, sum(trains), len(seen.mode))
         for train, (submission, i) in zip(trains, levels, strict=True):
             submission.ledger.put(*(("training", i, training) if train else ("evaluation", i, evaluation)))
         idle = evaluation * (len(seen.mode) - len(busy))
@@ -258,7 +258,7 @@ class Pool:
             self._at.update({index: (submission, i) for index, i in zip(indices, some, strict=True)})
             self._coming.popleft()
 
-    def _goes_on(self, submission: Submission, i: int) -> tuple[Begun, Pending]:
+    def _goes_on(self, submission: Submission, i: int) -> tuple[ExpertState, Pending]:
         """An expert that has begun, and what comes next for it."""
         no = np.bool_(False)
         fresh = Pending(no, no, np.int32(self.updates))
@@ -285,7 +285,7 @@ class Pool:
             if slot in stay:
                 continue
             if submission.keep:
-                submission.experts[i] = Kept(expert_of(self._slots, slot, self.config), submission.curves[i])
+                submission.experts[i] = KeptExpert(expert_of(self._slots, slot, self.config), submission.curves[i])
             submission.policies[i] = jax.device_get(_row(self._slots.slot.training.train_state.params, slot))
             submission.solved += bool(submission.candidates[i])
             del self._at[int(seen.queue_index[slot])]
@@ -331,10 +331,10 @@ def capacity_of(config: ExpertConfig) -> int:
     return max(QUEUED_PER_SLOT * slot_count(config), 2 * GROUP)
 
 
-def expert_of(slots: Slots, slot: int, config: ExpertConfig) -> Begun:
+def expert_of(slots: Slots, slot: int, config: ExpertConfig) -> ExpertState:
     """The expert in a slot, or that has just left it, on the host, as it would go on."""
     lanes = np.arange(slot * config.environments, (slot + 1) * config.environments)
-    return jax.device_get(Begun(_row(slots.slot.training, slot), take(slots.acting, lanes)))
+    return jax.device_get(ExpertState(_row(slots.slot.training, slot), take(slots.acting, lanes)))
 
 
 def evaluation_of(slots: Slots, slot: int) -> Evaluation:

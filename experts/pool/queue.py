@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from levelproof.experts.config import ExpertConfig
-from levelproof.experts.training.slots import Begun, LevelQueue, Pending, begin
+from levelproof.experts.training.slots import ExpertState, LevelQueue, Pending, begin
 from levelproof.experts.witness.success import Success, no_success
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
@@ -40,7 +40,7 @@ def enter(
     success: Success,
     config: ExpertConfig,
     updates: int,
-    begun: Mapping[int, tuple[Begun, Pending]] = MappingProxyType({}),
+    begun: Mapping[int, tuple[ExpertState, Pending]] = MappingProxyType({}),
 ) -> LevelQueue:
     """The queue (used up) with more levels: some, at most GROUP.
 
@@ -76,7 +76,7 @@ def _put(
     queue: LevelQueue,
     levels: Level,
     level_ids: Int[Array, "16"],
-    experts: Begun,
+    experts: ExpertState,
     pending: Pending,
     indices: Int[Array, "16"],
     numbers: Int[Array, "16"],

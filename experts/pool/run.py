@@ -10,14 +10,14 @@ from jaxtyping import Int
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig, Rule
 from levelproof.experts.labels import WITNESSED, Source, Verdict
 from levelproof.experts.ledger import Lap, Ledger, lap
-from levelproof.experts.pool.found import Found, Looking, joined
+from levelproof.experts.pool.found import LevelSearch, SearchFindings, joined
 from levelproof.experts.pool.paused import Paused
 from levelproof.experts.pool.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Submission, Totals
 from levelproof.experts.pool.rework import rework
 from levelproof.experts.steps import EnvSteps
 from levelproof.experts.verdict.afresh import attempt
 from levelproof.experts.verdict.before import decide
-from levelproof.experts.verdict.judge import Kept, Trained, Witness, judge, repeating
+from levelproof.experts.verdict.judge import KeptExpert, TrainedLevel, Witness, judge, repeating
 from levelproof.experts.verdict.portability import choose
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import Record, replay
@@ -35,7 +35,7 @@ class UnitResult:
     record: Record  # all zero where the level has no witness
     verdicts: list[Verdict]
     spent: EnvSteps
-    experts: dict[int, Kept] = field(default_factory=dict)  # by level id, where they are kept
+    experts: dict[int, KeptExpert] = field(default_factory=dict)  # by level id, where they are kept
     ledger: Ledger | None = None  # None: nobody has counted
 
 
@@ -47,7 +47,7 @@ class TrainingRun:
         pool: Pool,
         levels: Level,
         level_ids: np.ndarray,
-        begun: Mapping[int, Kept] = NOTHING_BEGUN,
+        begun: Mapping[int, KeptExpert] = NOTHING_BEGUN,
         keep: bool = False,
         ledger: Ledger | None = None,
         paused: Mapping[int, Paused] = NONE_PAUSED,
@@ -73,7 +73,7 @@ class TrainingRun:
         self._order = np.argsort(np.r_[np.flatnonzero(new), np.flatnonzero(~new)])  # of new ones and others, as left
         with self.ledger.timing("search"):
             self._looked = self.left[new]
-            self.looking = Looking(*self._some(self._looked), pool.searching)
+            self.looking = LevelSearch(*self._some(self._looked), pool.searching)
         self.submission: Submission | None = None  # of those that an expert is asked for
         self._gone: set[int] = set()  # ids of levels that others label
         self.look()
@@ -159,7 +159,7 @@ class TrainingRun:
         ledger.add("replay", took)
         return replace(result, ledger=ledger)
 
-    def _attempted(self, trained: Sequence[Trained]) -> dict[int, tuple[float, int]]:
+    def _attempted(self, trained: Sequence[TrainedLevel]) -> dict[int, tuple[float, int]]:
         """Success rates of experts, and the env steps that these took, by index among `left`."""
         policies = {
             i: of.policy
@@ -175,7 +175,7 @@ class TrainingRun:
         return dict(zip(policies, zip(*(x.tolist() for x in found), strict=True), strict=True))
 
     def _judged(
-        self, submission: Submission, trained: list[Trained], attempted: Mapping[int, tuple[float, int]]
+        self, submission: Submission, trained: list[TrainedLevel], attempted: Mapping[int, tuple[float, int]]
     ) -> UnitResult:
         config, rules = self.pool.config, self.pool.rules
         kept = np.flatnonzero(~np.isin(self.level_ids, list(self._gone)))
@@ -224,7 +224,7 @@ def with_attempts(verdict: Verdict, attempted: tuple[float, int] | None) -> Verd
     return replace(verdict, success_rate=rate, evaluation_steps=verdict.evaluation_steps + env_steps)
 
 
-def with_looks(verdict: Verdict, found: Found, index: int, reworked: int) -> Verdict:
+def with_looks(verdict: Verdict, found: SearchFindings, index: int, reworked: int) -> Verdict:
     """The verdict with what was done before training, and the env steps of search around its witness."""
     searched = int(found.search_steps[index])
     return replace(
@@ -235,10 +235,12 @@ def with_looks(verdict: Verdict, found: Found, index: int, reworked: int) -> Ver
     )
 
 
-def as_found(found: Found) -> list[Trained]:
+def as_found(found: SearchFindings) -> list[TrainedLevel]:
     """Levels that no expert trained for: their witness is what was found before."""
     each = zip(found.success.action, found.success.length, found.source, strict=True)
-    return [Trained([], [], candidates=repeating(Success(action, length), source)) for action, length, source in each]
+    return [
+        TrainedLevel([], [], candidates=repeating(Success(action, length), source)) for action, length, source in each
+    ]
 
 
 def idling(verdict: Verdict, nothing: Int[np.ndarray, "256 6"]) -> Sequence[Witness]:

@@ -16,7 +16,7 @@ from levelproof.experts.search.config import SearchConfig
 ONE = 65_536  # the weight of an entry that was never chosen
 
 
-class Reached(NamedTuple):
+class ReachedStates(NamedTuple):
     """States that were reached: entries of the archive, or what lanes have just come to."""
 
     feature: Float[Array, "level thing feature"]  # what tells them apart (`experts.search.cells`)
@@ -29,7 +29,7 @@ class Reached(NamedTuple):
 class Archive(NamedTuple):
     """Entries are numbered in no order; those not in use hold anything."""
 
-    entry: Reached
+    entry: ReachedStates
     used: Bool[Array, "level entry"]
     key: UInt32[Array, "level entry"]  # of its cell
     visits: Int[Array, "level entry"]  # how often it was chosen
@@ -37,7 +37,7 @@ class Archive(NamedTuple):
     cells: Int[Array, " level"]  # that entered it, ever
 
 
-def new_archive(start: Reached, config: SearchConfig) -> Archive:
+def new_archive(start: ReachedStates, config: SearchConfig) -> Archive:
     """Archives with nothing but the levels' starts [level, 1, ...]."""
     count, entries = len(start.steps), config.entries
     widen = lambda x: jnp.pad(x, [(0, 0), (0, entries - 1)] + [(0, 0)] * (x.ndim - 2))
@@ -74,7 +74,7 @@ def visit(archive: Archive, chosen: Int[Array, "level lane"], active: Bool[Array
     return archive._replace(visits=archive.visits + jnp.where(active[:, None], counts, 0))
 
 
-def insert(archive: Archive, new: Reached, valid: Bool[Array, "level lane"], config: SearchConfig) -> Archive:
+def insert(archive: Archive, new: ReachedStates, valid: Bool[Array, "level lane"], config: SearchConfig) -> Archive:
     """Put in what is new, or reached in fewer env steps. Where not all of it fits, cells become wider."""
     key = keys_of(new.feature, archive.width)
     slot, fits = jax.vmap(slots_for)(archive.used, archive.key, archive.entry.steps, key, new.steps, valid)

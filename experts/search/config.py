@@ -14,7 +14,7 @@ MAX_RUNGS = 16  # each is four times the one before, and env steps are counted i
 MAX_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) are counted in 32 bits
 
 
-class Ends(NamedTuple):
+class StopLimits(NamedTuple):
     """Of a SearchConfig what says when a search ends: data of its program, so that other numbers need no other one."""
 
     env_steps: Int[Array, ""]
@@ -87,11 +87,11 @@ class SearchConfig:
         return self.lanes * self.stretch * self.segment
 
     @property
-    def ends(self) -> Ends:
+    def ends(self) -> StopLimits:
         """When it ends. There is no rung that matters after `env_steps`, which end it anyway."""
         first = -(-self.first_rung // self.steps_per_round) * self.steps_per_round
         rungs = np.array([min(first * 4**i, MAX_COUNTED) for i in range(MAX_RUNGS)], np.int32)
-        return Ends(*map(np.int32, (self.env_steps, self.variations, self.patience, self.per_cell)), rungs)  # pyright: ignore
+        return StopLimits(*map(np.int32, (self.env_steps, self.variations, self.patience, self.per_cell)), rungs)  # pyright: ignore
 
     @property
     def endless(self) -> "SearchConfig":

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.search.archive import Archive, Reached, choose, insert, new_archive, visit
+from levelproof.experts.search.archive import Archive, ReachedStates, choose, insert, new_archive, visit
 from levelproof.experts.search.cells import features
-from levelproof.experts.search.config import Ends, SearchConfig
+from levelproof.experts.search.config import SearchConfig, StopLimits
 from levelproof.experts.search.near import FAR, gap, goals_of
 from levelproof.experts.search.play import CODES, Arena, Walk, arena, decode, most_steps, play
 from levelproof.experts.search.rows import from_rows, to_rows
@@ -41,7 +41,7 @@ class Search:
     length: Int[Array, " level"]  # of the success, env steps; 0: there is none
 
 
-class Chance(NamedTuple):
+class RoundDraws(NamedTuple):
     """Random numbers of one level's round."""
 
     choice: Float[Array, "3 lane"]  # of an entry of the archive
@@ -62,7 +62,7 @@ def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, 
     """
     count, room = len(level_ids), -(-most_steps(rules) // config.segment) * config.segment
     one = lambda x: x[:, None]
-    start = Reached(
+    start = ReachedStates(
         one(features(levels, levels.state, config)),
         one(to_rows(levels.state)),
         jnp.zeros((count, 1, room), jnp.uint16),
@@ -82,13 +82,13 @@ def explore(search: Search, config: SearchConfig, rules: TaskParams) -> Search:
 
 
 @partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="search")
-def _explore(search: Search, ends: Ends, config: SearchConfig, rules: TaskParams) -> Search:
+def _explore(search: Search, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Search:
     ring = arena(search.levels, config.lanes, config.redrawn)
     step = lambda search, _: (explore_round(search, ring, ends, config, rules), None)
     return jax.lax.scan(step, search, length=config.rounds)[0]
 
 
-def explore_round(search: Search, ring: Arena, ends: Ends, config: SearchConfig, rules: TaskParams) -> Search:
+def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Search:
     """One round; `ring` has the levels' lanes."""
     active = under_way(search, ends)
     chance = jax.vmap(partial(draw, config=config))(search.key, search.env_steps)
@@ -127,7 +127,7 @@ def explore_round(search: Search, ring: Arena, ends: Ends, config: SearchConfig,
     )
 
 
-def under_way(search: Search, ends: Ends) -> Bool[Array, " level"]:
+def under_way(search: Search, ends: StopLimits) -> Bool[Array, " level"]:
     """Levels without a success that have env steps left, are not at a rung with too few cells, and have lately come
     nearer to the goal.
 
@@ -146,12 +146,12 @@ def patient(waited: Int[Array, " level"], patience: Int[Array, ""]) -> Bool[Arra
     return (waited < patience) | (patience == 0)
 
 
-def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> Chance:
+def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> RoundDraws:
     """All the chance in one level's round."""
     one, other = jax.random.split(jax.random.fold_in(key, env_steps))
     uniform = jax.random.uniform(one, (5, config.lanes))
     bits = jax.random.bits(other, (config.stretch, config.segment, ACTIONS, config.lanes))
-    return Chance(uniform[:3], uniform[3] < config.anew, (uniform[4] * CODES).astype(jnp.uint16), bits)
+    return RoundDraws(uniform[:3], uniform[3] < config.anew, (uniform[4] * CODES).astype(jnp.uint16), bits)
 
 
 def back_to(search: Search, chosen: Int[Array, "level lane"]) -> tuple[Walk, UInt16[Array, "lane step"]]:
@@ -177,10 +177,10 @@ def written(
 
 def reached_by(
     walk: Walk, code: UInt16[Array, "lane step"], ring: Arena, config: SearchConfig
-) -> tuple[Reached, Bool[Array, "level lane"]]:
+) -> tuple[ReachedStates, Bool[Array, "level lane"]]:
     """Where lanes are, by level, and which of them may go on."""
     by_level = lambda x: x.reshape(-1, config.lanes, *x.shape[1:])
-    come = Reached(
+    come = ReachedStates(
         feature=features(ring.lanes, walk.state, config),
         state=to_rows(walk.state),
         code=code,

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from levelproof.experts.search import explore, vary
-from levelproof.experts.search.config import Ends, SearchConfig
+from levelproof.experts.search.config import SearchConfig, StopLimits
 from levelproof.experts.search.explore import Search, success_of
 from levelproof.experts.search.shorten import shorten
-from levelproof.experts.search.stage import Entrant, Searched, Sought, Stage
+from levelproof.experts.search.stage import Entrant, SearchJob, SearchResult, Stage
 from levelproof.experts.search.vary import Varying, nearest_of
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import at_once, blocks, take
@@ -38,7 +38,7 @@ class Searching:
         self.config, self._rules = config, rules
         self._exploring, self._varying = Stage(side_by_side(config)), Stage(side_by_side(config))
 
-    def submit(self, levels: Level, level_ids: Int[np.ndarray, " level"]) -> Sought:
+    def submit(self, levels: Level, level_ids: Int[np.ndarray, " level"]) -> SearchJob:
         """Let levels wait for rows.
 
         Args:
@@ -51,15 +51,15 @@ class Searching:
         of_one = jax.eval_shape(begin, take(levels, ONE), jnp.array(ONE))
         empty = lambda x: np.zeros((len(level_ids), *x.shape[1:]), x.dtype)
         nothing = jax.tree.map(empty, jax.eval_shape(explored, of_one, config.ends)[1])
-        sought = Sought(levels, level_ids, nothing)
+        sought = SearchJob(levels, level_ids, nothing)
         self._exploring.waiting.extend(Entrant(sought, i) for i in range(len(level_ids)))
         return sought
 
-    def waiting(self, sought: Sought) -> list[int]:
+    def waiting(self, sought: SearchJob) -> list[int]:
         """Indices of its levels that have had no row, ascending."""
         return [of.index for of in self._exploring.waiting if of.sought is sought]
 
-    def withdraw(self, sought: Sought, indices: Collection[int]) -> None:
+    def withdraw(self, sought: SearchJob, indices: Collection[int]) -> None:
         """Take levels out that have had no row."""
         queue = self._exploring.waiting
         staying = [of for of in queue if of.sought is not sought or of.index not in indices]
@@ -85,7 +85,7 @@ class Searching:
             return False
         return True
 
-    def result(self, sought: Sought) -> Searched:
+    def result(self, sought: SearchJob) -> SearchResult:
         """What was found, once none is left to search: successes that replay, made shorter."""
         assert not sought.left
         found, width = sought.known, side_by_side(self.config)
@@ -127,7 +127,7 @@ class Searching:
             of.sought.left -= not stage.at[row]
 
 
-def put(of: Entrant, seen: Searched) -> None:
+def put(of: Entrant, seen: SearchResult) -> None:
     """Into what is known of a level."""
     for known, now in zip(jax.tree.leaves(of.sought.known), jax.tree.leaves(seen), strict=True):
         known[of.index] = now
@@ -139,14 +139,14 @@ def side_by_side(config: SearchConfig) -> int:
 
 
 @jax.jit
-def explored(search: Search, ends: Ends) -> tuple[Bool[Array, " level"], Searched]:
+def explored(search: Search, ends: StopLimits) -> tuple[Bool[Array, " level"], SearchResult]:
     """Levels that are done, and what came of all of them so far."""
     found, none = success_of(search.code, search.length), jnp.zeros_like(search.env_steps)
-    seen = Searched(found, search.env_steps, none, search.archive.cells, search.grew)
+    seen = SearchResult(found, search.env_steps, none, search.archive.cells, search.grew)
     return ~explore.under_way(search, ends), seen
 
 
 @jax.jit
-def varied(varying: Varying, ends: Ends) -> tuple[Bool[Array, " level"], tuple[Success, Int[Array, " level"]]]:
+def varied(varying: Varying, ends: StopLimits) -> tuple[Bool[Array, " level"], tuple[Success, Int[Array, " level"]]]:
     """Levels that are done, what was found in all of them, and in how many env steps."""
     return ~vary.under_way(varying, ends), (success_of(varying.code, varying.length), varying.env_steps)

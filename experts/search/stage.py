@@ -19,7 +19,7 @@ from levelproof.levelgen.level import Level
 Rows = Any  # what a program advances: a dataclass, its `levels` with their axis last, all else level-first
 
 
-class Searched(NamedTuple):
+class SearchResult(NamedTuple):
     """What came of some levels, level first."""
 
     success: Success  # length 0: none was found
@@ -29,10 +29,10 @@ class Searched(NamedTuple):
     grew: Int[Array, " level"]  # env steps when the last cell was reached
 
 
-class Sought:
+class SearchJob:
     """Levels that came together, and what is known of each so far."""
 
-    def __init__(self, levels: Level, level_ids: Int[np.ndarray, " level"], nothing: Searched) -> None:
+    def __init__(self, levels: Level, level_ids: Int[np.ndarray, " level"], nothing: SearchResult) -> None:
         self.levels, self.level_ids, self.known = levels, level_ids, nothing
         self.left = len(level_ids)  # levels that are searched, or wait for it
         self.ledger = Ledger(len(level_ids))
@@ -47,7 +47,7 @@ class Sought:
 class Entrant:
     """A level that has a row, or waits for one."""
 
-    sought: Sought
+    sought: SearchJob
     index: int  # of the level there
     known: Any = None  # what its row begins with beside the level, as numpy arrays
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
 
 from levelproof.experts.search.archive import Archive
-from levelproof.experts.search.config import Ends, SearchConfig
+from levelproof.experts.search.config import SearchConfig, StopLimits
 from levelproof.experts.search.explore import NEARER, patient, with_success
 from levelproof.experts.search.near import FAR, gap
 from levelproof.experts.search.play import CODES, WITHOUT, Arena, Walk, act, arena, decode, fresh_walk, most_steps
@@ -118,13 +118,13 @@ def vary(varying: Varying, config: SearchConfig, rules: TaskParams) -> Varying:
 
 
 @partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="varying")
-def _vary(varying: Varying, ends: Ends, config: SearchConfig, rules: TaskParams) -> Varying:
+def _vary(varying: Varying, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Varying:
     ring = arena(varying.levels, config.lanes, (1.0,))
     step = lambda varying, _: (vary_round(varying, ring, ends, config, rules), None)
     return jax.lax.scan(step, varying, length=config.rounds)[0]
 
 
-def vary_round(varying: Varying, ring: Arena, ends: Ends, config: SearchConfig, rules: TaskParams) -> Varying:
+def vary_round(varying: Varying, ring: Arena, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Varying:
     """Lanes whose episodes are over begin another; then all play on. `ring` has the levels' lanes."""
     active = under_way(varying, ends)
     stays = lambda new, old: jnp.where(active.reshape(-1, *[1] * (old.ndim - 1)), new, old)
@@ -156,7 +156,7 @@ def vary_round(varying: Varying, ring: Arena, ends: Ends, config: SearchConfig, 
     )
 
 
-def under_way(varying: Varying, ends: Ends) -> Bool[Array, " level"]:
+def under_way(varying: Varying, ends: StopLimits) -> Bool[Array, " level"]:
     """Levels without a success that have env steps left and have lately come nearer to the goal."""
     going = (varying.length == 0) & (varying.env_steps < ends.variations)
     less = -(-ends.patience // LESS_PATIENT)  # rounded up: 0 would have no end

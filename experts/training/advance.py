@@ -1,8 +1,8 @@
-"""Continuous batching: a fixed number of slots, each with an expert in training or under evaluation.
+"""Continuous batching: a fixed number of slots, each training or evaluating an expert.
 
-One compiled program, `advance`, takes every slot a rollout further. A level that is decided leaves its slot, and the
-next of the queue takes it, on the device. What becomes of a level depends on the level, its id and the configuration
-alone: not on its slot, its neighbours or when it came.
+One compiled program, `advance`, advances every slot by a rollout. A decided level leaves its slot, and the next level
+of the queue enters it, on the device. A level's result depends on the level, its id and the configuration alone: not
+on its slot, its neighbours or its time of entry. `slots.Mode` draws a slot's states.
 
 An evaluation interrupts the training of its slot and leaves no trace in it.
 """
@@ -21,8 +21,8 @@ from levelproof.experts.labels import Cause
 from levelproof.experts.policy import ActorCritic, network_of
 from levelproof.experts.training import ppo, progress, stop
 from levelproof.experts.training.ppo import LevelConstants, Samples
-from levelproof.experts.training.rollout import Acting, Manner, Trajectory, rollout, start
-from levelproof.experts.training.slots import LevelQueue, Mode, Report, Slot, Slots, Training, Trial, lanes_of
+from levelproof.experts.training.rollout import Acting, ActionRule, Trajectory, rollout, start
+from levelproof.experts.training.slots import EvaluationState, LevelQueue, Mode, Report, Slot, Slots, Training, lanes_of
 from levelproof.experts.training.stop import StopRules
 from levelproof.experts.witness.success import find, remember
 from levelproof.levelgen.batching import repeat
@@ -31,12 +31,12 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import TaskParams
 
-STICKINESS = 0.25  # of sticky attempts (Machado et al. 2018, arXiv:1709.06009)
-MOVED = 0.1  # m/s and rad/s, the most by which velocities of moved attempts differ from the level's
+STICKINESS = 0.25  # probability of repeating the last action in sticky attempts (Machado et al. 2018, arXiv:1709.06009)
+MOVED = 0.1  # m/s and rad/s, maximum perturbation of the level's velocities in moved attempts
 
 
 def over_slots(function: Callable, *slots: Any) -> Any:
-    """One slot after another on a CPU: its minibatch stays in a core's cache, and `cond` skips what it can."""
+    """Map over slots; on a CPU one after another, so that a minibatch stays in cache and `cond` skips branches."""
     if jax.default_backend() == "cpu":
         return jax.lax.map(lambda xs: function(*xs), slots)
     return jax.vmap(function)(*slots)
@@ -46,14 +46,14 @@ def over_slots(function: Callable, *slots: Any) -> Any:
 def advance(
     slots: Slots, queue: LevelQueue, config: ExpertConfig, stopping: StopRules, rules: TaskParams
 ) -> tuple[Slots, Report]:
-    """A rollout in every slot, and what follows from it: an update, a part of an evaluation, another level.
+    """Fill empty slots, roll out every slot, then update its expert or record a part of its evaluation.
 
     Args:
-        slots: used up.
-        queue: the levels that wait.
-        config: what an expert is.
-        stopping: when a level leaves.
-        rules: of the task; their reward trains.
+        slots: state of every slot; donated.
+        queue: levels that wait, and those in slots.
+        config: settings of an expert.
+        stopping: rules that say when a level leaves.
+        rules: the task's rules, with the reward that experts train on.
     """
     slots = refill(slots, queue, config)
     slot = slots.slot
@@ -83,7 +83,7 @@ def advance(
 
 @partial(jax.jit, donate_argnames="slots")
 def train_on(slots: Slots, stays: Bool[Array, " slot"], stopping: StopRules) -> Slots:
-    """Slots (used up) in which some levels that left early stay, for a witness that more replays survive."""
+    """Resume training in slots marked in `stays`, for a witness that more replays survive; donates `slots`."""
     slot = slots.slot
     course, deadline = stop.steady_on(slot.training.course, slot.deadline, stopping)
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(stays, a, b), new, old)
@@ -97,8 +97,10 @@ def train_on(slots: Slots, stays: Bool[Array, " slot"], stopping: StopRules) -> 
 
 
 def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
-    """Slots that are empty take the next levels of the queue. An expert that is over is only evaluated again, and so is
-    one whose evaluation was under way when it was kept."""
+    """Move the next levels of the queue into empty slots.
+
+    An expert whose training has stopped for good is only evaluated; so is one that was paused during an evaluation.
+    """
     free = slots.slot.mode == Mode.EMPTY
     number = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
     takes, index = free & (number < queue.come), queue.order[number % queue.capacity]
@@ -124,8 +126,8 @@ def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
     return Slots(slot, acting, slots.trial, slots.taken + takes.sum(dtype=jnp.int32))
 
 
-class _Now(NamedTuple):
-    """What one slot's rollout gave."""
+class _RolloutData(NamedTuple):
+    """Data of one slot's rollout."""
 
     constants: LevelConstants
     key: Key[Array, ""]
@@ -135,7 +137,7 @@ class _Now(NamedTuple):
     done: Bool[Array, "time environment"]
     goal: Bool[Array, "time environment"]
     timestep: Int[Array, "time environment"]
-    own: Bool[Array, " environment"]  # as `Manner.own`
+    own: Bool[Array, " environment"]  # as `ActionRule.own`
 
 
 def _split(
@@ -144,10 +146,10 @@ def _split(
     keys: Key[Array, " slot"],
     trajectory: Trajectory,
     last_value: Float[Array, "slot environment"],
-    manner: Manner,
+    manner: ActionRule,
     config: ExpertConfig,
-) -> _Now:
-    """By slot, slots first."""
+) -> _RolloutData:
+    """Split a rollout by slot, slots first; compute advantages."""
     seen = trajectory
     advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
     rehearsed = jnp.broadcast_to(manner.rehearsing.reshape(seen.value.shape[1:]), seen.value.shape)
@@ -156,7 +158,7 @@ def _split(
     )
     rows = jax.vmap(ppo.as_rows, in_axes=-2)(samples)
     by_slot = lambda x: jnp.moveaxis(x, -2, 0)
-    return _Now(
+    return _RolloutData(
         jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), LevelConstants(network.constant(levels), action_mask(levels))),
         keys,
         rows,
@@ -170,9 +172,9 @@ def _split(
 
 
 def _follow(
-    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopRules
+    slot: Slot, now: _RolloutData, network: ActorCritic, config: ExpertConfig, stopping: StopRules
 ) -> tuple[Slot, Float[Array, ""], Int[Array, ""]]:
-    """What follows from a slot's rollout; also the share of successes, and the mode it was in."""
+    """Process a slot's rollout; return the slot, its share of successes, and the mode it was in."""
     nothing = jnp.float32(jnp.nan)
     branches = (
         lambda: (slot, nothing),
@@ -184,9 +186,9 @@ def _follow(
 
 
 def _learn(
-    slot: Slot, now: _Now, network: ActorCritic, config: ExpertConfig, stopping: StopRules
+    slot: Slot, now: _RolloutData, network: ActorCritic, config: ExpertConfig, stopping: StopRules
 ) -> tuple[Slot, Float[Array, ""]]:
-    """One update, and whether an evaluation comes next."""
+    """Update the expert, and decide whether an evaluation comes next."""
     training = slot.training
     totals, share = progress.follow(training.progress, now.reward, now.done, now.goal, now.own)
     recent = jnp.concatenate([training.recent, now.action])
@@ -200,8 +202,8 @@ def _learn(
     return slot._replace(mode=jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), training=training, trial=trial), share
 
 
-def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopRules) -> Slot:
-    """A part of an evaluation; after the last, whether the level leaves."""
+def _collect(slot: Slot, now: _RolloutData, config: ExpertConfig, stopping: StopRules) -> Slot:
+    """Record a part of an evaluation; after the last part, decide whether the level leaves."""
     first = slot.trial.part * config.horizon
     put = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, first, 0)
     action = put(slot.trial.action, now.action[..., : config.attempts])
@@ -210,7 +212,7 @@ def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopRules) -
     hopeless = ~slot.trial.final & stop.fails(done, goal, part * config.horizon, stopping, config)
     ended = (part == config.record_rollouts) | hopeless
     solved = ended & ~hopeless & stop.solves(done, goal, stopping, config)
-    trial = Trial(part, slot.trial.due, slot.trial.final, solved, action, done, goal)
+    trial = EvaluationState(part, slot.trial.due, slot.trial.final, solved, action, done, goal)
     course, leaves, deadline = stop.after_evaluation(
         slot.training.course, solved, trial.due, trial.final, slot.deadline, stopping
     )
@@ -221,15 +223,18 @@ def _collect(slot: Slot, now: _Now, config: ExpertConfig, stopping: StopRules) -
 
 
 def _key(level_id: Int[Array, ""], slot: Slot) -> Key[Array, ""]:
-    """The key of a slot's next rollout."""
+    """Derive the key of a slot's next rollout."""
     update = slot.training.course.updates
     learning = jax.random.fold_in(key_for(level_id, Stream.EXPERT), update + 1)
     evaluation = jax.random.fold_in(jax.random.fold_in(key_for(level_id, Stream.EVALUATION), update), slot.trial.part)
     return jnp.where(slot.mode == Mode.EVALUATE, evaluation, learning)
 
 
-def _manner(slot: Slot, evaluating: Bool[Array, " slot"], config: ExpertConfig) -> Manner:
-    """Evaluations: attempts, then sticky ones, then moved ones. Training: rehearsals in the last environments."""
+def _manner(slot: Slot, evaluating: Bool[Array, " slot"], config: ExpertConfig) -> ActionRule:
+    """Choose how each lane acts.
+
+    Evaluation: plain attempts first, then sticky and moved ones. Training: rehearsals in the last environments.
+    """
     number = jnp.arange(config.environments)
     sticky = (number >= config.attempts) & (number < config.attempts + config.sticky_attempts)
     succeeded = slot.training.success.length > 0
@@ -238,7 +243,7 @@ def _manner(slot: Slot, evaluating: Bool[Array, " slot"], config: ExpertConfig) 
     stickiness = STICKINESS * per_lane(evaluating, sticky) + config.persistence * per_lane(
         ~evaluating & ~succeeded, guides
     )
-    return Manner(
+    return ActionRule(
         per_lane(evaluating, number == 0),
         stickiness,
         per_lane(~evaluating & succeeded, guides),
@@ -247,7 +252,7 @@ def _manner(slot: Slot, evaluating: Bool[Array, " slot"], config: ExpertConfig) 
 
 
 def _moved_start(lanes: Level, keys: Key[Array, " slot"], config: ExpertConfig) -> Acting:
-    """The first state of each lane's level; bodies of the moved attempts start with slightly other velocities."""
+    """Reset each lane to its level's first state, with perturbed velocities in moved attempts."""
     number = jnp.arange(config.environments)
     first = config.attempts + config.sticky_attempts
     moved = jnp.tile((number >= first) & (number < first + config.moved_attempts), len(keys))

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation of one expert, on the trajectory of one rollout. Knows nothing of physics.
+"""Proximal policy optimisation of one expert, on the trajectory of one rollout; independent of physics.
 
 Schulman et al. 2017 (arXiv:1707.06347) with clipped values and per-minibatch normalised advantages.
 """
@@ -18,28 +18,28 @@ ADVANTAGE_EPSILON = 1e-8
 
 
 class TrainState(NamedTuple):
-    """What learns."""
+    """Parameters of an expert, and the state of their optimiser."""
 
     params: Params
     optimiser: optax.OptState
 
 
 class LevelConstants(NamedTuple):
-    """What is constant within a level."""
+    """Constants of a level."""
 
-    features: Constant  # of what the network sees
-    live: Bool[Array, "6"]  # entries of an action that something obeys
+    features: Constant  # constant features of the observation
+    live: Bool[Array, "6"]  # entries of an action that have an effect
 
 
 class Samples(NamedTuple):
-    """What an update learns from; targets and advantages from GAE. A minibatch is some of them."""
+    """Samples of an update, or of one of its minibatches; targets and advantages from GAE."""
 
     moving: Float[Array, "dynamic sample"]
     action: Float[Array, "6 sample"]
     log_probability: Float[Array, " sample"]
     value: Float[Array, " sample"]
     advantage: Float[Array, " sample"]
-    rehearsed: Float[Array, " sample"]  # 1 where a success was repeated, else 0
+    rehearsed: Float[Array, " sample"]  # 1 where a success was rehearsed, else 0
 
 
 def optimiser(config: ExpertConfig) -> optax.GradientTransformation:
@@ -50,7 +50,7 @@ def optimiser(config: ExpertConfig) -> optax.GradientTransformation:
 
 
 def init(key: Key[Array, ""], network: ActorCritic, constant: Constant, config: ExpertConfig) -> TrainState:
-    """An expert that has seen nothing."""
+    """Initialise an expert."""
     params = initial(key, network, constant)
     return TrainState(params, optimiser(config).init(params))
 
@@ -62,7 +62,7 @@ def advantages(
     last_value: Float[Array, "..."],
     config: ExpertConfig,
 ) -> Float[Array, "time ..."]:
-    """Generalised advantage estimates (Schulman et al. 2016, arXiv:1506.02438)."""
+    """Estimate generalised advantages (Schulman et al. 2016, arXiv:1506.02438)."""
 
     def back(carry, now):
         advantage, next_value = carry
@@ -79,7 +79,7 @@ def advantages(
 def loss(
     params: Params, network: ActorCritic, constants: LevelConstants, minibatch: Samples, config: ExpertConfig
 ) -> Float[Array, ""]:
-    """Clipped policy surrogate, clipped value error, imitation, entropy bonus; means over the minibatch."""
+    """Sum the minibatch means of clipped surrogate, clipped value error, imitation and entropy bonus."""
     logits, value = forward(network, params, constants.features, minibatch.moving)
     live = constants.live[:, None]
     log_prob = log_probability(logits, minibatch.action, live)  # type: ignore[arg-type]
@@ -103,7 +103,7 @@ def update(
     rows: Float[Array, "sample column"],
     config: ExpertConfig,
 ) -> TrainState:
-    """Several epochs of minibatches, shuffled anew each epoch. `rows` are samples as `as_rows` lays them."""
+    """Train for some epochs of minibatches, reshuffled each epoch. `rows` are samples as `as_rows` lays them out."""
     transform = optimiser(config)
 
     def learn(now, minibatch):
@@ -120,10 +120,10 @@ def update(
 
 
 def shuffled(key: Key[Array, ""], config: ExpertConfig) -> Int[Array, " sample"]:
-    """A random order of an update's samples, in which every run of `environments` has one of each environment.
+    """Shuffle an update's samples so that every run of `environments` samples has one of each environment.
 
-    The env steps are shuffled, by another shift in each environment, and so are the environments: that takes sorting
-    `horizon + environments` numbers, where sorting all of them takes a seventh of the update.
+    Env steps are permuted once, then shifted by a random offset in each environment; environments are permuted too.
+    So `horizon + environments` numbers are sorted instead of all samples, which would take a seventh of the update.
     """
     by_time, by_environment, by_shift = jax.random.split(key, 3)
     times = jnp.argsort(jax.random.bits(by_time, (config.horizon,)))
@@ -134,9 +134,9 @@ def shuffled(key: Key[Array, ""], config: ExpertConfig) -> Int[Array, " sample"]
 
 
 def as_rows(samples: Samples) -> Float[Array, "sample column"]:
-    """Everything a sample needs side by side in one row: shuffling is then one copy of rows.
+    """Pack each sample into one row, so that shuffling copies rows.
 
-    `samples` has [time, ..., environment] instead of an axis of samples, as a rollout gives them.
+    `samples` are as a rollout gives them: [time, ..., environment] instead of a sample axis.
     """
     singles = [x[:, None] for x in samples[2:]]
     columns = jnp.concatenate([samples.moving, samples.action.astype(jnp.float32), *singles], axis=1)

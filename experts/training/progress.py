@@ -1,4 +1,4 @@
-"""What training showed of one level: returns, episodes, first success. Kept on the device while an expert trains."""
+"""Training statistics of one level: returns, episodes, first success. They stay on the device during training."""
 
 from typing import NamedTuple
 
@@ -7,18 +7,18 @@ import jax.numpy as jnp
 from flax.typing import VariableDict as Params
 from jaxtyping import Array, Bool, Float, Int
 
-NEVER = -1  # it has not happened yet
+NEVER = -1  # not yet
 
 
 class Progress(NamedTuple):
     """Running totals."""
 
-    episode_return: Float[Array, " environment"]  # of the episodes under way, shaping included
-    best_return: Float[Array, ""]  # of the episodes that ended; -inf: none
-    episodes: Int[Array, ""]  # that ended
+    episode_return: Float[Array, " environment"]  # of unfinished episodes, shaping included
+    best_return: Float[Array, ""]  # of finished episodes; -inf: none
+    episodes: Int[Array, ""]  # finished
     env_steps: Int[Array, ""]
-    first_success: Int[Array, ""]  # of the expert's own; env steps taken until then; NEVER
-    diverged: Int[Array, ""]  # env steps taken until a parameter of the expert was not finite; NEVER
+    first_success: Int[Array, ""]  # env steps until the expert's own first success; NEVER
+    diverged: Int[Array, ""]  # env steps until a parameter was not finite; NEVER
 
 
 def start(environments: int) -> Progress:
@@ -36,8 +36,8 @@ def follow(
     """Add one rollout.
 
     Returns:
-        The totals, and the share of its finished episodes that reached the goal, of the environments in which the
-        expert alone chose the actions (NaN: none finished).
+        The totals, and the share of finished episodes that reached the goal in environments whose actions the expert
+        alone chose (NaN: none finished).
     """
     steps, environments = reward.shape
 
@@ -63,7 +63,7 @@ def follow(
 
 
 def watch(progress: Progress, params: Params) -> Progress:
-    """Remember when an expert's parameters were no longer finite: nothing is learnt from there on."""
+    """Record when an expert's parameters stop being finite; it learns nothing afterwards."""
     finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(params)]).all()
     now = (progress.diverged == NEVER) & ~finite
     return progress._replace(diverged=jnp.where(now, progress.env_steps, progress.diverged))

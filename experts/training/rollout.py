@@ -1,4 +1,4 @@
-"""Experts acting in their levels: `levels x environments` lanes, level by level.
+"""Rollouts of experts in their levels: `levels x environments` lanes, level by level.
 
 Lane `i * environments + j` is environment j of level i.
 """
@@ -20,41 +20,41 @@ from levelproof.levelgen.task.rules import TaskParams, TaskState
 
 
 class Acting(NamedTuple):
-    """Episodes under way."""
+    """Unfinished episodes."""
 
     world: TaskState
     last_action: Int[Array, "6 lane"]  # in this episode; 0 at its start
 
 
-class Manner(NamedTuple):
-    """How lanes choose their actions, where it is not by sampling."""
+class ActionRule(NamedTuple):
+    """How lanes choose actions, if not by sampling."""
 
-    greedy: Bool[Array, " lane"]  # the most probable one
-    stickiness: Float[Array, " lane"]  # chance of the last one again
-    rehearsing: Bool[Array, " lane"]  # what `rehearsal` has for the episode's env step
+    greedy: Bool[Array, " lane"]  # take the most probable action
+    stickiness: Float[Array, " lane"]  # probability of repeating the last action
+    rehearsing: Bool[Array, " lane"]  # take the action of `rehearsal` at the episode's env step
     rehearsal: Int[Array, "256 6 level"]
 
     @property
     def own(self) -> Bool[Array, " lane"]:
-        """Lanes in which the expert alone chooses every action."""
+        """Whether the expert alone chooses every action of the lane."""
         return ~self.rehearsing & (self.stickiness == 0)
 
 
 class Trajectory(NamedTuple):
-    """What happened, time first."""
+    """Data of a rollout, time first."""
 
-    moving: Float[Array, "time dynamic level environment"]  # the moving rows of the observation before the action
+    moving: Float[Array, "time dynamic level environment"]  # moving features of the observation before the action
     action: Int[Array, "time 6 level environment"]
     log_probability: Float[Array, "time level environment"]
     value: Float[Array, "time level environment"]
     reward: Float[Array, "time level environment"]
     done: Bool[Array, "time level environment"]
     goal: Bool[Array, "time level environment"]
-    timestep: Int[Array, "time level environment"]  # env steps of the episode before this one
+    timestep: Int[Array, "time level environment"]  # env steps of the episode before this step
 
 
 def start(lanes: Level) -> Acting:
-    """The first state of every lane's level."""
+    """Start an episode in every lane."""
     world = task.reset(lanes)
     return Acting(world, jnp.zeros((len(CHOICES), *world.timestep.shape), jnp.int32))
 
@@ -65,7 +65,7 @@ def rollout(
     levels: Level,
     acting: Acting,
     keys: Key[Array, " level"],
-    manner: Manner,
+    manner: ActionRule,
     steps: int,
     rules: TaskParams,
 ) -> tuple[Acting, Trajectory, Float[Array, "level environment"]]:
@@ -73,16 +73,16 @@ def rollout(
 
     Args:
         network: the shape of the experts' networks.
-        params: of every expert, level axis first.
-        levels: one per expert.
-        acting: episodes under way, one per lane.
-        keys: one per expert, used up.
+        params: parameters of every expert, level axis first.
+        levels: one level per expert.
+        acting: unfinished episodes, one per lane.
+        keys: one per expert; consumed.
         manner: how actions are chosen.
         steps: env steps in each lane.
-        rules: of the task.
+        rules: the task's rules.
 
     Returns:
-        The episodes afterwards, the trajectory, and the value of the last observation.
+        The unfinished episodes, the trajectory, and the value of the last observation.
     """
     level_count = keys.shape[0]
     environments = len(manner.greedy) // level_count

@@ -1,6 +1,6 @@
-"""The state of continuous batching: slots, each with an expert in training or under evaluation, and the queue.
+"""State of continuous batching: slots, each training or evaluating an expert, and the queue before them.
 
-`experts.training.advance` says how it changes.
+`experts.training.advance` advances it.
 """
 
 from enum import IntEnum
@@ -18,7 +18,7 @@ from levelproof.experts.training import ppo, progress, stop
 from levelproof.experts.training.ppo import TrainState
 from levelproof.experts.training.progress import Progress
 from levelproof.experts.training.rollout import Acting, start
-from levelproof.experts.training.stop import Course
+from levelproof.experts.training.stop import StopState
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.identity.keys import Stream, key_for
@@ -27,75 +27,98 @@ from levelproof.levelgen.task.actions import CHOICES
 
 
 class Mode(IntEnum):
+    """What a slot does in a call of `advance`.
+
+               over, or paused during an evaluation
+            .------------------------------------------.
+            |                                          v      next part
+        +-------+  a level   +-------+ due, final +----------+ of the record
+        | EMPTY |----------->| TRAIN |----------->| EVALUATE |----.
+        +-------+  enters    +-------+            +----------+ <--'
+            ^                    ^                     |  |
+            |                    `---------------------'  |
+            |           not solved, or solved and polish  |
+            `---------------------------------------------'
+                       final, or solved without polish
+
+    due: enough finished episodes of an update reached the goal (`stop.after_update`).
+    over: training has stopped for good (`labels.Cause`).
+    final: the expert is over or its budget is used up, so the level leaves after this evaluation.
+    polish: `StopConfig.polish`, training after a level is solved.
+
+    Some levels that leave before a final evaluation (`Report.early`) were solved by witnesses that few replays
+    survive: the host sets their slots back to TRAIN before the next call (`advance.train_on`).
+    """
+
     EMPTY = 0
     TRAIN = 1
     EVALUATE = 2
 
 
 class Training(NamedTuple):
-    """An expert and what its training has shown."""
+    """An expert, and the results of its training so far."""
 
     train_state: TrainState
     progress: Progress
-    course: Course
-    success: Success  # the first: the search's, else training's
-    recent: Int[Array, "time 6 environment"]  # the last actions, enough for an episode that ends in the next rollout
+    course: StopState
+    success: Success  # the first, of the search or of training
+    recent: Int[Array, "time 6 environment"]  # last actions, enough for an episode that ends in the next rollout
 
 
-class Begun(NamedTuple):
-    """All that decides how training goes on."""
+class ExpertState(NamedTuple):
+    """An expert with all that decides how its training continues."""
 
     training: Training
     acting: Acting  # [..., environment]
 
 
 class Pending(NamedTuple):
-    """What comes next for an expert, beside what its course says."""
+    """What comes next for an expert, besides its `StopState`."""
 
-    due: Bool[Array, ""] | Bool[np.ndarray, " index"] | np.bool_  # an evaluation, by what training showed
-    final: Bool[Array, ""] | Bool[np.ndarray, " index"] | np.bool_  # one after which the level leaves
-    deadline: Int[Array, ""] | Int[np.ndarray, " index"] | np.int32  # updates after which the last evaluation comes
+    due: Bool[Array, ""] | Bool[np.ndarray, " index"] | np.bool_  # an evaluation, triggered by training
+    final: Bool[Array, ""] | Bool[np.ndarray, " index"] | np.bool_  # an evaluation, after which the level leaves
+    deadline: Int[Array, ""] | Int[np.ndarray, " index"] | np.int32  # updates before the final evaluation
 
 
-class Trial(NamedTuple):
-    """An evaluation: every environment rolls out a record."""
+class EvaluationState(NamedTuple):
+    """An evaluation under way: every environment rolls out a record."""
 
-    part: Int[Array, ""]  # rollouts of it that are done
-    due: Bool[Array, ""]  # by what training showed
+    part: Int[Array, ""]  # rollouts done
+    due: Bool[Array, ""]  # training triggered it
     final: Bool[Array, ""]  # the level leaves afterwards
-    solved: Bool[Array, ""]  # it has ended, and enough attempts succeeded
+    solved: Bool[Array, ""]  # it has ended with enough successes
     action: Int[Array, "time 6 attempt"]
     done: Bool[Array, "time environment"]
     goal: Bool[Array, "time environment"]
 
 
 class Slot(NamedTuple):
-    """One slot. In `Slots` every array has the slots first."""
+    """One slot. In `Slots` every array has the slot axis first."""
 
     mode: Int[Array, ""]
     queue_index: Int[Array, ""]  # of the level in the queue
-    deadline: Int[Array, ""]  # updates after which the last evaluation comes
+    deadline: Int[Array, ""]  # updates before the final evaluation
     training: Training
-    trial: Trial
+    trial: EvaluationState
 
 
 class Slots(NamedTuple):
-    """All of them."""
+    """All slots, with the lanes of their experts."""
 
     slot: Slot
-    acting: Acting  # of training; lanes, slot by slot
-    trial: Acting  # of evaluation
-    taken: Int[Array, ""]  # levels that have left the queue, ever
+    acting: Acting  # lanes of training, slot by slot
+    trial: Acting  # lanes of evaluation, slot by slot
+    taken: Int[Array, ""]  # total number of levels that have left the queue
 
 
 class LevelQueue(NamedTuple):
-    """Levels that wait, and those in slots: each keeps its index, which is any, until it leaves its slot."""
+    """Levels that wait, and those in slots. A level keeps its index, any free one, until it leaves its slot."""
 
     levels: Level  # [..., index]
     level_ids: Int[Array, " index"] | Int[np.ndarray, " index"]
-    order: Int[Array, " number"] | Int[np.ndarray, " number"]  # indices of levels, as they came, modulo capacity
-    come: Int[Array, ""] | np.int32  # levels that have come, ever
-    begun: Begun  # where their experts go on, index first
+    order: Int[Array, " number"] | Int[np.ndarray, " number"]  # indices of levels in order of arrival, modulo capacity
+    come: Int[Array, ""] | np.int32  # total number of levels that have arrived
+    begun: ExpertState  # their experts, index first
     pending: Pending  # index first
 
     @property
@@ -104,20 +127,20 @@ class LevelQueue(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What one call of `advance` did in each slot."""
+    """Report of one call of `advance`, by slot."""
 
     queue_index: Int[Array, " slot"]  # of the level in the queue
-    mode: Int[Array, " slot"]  # while it did
-    share: Float[Array, " slot"]  # of a trained slot's finished episodes that reached the goal
-    evaluated: Bool[Array, " slot"]  # an evaluation ended that solved the level, or after which it left
+    mode: Int[Array, " slot"]  # during the call
+    share: Float[Array, " slot"]  # share of a training slot's finished episodes that reached the goal
+    evaluated: Bool[Array, " slot"]  # an evaluation ended and solved the level, or the level left
     left: Bool[Array, " slot"]
-    early: Bool[Array, " slot"]  # it left, being solved, and might have trained on
-    taken: Int[Array, ""]  # levels that have left the queue, ever
+    early: Bool[Array, " slot"]  # it left solved, before its final evaluation
+    taken: Int[Array, ""]  # total number of levels that have left the queue
 
 
 @partial(jax.jit, static_argnames="config")
-def begin(levels: Level, level_ids: Int[Array, " level"], success: Success, config: ExpertConfig) -> Begun:
-    """Experts that have seen nothing but a success, where there is one; level axis first."""
+def begin(levels: Level, level_ids: Int[Array, " level"], success: Success, config: ExpertConfig) -> ExpertState:
+    """Initialise experts, level axis first; they know nothing but the success, if there is one."""
     network, lanes = network_of(levels.size, config), config.environments
 
     def training(level_id, constant: Constant, success: Success) -> Training:
@@ -127,27 +150,27 @@ def begin(levels: Level, level_ids: Int[Array, " level"], success: Success, conf
         return Training(train_state, progress.start(lanes), stop.begin(), success, recent)
 
     experts = jax.vmap(training, in_axes=(0, -1, 0))(level_ids, network.constant(levels), success)
-    return Begun(experts, _by_slot(start(repeat(levels, lanes)), lanes))
+    return ExpertState(experts, _by_slot(start(repeat(levels, lanes)), lanes))
 
 
 @partial(jax.jit, static_argnames=("count", "config"))
 def empty_slots(count: int, queue: LevelQueue, config: ExpertConfig) -> Slots:
-    """Slots without levels."""
+    """Return slots without levels."""
     blank = lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype)
     training, acting = jax.tree.map(blank, queue.begun)
     rows, zeros, no = config.record_rollouts * config.horizon, jnp.zeros(count, jnp.int32), jnp.zeros(count, bool)
     action = jnp.zeros((count, rows, len(CHOICES), config.attempts), jnp.int8)
-    trial = Trial(zeros, no, no, no, action, *jnp.zeros((2, count, rows, config.environments), bool))
+    trial = EvaluationState(zeros, no, no, no, action, *jnp.zeros((2, count, rows, config.environments), bool))
     acting = lanes_of(acting)
     return Slots(Slot(zeros, zeros, zeros, training, trial), acting, acting, jnp.int32(0))
 
 
 def lanes_of(tree: Any) -> Any:
-    """[slot, ..., environment] -> [..., lane]."""
+    """Reshape [slot, ..., environment] to [..., lane]."""
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1]), tree)
 
 
 def _by_slot(tree: Any, environments: int) -> Any:
-    """[..., lane] -> [slot, ..., environment]."""
+    """Reshape [..., lane] to [slot, ..., environment]."""
     apart = lambda x: x.reshape(*x.shape[:-1], x.shape[-1] // environments, environments)
     return jax.tree.map(lambda x: jnp.moveaxis(apart(x), -2, 0), tree)

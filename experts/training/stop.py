@@ -1,4 +1,4 @@
-"""When a level leaves its slot: rules on what training and evaluation of that level alone have shown."""
+"""When a level leaves its slot: rules that depend on the training and evaluation of that level alone."""
 
 from typing import NamedTuple
 
@@ -10,26 +10,26 @@ from levelproof.experts.config import MAX_DOUBLINGS, RECORD_STEPS, ExpertConfig,
 from levelproof.experts.labels import Cause
 from levelproof.experts.training.progress import NEVER, Progress
 
-LAST = np.int32(2**31 - 1)  # update, that nobody reaches
+LAST = np.int32(2**31 - 1)  # an update count that no expert reaches
 
 
 class StopRules(NamedTuple):
-    """A StopConfig as data of a compiled program: one program serves all."""
+    """A StopConfig as arrays, so that one compiled program serves all."""
 
-    evaluates: np.bool_  # success of training asks for an evaluation
+    evaluates: np.bool_  # successes in training trigger an evaluation
     halves: np.bool_  # there are rungs
-    enough: np.int32  # attempts that have to succeed
-    share: np.float32  # of finished episodes that must reach the goal before an evaluation
-    wait: np.int32  # updates between an evaluation that failed and the next; doubles each time
+    enough: np.int32  # attempts that must succeed
+    share: np.float32  # share of finished episodes that must reach the goal to trigger an evaluation
+    wait: np.int32  # updates between a failed evaluation and the next; doubles each time
     polish: np.int32  # updates after the level is solved
-    steady: np.int32  # updates after it is solved by witnesses that few replays survive
-    first_rung: np.int32  # updates
-    gain: np.float32  # of the best return between rungs
-    fruitless: np.int32  # updates
+    steady: np.int32  # updates after the level is solved by fragile witnesses
+    first_rung: np.int32  # updates at the first rung
+    gain: np.float32  # minimum growth of the best return between rungs
+    fruitless: np.int32  # updates after which an expert without a success leaves
 
 
 def rules_of(stopping: StopConfig, config: ExpertConfig) -> StopRules:
-    """The rules for experts of this configuration."""
+    """Convert settings of stopping to rules, in updates."""
     return StopRules(
         evaluates=np.bool_(stopping.rule != Rule.BUDGET),
         halves=np.bool_(stopping.rule == Rule.HALVING),
@@ -44,42 +44,42 @@ def rules_of(stopping: StopConfig, config: ExpertConfig) -> StopRules:
     )
 
 
-class Course(NamedTuple):
-    """How far an expert is, and what comes next."""
+class StopState(NamedTuple):
+    """Progress of an expert through the stopping rules."""
 
     updates: Int[Array, ""]  # done
-    next_evaluation: Int[Array, ""]  # updates before which none is worth it
-    failed: Int[Array, ""]  # evaluations after which it trained on
-    solved: Bool[Array, ""]  # by an evaluation
+    next_evaluation: Int[Array, ""]  # no evaluation before this many updates
+    failed: Int[Array, ""]  # evaluations after which training continued
+    solved: Bool[Array, ""]  # an evaluation solved the level
     rung_return: Float[Array, ""]  # the best return at the last rung
-    over: Int[Array, ""]  # the Cause for which training stopped for good: more budget would change nothing
+    over: Int[Array, ""]  # Cause why training stopped for good: a larger budget would change nothing
 
 
-def begin() -> Course:
+def begin() -> StopState:
     zero = jnp.int32(0)
-    return Course(zero, zero, zero, jnp.bool_(False), jnp.float32(-jnp.inf), jnp.int8(Cause.NONE))
+    return StopState(zero, zero, zero, jnp.bool_(False), jnp.float32(-jnp.inf), jnp.int8(Cause.NONE))
 
 
 def after_update(
-    course: Course,
+    course: StopState,
     progress: Progress,
     usable: Bool[Array, ""],
     share: Float[Array, ""],
     deadline: Int[Array, ""],
     rules: StopRules,
-) -> tuple[Course, Bool[Array, ""], Bool[Array, ""]]:
-    """What one more update means.
+) -> tuple[StopState, Bool[Array, ""], Bool[Array, ""]]:
+    """Advance the stopping rules by one update.
 
     Args:
-        course: before the update.
-        progress: after it.
+        course: state before the update.
+        progress: totals after the update.
         usable: whether there is a success to rehearse.
-        share: of the update's finished episodes that reached the goal.
-        deadline: updates after which the last evaluation comes.
-        rules: when a level leaves.
+        share: share of the update's finished episodes that reached the goal.
+        deadline: updates before the final evaluation.
+        rules: the stopping rules.
 
     Returns:
-        The course, whether an evaluation is due, and whether the level leaves after one, due or not.
+        The new state, whether training triggers an evaluation, and whether a final evaluation comes now.
     """
     updates = course.updates + 1
     worth_it = (share >= rules.share) & (updates >= course.next_evaluation)
@@ -96,14 +96,14 @@ def after_update(
 
 
 def after_evaluation(
-    course: Course,
+    course: StopState,
     solved: Bool[Array, ""],
     due: Bool[Array, ""],
     final: Bool[Array, ""],
     deadline: Int[Array, ""],
     rules: StopRules,
-) -> tuple[Course, Bool[Array, ""], Int[Array, ""]]:
-    """The course, whether the level leaves, and its deadline."""
+) -> tuple[StopState, Bool[Array, ""], Int[Array, ""]]:
+    """Return the state after an evaluation, whether the level leaves, and its deadline."""
     polished = solved & (rules.polish > 0)
     leaves = final | (solved & ~polished)
     deadline = jnp.where(polished & ~final, jnp.minimum(deadline, course.updates + rules.polish), deadline)
@@ -112,19 +112,19 @@ def after_evaluation(
         failed=course.failed + ~solved,
         solved=course.solved | solved,
     )
-    # one that only the deadline asked for leaves no trace: an expert that goes on later goes on as if it had not been
-    course = Course(*(jnp.where(due, new, old) for old, new in zip(course, tried, strict=True)))
+    # an evaluation that only the deadline triggered leaves no trace, so that a larger budget continues without it
+    course = StopState(*(jnp.where(due, new, old) for old, new in zip(course, tried, strict=True)))
     return course, leaves, deadline
 
 
-def steady_on(course: Course, deadline: Int[Array, "..."], rules: StopRules) -> tuple[Course, Int[Array, "..."]]:
-    """The course and the deadline of a level that would leave, being solved, but trains on for a steadier witness."""
+def steady_on(course: StopState, deadline: Int[Array, "..."], rules: StopRules) -> tuple[StopState, Int[Array, "..."]]:
+    """Return state and deadline of a solved level that trains on for a more robust witness."""
     course = course._replace(next_evaluation=course.updates + _wait(course, rules), failed=course.failed + 1)
     return course, jnp.minimum(deadline, course.updates + rules.steady)
 
 
-def _wait(course: Course, rules: StopRules) -> Int[Array, "..."]:
-    """Updates before another evaluation is worth it."""
+def _wait(course: StopState, rules: StopRules) -> Int[Array, "..."]:
+    """Return the number of updates before the next evaluation."""
     return rules.wait << jnp.minimum(course.failed, MAX_DOUBLINGS)
 
 
@@ -134,7 +134,7 @@ def solves(
     rules: StopRules,
     config: ExpertConfig,
 ) -> Bool[Array, "..."]:
-    """Whether enough attempts succeed: every episode that ended, ended in the goal."""
+    """Return whether enough attempts succeed: every finished episode reached the goal."""
     done, goal = (x[..., :RECORD_STEPS, : config.attempts] for x in (done, goal))
     succeed = done.any(-2) & (goal | ~done).all(-2)
     return succeed.sum(-1) >= rules.enough
@@ -147,13 +147,13 @@ def fails(
     rules: StopRules,
     config: ExpertConfig,
 ) -> Bool[Array, ""]:
-    """Whether an evaluation can no longer solve its level, after so many steps: too many attempts have failed."""
+    """Return whether, after `steps` env steps, too many attempts have failed for the evaluation to solve its level."""
     done, goal = (x[:RECORD_STEPS, : config.attempts] for x in (done, goal))
     failed = (done & ~goal & (jnp.arange(len(done)) < steps)[:, None]).any(0)
     return config.attempts - failed.sum() < rules.enough
 
 
 def is_rung(updates: Int[Array, ""], first: int | np.int32) -> Bool[Array, ""]:
-    """Whether it is `first` times a power of two."""
+    """Return whether `updates` is `first` times a power of two."""
     times = updates // first
     return (updates % first == 0) & (times > 0) & ((times & (times - 1)) == 0)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig
 from levelproof.experts.policy import Params, network_of
-from levelproof.experts.training.rollout import Acting, Manner, rollout, start
+from levelproof.experts.training.rollout import Acting, ActionRule, rollout, start
 from levelproof.experts.verdict.portability import IN_CACHE
 from levelproof.levelgen.batching import at_once, blocks, repeat, take
 from levelproof.levelgen.identity.keys import Stream, key_for
@@ -25,7 +25,7 @@ from levelproof.levelgen.task.rules import TaskParams
 PART = 16  # env steps between checks whether all attempts have ended
 
 
-class Attempted(NamedTuple):
+class AttemptResults(NamedTuple):
     """First episodes under sampled actions."""
 
     success_rate: Float[np.ndarray, " level"]  # share of attempts
@@ -46,7 +46,7 @@ def attempt(
     policies: Sequence[Params],
     config: ExpertConfig,
     rules: TaskParams,
-) -> Attempted:
+) -> AttemptResults:
     """Have each level's policy make `expert.attempts` attempts, of at most a record's length.
 
     Args:
@@ -56,21 +56,21 @@ def attempt(
         config: of the experts.
         rules: of the task.
     """
-    parts = [Attempted(np.zeros(0, np.float32), np.zeros(0, np.int32))]
+    parts = [AttemptResults(np.zeros(0, np.float32), np.zeros(0, np.int32))]
     for some in blocks(len(level_ids), at_once(config.attempts, IN_CACHE)):
         params = jax.tree.map(lambda *xs: np.stack(xs), *(policies[i] for i in some))
         parts.append(jax.device_get(_attempt(take(levels, some), level_ids[some], params, config, rules)))
-    return Attempted(*(np.concatenate(of)[: len(level_ids)] for of in zip(*parts, strict=True)))
+    return AttemptResults(*(np.concatenate(of)[: len(level_ids)] for of in zip(*parts, strict=True)))
 
 
 @partial(jax.jit, static_argnames=("config", "rules"))
 def _attempt(
     levels: Level, level_ids: Int[Array, " level"], params: Params, config: ExpertConfig, rules: TaskParams
-) -> Attempted:
+) -> AttemptResults:
     network, shape = network_of(levels.size, config), (len(level_ids), config.attempts)
     no = jnp.zeros(shape, bool)
     never, nothing = jnp.zeros(no.size), jnp.zeros((1, len(CHOICES), len(level_ids)), jnp.int8)
-    manner = Manner(no.reshape(-1), never, no.reshape(-1), nothing)
+    manner = ActionRule(no.reshape(-1), never, no.reshape(-1), nothing)
     keys = jax.vmap(lambda level_id: key_for(level_id, Stream.SUCCESS_RATE))(level_ids)
 
     def act(now: _Attempting) -> _Attempting:
@@ -85,4 +85,4 @@ def _attempt(
     going = lambda now: (now.part < RECORD_STEPS // PART) & ~now.ended.all()
     begun = _Attempting(start(repeat(levels, config.attempts)), jnp.int32(0), no, no, jnp.zeros(shape[0], jnp.int32))
     after = jax.lax.while_loop(going, act, begun)
-    return Attempted(after.reached.mean(1), after.env_steps)  # pyright: ignore[reportArgumentType]
+    return AttemptResults(after.reached.mean(1), after.env_steps)  # pyright: ignore[reportArgumentType]

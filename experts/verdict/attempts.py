@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from levelproof.experts.config import ExpertConfig
 from levelproof.experts.policy import network_of
-from levelproof.experts.training.rollout import Manner, rollout, start
+from levelproof.experts.training.rollout import ActionRule, rollout, start
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.actions import CHOICES
@@ -42,7 +42,7 @@ def attempts(
     """
     network, lanes = network_of(level.size, config), repeat(level, count)
     no, never = jnp.zeros(count, bool), jnp.zeros(count)
-    manner = Manner(no, never, no, jnp.zeros((1, len(CHOICES), 1), jnp.int8))
+    manner = ActionRule(no, never, no, jnp.zeros((1, len(CHOICES), 1), jnp.int8))
     params = jax.tree.map(lambda x: x[None], params)
 
     def act(carry, key):

@@ -15,14 +15,14 @@ from levelproof.levelgen.proofs import Facts, Proof, examine
 from levelproof.levelgen.task.rules import TaskParams
 
 
-class Before(NamedTuple):
+class PriorVerdicts(NamedTuple):
     """What is known before training."""
 
     verdicts: list[Verdict | None]  # None: an expert has to try
     failed_by_noop: Bool[np.ndarray, " level"]
 
 
-def decide(levels: Level, rules: TaskParams) -> Before:
+def decide(levels: Level, rules: TaskParams) -> PriorVerdicts:
     """Verdicts on levels that need no expert. Every lane on its own, in blocks of one compiled program."""
     count = levels.role.shape[-1]
     facts = facts_of(levels, rules)
@@ -36,7 +36,7 @@ def decide(levels: Level, rules: TaskParams) -> Before:
     for i in np.flatnonzero(facts.proof != Proof.NONE):
         fails = bool(facts.fails[i])
         verdicts[i] = untrained(Label.UNSOLVABLE, unsolvable_reason(Proof(int(facts.proof[i])), fails), fails)
-    return Before(verdicts, np.asarray(facts.fails))
+    return PriorVerdicts(verdicts, np.asarray(facts.fails))
 
 
 def facts_of(levels: Level, rules: TaskParams) -> Facts:

@@ -20,7 +20,7 @@ from levelproof.experts.labels import (
 )
 from levelproof.experts.policy import Params
 from levelproof.experts.training.progress import NEVER, Progress
-from levelproof.experts.training.slots import Begun
+from levelproof.experts.training.slots import ExpertState
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import Record, steps_to_goal, succeeds
 
@@ -38,11 +38,11 @@ class Evaluation(NamedTuple):
     over: int | Int[np.ndarray, ""] | Int[Array, ""]  # the Cause for which training stopped for good
 
 
-class Kept(NamedTuple):
+class KeptExpert(NamedTuple):
     """An expert that can go on later."""
 
-    begun: Begun
-    curve: list[float]  # so far, as in `Trained`
+    begun: ExpertState
+    curve: list[float]  # so far, as in `TrainedLevel`
 
 
 class Witness(NamedTuple):
@@ -54,19 +54,19 @@ class Witness(NamedTuple):
     portability: float | None = None  # as in `Verdict`; None: not known
 
 
-class Trained(NamedTuple):
+class TrainedLevel(NamedTuple):
     """A level that has left its slot."""
 
     curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
     evaluations: list[Evaluation]  # those that solved it, and the last
-    expert: Kept | None = None  # if it is kept
+    expert: KeptExpert | None = None  # if it is kept
     candidates: Sequence[Witness] = ()  # for its witness, the shortest first; some have been replayed
     evaluation_steps: int = 0  # env steps
     policy: Params | None = None  # of the expert that left; None: there was none
 
 
 def judge(
-    trained: Sequence[Trained],
+    trained: Sequence[TrainedLevel],
     chosen: Sequence[Witness | None],
     record: Record,
     config: ExpertConfig,
@@ -137,7 +137,7 @@ def repeated(action: Int[np.ndarray, "time 6"], steps: int) -> Int[np.ndarray, "
 
 
 def verdict_of(
-    trained: Trained,
+    trained: TrainedLevel,
     witness: Witness | None,
     episodes: int,
     config: ExpertConfig,

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.config import Rule
 from levelproof.experts.labels import BY_EXPERT
-from levelproof.experts.training.slots import Begun, begin
-from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.training.slots import ExpertState, begin
+from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.identity.keys import level_id_array
 from levelproof.levelgen.level import size_of
@@ -36,7 +36,7 @@ class SourceUnseen(Failure):
     """A worker does not find the split that `continue_from` names."""
 
 
-def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
+def save_experts(path: Path, experts: Mapping[int, KeptExpert]) -> None:
     """Write experts, by level id, durably.
 
     Raises:
@@ -53,7 +53,7 @@ def save_experts(path: Path, experts: Mapping[int, Kept]) -> None:
     flush(path)
 
 
-def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
+def load_experts(path: Path, job: JobConfig) -> dict[int, KeptExpert]:
     """Load all experts of a checkpoint, by level id.
 
     Raises:
@@ -80,7 +80,7 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, Kept]:
     return {i: kept(expert, curve) for i, expert, curve in zip(level_ids.tolist(), begun, curves, strict=True)}
 
 
-def stacked_curves(experts: Sequence[Kept]) -> Float[np.ndarray, "expert update"]:
+def stacked_curves(experts: Sequence[KeptExpert]) -> Float[np.ndarray, "expert update"]:
     """Stack the experts' learning curves, padded with NaN."""
     curves = np.full((len(experts), max(len(expert.curve) for expert in experts)), np.nan, np.float32)
     for row, expert in zip(curves, experts, strict=True):
@@ -88,9 +88,9 @@ def stacked_curves(experts: Sequence[Kept]) -> Float[np.ndarray, "expert update"
     return curves
 
 
-def kept(begun: Begun, curve: Float[np.ndarray, " update"]) -> Kept:
+def kept(begun: ExpertState, curve: Float[np.ndarray, " update"]) -> KeptExpert:
     """Return an expert with its learning curve, without the padding of `stacked_curves`."""
-    return Kept(begun, curve[: int(begun.training.course.updates)].tolist())
+    return KeptExpert(begun, curve[: int(begun.training.course.updates)].tolist())
 
 
 def unstacked(arrays: Mapping[str, np.ndarray], path: str, like: T, count: int) -> list[T]:
@@ -106,7 +106,7 @@ def unstacked(arrays: Mapping[str, np.ndarray], path: str, like: T, count: int) 
 
 
 @lru_cache(maxsize=8)
-def begun_like(job: JobConfig) -> Begun:
+def begun_like(job: JobConfig) -> ExpertState:
     """Return zeros with the shapes and types of an expert of this job."""
     level = empty_level(size_of(job.size), 1)
     like = jax.eval_shape(lambda level: begin(level, np.zeros(1, np.int32), no_success(1), job.expert), level)
@@ -121,7 +121,7 @@ def require_plain(file: Path | IO[bytes], size: int) -> None:
         raise ValueError("it is compressed, which experts never are")
 
 
-def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
+def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, KeptExpert]:
     """Load the experts of the split `job.continue_from` that can continue on these levels; all others start new.
 
     An expert that solved its level starts new, because it ends the same with any larger budget; not so if experts use
@@ -141,7 +141,7 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, Kept]:
         witness, path = rows.get(level_id, ("", None))
         if path and (witness not in BY_EXPERT or job.stop.rule == Rule.BUDGET):
             paths.setdefault(path, set()).add(level_id)
-    found: dict[int, Kept] = {}
+    found: dict[int, KeptExpert] = {}
     for path, ids in paths.items():
         experts = load_experts(data_path(source, path), job)
         found |= {i: experts[i] for i in ids if not experts[i].begun.training.course.solved}

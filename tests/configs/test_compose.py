@@ -57,7 +57,7 @@ def test_out_may_be_any_path(text: str) -> None:
         ("levels=1.5", "not a whole number"),
         ("budget=0", "budget is '0'"),
         ("budget=1000", "one update of an expert takes 2048 env steps"),
-        ("budget=3B", "budget is 3000000000: an expert can count no more than 2147483647 env steps"),
+        ("budget=3B", "budget is 3000000000: the maximum is 2147483647 env steps"),
         ("budget=", "budget is ''"),
         ("budgt=1k", r"no setting budgt \(did you mean budget\?\)"),
         ("expert.lerning_rate=1", r"no setting expert.lerning_rate \(did you mean expert.learning_rate\?\)"),

@@ -9,7 +9,7 @@ from jaxtyping import Array, Int
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import Source
 from levelproof.experts.pool import run
-from levelproof.experts.pool.found import Looking
+from levelproof.experts.pool.found import LevelSearch
 from levelproof.experts.search.search import Searching
 from levelproof.experts.witness.success import Success, ending_at
 from levelproof.levelgen.batching import repeat
@@ -31,13 +31,13 @@ def random_successes(levels: Level, level_ids: Int[np.ndarray, " level"]) -> Suc
 def searched_randomly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make random play stand in for the search of a `TrainingRun` whose procedure has none."""
 
-    def found(levels: Level, level_ids: Int[np.ndarray, " level"], searching: Searching) -> Looking:
-        looking = Looking(levels, level_ids, searching)
+    def found(levels: Level, level_ids: Int[np.ndarray, " level"], searching: Searching) -> LevelSearch:
+        looking = LevelSearch(levels, level_ids, searching)
         source = [Source.SCOUT] * len(level_ids)
         looking.found = looking.found._replace(success=random_successes(levels, level_ids), source=source)
         return looking
 
-    monkeypatch.setattr(run, "Looking", found)
+    monkeypatch.setattr(run, "LevelSearch", found)
 
 
 @jax.jit

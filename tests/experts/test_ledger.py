@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelproof.experts.ledger import Lap, Ledger, Steps, lap
+from levelproof.experts.ledger import Lap, Ledger, StepCosts, lap
 
 
 def test_what_is_compiled_is_apart_from_what_is_done() -> None:
@@ -45,12 +45,12 @@ def test_seconds_are_parted_between_levels() -> None:
 
 @pytest.mark.parametrize("update", [0.0, 0.3])  # a GPU's slots cost the same, whatever they do
 def test_an_update_is_told_from_playing(update: float) -> None:
-    rng, steps, slots = np.random.default_rng(0), Steps(), 4
+    rng, steps, slots = np.random.default_rng(0), StepCosts(), 4
     for _ in range(200):
         training = int(rng.integers(0, slots + 1))
         seconds = 0.4 + training * update + rng.normal(0, 0.005)
-        train, play = steps.part(seconds, training, slots)
+        train, play = steps.split(seconds, training, slots)
         assert training * train + (slots - training) * play == pytest.approx(seconds)
-    train, play = steps.part(0.4 + 2 * update, 2, slots)
+    train, play = steps.split(0.4 + 2 * update, 2, slots)
     assert train - play == pytest.approx(update, abs=0.01)
-    assert steps.part(1.0, 0, slots)[1] == pytest.approx(0.25)
+    assert steps.split(1.0, 0, slots)[1] == pytest.approx(0.25)

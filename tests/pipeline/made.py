@@ -20,7 +20,7 @@ from levelproof.experts.labels import WITNESSED, Label, Source, Verdict
 from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.steps import EnvSteps
 from levelproof.experts.verdict.before import decide
-from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.experts.witness.witness import Record, replay, steps_to_goal, succeeds
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import ACTIONS, SIZES, Level
@@ -172,7 +172,7 @@ def honest_split(folder: Path, unit: int, units: int, *, experts: bool = False) 
             for i in lanes
         ]
         weights: Any = {"weights": np.arange(4.0)}
-        kept = {int(i): Kept(weights, [0.5]) for i in lanes if experts}
+        kept = {int(i): KeptExpert(weights, [0.5]) for i in lanes if experts}
         result = UnitResult(lanes, take(levels, lanes), take(record, lanes), told, SPENT, kept)
         commit(job, path, WorkUnit(tuple(lanes.tolist())), result)
     return path

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from levelproof.experts.config import Network
-from levelproof.experts.verdict.judge import Trained
+from levelproof.experts.verdict.judge import TrainedLevel
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
@@ -17,7 +17,7 @@ from tests.experts.training.test_slots import SOLVED, UPDATES, same, train
 IDS = np.array([0, 2, 6, 7])
 
 
-def trained(network: Network, at: list[int]) -> list[Trained]:
+def trained(network: Network, at: list[int]) -> list[TrainedLevel]:
     levels = jax.tree.map(np.asarray, sample_levels(IDS, SIZES["s"]))
     config = replace(CONFIG, network=network, encoding=16)
     return train(take(levels, np.array(at)), IDS[at], UPDATES, config, SOLVED)[0]

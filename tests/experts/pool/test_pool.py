@@ -11,7 +11,7 @@ from levelproof.experts.pool.paused import Paused
 from levelproof.experts.pool.pool import Pool, Submission, capacity_of
 from levelproof.experts.pool.queue import GROUP, empty_queue, enter
 from levelproof.experts.training.slots import Pending, begin
-from levelproof.experts.verdict.judge import Kept, Trained, Witness
+from levelproof.experts.verdict.judge import KeptExpert, TrainedLevel, Witness
 from levelproof.experts.verdict.portability import PORTABLE, choose
 from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.batching import take
@@ -31,7 +31,7 @@ def levels() -> Level:
 
 
 @pytest.fixture(scope="module")
-def alone(levels: Level) -> list[Trained]:
+def alone(levels: Level) -> list[TrainedLevel]:
     pool = new_pool()
     (submission,) = finished(pool, pool.submit(levels, IDS))
     return submission.trained(CONFIG)
@@ -53,7 +53,7 @@ def finished(pool: Pool, *submissions: Submission) -> list[Submission]:
     return done
 
 
-def test_each_gets_what_it_would_get_alone(levels: Level, alone: list[Trained]) -> None:
+def test_each_gets_what_it_would_get_alone(levels: Level, alone: list[TrainedLevel]) -> None:
     """More levels come than the queue has room for, so its entries are used again."""
     assert capacity_of(CONFIG) < len(IDS)
     pool, parts = new_pool(), [range(20), range(20, 23), range(23, 36), range(0)]
@@ -79,7 +79,7 @@ def test_levels_that_come_later_take_the_slots_that_are_empty(levels: Level) -> 
     assert first.idle_rollouts == 1  # of the first rollout alone
 
 
-def test_levels_that_wait_are_taken_out_and_change_no_other(levels: Level, alone: list[Trained]) -> None:
+def test_levels_that_wait_are_taken_out_and_change_no_other(levels: Level, alone: list[TrainedLevel]) -> None:
     """From the queue, and from before it; another pool gives them what they would have got here."""
     pool, other = new_pool(), new_pool()
     first, second = pool.submit(*part(levels, range(30))), pool.submit(*part(levels, range(30, 36)))
@@ -98,7 +98,7 @@ def test_levels_that_wait_are_taken_out_and_change_no_other(levels: Level, alone
     same([trained[i] for i in range(36)], alone)
 
 
-def test_an_expert_that_is_paused_at_any_moment_goes_on_to_the_same(levels: Level, alone: list[Trained]) -> None:
+def test_an_expert_that_is_paused_at_any_moment_goes_on_to_the_same(levels: Level, alone: list[TrainedLevel]) -> None:
     """In a slot of another pool, from a training step or an evaluation, and from the middle of one."""
     pool, evaluated = new_pool(), 0
     submission = pool.submit(*part(levels, range(4)))
@@ -132,12 +132,12 @@ def steadied(updates: int) -> Pool:
     return Pool(10 * CONFIG.steps_per_update, untouched(stopping), DEFAULT_RULES)
 
 
-def trained_by(pool: Pool, levels: Level) -> list[Trained]:
+def trained_by(pool: Pool, levels: Level) -> list[TrainedLevel]:
     (submission,) = finished(pool, pool.submit(levels, IDS))
     return submission.trained(CONFIG)
 
 
-def chosen(levels: Level, i: int, trained: Trained) -> Witness:
+def chosen(levels: Level, i: int, trained: TrainedLevel) -> Witness:
     """A level's witness."""
     level, candidates = take(levels, np.array([i])), [trained.candidates]
     (witness,) = choose(level, IDS[[i]], candidates, CONFIG.replays, DEFAULT_RULES)
@@ -249,7 +249,9 @@ def test_a_level_that_stays_long_keeps_no_slot_empty(levels: Level) -> None:
     experts = jax.tree.map(lambda *xs: np.concatenate(xs), *begun)
     soon, no = np.int32(1), np.bool_(False)  # they leave after an update
     paused = {
-        i: Paused(Kept(jax.tree.map(lambda x, i=i: x[i], experts), []), Pending(no, no, soon), 0, [], nothing_found(1))
+        i: Paused(
+            KeptExpert(jax.tree.map(lambda x, i=i: x[i], experts), []), Pending(no, no, soon), 0, [], nothing_found(1)
+        )
         for i in range(1, len(IDS))
     }
     submission = pool.submit(levels, IDS, paused=paused)

@@ -127,7 +127,7 @@ def test_levels_that_all_need_no_expert() -> None:
     ("budget", "stopping", "words"),
     [
         (511, StopConfig(), "budget is 511: one update of an expert takes 512 env steps"),
-        (2**31, StopConfig(), "budget is 2147483648: an expert can count no more than 2147483647 env steps"),
+        (2**31, StopConfig(), "budget is 2147483648: the maximum is 2147483647 env steps"),
         (2**31 - 1, StopConfig(wait=2**35), "stop.wait is 34359738368: with a budget of 2147483647"),
         (1024, StopConfig(polish=2**41), "stop.polish is"),
         (1024, StopConfig(first_rung=2**41), "stop.first_rung is"),
@@ -147,7 +147,7 @@ def test_the_largest_budget_is_accepted() -> None:
     [
         ({"width": 0}, "width is 0"),
         ({"minibatches": 3}, "must divide"),
-        ({"attempts": 64}, "are 80 together"),
+        ({"attempts": 64}, "add up to 80"),
         ({"rehearsals": 32}, "rehearsals is 32: it must be below environments = 32"),
         ({"persistence": 1.5}, "persistence is 1.5: it must be between 0 and 1"),
         ({"clip": 2.0}, "clip is 2.0"),

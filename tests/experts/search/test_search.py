@@ -18,7 +18,7 @@ from levelproof.experts.search.near import FAR
 from levelproof.experts.search.play import arena, fresh_walk, play
 from levelproof.experts.search.search import AHEAD, Searching, side_by_side
 from levelproof.experts.search.shorten import shorten
-from levelproof.experts.search.stage import Searched
+from levelproof.experts.search.stage import SearchResult
 from levelproof.experts.steps import EnvSteps
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import replay
@@ -37,7 +37,7 @@ IDS = np.arange(700, 700 + len(KINDS), dtype=np.int32)
 SOLVABLE = np.flatnonzero(KINDS != BROKEN)
 
 
-def search(levels: Level, level_ids: np.ndarray, config: SearchConfig, rules: TaskParams) -> Searched:
+def search(levels: Level, level_ids: np.ndarray, config: SearchConfig, rules: TaskParams) -> SearchResult:
     """Every level until it has a success or has had its env steps."""
     searching = Searching(config, rules)
     sought = searching.submit(levels, level_ids)
@@ -52,11 +52,11 @@ def levels() -> Level:
 
 
 @cache
-def found() -> Searched:
+def found() -> SearchResult:
     return search(levels(), IDS, CONFIG, DEFAULT_RULES)
 
 
-def same(one: Searched, other: Searched) -> None:
+def same(one: SearchResult, other: SearchResult) -> None:
     jax.tree.map(np.testing.assert_array_equal, one, other)
 
 

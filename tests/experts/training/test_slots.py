@@ -18,7 +18,7 @@ from levelproof.experts.training.advance import advance
 from levelproof.experts.training.progress import NEVER
 from levelproof.experts.training.slots import LevelQueue, Mode, empty_slots
 from levelproof.experts.training.stop import rules_of
-from levelproof.experts.verdict.judge import Trained
+from levelproof.experts.verdict.judge import TrainedLevel
 from levelproof.experts.witness.success import Success, no_success
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES, Level
@@ -34,7 +34,7 @@ UPDATES = 24  # 12,288 env steps
 
 def train(
     levels: Level, level_ids: np.ndarray, updates: int, config: ExpertConfig, stopping: StopConfig, **how: Any
-) -> tuple[list[Trained], Submission]:
+) -> tuple[list[TrainedLevel], Submission]:
     pool = Pool(updates * config.steps_per_update, untouched(stopping, config), DEFAULT_RULES)
     submission = pool.submit(levels, level_ids, **how)
     while not pool.step():
@@ -54,12 +54,12 @@ def levels() -> Level:
 
 
 @pytest.fixture(scope="module")
-def solved(levels: Level) -> list[Trained]:
+def solved(levels: Level) -> list[TrainedLevel]:
     return train(levels, IDS, UPDATES, CONFIG, SOLVED)[0]
 
 
 @pytest.fixture(scope="module")
-def whole(levels: Level) -> list[Trained]:
+def whole(levels: Level) -> list[TrainedLevel]:
     return train(levels, IDS, UPDATES, CONFIG, WHOLE, keep=True)[0]
 
 
@@ -67,7 +67,7 @@ def same(a, b) -> None:
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-def test_levels_leave_when_they_are_solved(solved: list[Trained], whole: list[Trained]) -> None:
+def test_levels_leave_when_they_are_solved(solved: list[TrainedLevel], whole: list[TrainedLevel]) -> None:
     steps = [len(of.curve) for of in solved]
     assert min(steps) < UPDATES, "one of these levels should be solved early"
     assert max(steps) == UPDATES, "one of these levels should not be solved"
@@ -76,14 +76,14 @@ def test_levels_leave_when_they_are_solved(solved: list[Trained], whole: list[Tr
         assert int(of.evaluations[-1].progress.env_steps) == len(of.curve) * CONFIG.steps_per_update
 
 
-def test_an_evaluation_leaves_no_trace_in_training(solved: list[Trained], whole: list[Trained]) -> None:
+def test_an_evaluation_leaves_no_trace_in_training(solved: list[TrainedLevel], whole: list[TrainedLevel]) -> None:
     for early, late in zip(solved, whole, strict=True):
         np.testing.assert_array_equal(early.curve, late.curve[: len(early.curve)])
 
 
 @pytest.mark.parametrize("at", [[5, 1, 3], [6], [2, 6, 5, 4, 0]])
 def test_a_result_depends_neither_on_slot_nor_on_neighbours(
-    levels: Level, solved: list[Trained], at: list[int]
+    levels: Level, solved: list[TrainedLevel], at: list[int]
 ) -> None:
     some, _ = train(take(levels, np.array(at)), IDS[at], UPDATES, CONFIG, SOLVED)
     for i, of in zip(at, some, strict=True):
@@ -121,7 +121,7 @@ def test_nothing_is_compiled_again(levels: Level) -> None:
     assert advance._cache_size() == before
 
 
-def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) -> None:
+def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[TrainedLevel]) -> None:
     halved, submission = train(levels, IDS, UPDATES, CONFIG, HALVED)
     never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
     assert never
@@ -133,7 +133,7 @@ def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[Trained]) ->
     assert all("at a rung the best return had not grown" in reasons[i] for i in never)
 
 
-def test_a_fruitless_expert_says_why_it_left(levels: Level, whole: list[Trained]) -> None:
+def test_a_fruitless_expert_says_why_it_left(levels: Level, whole: list[TrainedLevel]) -> None:
     never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
     stopping = replace(HALVED, first_rung=UPDATES * 512, fruitless=5 * 512)
     verdicts = label(levels, IDS, UPDATES * 512, untouched(stopping)).verdicts
@@ -161,7 +161,7 @@ def test_a_success_of_training_is_a_witness_where_evaluation_has_none(levels: Le
 
 
 @pytest.mark.campaign
-def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[Trained]) -> None:
+def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[TrainedLevel]) -> None:
     polished, _ = train(levels, IDS, UPDATES, CONFIG, replace(SOLVED, polish=4 * 512))
     early = [i for i, of in enumerate(solved) if len(of.curve) < UPDATES - 4]
     assert early
@@ -187,7 +187,7 @@ def test_going_on_equals_having_trained_through(levels: Level, stopping: StopCon
         same(of, through[i])
 
 
-def test_a_success_before_training_is_rehearsed_from_the_first_update(levels: Level, whole: list[Trained]) -> None:
+def test_a_success_before_training_is_rehearsed_from_the_first_update(levels: Level, whole: list[TrainedLevel]) -> None:
     """It ends at its goal, so the first of its episodes does; and those lanes do not count as the expert's own."""
     found = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))
     trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=found)
@@ -208,7 +208,7 @@ def test_a_success_of_a_lane_that_repeats_its_actions_is_not_the_experts_own() -
     assert all(np.isnan(share) or share == 0 for share in forced)
 
 
-def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level, whole: list[Trained]) -> None:
+def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level, whole: list[TrainedLevel]) -> None:
     begun = {}
     for i, weight in enumerate((np.inf, np.nan)):
         kept = whole[i].expert

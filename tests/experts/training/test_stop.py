@@ -156,6 +156,6 @@ def test_what_follows_the_record_decides_nothing() -> None:
 
 def test_more_successes_than_attempts_are_refused() -> None:
     for rule in (Rule.SOLVED, Rule.HALVING):
-        with pytest.raises(ValueError, match=r"stop.successes is 9: with expert.attempts=8 give at most 8"):
+        with pytest.raises(ValueError, match=r"stop.successes is 9, more than expert.attempts=8: lower it"):
             check_budget(10_000, CONFIG, StopConfig(rule=rule, successes=9))
     check_budget(10_000, CONFIG, StopConfig(rule=Rule.BUDGET, successes=9))

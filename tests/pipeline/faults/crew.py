@@ -18,7 +18,7 @@ from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.steps import EnvSteps
-from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.pipeline.jobs.progress import Board
 from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, Summary, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.unit import commit, failure
@@ -37,7 +37,7 @@ def result_of(level_ids: tuple[int, ...], experts: bool) -> UnitResult:
     verdicts = [made_verdict(Label.UNSOLVED if i % 3 == 1 else Label.SOLVED) for i in level_ids]
     level, record = made_level("s", number, seed), made_record("s", number, seed)
     weights: Any = {"weights": np.arange(seed, seed + 4.0)}
-    kept = {i: Kept(weights, [0.5]) for i in level_ids if experts}
+    kept = {i: KeptExpert(weights, [0.5]) for i in level_ids if experts}
     return UnitResult(np.array(level_ids), level, record, verdicts, EnvSteps(), kept)
 
 

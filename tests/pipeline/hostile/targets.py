@@ -31,7 +31,7 @@ from levelproof.configs.numbers import parse_count
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.experts.training.slots import begin
-from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.files.level_file import (
     LevelFile,
@@ -344,7 +344,7 @@ def checkpoints(folder: Path) -> Target:
     levels = sample_levels(ids, size_of("s"), job.distribution)
     shapes = jax.eval_shape(lambda: begin(levels, ids, no_success(len(ids)), job.expert))
     begun = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
-    save_experts(good, {i: Kept(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(2)})
+    save_experts(good, {i: KeptExpert(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(2)})
     data = good.read_bytes()
     with np.load(good) as file:
         arrays = {name: file[name] for name in file.files}

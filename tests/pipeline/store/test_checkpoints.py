@@ -11,7 +11,7 @@ import pytest
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Cause, Label, Source
 from levelproof.experts.training.slots import begin
-from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
@@ -26,7 +26,7 @@ FILE = "experts/000000000000-000000000001-00000000.npz"
 SETTINGS = ("expert.width=8", "expert.environments=24", "expert.attempts=8")
 
 
-def some_experts(job: JobConfig) -> list[Kept]:
+def some_experts(job: JobConfig) -> list[KeptExpert]:
     """Make experts with random bits."""
     ids = np.arange(UNITS, dtype=np.int32)
     levels = sample_levels(ids, SIZES["s"], job.distribution)
@@ -34,7 +34,7 @@ def some_experts(job: JobConfig) -> list[Kept]:
     shapes = jax.eval_shape(lambda: begin(levels, ids, no_success(len(ids)), job.expert))
     random = lambda x: np.frombuffer(rng.bytes(x.size * x.dtype.itemsize), x.dtype).reshape(x.shape)
     begun = jax.tree.map(lambda x: rng.random(x.shape) < 0.5 if x.dtype == bool else random(x), shapes)
-    return [Kept(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(UNITS)]
+    return [KeptExpert(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(UNITS)]
 
 
 def test_load_experts_restores_each_units_experts_bit_for_bit(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from levelproof.experts.training.slots import begin as begin_experts
-from levelproof.experts.verdict.judge import Kept
+from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
@@ -51,12 +51,12 @@ def tiny(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
-def kept_experts() -> dict[int, Kept]:
+def kept_experts() -> dict[int, KeptExpert]:
     job = made_job("data", "expert.width=8", "expert.environments=24", "expert.attempts=8")
     ids = np.arange(1, dtype=np.int32)
     levels = sample_levels(ids, SIZES["s"], job.distribution)
     begun = jax.eval_shape(lambda: begin_experts(levels, ids, no_success(len(ids)), job.expert))
-    return {0: Kept(jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), begun), [0.0])}
+    return {0: KeptExpert(jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), begun), [0.0])}
 
 
 @pytest.mark.parametrize(("code", "words"), [(errno.ENOSPC, "the disk is full: free"), (errno.EIO, "the disk fails")])

@@ -15,7 +15,7 @@ from levelproof.experts.labels import Source
 from levelproof.experts.pool.found import nothing_found
 from levelproof.experts.pool.paused import Paused
 from levelproof.experts.training.slots import Pending
-from levelproof.experts.verdict.judge import Evaluation, Kept
+from levelproof.experts.verdict.judge import Evaluation, KeptExpert
 from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.store import paused as store
 from levelproof.pipeline.store import remote
@@ -45,7 +45,9 @@ def kept() -> dict[int, Paused]:
         begun = begun._replace(training=begun.training._replace(course=course))
         found = nothing_found(1)._replace(source=[Source.SEARCH], search_steps=np.array([5]))
         pending = Pending(np.bool_(True), np.bool_(False), np.int32(9))
-        return Paused(Kept(begun, [0.5] * updates), pending, 3, [filled(shown) for _ in range(evaluations)], found)
+        return Paused(
+            KeptExpert(begun, [0.5] * updates), pending, 3, [filled(shown) for _ in range(evaluations)], found
+        )
 
     return {3: one(2, 0), 7: one(5, 2)}
 
