@@ -1,4 +1,4 @@
-"""Who solves it: one PPO specialist per level, many side by side, and the witnesses that prove it."""
+"""Solving levels: one PPO expert per level, many side by side, and the witnesses that prove it."""
 
 if __name__ != "levelproof.experts":
     raise ImportError(f"import levelproof.experts, not {__name__}: no module is loaded under two names")

@@ -50,17 +50,17 @@ _compiled = _Compiled()
 @contextmanager
 def lap() -> Iterator[Lap]:
     """Time the `with` block, which must wait for its device results."""
-    of, begun, compiled = Lap(), time.perf_counter(), _compiled.seconds
-    yield of
-    of.compiling = _compiled.seconds - compiled
-    of.seconds = max(0.0, time.perf_counter() - begun - of.compiling)
+    took, begun, compiled = Lap(), time.perf_counter(), _compiled.seconds
+    yield took
+    took.compiling = _compiled.seconds - compiled
+    took.seconds = max(0.0, time.perf_counter() - begun - took.compiling)
 
 
 class Ledger:
     """Seconds of each level, by stage (a field of `Seconds`)."""
 
     def __init__(self, count: int) -> None:
-        self._of = {stage: np.zeros(count) for stage in Seconds._fields}
+        self._seconds = {stage: np.zeros(count) for stage in Seconds._fields}
 
     @contextmanager
     def timing(self, stage: str) -> Iterator[None]:
@@ -71,37 +71,37 @@ class Ledger:
 
     def add(self, stage: str, took: Lap) -> None:
         """Charge a lap evenly to all levels."""
-        for of, seconds in (stage, took.seconds), ("compiling", took.compiling):
-            self._of[of] += seconds / max(len(self._of[of]), 1)
+        for name, seconds in (stage, took.seconds), ("compiling", took.compiling):
+            self._seconds[name] += seconds / max(len(self._seconds[name]), 1)
 
     def put(self, stage: str, index: int, seconds: float) -> None:
         """Charge seconds to one level."""
-        self._of[stage][index] += seconds
+        self._seconds[stage][index] += seconds
 
     def take(self, other: "Ledger", indices: Int[np.ndarray, " index"]) -> None:
         """Add another ledger, whose levels have these indices here."""
-        for stage, theirs in other._of.items():
-            self._of[stage][indices] += theirs
+        for stage, theirs in other._seconds.items():
+            self._seconds[stage][indices] += theirs
 
     def share(self, stage: str, steps: Int[np.ndarray, " level"]) -> None:
         """Redistribute a stage's seconds in proportion to each level's env steps."""
-        values = self._of[stage]
+        values = self._seconds[stage]
         if steps.sum():
             values[:] = values.sum() * (steps / steps.sum())
 
     def only(self, indices: Int[np.ndarray, " index"]) -> "Ledger":
         """Return the ledger of these levels; they share the seconds spent on the others."""
         some = Ledger(len(indices))
-        for stage, values in self._of.items():
-            some._of[stage] = values[indices] + (values.sum() - values[indices].sum()) / max(len(indices), 1)
+        for stage, values in self._seconds.items():
+            some._seconds[stage] = values[indices] + (values.sum() - values[indices].sum()) / max(len(indices), 1)
         return some
 
     def of(self, index: int) -> Seconds:
         """Return one level's seconds."""
-        return Seconds(*(float(values[index]) for values in self._of.values()))
+        return Seconds(*(float(values[index]) for values in self._seconds.values()))
 
     def total(self) -> Seconds:
-        return Seconds(*(float(values.sum()) for values in self._of.values()))
+        return Seconds(*(float(values.sum()) for values in self._seconds.values()))
 
 
 class StepCosts:

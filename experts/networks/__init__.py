@@ -1,1 +1,1 @@
-"""What an expert can be: networks from what it sees of a state to logits of its actions and an expected return."""
+"""Networks of experts: from observations to action logits and a value."""

@@ -1,11 +1,11 @@
-"""Networks on a level as sets of things: its polygons, circles, joints and thrusters.
+"""Networks on a level as sets of entities: polygons, circles, joints and thrusters.
 
-Each kind has one encoder, a layer that all its things share. What it makes of the active ones is averaged, and the
-averages of all kinds go on through ordinary layers. So things may be numbered in any way, and the number of parameters
-does not grow with the size. A thing's rows are those of the symbolic-flat view, then those of the bodies that it is
-fixed to (but for their shape, and in place of one-hot numbers), then gravity.
+Each kind has one encoder, a layer that all its entities share. The encodings of active entities are averaged, and the
+averages of all kinds pass through dense layers. So the order of entities does not matter, and the number of parameters
+does not grow with the size. An entity's rows are those of the symbolic-flat view, then those of the bodies that it is
+fixed to (without their shape, and in place of one-hot indices), then gravity.
 
-What is constant within a level is folded into the encoders' biases, one for each thing, as in the flat network.
+Constant features are folded into the encoders' biases, one per entity, as in the flat network.
 """
 
 from typing import NamedTuple
@@ -33,15 +33,15 @@ from levelproof.physics.vector import rows
 
 
 class Kind(NamedTuple):
-    """What an encoder must know of its kind."""
+    """Row layout of one kind of entity."""
 
     name: str
     own_rows: int
-    ends: int  # bodies that a thing is fixed to; their rows follow its own
+    ends: int  # bodies that an entity is fixed to; their rows follow its own
 
     @property
     def moving_rows(self) -> tuple[int, ...]:
-        """Those that change within a level."""
+        """Rows that change within a level."""
         firsts = [self.own_rows + BODY_ROWS * end for end in range(self.ends)] or [0]
         return tuple(first + row for first in firsts for row in DYNAMIC_ROWS)
 
@@ -55,18 +55,18 @@ KINDS = (  # in the order of the flat view
 
 
 class Entities(NamedTuple):
-    """All things of a kind, and what is constant about them."""
+    """All entities of a kind: their constant rows, weights and bodies."""
 
-    rows: Float[Array, "row thing level"]  # 0 where it moves
-    weight: Float[Array, "thing level"]  # in the average; 0 where a thing is not active
-    ends: Float[Array, "end thing movable level"]  # one-hot: the movable bodies that each is fixed to
+    rows: Float[Array, "row thing level"]  # 0 in moving rows
+    weight: Float[Array, "thing level"]  # in the average; 0 for inactive entities
+    ends: Float[Array, "end thing movable level"]  # one-hot: the movable bodies that each entity is fixed to
 
 
-Constant = tuple[Entities, ...]  # of all KINDS; without the level axis where there is one level
+Constant = tuple[Entities, ...]  # one of each of KINDS; without the level axis for one level
 
 
 class Encoder(nn.Module):
-    """A layer on every thing of a kind, then the average over those that are active."""
+    """A layer on every entity of a kind, then the average over active ones."""
 
     units: int
     kind: Kind
@@ -114,7 +114,7 @@ class EntityNetwork(nn.Module):
 
     @staticmethod
     def constant(levels: Level) -> Constant:
-        """What is constant within each level."""
+        """Compute the constants of each level."""
         size, features, bodies = levels.size, level_features(levels), resting_bodies(levels)
         things, seen, lanes = [], 0, features.shape[-1]
         for kind, active, (count, width) in zip(KINDS, active_things(levels), tables_of(size), strict=True):
@@ -139,7 +139,7 @@ class EntityNetwork(nn.Module):
 
 
 def active_things(levels: Level) -> list[Float[Array, "thing level"]]:
-    """1 where active, by kind; the floor stands for all scenery."""
+    """Return 1 for active entities, by kind; the floor stands for all scenery."""
     model, size = levels.model, levels.size
     polygons = jnp.concatenate([model.active[:1], model.active[FIXED_POLYGONS : size.polygons]])
     kinds = (polygons, model.active[size.polygons :], model.joint_active, model.thruster_active)
@@ -147,7 +147,7 @@ def active_things(levels: Level) -> list[Float[Array, "thing level"]]:
 
 
 def resting_bodies(levels: Level) -> Float[Array, "body row level"]:
-    """The rows of all bodies, scenery too, that bodies of any shape have; 0 where they move."""
+    """Return the rows common to bodies of any shape, scenery included; 0 in moving rows."""
     scenery, movable = slice(0, FIXED_POLYGONS), slice(FIXED_POLYGONS, None)
     parts = [body_rows(levels, scenery), body_rows(levels, movable, constant=True)]
     stacks = [jnp.stack([row.astype(jnp.float32) for row in jnp.broadcast_arrays(*part)], 1) for part in parts]
@@ -157,7 +157,7 @@ def resting_bodies(levels: Level) -> Float[Array, "body row level"]:
 def moving_things(
     size: Size, constant: Constant, moving: Float[Array, "dynamic lane"]
 ) -> list[Float[Array, "moving thing lane"]]:
-    """What moves of all things but the floor, by kind."""
+    """Return the moving rows of all entities except the floor, by kind."""
     bodies = moving.reshape(size.bodies - FIXED_POLYGONS, len(DYNAMIC_ROWS), moving.shape[-1])
     polygons = size.polygons - FIXED_POLYGONS
     at_ends = [jnp.tensordot(things.ends, bodies, 1) for things in constant[2:]]

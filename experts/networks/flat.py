@@ -1,7 +1,7 @@
 """Networks on the symbolic-flat view.
 
-Most features are constant within a level, so the first layer folds them into its bias once, and multiplies only those
-that move. That is the same function of the whole observation, at a sixth of its cost for size s.
+Most features are constant within a level, so the first layer folds them into its bias once, and multiplies only moving
+ones. The function of the whole observation stays the same, at a sixth of its cost for size s.
 """
 
 from typing import NamedTuple
@@ -18,19 +18,19 @@ from levelproof.physics.vector import rows
 
 
 class FirstKernel(NamedTuple):
-    """Of a first layer, in two: taking columns out of one would cost more than all products, backwards even more."""
+    """Kernel of a first layer, in two parts: slicing one would cost more than all products, backwards even more."""
 
     moving: Float[Array, "unit dynamic"]
     constant: Float[Array, "unit resting"]
 
 
 def resting_features(size: Size) -> Int[np.ndarray, " resting"]:
-    """Rows of the observation that cannot change within a level, ascending."""
+    """Return the rows of the observation that cannot change within a level, ascending."""
     return np.setdiff1d(np.arange(feature_count(size)), dynamic_features(size))
 
 
 class FirstDense(nn.Module):
-    """A layer on the whole observation, given as its constant and its moving rows."""
+    """A layer on the whole observation, split into its constant and its moving rows."""
 
     size: Size
     units: int
@@ -73,7 +73,7 @@ class FlatNetwork(nn.Module):
 
     @staticmethod
     def constant(levels: Level) -> Float[Array, "resting level"]:
-        """What is constant within each level."""
+        """Select the constant features of each level."""
         return rows(level_features(levels), resting_features(levels.size).tolist())
 
     @nn.compact

@@ -1,7 +1,6 @@
-"""Layers on columns, and how their kernels start.
+"""Layers on columns, and their initial kernels.
 
-Lanes last, as in the engine: a layer is `kernel @ x`, and everything between matrix products is a dense loop over
-lanes.
+Lanes are last, as in the engine: a layer is `kernel @ x`, and all else is a dense loop over lanes.
 """
 
 import flax.linen as nn
@@ -16,10 +15,10 @@ HIDDEN_GAIN, POLICY_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0  # of orthogonal initia
 
 
 def orthogonal(gain: float) -> nn.initializers.Initializer:
-    """Kernels with orthogonal rows (or columns, if these are fewer) of length `gain`, evenly distributed.
+    """Return an initializer of Haar-random kernels with orthogonal rows (columns, if fewer) of norm `gain`.
 
-    Gram-Schmidt, twice for accuracy, on a Gaussian matrix. Flax's own does a QR factorisation, and several of these
-    side by side can deadlock the thread pool of jaxlib 0.10's CPU backend.
+    It runs Gram-Schmidt, twice for accuracy, on a Gaussian matrix. Flax's initializer does a QR factorisation, and
+    several side by side can deadlock the thread pool of jaxlib 0.10's CPU backend.
     """
 
     def initialise(key, shape, dtype=jnp.float32):

@@ -58,31 +58,31 @@ class LevelSearch:
         """
         self.found = nothing_found(len(level_ids))
         self._searching = searching
-        self._sought = searching.submit(levels, level_ids) if searching.config.env_steps and len(level_ids) else None
+        self._job = searching.submit(levels, level_ids) if searching.config.env_steps and len(level_ids) else None
         self.ledger = Ledger(len(level_ids))  # of the search, once it has ended
 
     @property
     def env_steps(self) -> int:
         """Env steps searched so far."""
-        return self._sought.env_steps if self._sought else int(self.found.search_steps.sum())
+        return self._job.env_steps if self._job else int(self.found.search_steps.sum())
 
     @property
     def waiting(self) -> Int[np.ndarray, " index"]:
         """Indices of the levels whose search has not begun."""
-        return np.array(self._searching.waiting(self._sought) if self._sought else [], int)
+        return np.array(self._searching.waiting(self._job) if self._job else [], int)
 
     def withdraw(self, indices: Int[np.ndarray, " index"]) -> None:
         """Skip the search of these levels, which must not have begun."""
-        if self._sought:
-            self._searching.withdraw(self._sought, indices.tolist())
+        if self._job:
+            self._searching.withdraw(self._job, indices.tolist())
 
     def ended(self) -> bool:
         """Return whether no level is left to search; if so, `found` and `ledger` hold the results."""
-        if self._sought and not self._sought.left:
-            self._take(self._searching.result(self._sought))
-            self.ledger = self._sought.ledger
-            self._sought = None
-        return self._sought is None
+        if self._job and not self._job.left:
+            self._take(self._searching.result(self._job))
+            self.ledger = self._job.ledger
+            self._job = None
+        return self._job is None
 
     def _take(self, searched: SearchResult) -> None:
         found = self.found

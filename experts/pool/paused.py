@@ -1,4 +1,4 @@
-"""An expert under way, as it goes on later: in another slot, process or machine, to the same bits."""
+"""A paused expert, which can resume in another slot, process or machine, to the same bits."""
 
 from typing import NamedTuple
 
@@ -8,13 +8,13 @@ from levelproof.experts.verdict.judge import Evaluation, KeptExpert
 
 
 class Paused(NamedTuple):
-    """All that decides how its training goes on and what is told of its level; on the host.
+    """All that decides how training continues and what is reported of the level; on the host.
 
-    An evaluation that was under way begins again.
+    An interrupted evaluation is repeated from its start.
     """
 
     expert: KeptExpert
     pending: Pending
-    evaluated_rollouts: int  # of evaluations that have ended
+    evaluated_rollouts: int  # of finished evaluations
     evaluations: list[Evaluation]  # those that solved the level
-    found: SearchFindings  # before it trained: of one level
+    found: SearchFindings  # of its one level

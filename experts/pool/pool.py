@@ -1,7 +1,7 @@
-"""Levels in training: they wait in the queue, go through the slots, and leave.
+"""A worker's pool: levels are searched, wait in the queue, train in slots, and leave.
 
-Levels are submitted together and finish together, and those of one submission take the slots that those of another
-leave empty. A result depends on nothing but its level, so sharing changes none.
+Levels are submitted together and finish together; submissions share the slots. A level's result depends on that level
+alone, so sharing changes no result.
 """
 
 from collections import deque
@@ -41,22 +41,24 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskParams
 
 IN_CACHE = 128  # lanes: their physics and one minibatch fit the cache of a core
-QUEUED_PER_SLOT = 4  # levels: with those in the slots, and while the next group does not fit yet, enough wait
+QUEUED_PER_SLOT = (
+    4  # levels in the queue per slot, those in slots included: enough wait while the next group does not fit
+)
 T = TypeVar("T")
 NOTHING_BEGUN: Mapping[int, KeptExpert] = MappingProxyType({})
 NONE_PAUSED: Mapping[int, Paused] = MappingProxyType({})
 
 
 class Totals(NamedTuple):
-    """How far some levels are."""
+    """Progress of some levels."""
 
     env_steps: int  # of training
-    levels: float  # decided; those in training count by the part of their budget that they have had
+    levels: float  # decided; those in training count by the share of their budget used
     solved: int
 
 
 class Submission:
-    """Levels that came together, and what has become of each so far. The arguments are those of `Pool.submit`."""
+    """Levels submitted together, and the results of each so far. Arguments as in `Pool.submit`."""
 
     def __init__(
         self,
@@ -85,28 +87,28 @@ class Submission:
 
     def trained(self, config: ExpertConfig) -> list[TrainedLevel]:
         evaluated = (self.evaluated_rollouts * config.steps_per_update).tolist()
-        of = self.curves, self.evaluations, self.experts, self.candidates, evaluated, self.policies
-        return [TrainedLevel(*level) for level in zip(*of, strict=True)]
+        columns = self.curves, self.evaluations, self.experts, self.candidates, evaluated, self.policies
+        return [TrainedLevel(*level) for level in zip(*columns, strict=True)]
 
 
 class Pool:
-    """Slots and the queue before them, and the search before that. All in it has one procedure and one budget."""
+    """The search, the queue and the slots of a worker, for one procedure and one budget."""
 
     def __init__(self, budget: int, procedure: Procedure, rules: TaskParams) -> None:
-        """`budget` are env steps of an expert. Raises ValueError as `check_budget`."""
+        """`budget` is in env steps per expert. Raises ValueError as `check_budget` does."""
         check_budget(budget, procedure.expert, procedure.stop)
         self.procedure, self.config, self.rules = procedure, procedure.expert, rules
         self.updates = self.config.updates_in(budget)
         self.searching = Searching(procedure.search, rules)
         self._stopping = rules_of(procedure.stop, self.config)
         self._shaped = replace(rules, dense_reward_scale=self.config.dense_reward_scale)
-        self._slots: Slots | None = None  # these two are there once the first levels have come
+        self._slots: Slots | None = None  # both None until the first levels arrive
         self._queue: LevelQueue | None = None
-        self._taken = 0  # levels that left the queue, ever
-        # By index in the queue, in the order in which they came: levels that have not left their slots
+        self._taken = 0  # total number of levels that have left the queue
+        # By index in the queue, in order of arrival: levels in the queue or in slots
         self._at: dict[int, tuple[Submission, int]] = {}
-        self._coming: deque[tuple[Submission, Sequence[int]]] = deque()  # levels that wait for room in the queue
-        self._submissions: list[Submission] = []  # not finished
+        self._coming: deque[tuple[Submission, Sequence[int]]] = deque()  # levels that wait to enter the queue
+        self._submissions: list[Submission] = []  # unfinished
         self._steps = StepCosts()
 
     def submit(
@@ -118,15 +120,15 @@ class Pool:
         keep: bool = False,
         paused: Mapping[int, Paused] = NONE_PAUSED,
     ) -> Submission:
-        """Let levels wait for slots: each stays in one until it is decided or has had its budget.
+        """Queue levels for slots: each trains in one until it is decided or has used its budget.
 
         Args:
-            levels: on the host.
+            levels: the levels, on the host.
             level_ids: their ids.
-            found: what their experts rehearse from the start; None: nothing.
-            begun: by index among them, experts that go on.
-            keep: whether the result has the experts.
-            paused: by index among them, experts that were under way before.
+            found: search results, whose successes their experts rehearse from the start; None: none.
+            begun: earlier experts to continue, by index among the levels.
+            keep: whether to return the experts.
+            paused: interrupted experts to resume, by index among the levels.
         """
         count = len(level_ids)
         submission = Submission(levels, level_ids, found or nothing_found(count), begun, keep, paused)
@@ -135,10 +137,9 @@ class Pool:
         return submission
 
     def step(self) -> list[Submission]:
-        """Search a step further, if there is anything to search and too few levels wait for slots; else take every slot
-        a rollout further, if there is a level. The submissions that have finished.
+        """Search if too few levels wait for slots, else advance all slots by a rollout; return finished submissions.
 
-        An exception leaves the pool useless: its slots were used up.
+        After an exception the pool is unusable, because its slots were donated.
         """
         searched = self._short and self.searching.step()
         if not searched and any(submission.under_way for submission in self._submissions):
@@ -148,24 +149,26 @@ class Pool:
         return finished
 
     def wants(self, searched: int) -> int:
-        """Levels to submit or to search, so that no slot and no row of the search is empty for a while; of so many
-        that are searched, and those that wait for it, all may come to the slots."""
+        """Return the number of levels to submit to keep slots and search slots busy.
+
+        `searched` levels are in the search or wait for it; all of them may come to the slots.
+        """
         return max(self._short - searched, self.searching.wants, 0)
 
     @property
     def _short(self) -> int:
-        """Levels by which as many would wait as there are slots."""
+        """Number of levels missing until as many wait as there are slots."""
         come = int(self._queue.come) if self._queue else 0
         waiting = come - self._taken + sum(len(some) for _, some in self._coming)
         return max(0, slot_count(self.config) - waiting)
 
     def waiting(self, submission: Submission) -> list[int]:
-        """Indices of its levels that have had no slot, ascending."""
+        """Return indices of the submission's levels that have had no slot, ascending."""
         coming = (i for of, some in self._coming for i in some if of is submission)
         return [*(i for _, (of, i) in self._queued() if of is submission), *coming]
 
     def withdraw(self, submission: Submission, indices: Collection[int]) -> None:
-        """Take levels out that have had no slot."""
+        """Remove levels that have had no slot."""
         queued = self._queued()
         for index, _ in queued:
             del self._at[index]
@@ -180,14 +183,14 @@ class Pool:
         submission.under_way.difference_update(indices)
 
     def totals(self, submission: Submission) -> Totals:
-        """How far the levels of a submission are."""
+        """Return the progress of a submission."""
         parts = sum(len(submission.curves[i]) for i in submission.under_way) / self.updates
         steps = submission.trained_rollouts * self.config.steps_per_update
         decided = len(submission.curves) - len(submission.under_way)
         return Totals(steps, decided + parts, submission.solved)
 
     def paused(self) -> Iterator[tuple[Submission, int, Paused]]:
-        """Every expert that has a slot, as it would go on from here, with its index in its submission."""
+        """Yield every expert in a slot, ready to resume, with its submission and index there."""
         if self._slots is None:
             return
         slot = self._slots.slot
@@ -212,12 +215,12 @@ class Pool:
             )
 
     def _queued(self) -> list[tuple[int, tuple[Submission, int]]]:
-        """Levels in the queue that have had no slot, in order, with their indices there."""
+        """Return levels in the queue that have had no slot, in order, with their indices in the queue."""
         count = int(self._queue.come) - self._taken if self._queue else 0
         return list(self._at.items())[len(self._at) - count :]
 
     def _advance(self) -> None:
-        """A rollout in every slot, and the account of it."""
+        """Advance every slot by a rollout, and charge its time to the levels."""
         with lap() as took:
             self._fill()
             assert self._queue is not None
@@ -225,7 +228,7 @@ class Pool:
             self._slots, report = advance(self._slots, self._queue, self.config, self._stopping, self._shaped)
             seen = jax.device_get(report)
             self._taken = int(seen.taken)
-            # Empty slots are the last submission's, so that their cost is counted once, whoever else is here
+            # charge empty slots to the last submission, so that they count once
             self._submissions[-1].idle_rollouts += int((seen.mode == Mode.EMPTY).sum())
             busy = np.flatnonzero(seen.mode != Mode.EMPTY).tolist()
             levels = [self._at[int(seen.queue_index[slot])] for slot in busy]
@@ -240,7 +243,7 @@ class Pool:
         self._submissions[-1].ledger.add("idle", Lap(idle, took.compiling))
 
     def _fill(self) -> None:
-        """Let levels into the queue while there is room for the next group of them."""
+        """Move levels into the queue while the next group fits."""
         while self._coming:
             submission, some = self._coming[0]
             if self._queue is None:
@@ -250,7 +253,7 @@ class Pool:
             if len(free) < len(some):
                 return
             indices = free[: len(some)]
-            begun = {row: self._goes_on(submission, i) for row, i in enumerate(some) if i in submission.begun}
+            begun = {row: self._continued(submission, i) for row, i in enumerate(some) if i in submission.begun}
             at = np.array(some)
             success = jax.tree.map(lambda x, at=at: x[at], submission.found.success)
             levels, level_ids = take(submission.levels, at), submission.level_ids[at]
@@ -258,14 +261,14 @@ class Pool:
             self._at.update({index: (submission, i) for index, i in zip(indices, some, strict=True)})
             self._coming.popleft()
 
-    def _goes_on(self, submission: Submission, i: int) -> tuple[ExpertState, Pending]:
-        """An expert that has begun, and what comes next for it."""
+    def _continued(self, submission: Submission, i: int) -> tuple[ExpertState, Pending]:
+        """Return an expert that continues, and what comes next for it."""
         no = np.bool_(False)
         fresh = Pending(no, no, np.int32(self.updates))
         return submission.begun[i].begun, submission.paused[i].pending if i in submission.paused else fresh
 
     def _note(self, slot: int, seen: Report, submission: Submission, i: int) -> None:
-        """What became of a submission's level in its slot."""
+        """Record what happened to a level in its slot."""
         assert self._slots is not None
         if seen.mode[slot] == Mode.TRAIN:
             submission.trained_rollouts += 1
@@ -276,7 +279,7 @@ class Pool:
             submission.evaluations[i].append(evaluation_of(self._slots, slot))
 
     def _leave(self, seen: Report, levels: Mapping[int, tuple[Submission, int]]) -> None:
-        """Let levels go whose time is over, by slot; not yet those whose witness few replays survive."""
+        """Release finished levels from their slots; early leavers with a fragile witness train on."""
         assert self._slots is not None
         for submission, i in levels.values():
             submission.candidates[i] = self._candidates(submission, i)
@@ -301,7 +304,7 @@ class Pool:
         return candidates_of(evaluations, submission.found.source[i], self.config)
 
     def _fragile(self, solved: Mapping[int, tuple[Submission, int]]) -> list[int]:
-        """Slots of levels that are solved by witnesses of which none survives enough replays; each keeps its best."""
+        """Return slots of solved levels without a portable witness; each level keeps its best candidate."""
         if not (solved and self.procedure.stop.steady and self.config.replays):
             return []
         with lap() as took:
@@ -322,23 +325,23 @@ class Pool:
 
 
 def slot_count(config: ExpertConfig) -> int:
-    """How many experts train side by side in one program."""
+    """Return the number of experts that train side by side in one program."""
     return config.slots or at_once(config.environments, IN_CACHE)
 
 
 def capacity_of(config: ExpertConfig) -> int:
-    """How many levels a queue has room for: one number for a configuration, so that one program is compiled."""
+    """Return the queue's capacity: one number per configuration, so that one program is compiled."""
     return max(QUEUED_PER_SLOT * slot_count(config), 2 * GROUP)
 
 
 def expert_of(slots: Slots, slot: int, config: ExpertConfig) -> ExpertState:
-    """The expert in a slot, or that has just left it, on the host, as it would go on."""
+    """Copy the expert in a slot, or that has just left it, to the host, ready to continue."""
     lanes = np.arange(slot * config.environments, (slot + 1) * config.environments)
     return jax.device_get(ExpertState(_row(slots.slot.training, slot), take(slots.acting, lanes)))
 
 
 def evaluation_of(slots: Slots, slot: int) -> Evaluation:
-    """What the evaluation that has just ended in a slot showed."""
+    """Copy the evaluation that has just ended in a slot to the host."""
     training = slots.slot.training
     shown = slots.slot.trial, training.progress, training.success, training.course.over
     trial, progress, success, over = jax.device_get(_row(shown, slot))
@@ -349,5 +352,5 @@ def evaluation_of(slots: Slots, slot: int) -> Evaluation:
 
 @jax.jit
 def _row(tree: T, index: int) -> T:
-    """This row of every array, by one program."""
+    """Select one row of every array, in one program."""
     return jax.tree.map(lambda x: x[index], tree)

@@ -1,4 +1,4 @@
-"""The queue before the slots: levels enter it in groups, with experts that have seen nothing or that go on."""
+"""The queue before the slots: levels enter it in groups, with new experts or experts that continue."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -15,11 +15,11 @@ from levelproof.experts.witness.success import Success, no_success
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
 
-GROUP = 16  # levels that enter at once
+GROUP = 16  # levels that enter together
 
 
 def empty_queue(levels: Level, capacity: int, config: ExpertConfig) -> LevelQueue:
-    """A queue for levels of the size of these, without any: on the host, where zeros take no program each."""
+    """Return an empty queue for levels of this size, on the host, where zeros need no compiled programs."""
     one = take(levels, np.zeros(1, int))
     begun = jax.eval_shape(partial(begin, config=config), one, jnp.zeros(1, jnp.int32), no_success(1))
     return LevelQueue(
@@ -42,23 +42,23 @@ def enter(
     updates: int,
     begun: Mapping[int, tuple[ExpertState, Pending]] = MappingProxyType({}),
 ) -> LevelQueue:
-    """The queue (used up) with more levels: some, at most GROUP.
+    """Add at least one and at most GROUP levels to the queue.
 
     Args:
-        queue: before.
-        indices: that they get, of none that is there.
-        levels: on the host, as are the others.
+        queue: the queue before; donated.
+        indices: free indices for the levels.
+        levels: the levels, on the host, like all that follow.
         level_ids: their ids.
-        success: what their experts rehearse from the start, level first.
-        config: what an expert is.
-        updates: that an expert may use.
-        begun: experts that go on, by index among these levels; they have their own success.
+        success: successes that their experts rehearse from the start, level first.
+        config: settings of an expert.
+        updates: budget of an expert.
+        begun: experts that continue, by index among these levels; they have their own successes.
     """
     count, come = len(level_ids), int(queue.come)
-    fill = np.minimum(np.arange(GROUP), count - 1)  # a group that is not full has its last level several times
-    group, ids = take(levels, fill), level_ids[fill]
+    padded = np.minimum(np.arange(GROUP), count - 1)  # pad the group with its last level
+    group, ids = take(levels, padded), level_ids[padded]
     no = np.zeros(GROUP, bool)
-    fresh = begin(group, ids, jax.tree.map(lambda x: x[fill], success), config)
+    fresh = begin(group, ids, jax.tree.map(lambda x: x[padded], success), config)
     experts = fresh, Pending(no, no, np.full(GROUP, updates, np.int32))
     if begun:
         experts = jax.tree.map(np.array, experts)

@@ -1,4 +1,4 @@
-"""Witnesses reworked before they count: polished, where that is asked for, and made steady, where replays fail."""
+"""Rework of witnesses before they count: polish them if asked for, and steady them if replays fail."""
 
 from collections.abc import Callable, Sequence
 
@@ -19,7 +19,7 @@ from levelproof.levelgen.batching import at_once, blocks, take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskParams
 
-OWN = 0.5  # share of replays of an expert's own witness; only where fewer survive, a search's may stand in
+OWN = 0.5  # portability below which a witness of the search may replace an expert's own
 IN_CACHE = 256  # lanes: their physics fits the cache of a core
 Program = Callable[[Level, Int[np.ndarray, " level"], Success], Shortened]
 
@@ -31,28 +31,28 @@ def rework(
     procedure: Procedure,
     rules: TaskParams,
 ) -> tuple[list[Witness | None], Int[np.ndarray, " level"]]:
-    """Each level's witness, or a better one that search around it finds; and the env steps of that.
+    """Search around each witness for a better one; return the witnesses and the env steps.
 
-    Better is what survives more replays from moved starts, and of equals the shorter one.
+    The better of two survives more replays from perturbed starts; of equals it is the shorter one.
 
     Args:
-        levels: on the host.
+        levels: the levels, on the host.
         level_ids: their ids, the seeds of all randomness.
-        chosen: the witness of each, if it has one. One that does nothing stays.
-        procedure: how long to search, and how many replays.
-        rules: of the task.
+        chosen: witness of each level, if any. One that does nothing stays.
+        procedure: its settings say how long to search, and how often to replay.
+        rules: the task's rules.
     """
     search, replays = procedure.search, procedure.expert.replays
     witnesses, env_steps = list(chosen), np.zeros(len(chosen), np.int64)
 
     def improve(some: Sequence[int], lanes: int, program: Program) -> None:
-        """Let a program look for better ones, of a few levels at once; so many lanes each."""
+        """Run a search program on a few levels at once, in `lanes` lanes each."""
         now = {i: witness for i in some if (witness := witnesses[i]) and witness.source != Source.NOTHING}
         candidates = {}
         for block in blocks(len(now), at_once(lanes, IN_CACHE)):
             at = np.array(list(now))[block]
             found = jax.device_get(program(take(levels, at), level_ids[at], successes([now[i] for i in at.tolist()])))
-            env_steps[at] += found.env_steps  # once for a level that fills up its block
+            env_steps[at] += found.env_steps  # a level that pads its block counts once
             for i, *success in zip(at.tolist(), *found.success, strict=True):
                 new = repeating(Success(*success), Source.SEARCH)
                 candidates[i] = sorted([now[i], *new], key=lambda witness: witness.steps)
@@ -71,7 +71,7 @@ def rework(
 
 
 def successes(witnesses: Sequence[Witness]) -> Success:
-    """Their first episodes, level first."""
+    """Return the witnesses' first episodes, level first."""
     steps = np.array([witness.steps for witness in witnesses], np.int32)
     action = np.stack([witness.action for witness in witnesses])
     inside = np.arange(RECORD_STEPS) < steps[:, None]

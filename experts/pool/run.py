@@ -1,4 +1,4 @@
-"""From levels to verdicts: they are decided without an expert, or searched, trained and judged."""
+"""From levels to verdicts: decide levels that need no expert; search, train and judge the others."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,19 +28,19 @@ from levelproof.levelgen.level import ACTIONS, Level
 
 @dataclass(frozen=True)
 class UnitResult:
-    """What came of some levels, on the host, in the order they were given."""
+    """Results of some levels, on the host, in the order of `level_ids`."""
 
     level_ids: Int[np.ndarray, " level"]
     levels: Level
-    record: Record  # all zero where the level has no witness
+    record: Record  # all zero if the level has no witness
     verdicts: list[Verdict]
     spent: EnvSteps
-    experts: dict[int, KeptExpert] = field(default_factory=dict)  # by level id, where they are kept
-    ledger: Ledger | None = None  # None: nobody has counted
+    experts: dict[int, KeptExpert] = field(default_factory=dict)  # by level id, if they are kept
+    ledger: Ledger | None = None  # None: not measured
 
 
 class TrainingRun:
-    """Levels on their way to their verdicts: decided at once, looked into, then in a pool, perhaps beside others."""
+    """Levels on their way to verdicts: decided at once, or searched, then trained in a pool shared with other runs."""
 
     def __init__(
         self,
@@ -54,13 +54,13 @@ class TrainingRun:
     ) -> None:
         """
         Args:
-            pool: where experts train.
+            pool: pool in which experts train.
             levels: the levels, as their ids rebuild them.
             level_ids: their ids; the seeds of all randomness.
-            begun: by level id, experts that go on with what they have left of the budget; the others begin.
-            keep: whether the result has the experts.
-            ledger: what the levels have cost before.
-            paused: by level id, experts that were under way before with this budget; nobody looks into their levels.
+            begun: by level id, experts of a smaller budget to continue; the other levels get new ones.
+            keep: whether to return the experts.
+            ledger: costs of the levels so far.
+            paused: by level id, interrupted experts of this budget to resume; their levels are not searched again.
         """
         self.ledger = ledger or Ledger(len(level_ids))
         self.pool, self.level_ids, self._begun, self._keep = pool, level_id_array(level_ids), begun, keep
@@ -70,16 +70,18 @@ class TrainingRun:
         self.left = np.array([i for i, verdict in enumerate(self.before.verdicts) if verdict is None], int)
         self._paused = {i: paused[i] for i in self.level_ids[self.left].tolist() if i in paused}
         new = ~np.isin(self.level_ids[self.left], list(self._paused))
-        self._order = np.argsort(np.r_[np.flatnonzero(new), np.flatnonzero(~new)])  # of new ones and others, as left
+        self._order = np.argsort(
+            np.r_[np.flatnonzero(new), np.flatnonzero(~new)]
+        )  # of new levels, then resumed ones, as `left` has them
         with self.ledger.timing("search"):
             self._looked = self.left[new]
             self.looking = LevelSearch(*self._some(self._looked), pool.searching)
-        self.submission: Submission | None = None  # of those that an expert is asked for
-        self._gone: set[int] = set()  # ids of levels that others label
+        self.submission: Submission | None = None  # of levels that need an expert
+        self._gone: set[int] = set()  # ids of levels that other workers label
         self.look()
 
     def look(self) -> None:
-        """Let experts begin, once there is nothing left to search."""
+        """Submit the levels to the pool once their search has ended."""
         if self.submission is None:
             with self.ledger.timing("search"):
                 ended = self.looking.ended()
@@ -98,12 +100,12 @@ class TrainingRun:
 
     @property
     def searching(self) -> int:
-        """Levels that will come to the pool."""
+        """Number of levels that will come to the pool."""
         return 0 if self.submission else len(self.left) - len(self._gone)
 
     @property
     def unbegun(self) -> list[int]:
-        """Ids of levels that wait for their search to begin, or for their expert."""
+        """Ids of levels that wait for their search, or for a slot."""
         if self.submission is None:
             waiting = self.level_ids[self._looked[self.looking.waiting]]
         else:
@@ -111,7 +113,7 @@ class TrainingRun:
         return [level_id for level_id in waiting.tolist() if level_id not in self._paused]
 
     def paused(self, in_slots: Iterable[tuple[Submission, int, Paused]]) -> dict[int, Paused]:
-        """Its experts under way, by level id: those among these, which have a slot, and those that wait for one."""
+        """Return the run's unfinished experts by level id: its own among `in_slots`, and those that wait."""
         undecided = set(self.undecided)
         waiting = {level_id: of for level_id, of in self._paused.items() if level_id in undecided}
         return waiting | {
@@ -120,12 +122,12 @@ class TrainingRun:
 
     @property
     def undecided(self) -> list[int]:
-        """Ids of levels that wait for an expert or have one; of all, while there is anything left to search."""
+        """Ids of levels that wait for an expert or have one; all ids until the search has ended."""
         of = self.submission
         return (of.level_ids[sorted(of.under_way)] if of else self.level_ids).tolist()
 
     def leave_out(self, level_ids: Collection[int]) -> None:
-        """Have others label some of these levels: any that are `unbegun`, or all that are `undecided` at the end."""
+        """Leave levels to other workers: any of those `unbegun`, or all `undecided` when this worker stops."""
         self._gone.update(level_ids)
         indices = lambda of: np.flatnonzero(np.isin(of, list(self._gone)))
         if self.submission is None:
@@ -134,7 +136,7 @@ class TrainingRun:
             self.pool.withdraw(self.submission, indices(self.submission.level_ids).tolist())
 
     def totals(self) -> Totals:
-        """How far all levels are, those that need no expert included."""
+        """Return the progress of all levels, including those that need no expert."""
         looked = self.looking.env_steps
         if self.submission is None:
             return Totals(looked, len(self.level_ids) - len(self.left), 0)
@@ -143,7 +145,7 @@ class TrainingRun:
         return now._replace(env_steps=now.env_steps + looked, levels=others + now.levels)
 
     def finish(self) -> UnitResult:
-        """Choose witnesses and give verdicts, once the submission has finished; of all levels that are not left out."""
+        """Choose witnesses and return verdicts, once the submission has finished; omit levels left to other workers."""
         submission = self.submission
         assert submission is not None
         trained = submission.trained(self.pool.config) if len(submission.level_ids) else as_found(submission.found)
@@ -160,7 +162,7 @@ class TrainingRun:
         return replace(result, ledger=ledger)
 
     def _attempted(self, trained: Sequence[TrainedLevel]) -> dict[int, tuple[float, int]]:
-        """Success rates of experts, and the env steps that these took, by index among `left`."""
+        """Measure experts' success rates; return each with its env steps, by index among `left`."""
         policies = {
             i: of.policy
             for i, (level, of) in enumerate(zip(self.left, trained, strict=True))
@@ -182,10 +184,10 @@ class TrainingRun:
         levels, level_ids = self._some(kept)
         before, failed = [self.before.verdicts[i] for i in kept], self.before.failed_by_noop[kept]
         found = submission.found
-        asked = np.flatnonzero(np.isin(self.left, kept))  # of those that came to the submission
+        asked = np.flatnonzero(np.isin(self.left, kept))  # indices among the submitted levels
         left = np.searchsorted(kept, self.left[asked])
         trained = [trained[i] for i in asked]
-        actions = np.zeros((RECORD_STEPS, ACTIONS, len(kept)), np.int32)  # doing nothing, if none are found
+        actions = np.zeros((RECORD_STEPS, ACTIONS, len(kept)), np.int32)  # a level without a witness does nothing
         candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
         for i, of in zip(left, trained, strict=True):
             candidates[i] = of.candidates
@@ -217,7 +219,7 @@ class TrainingRun:
 
 
 def with_attempts(verdict: Verdict, attempted: tuple[float, int] | None) -> Verdict:
-    """The verdict with what the expert's last attempts gave, and their env steps, if it made any."""
+    """Add the success rate of the expert's attempts, and their env steps, if it made any."""
     if attempted is None:
         return verdict
     rate, env_steps = attempted
@@ -225,7 +227,7 @@ def with_attempts(verdict: Verdict, attempted: tuple[float, int] | None) -> Verd
 
 
 def with_looks(verdict: Verdict, found: SearchFindings, index: int, reworked: int) -> Verdict:
-    """The verdict with what was done before training, and the env steps of search around its witness."""
+    """Add results of the search before training, and the env steps of rework."""
     searched = int(found.search_steps[index])
     return replace(
         verdict,
@@ -236,7 +238,7 @@ def with_looks(verdict: Verdict, found: SearchFindings, index: int, reworked: in
 
 
 def as_found(found: SearchFindings) -> list[TrainedLevel]:
-    """Levels that no expert trained for: their witness is what was found before."""
+    """Wrap levels without an expert: their candidates are the successes of the search."""
     each = zip(found.success.action, found.success.length, found.source, strict=True)
     return [
         TrainedLevel([], [], candidates=repeating(Success(action, length), source)) for action, length, source in each
@@ -244,13 +246,13 @@ def as_found(found: SearchFindings) -> list[TrainedLevel]:
 
 
 def idling(verdict: Verdict, nothing: Int[np.ndarray, "256 6"]) -> Sequence[Witness]:
-    """The witness of a level that needs no expert, if it has one: doing nothing."""
+    """Return the witness of a level that needs no expert, if any: doing nothing."""
     steps = verdict.steps_to_goal
     return () if steps is None else (Witness(nothing, Source.NOTHING, steps),)
 
 
 def spent_on(verdicts: list[Verdict], submission: Submission, config: ExpertConfig) -> EnvSteps:
-    """What the levels of a submission took, and the slots that had none."""
+    """Sum the env steps of levels, and of empty slots."""
     total = lambda name: sum(getattr(verdict, name) for verdict in verdicts)
     return EnvSteps(
         total("search_steps"),

@@ -1,7 +1,8 @@
-"""A witness made steady: search around it for one that survives more replays from moved starts.
+"""Steadying: search around a witness for one that survives more replays from perturbed starts.
 
-In every round its actions are varied in many lanes; of those that reach the goal some are replayed from moved starts,
-beside the witness as it is, and the one that survives most goes into the next round, which has other starts.
+In every round many lanes play variations of the witness. The shortest of those that reach the goal, and the
+witness itself, are replayed from perturbed starts; the one that survives most enters the next round, which draws
+other starts.
 """
 
 from functools import partial
@@ -23,32 +24,32 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import TaskParams
 
-LANES = 64  # of variations, the witness itself the first
-KEPT = 8  # of these, to be replayed
-STARTS = 32  # of each
+LANES = 64  # per level; the first plays the witness itself, the others variations
+KEPT = 8  # successes per level that are replayed, the witness among them
+STARTS = 32  # perturbed starts of each
 
 
 class Steadying(NamedTuple):
-    """Witnesses that are made steady, level first."""
+    """State of steadying, level first."""
 
     success: Success
-    steady: Bool[Array, " level"]  # it has survived all replays of a round
+    steady: Bool[Array, " level"]  # the success has survived all replays of a round
     env_steps: Int[Array, " level"]  # of all lanes
-    number: Int[Array, ""]  # of the round
+    number: Int[Array, ""]  # of rounds done
 
 
 @partial(jax.jit, static_argnames=("rounds", "rules"))
 def steady(
     levels: Level, level_ids: Int[Array, " level"], success: Success, rounds: int, rules: TaskParams
 ) -> Shortened:
-    """Vary every success for so many rounds, or until one has survived all replays of a round.
+    """Vary every success until one has survived all replays of a round.
 
     Args:
-        levels: lane axis last.
+        levels: the levels, lane axis last.
         level_ids: their ids, the seeds of all randomness.
-        success: of each level, level first; it replays.
-        rounds: at most.
-        rules: of the task.
+        success: a success of each level that replays, level first.
+        rounds: maximum number of rounds.
+        rules: the task's rules.
     """
     count = len(level_ids)
     level, lane, step = jnp.arange(count), jnp.arange(LANES), jnp.arange(RECORD_STEPS)

@@ -1,7 +1,7 @@
-"""A level's archive: of each cell of its worlds one state that was reached, and the actions that reached it.
+"""A level's archive: for each cell one state that was reached, and the actions that reach it.
 
-Everything here has the level axis first and treats each level on its own. Weights of choices are whole numbers, so that
-sums of them have no rounding that could depend on how many levels are computed together.
+All arrays have the level axis first, and levels are independent. Weights of choices are integers, so that their sums
+have no rounding that could depend on the number of levels computed together.
 """
 
 from typing import NamedTuple
@@ -13,32 +13,32 @@ from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 from levelproof.experts.search.cells import cell_key
 from levelproof.experts.search.config import SearchConfig
 
-ONE = 65_536  # the weight of an entry that was never chosen
+ONE = 65_536  # weight of an entry that was never chosen
 
 
 class ReachedStates(NamedTuple):
-    """States that were reached: entries of the archive, or what lanes have just come to."""
+    """States that were reached: entries of the archive, or new states of lanes."""
 
-    feature: Float[Array, "level thing feature"]  # what tells them apart (`experts.search.cells`)
-    state: Float[Array, "level thing word"]  # all that evolves (`experts.search.rows`)
-    code: UInt16[Array, "level thing step"]  # actions from the level's start, each as one number
-    steps: Int[Array, "level thing"]  # how many of them
-    distance: Float[Array, "level thing"]  # m, of green and blue
+    feature: Float[Array, "level thing feature"]  # features that tell states apart (`experts.search.cells`)
+    state: Float[Array, "level thing word"]  # the whole state (`experts.search.rows`)
+    code: UInt16[Array, "level thing step"]  # codes of the actions from the level's start
+    steps: Int[Array, "level thing"]  # number of these actions
+    distance: Float[Array, "level thing"]  # m, gap between green and blue
 
 
 class Archive(NamedTuple):
-    """Entries are numbered in no order; those not in use hold anything."""
+    """Entries of each level, in no order; unused entries hold arbitrary values."""
 
     entry: ReachedStates
     used: Bool[Array, "level entry"]
-    key: UInt32[Array, "level entry"]  # of its cell
-    visits: Int[Array, "level entry"]  # how often it was chosen
-    width: Float[Array, " level"]  # m, of a cell
-    cells: Int[Array, " level"]  # that entered it, ever
+    key: UInt32[Array, "level entry"]  # key of its cell
+    visits: Int[Array, "level entry"]  # times it was chosen
+    width: Float[Array, " level"]  # m, width of a cell
+    cells: Int[Array, " level"]  # total number of cells entered
 
 
 def new_archive(start: ReachedStates, config: SearchConfig) -> Archive:
-    """Archives with nothing but the levels' starts [level, 1, ...]."""
+    """Return archives that hold the levels' first states alone, [level, 1, ...]."""
     count, entries = len(start.steps), config.entries
     widen = lambda x: jnp.pad(x, [(0, 0), (0, entries - 1)] + [(0, 0)] * (x.ndim - 2))
     width, entry = jnp.full(count, config.width, jnp.float32), jax.tree.map(widen, start)
@@ -50,12 +50,12 @@ def new_archive(start: ReachedStates, config: SearchConfig) -> Archive:
 def keys_of(
     feature: Float[Array, "level thing feature"], width: Float[Array, " level"]
 ) -> UInt32[Array, "level thing"]:
-    """Of the cells that things are in."""
+    """Return the keys of the states' cells."""
     return jax.vmap(cell_key)(feature, width)
 
 
 def choose(archive: Archive, uniform: Float[Array, "level 3 lane"], config: SearchConfig) -> Int[Array, "level lane"]:
-    """An entry for each lane: by novelty, and of two such sometimes the one nearer to the goal."""
+    """Choose an entry for each lane, novel ones more often; of two draws sometimes the one nearer to the goal."""
     weight = jnp.where(archive.used, jnp.maximum(ONE // (1 + archive.visits), 1), 0)
     total = jnp.cumsum(weight, axis=-1)
 
@@ -69,13 +69,13 @@ def choose(archive: Archive, uniform: Float[Array, "level 3 lane"], config: Sear
 
 
 def visit(archive: Archive, chosen: Int[Array, "level lane"], active: Bool[Array, " level"]) -> Archive:
-    """Count who was chosen, in levels that are active."""
+    """Count the chosen entries of active levels."""
     counts = (chosen[:, :, None] == jnp.arange(archive.used.shape[1])).sum(1)
     return archive._replace(visits=archive.visits + jnp.where(active[:, None], counts, 0))
 
 
 def insert(archive: Archive, new: ReachedStates, valid: Bool[Array, "level lane"], config: SearchConfig) -> Archive:
-    """Put in what is new, or reached in fewer env steps. Where not all of it fits, cells become wider."""
+    """Insert states of new cells, or reached in fewer env steps; widen the cells if they do not fit."""
     key = keys_of(new.feature, archive.width)
     slot, fits = jax.vmap(slots_for)(archive.used, archive.key, archive.entry.steps, key, new.steps, valid)
     level = jnp.arange(len(key))[:, None]
@@ -99,9 +99,9 @@ def slots_for(
     steps: Int[Array, " lane"],
     valid: Bool[Array, " lane"],
 ) -> tuple[Int[Array, " lane"], Bool[Array, ""]]:
-    """Where in one level's archive each lane's state goes, past the end for nowhere; and whether all new cells fit."""
+    """Assign each lane's state an index in one level's archive (past the end: none); tell whether all new cells fit."""
     nowhere, number = len(used), jnp.arange(len(used))[:, None]
-    old = jnp.where(used[:, None] & (known[:, None] == key), number + 1, 0).sum(0) - 1  # -1: the cell is new
+    old = jnp.where(used[:, None] & (known[:, None] == key), number + 1, 0).sum(0) - 1  # -1: new cell
     first = valid & ~beaten(key, steps, valid)
     fresh = first & (old < 0)
     free = jnp.where(used, nowhere, jnp.cumsum(~used) - 1)
@@ -116,14 +116,14 @@ def slots_for(
 def beaten(
     key: UInt32[Array, " thing"], steps: Int[Array, " thing"], valid: Bool[Array, " thing"]
 ) -> Bool[Array, " thing"]:
-    """Whether another one has the same cell in fewer env steps, or in as many and comes first."""
+    """Return whether another state has the same cell in fewer env steps, or in as many and a lower index."""
     other, number = lambda x: x[:, None], jnp.arange(len(key))
     sooner = (other(steps) < steps) | ((other(steps) == steps) & (other(number) < number))
     return ((other(key) == key) & sooner & other(valid)).any(0)
 
 
 def widen(archive: Archive, full: Bool[Array, " level"], config: SearchConfig) -> Archive:
-    """Wider cells in archives that are full; of entries that then share a cell the one reached first stays."""
+    """Widen the cells of full archives; of entries that then share a cell, keep the one reached in fewest env steps."""
 
     def wider(archive: Archive) -> tuple:
         width = jnp.where(full, archive.width * config.growth, archive.width)

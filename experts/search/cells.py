@@ -1,4 +1,4 @@
-"""Cells: what makes two states of a level different enough to keep both."""
+"""Cells: two states of a level in different cells are both archived."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +10,13 @@ from levelproof.levelgen.proofs import driven
 from levelproof.physics.types import FIXED_POLYGONS, State
 
 TURN = 2 * np.pi
-FARTHEST = 1e6  # cells from the start
+FARTHEST = 1e6  # cells from the origin
 
 
 def features(level: Level, state: State, config: SearchConfig) -> Float[Array, "lane feature"]:
-    """Metres that tell states apart: where bodies are, and how they are turned.
+    """Return features that tell states apart, in metres: positions of bodies, and rotations times radii of gyration.
 
-    Not how fast they are: in a world of many bodies that fills the archive with states that differ in nothing else.
+    Velocities are left out: with many bodies they would fill the archive with states that differ in nothing else.
     """
     model, moving = level.model, slice(FIXED_POLYGONS, None)
     turns = (model.inverse_inertia > 0) & (model.inverse_mass > 0)
@@ -29,13 +29,14 @@ def features(level: Level, state: State, config: SearchConfig) -> Float[Array, "
 
 
 def weights(level: Level, config: SearchConfig) -> Float[Array, "body lane"]:
+    """Return the weight of each body in the features; 0 for bodies that cannot move."""
     goal = (level.role == Role.GREEN) | (level.role == Role.BLUE)
     moves = level.model.active & (level.model.inverse_mass + level.model.inverse_inertia > 0)
     return jnp.where(moves, jnp.where(driven(level) & ~goal, config.driven_weight, 1.0), 0.0)
 
 
 def cell_key(feature: Float[Array, "thing feature"], width: Float[Array, ""]) -> UInt32[Array, " thing"]:
-    """A number for each cell; that two cells share one is as good as impossible among so few."""
+    """Hash the cell of each state to 32 bits; among so few cells, collisions are negligible."""
     cell = jnp.round(jnp.clip(feature / width, -FARTHEST, FARTHEST)).astype(jnp.int32).astype(jnp.uint32)
     factor = np.random.default_rng(0).integers(2**31, size=cell.shape[-1], dtype=np.uint32) * 2 + 1
     mixed = cell * factor

@@ -1,5 +1,5 @@
-"""The search of some levels side by side. Each round, every lane returns to a state of its level's archive, plays
-some segments from there, and after each puts what it came to into the archive.
+"""Go-Explore of some levels side by side. Each round, every lane returns to an archived state of its level, plays some
+segments from there, and archives the state after each segment.
 """
 
 from dataclasses import dataclass
@@ -22,43 +22,43 @@ from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.rules import TaskParams
 
-NEARER = 0.98  # of the least gap: what shrinks it less does not count
+NEARER = 0.98  # the gap must shrink to this share of the smallest so far to count as progress
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Search:
-    """Levels under search. The level axis is first, but for the levels themselves."""
+    """State of the search, level axis first, except in `levels`."""
 
     levels: Level  # lane axis last
     key: Key[Array, " level"]  # of the search's random stream
     archive: Archive
     env_steps: Int[Array, " level"]  # of all lanes
     grew: Int[Array, " level"]  # env steps when the last cell entered the archive
-    gap: Float[Array, " level"]  # m, the least one of green and blue so far
-    closed: Int[Array, " level"]  # env steps when it last shrank
-    code: UInt16[Array, "level step"]  # actions of the success, each as one number
-    length: Int[Array, " level"]  # of the success, env steps; 0: there is none
+    gap: Float[Array, " level"]  # m, smallest gap between green and blue so far
+    closed: Int[Array, " level"]  # env steps when the gap last shrank
+    code: UInt16[Array, "level step"]  # codes of the success's actions
+    length: Int[Array, " level"]  # of the success, env steps; 0: none
 
 
 class RoundDraws(NamedTuple):
-    """Random numbers of one level's round."""
+    """Random draws of one level's round."""
 
-    choice: Float[Array, "3 lane"]  # of an entry of the archive
-    anew: Bool[Array, " lane"]  # whether a lane starts with an action of its own, not with the last one of the entry
-    code: UInt16[Array, " lane"]  # which
-    bits: UInt32[Array, "stretch time 6 lane"]  # what it does then
+    choice: Float[Array, "3 lane"]  # uniform, to choose an archive entry
+    anew: Bool[Array, " lane"]  # whether a lane starts with a new action instead of the entry's last one
+    code: UInt16[Array, " lane"]  # code of that action
+    bits: UInt32[Array, "stretch time 6 lane"]  # bits for the actions that follow
 
 
 @partial(jax.jit, static_argnames=("config", "rules"))
 def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, rules: TaskParams) -> Search:
-    """Levels of which nothing but the start is known.
+    """Start a search: archives contain the levels' first states alone.
 
     Args:
-        levels: lane axis last.
+        levels: the levels, lane axis last.
         level_ids: their ids, the seeds of all randomness.
-        config: how they are searched.
-        rules: of the task.
+        config: settings of the search.
+        rules: the task's rules.
     """
     count, room = len(level_ids), -(-most_steps(rules) // config.segment) * config.segment
     one = lambda x: x[:, None]
@@ -71,13 +71,12 @@ def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, 
     )
     key = jax.vmap(lambda level_id: key_for(level_id, Stream.SEARCH))(level_ids)
     none, code = jnp.zeros(count, jnp.int32), jnp.zeros((count, room), jnp.uint16)
-    apart = jnp.nan_to_num(start.distance[:, 0], nan=FAR)  # of a world that is broken from the start
+    apart = jnp.nan_to_num(start.distance[:, 0], nan=FAR)  # NaN: the world is broken from its start
     return Search(levels, key, new_archive(start, config), none, none, apart, none, code, none)
 
 
 def explore(search: Search, config: SearchConfig, rules: TaskParams) -> Search:
-    """`config.rounds` rounds, after which `search` is used up. Levels that have a success, or have had their env steps,
-    stay as they are."""
+    """Search for `config.rounds` rounds; donates `search`. Levels that are done stay unchanged."""
     return _explore(search, config.ends, config.endless, rules)
 
 
@@ -89,7 +88,7 @@ def _explore(search: Search, ends: StopLimits, config: SearchConfig, rules: Task
 
 
 def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Search:
-    """One round; `ring` has the levels' lanes."""
+    """Search for one round; `ring` has the levels' lanes."""
     active = under_way(search, ends)
     chance = jax.vmap(partial(draw, config=config))(search.key, search.env_steps)
     bits = jnp.moveaxis(chance.bits, 0, 3).reshape(config.stretch, config.segment, ACTIONS, -1)
@@ -128,26 +127,26 @@ def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchC
 
 
 def under_way(search: Search, ends: StopLimits) -> Bool[Array, " level"]:
-    """Levels without a success that have env steps left, are not at a rung with too few cells, and have lately come
-    nearer to the goal.
+    """Return which levels are searched on.
 
-    Where next to nothing is reached, nothing will be: the world ends at once, or what acts moves little in it. And the
-    longer green and blue have come no nearer to each other, the less a search finds (docs/tried/variations.md).
+    These have no success, have env steps left, are not at a rung with too few cells, and have lately come nearer to
+    the goal. A level with few cells is hopeless: its episodes end at once, or its actuators move little. And the
+    longer the gap has not shrunk, the less a search finds (docs/tried/variations.md).
     """
     going = (search.length == 0) & (search.env_steps < ends.env_steps)
     at_rung = (search.env_steps[:, None] == ends.rungs).any(-1)
-    least = -(-search.env_steps // jnp.maximum(ends.per_cell, 1))  # rounded up; nothing here outgrows 32 bits
+    least = -(-search.env_steps // jnp.maximum(ends.per_cell, 1))  # rounded up, without overflow of 32 bits
     few = at_rung & (search.archive.cells < least) & (ends.per_cell > 0)
     return going & ~few & patient(search.env_steps - search.closed, ends.patience)
 
 
 def patient(waited: Int[Array, " level"], patience: Int[Array, ""]) -> Bool[Array, " level"]:
-    """Whether levels go on that have come no nearer to the goal for so many env steps; always where patience is 0."""
+    """Return whether levels continue after `waited` env steps without progress; always if `patience` is 0."""
     return (waited < patience) | (patience == 0)
 
 
 def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> RoundDraws:
-    """All the chance in one level's round."""
+    """Draw all random numbers of one level's round."""
     one, other = jax.random.split(jax.random.fold_in(key, env_steps))
     uniform = jax.random.uniform(one, (5, config.lanes))
     bits = jax.random.bits(other, (config.stretch, config.segment, ACTIONS, config.lanes))
@@ -155,7 +154,7 @@ def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -
 
 
 def back_to(search: Search, chosen: Int[Array, "level lane"]) -> tuple[Walk, UInt16[Array, "lane step"]]:
-    """Every lane in the state of the entry it has chosen, and the actions that lead there."""
+    """Return every lane to the state of its chosen entry, with the actions that lead there."""
     level, entry = jnp.arange(len(chosen))[:, None], search.archive.entry
     by_lane = lambda x: x[level, chosen].reshape(chosen.size, *x.shape[2:])
     code, steps = by_lane(entry.code), by_lane(entry.steps)
@@ -169,7 +168,7 @@ def back_to(search: Search, chosen: Int[Array, "level lane"]) -> tuple[Walk, UIn
 def written(
     code: UInt16[Array, "lane step"], played: UInt16[Array, "time lane"], segment: Int[Array, " lane"]
 ) -> UInt16[Array, "lane step"]:
-    """The actions with these in the lane's segment of this number."""
+    """Write the played actions into each lane's segment of this index."""
     segments = code.reshape(len(code), -1, len(played))
     now = jnp.arange(segments.shape[1]) == segment[:, None]
     return jnp.where(now[:, :, None], played.T[:, None], segments).reshape(code.shape)
@@ -178,7 +177,7 @@ def written(
 def reached_by(
     walk: Walk, code: UInt16[Array, "lane step"], ring: Arena, config: SearchConfig
 ) -> tuple[ReachedStates, Bool[Array, "level lane"]]:
-    """Where lanes are, by level, and which of them may go on."""
+    """Return the states of lanes, by level, and which of their episodes continue."""
     by_level = lambda x: x.reshape(-1, config.lanes, *x.shape[1:])
     come = ReachedStates(
         feature=features(ring.lanes, walk.state, config),
@@ -198,7 +197,7 @@ def with_success(
     active: Bool[Array, " level"],
     rules: TaskParams,
 ) -> tuple[UInt16[Array, "level step"], Int[Array, " level"]]:
-    """Actions of each level's success, and their number: the shortest one of its lanes, where one is in time."""
+    """Take each level's shortest success of its lanes, if one is in time; return codes and lengths."""
     in_time = (walk.reached > 0) & (walk.reached <= most_steps(rules))
     steps = jnp.where(in_time, walk.reached, RECORD_STEPS + 1).reshape(len(active), -1)
     level, lane = jnp.arange(len(active)), jnp.argmin(steps, axis=-1)
@@ -208,7 +207,7 @@ def with_success(
 
 
 def success_of(code: UInt16[Array, "level step"], length: Int[Array, " level"]) -> Success:
-    """What was found, level first."""
+    """Decode successes, level first."""
     code = jnp.pad(code, [(0, 0), (0, max(0, RECORD_STEPS - code.shape[1]))])[:, :RECORD_STEPS]
     action = decode(jnp.where(jnp.arange(RECORD_STEPS) < length[:, None], code, 0))
     return Success(jnp.moveaxis(action, 0, -1).astype(jnp.int8), length)

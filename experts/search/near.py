@@ -1,6 +1,6 @@
-"""How near the goal is: the gap between green and blue, which closes where they touch.
+"""Distance to the goal: the gap between green and blue bodies, 0 when they touch.
 
-The task's own distance is one of centres. It says little of a long floor, and sums up where there are several goals.
+The task's own distance is between centres. It says little about a long floor, and sums over several goals.
 """
 
 from typing import NamedTuple
@@ -13,15 +13,15 @@ from levelproof.physics.manifold import faces
 from levelproof.physics.types import MAX_VERTICES, Model, State
 from levelproof.physics.vector import Vec, nonzero, select, vec
 
-MAX_PAIRS = 2  # of a green and a blue body that are measured; sampled levels have one
-FAR = 1e6  # m; where there is none
+MAX_PAIRS = 2  # pairs of a green and a blue body that are measured; sampled levels have one
+FAR = 1e6  # m, gap without a pair
 
 
 class Shape(NamedTuple):
-    """One body of each pair. A circle is four corners in its centre, with a radius."""
+    """One body of each pair. A circle has four corners, all at its centre, and a radius."""
 
     body: Int[Array, "pair lane"]
-    corner: Vec  # in its own frame, components [vertex, pair, lane]
+    corner: Vec  # in the body's frame, components [vertex, pair, lane]
     radius: Float[Array, "pair lane"]
 
 
@@ -34,7 +34,7 @@ class Goals(NamedTuple):
 
 
 def goals_of(level: Level) -> Goals:
-    """The first pairs of each lane."""
+    """Return the first pairs of each lane."""
     role = jnp.where(level.model.active, level.role, Role.PLAIN)
     bodies = len(role)
     both = ((role[:, None] == Role.GREEN) & (role[None] == Role.BLUE)).reshape(bodies * bodies, -1)
@@ -47,9 +47,9 @@ def goals_of(level: Level) -> Goals:
 
 
 def gap(goals: Goals, state: State) -> Float[Array, " lane"]:
-    """The least gap between the bodies of a pair, m: along the normals of their faces or the line of their centres.
+    """Return the smallest gap of the pairs, m: the best separation along face normals and the line of centres.
 
-    Exact between circles and opposite a face, else no more than it is; 0 where they overlap.
+    The gap is exact between circles and opposite a face, else a lower bound; 0 if the bodies overlap.
     """
     (centre_a, corner_a), (centre_b, corner_b) = _in_world(goals.green, state), _in_world(goals.blue, state)
     between = centre_b - centre_a
@@ -79,13 +79,13 @@ def _pick(x: Float[Array, "thing *row lane"], number: Int[Array, "pair lane"]) -
 
 
 def _in_world(shape: Shape, state: State) -> tuple[Vec, Vec]:
-    """Centres and corners."""
+    """Return centres and corners in the world."""
     centre, rotation = vec(_pick(state.position, shape.body)), _pick(state.rotation, shape.body)
     return centre, shape.corner.rotate(jnp.cos(rotation), jnp.sin(rotation)) + centre
 
 
 def _beyond(corner: Vec, other: Vec) -> Float[Array, "pair lane"]:
-    """How far the other's corners are beyond the face that separates most."""
+    """Return the distance of the other's corners from the face that separates most."""
     outward = faces(corner).outward
     reach = [outward.dot(other.map(lambda x, k=k: x[k]) - corner) for k in range(MAX_VERTICES)]
     return jnp.stack(reach).min(0).max(0)

@@ -1,6 +1,6 @@
-"""Random play at nearly the speed of bare physics: no reward, no distance of the goal, no observation.
+"""Random play at nearly the speed of bare physics: no reward, no goal distance, no observation.
 
-The goal is reached, and an episode over, where `levelgen.task.rules.advance` says so.
+Episodes end, and reach the goal, exactly as in `levelgen.task.rules.advance`.
 """
 
 import math
@@ -21,11 +21,11 @@ from levelproof.physics.pairs import pairs_of
 from levelproof.physics.step import step
 from levelproof.physics.types import State
 
-CODES = math.prod(CHOICES)  # different actions
+CODES = math.prod(CHOICES)  # number of actions
 
 
 def _without() -> UInt16[np.ndarray, "entries code"]:
-    """Each action with some of its entries 0: those whose bit is set in the first index."""
+    """Tabulate each action with some entries set to 0: those whose bit is set in the first index."""
     entry, code = np.array(np.unravel_index(np.arange(CODES), CHOICES)), np.empty((1 << ACTIONS, CODES), np.uint16)
     for entries in range(1 << ACTIONS):
         zero = (entries >> np.arange(ACTIONS)) & 1 == 1
@@ -37,33 +37,33 @@ WITHOUT = _without()
 
 
 class Arena(NamedTuple):
-    """What is constant while lanes play."""
+    """Constants of lanes that play."""
 
-    lanes: Level  # each level in as many neighbouring lanes
+    lanes: Level  # each level in neighbouring lanes
     live: Bool[Array, "6 lane"]  # entries of an action that can have an effect
     blue: Bool[Array, "contact lane"]  # contacts that reach the goal
-    red: Bool[Array, "contact lane"]  # contacts that end the episode without
-    goals: Goals  # of which the gap says how near the goal is
-    redrawn: Float[Array, " lane"]  # chance that an entry of the action is drawn anew, per env step
+    red: Bool[Array, "contact lane"]  # contacts that end the episode without success
+    goals: Goals  # pairs of bodies whose gap measures the distance to the goal
+    redrawn: Float[Array, " lane"]  # probability of resampling an entry of the action, per env step
 
 
 class Walk(NamedTuple):
-    """Episodes under way; one that is over goes on, and nothing of it counts."""
+    """Episodes of lanes. One that has ended is still simulated, without effect."""
 
     state: State
-    action: Int[Array, "6 lane"]  # the last one
+    action: Int[Array, "6 lane"]  # last action
     timestep: Int[Array, " lane"]  # env steps since the level's start
-    reached: Int[Array, " lane"]  # env steps until the goal; 0: it was not reached
-    ended: Bool[Array, " lane"]  # the episode is over
+    reached: Int[Array, " lane"]  # env steps until the goal; 0: not reached
+    ended: Bool[Array, " lane"]  # whether the episode is over
 
 
 def most_steps(rules: TaskParams) -> int:
-    """Env steps within which the goal has to be reached: an episode's, and no more than a record holds."""
+    """Return the env steps within which the goal must be reached: the length of an episode or of a record."""
     return min(RECORD_STEPS, rules.max_timesteps)
 
 
 def arena(levels: Level, lanes: int, redrawn: tuple[float, ...]) -> Arena:
-    """Each level in `lanes` neighbouring lanes, an equal share of them for each chance."""
+    """Spread each level over `lanes` neighbouring lanes, an equal share for each probability in `redrawn`."""
     count = levels.role.shape[-1]
     spread = repeat(levels, lanes)
     chance = jnp.tile(jnp.repeat(jnp.array(redrawn, jnp.float32), lanes // len(redrawn)), count)
@@ -72,7 +72,7 @@ def arena(levels: Level, lanes: int, redrawn: tuple[float, ...]) -> Arena:
 
 
 def contacts(level: Level, second: Role) -> Bool[Array, "contact lane"]:
-    """Contacts of green and this role that `levelgen.task.rules.touches` counts."""
+    """Return which contacts join green and this role, as `levelgen.task.rules.touches` counts them."""
     pairs = pairs_of(level.size)
     of = lambda pair: has_roles(level, pair.a, pair.b, Role.GREEN, second)
     polygon = of(pairs.polygon)
@@ -80,7 +80,7 @@ def contacts(level: Level, second: Role) -> Bool[Array, "contact lane"]:
 
 
 def fresh_walk(lanes: Level) -> Walk:
-    """Every lane at its level's start."""
+    """Start every lane at its level's first state."""
     zeros = jnp.zeros(lanes.state.rotation.shape[-1], jnp.int32)
     return Walk(lanes.state, jnp.zeros((ACTIONS, len(zeros)), jnp.int32), zeros, zeros, zeros.astype(bool))
 
@@ -88,7 +88,7 @@ def fresh_walk(lanes: Level) -> Walk:
 def play(
     arena: Arena, walk: Walk, bits: UInt32[Array, "time 6 lane"], rules: TaskParams
 ) -> tuple[Walk, UInt16[Array, "time lane"]]:
-    """An env step for each time, and the actions, each as one number. Random bits choose them (`persistent`)."""
+    """Play an env step per row of random bits; return the walk and the codes of its actions."""
 
     def one(walk: Walk, bits: UInt32[Array, "6 lane"]) -> tuple[Walk, UInt16[Array, " lane"]]:
         action = persistent(walk.action, bits, arena)
@@ -98,7 +98,7 @@ def play(
 
 
 def persistent(action: Int[Array, "6 lane"], bits: UInt32[Array, "6 lane"], arena: Arena) -> Int[Array, "6 lane"]:
-    """The action, some of its entries drawn anew: one random number says whether, and if so which choice."""
+    """Resample some entries of the action; one random number decides both whether, and which choice."""
     choices = jnp.array(CHOICES, jnp.float32)[:, None]
     uniform = (bits >> 8).astype(jnp.float32) * 2.0**-24
     drawn = jnp.minimum(uniform / arena.redrawn * choices, choices - 1).astype(jnp.int32)
@@ -106,7 +106,7 @@ def persistent(action: Int[Array, "6 lane"], bits: UInt32[Array, "6 lane"], aren
 
 
 def act(arena: Arena, walk: Walk, action: Int[Array, "6 lane"], rules: TaskParams) -> Walk:
-    """One env step."""
+    """Advance all lanes by one env step."""
     state, reached, ended, timestep = walk.state, walk.reached, walk.ended, walk.timestep + 1
     driven = controls(arena.lanes, action)
     for _ in range(rules.frame_skip):
@@ -120,7 +120,7 @@ def act(arena: Arena, walk: Walk, action: Int[Array, "6 lane"], rules: TaskParam
 
 
 def encode(action: Int[Array, "6 *lane"]) -> UInt16[Array, "*lane"]:
-    """An action as one number below CODES."""
+    """Encode an action as an integer below CODES."""
     code = jnp.zeros(action.shape[1:], jnp.int32)
     for entry, choices in zip(action, CHOICES, strict=True):
         code = code * choices + entry
@@ -128,7 +128,7 @@ def encode(action: Int[Array, "6 *lane"]) -> UInt16[Array, "*lane"]:
 
 
 def decode(code: UInt16[Array, "*lane"]) -> Int[Array, "6 *lane"]:
-    """The action of a number."""
+    """Decode an action."""
     entries, rest = [], code.astype(jnp.int32)
     for choices in reversed(CHOICES):
         rest, entry = jnp.divmod(rest, choices)

@@ -1,8 +1,8 @@
-"""A witness polished: search around it for a shorter one, until its env steps are used up.
+"""Polishing: search around a witness for a shorter one, within a number of env steps.
 
-In every round each lane plays the shortest success so far with some of it changed: a stretch left out, held or drawn
-anew. The one that reaches the goal first is the next round's; of equals the one that comes nearer a step before, which
-is how a way becomes a step shorter.
+In every round each lane plays a variation of the shortest success so far: a stretch of it is left out, held or
+resampled. The shortest variation enters the next round; of equals the one that is nearest to the goal one step
+earlier, because it can become a step shorter.
 """
 
 from functools import partial
@@ -21,30 +21,30 @@ from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import TaskParams, goal_distance
 
-LANES = 16  # of a level: few, so that there are many rounds
+LANES = 16  # per level: few, so that there are many rounds
 
 
 class Polishing(NamedTuple):
-    """Levels under polish, level first."""
+    """State of polishing, level first."""
 
     success: Success
-    near: Float[Array, " level"]  # m, of green and blue, one env step before the goal; infinity: not known
+    near: Float[Array, " level"]  # m, distance of green and blue one env step before the goal; infinity: unknown
     env_steps: Int[Array, " level"]  # of all lanes
-    number: Int[Array, ""]  # of the round
+    number: Int[Array, ""]  # of rounds done
 
 
 @partial(jax.jit, static_argnames=("env_steps", "rules"))
 def polish(
     levels: Level, level_ids: Int[Array, " level"], success: Success, env_steps: int, rules: TaskParams
 ) -> Shortened:
-    """Look for shorter successes until every level has had so many env steps, rounded up to whole rounds.
+    """Search for shorter successes until every level has used its env steps, rounded up to whole rounds.
 
     Args:
-        levels: lane axis last.
+        levels: the levels, lane axis last.
         level_ids: their ids, the seeds of all randomness.
-        success: of each level, level first; it replays. Length 0: there is none, and no env step is made.
-        env_steps: of a level, all lanes together.
-        rules: of the task.
+        success: a success of each level that replays, level first; length 0: none, so no env step is made.
+        env_steps: env steps per level, all lanes together.
+        rules: the task's rules.
     """
     ring = arena(levels, LANES, (1.0,))
     keys = jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, Stream.SEARCH), 2))(level_ids)
@@ -83,9 +83,9 @@ def polish(
 def varied(
     action: Int[Array, "256 6"], length: Int[Array, ""], bits: UInt32[Array, "10 lane"], live: Bool[Array, "6"]
 ) -> Int[Array, "lane 256 6"]:
-    """The actions of each lane: half have a stretch drawn anew, three quarters one left out or held.
+    """Vary the actions for each lane: half resample a stretch, three quarters leave out or hold one.
 
-    Only `live` entries are drawn, those that have an effect.
+    Only `live` entries, those that have an effect, are resampled.
     """
     edit = drawn(bits[:6], length)
     redraws, edits = bits[6] >> 31 == 1, (bits[6] >> 29) % 4 > 0
@@ -103,7 +103,7 @@ def varied(
 def neared(
     ring: Arena, action: Int[Array, "level lane 256 6"], most: Int[Array, " level"], rules: TaskParams
 ) -> tuple[Int[Array, "level lane"], Float[Array, "level lane"]]:
-    """As `replayed`; and how far green and blue were apart a step before `most`, m, where the goal is reached then."""
+    """Replay as `replayed`; also return the distance of green and blue, m, a step before `most`, if that is the end."""
     last = jnp.repeat(most, action.shape[1])
 
     def look(walk: Walk, near: Float[Array, " lane"]) -> Float[Array, " lane"]:

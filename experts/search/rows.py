@@ -1,4 +1,4 @@
-"""A state as a row of numbers, exactly."""
+"""Exact conversion of states to rows of floats and back."""
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +8,13 @@ from levelproof.physics.types import State
 
 
 def to_rows(state: State) -> Float[Array, "lane word"]:
-    """Each lane's state as one row."""
+    """Pack each lane's state into one row."""
     lanes = state.rotation.shape[-1]
     return jnp.concatenate([x.reshape(-1, lanes).astype(jnp.float32) for x in jax.tree.leaves(state)]).T
 
 
 def from_rows(rows: Float[Array, "lane word"], like: State) -> State:
-    """The states in rows; `like` has their shapes and dtypes, with any number of lanes."""
+    """Unpack states from rows; `like` has their shapes and dtypes, with any number of lanes."""
     leaves, first, words = [], 0, rows.T
     for x in jax.tree.leaves(like):
         count = x[..., 0].size

@@ -1,4 +1,4 @@
-"""A success made shorter: stretches of it are left out or held, and what then reaches the goal sooner is kept."""
+"""Shortening of a success: leave out or hold stretches of it, and keep what reaches the goal sooner."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,19 +16,19 @@ from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.rules import TaskParams
 
-MAX_HALVINGS = 6  # stretches are from a whole success to a 64th of it
+MAX_HALVINGS = 6  # stretches range from a whole success to a 64th of it
 T = TypeVar("T")
 
 
 class Shortened(NamedTuple):
-    """What is left of successes, level first."""
+    """Shortened successes, level first."""
 
-    success: Success  # length 0 where the success that was given does not reach the goal
+    success: Success  # length 0: the given success does not reach the goal
     env_steps: Int[Array, " level"]  # of all lanes
 
 
 class Edit(NamedTuple):
-    """A stretch that is left out, then one that does what its first step does; each by its first step and length."""
+    """A stretch to leave out, then one that holds its first action; each by its first step and length."""
 
     left_out: Int[Array, " lane"]
     left_out_steps: Int[Array, " lane"]
@@ -40,16 +40,16 @@ class Edit(NamedTuple):
 def shorten(
     levels: Level, level_ids: Int[Array, " level"], success: Success, config: SearchConfig, rules: TaskParams
 ) -> Shortened:
-    """Try `config.trials` rounds of changes, one in every lane; each round starts from the shortest success so far.
+    """Try `config.trials` rounds of edits, one per lane; each round edits the shortest success so far.
 
-    In the first round, one lane plays the success as it is.
+    In the first round, one lane plays the unchanged success.
 
     Args:
-        levels: lane axis last.
+        levels: the levels, lane axis last.
         level_ids: their ids, the seeds of all randomness.
-        success: of each level, level first; length 0: there is none.
-        config: lanes of a level, and rounds.
-        rules: of the task.
+        success: a success of each level, level first; length 0: none.
+        config: its settings give lanes and rounds.
+        rules: the task's rules.
     """
     ring = arena(levels, config.lanes, config.redrawn)
     keys = jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, Stream.SEARCH), 1))(level_ids)
@@ -75,18 +75,18 @@ def shorten(
 
 
 def ended(action: Int[Array, "level 256 6"], length: Int[Array, " level"]) -> Success:
-    """Successes of these lengths, with zeros after their ends."""
+    """Return successes of these lengths, with zeros after the end."""
     inside = jnp.arange(RECORD_STEPS) < length[:, None]
     return Success(jnp.where(inside[:, :, None], action, 0), length)
 
 
 def below(bits: UInt32[Array, " lane"], bound: Int[Array, "*lane"]) -> Int[Array, " lane"]:
-    """Random numbers from 0 to below a bound, 0 where that is 0."""
+    """Map random bits to integers below a bound; 0 if the bound is 0."""
     return (bits % jnp.maximum(bound, 1).astype(jnp.uint32)).astype(jnp.int32)
 
 
 def drawn(bits: UInt32[Array, "6 lane"], length: Int[Array, ""]) -> Edit:
-    """Random changes: a quarter leave out a beginning, half hold nothing."""
+    """Draw random edits: a quarter leave out the beginning, half hold nothing."""
     stretch = lambda bits: jnp.maximum(length >> below(bits, jnp.int32(MAX_HALVINGS + 1)), 1)
     first = jnp.where(bits[0] >> 30 == 0, 0, below(bits[1], length))
     holds = bits[0] >> 31 == 1
@@ -94,7 +94,7 @@ def drawn(bits: UInt32[Array, "6 lane"], length: Int[Array, ""]) -> Edit:
 
 
 def edited(action: Int[Array, "256 6"], length: Int[Array, ""], edit: Edit) -> Int[Array, "lane 256 6"]:
-    """The actions of each lane; the last one goes on to the end."""
+    """Apply an edit per lane; the last action is repeated to the end."""
     step = jnp.arange(RECORD_STEPS)
     at = lambda x: x[:, None]
     step = jnp.where((step >= at(edit.held)) & (step < at(edit.held + edit.held_steps)), at(edit.held), step)
@@ -110,9 +110,9 @@ def replayed(
     look: Callable[[Walk, T], T] = lambda _, seen: seen,
     seen: T = None,
 ) -> tuple[Int[Array, "level lane"], T]:
-    """Env steps until the goal, from the level's start; RECORD_STEPS + 1 where it is not reached within `most`.
+    """Return env steps from the level's start to the goal; RECORD_STEPS + 1 if it is not reached within `most`.
 
-    After each env step, `look` makes of the walk and what was seen before what is returned as well.
+    After each env step, `look` folds the walk into `seen`, which is returned as well.
     """
     count, lanes = action.shape[:2]
     by_step = jnp.moveaxis(action.reshape(count * lanes, RECORD_STEPS, ACTIONS), 0, -1).astype(jnp.int32)

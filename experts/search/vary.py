@@ -1,9 +1,9 @@
-"""What came nearest to the goal, varied until it reaches it: evolution of whole trajectories.
+"""Variations: evolution of whole trajectories until one reaches the goal.
 
-Of each level the few trajectories that brought green and blue nearest to each other are kept. A lane plays one of them
-from the level's start, with some of it drawn anew or moved in time. At its end it takes its place among them if it came
-nearer than they did, and the lane plays another. A search from states draws all anew that comes after the state; here
-what follows a change stays, and an aim is corrected.
+Each level keeps the few trajectories that brought green and blue nearest to each other. A lane plays a variation of
+one of them from the level's start: stretches are resampled or shifted in time. If the variation came nearer than a kept
+trajectory, it replaces it; then the lane plays another. Go-Explore resamples all actions after the state it returns to;
+a variation keeps the actions after a change, so it can correct an aim.
 """
 
 from dataclasses import dataclass
@@ -25,58 +25,58 @@ from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.rules import TaskParams
 
-KEPT = 8  # trajectories of a level
-BEYOND = 16  # env steps, at least, that are played after the one at which the trajectory that is varied was nearest
-CHANGES = 2  # at most, in a variation
-LESS_PATIENT = 4  # times, than Go-Explore: what they find comes sooner (docs/tried/cells.md)
-MAX_MOVED = 8  # env steps by which what follows comes sooner or later
+KEPT = 8  # trajectories per level
+BEYOND = 16  # env steps played beyond the step at which the varied trajectory was nearest
+CHANGES = 2  # maximum number in a variation
+LESS_PATIENT = 4  # divides the patience of Go-Explore: variations succeed sooner (docs/tried/cells.md)
+MAX_MOVED = 8  # env steps, maximum shift in time
 
 
 class Approaches(NamedTuple):
-    """Of each level, the nearest to the goal first."""
+    """Trajectories of each level, the nearest to the goal first."""
 
-    code: UInt16[Array, "level kept step"]  # actions from the level's start, each as one number
-    gap: Float[Array, "level kept"]  # m, the least one of green and blue
-    steps: Int[Array, "level kept"]  # env steps until then
+    code: UInt16[Array, "level kept step"]  # codes of the actions from the level's start
+    gap: Float[Array, "level kept"]  # m, smallest gap between green and blue
+    steps: Int[Array, "level kept"]  # env steps until that gap
 
 
 class Episodes(NamedTuple):
-    """What lanes play."""
+    """Episodes of lanes."""
 
-    so_far: Approaches  # a lane in the place of what is kept: all its actions, its least gap until now
-    state: Float[Array, "level lane word"]  # all that evolves (`experts.search.rows`)
+    so_far: Approaches  # one trajectory per lane instead of the kept ones: all its actions, its smallest gap so far
+    state: Float[Array, "level lane word"]  # the whole state (`experts.search.rows`)
     timestep: Int[Array, "level lane"]
-    most: Int[Array, "level lane"]  # env steps after which it is over
+    most: Int[Array, "level lane"]  # env steps after which the episode is over
     over: Bool[Array, "level lane"]
 
 
 class Change(NamedTuple):
     """Random numbers of one variation."""
 
-    parent: UInt32[Array, "2 *lane"]  # of which the nearer is varied
-    number: UInt32[Array, "*lane"]  # of changes
+    parent: UInt32[Array, "2 *lane"]  # two draws, the nearer one is varied
+    number: UInt32[Array, "*lane"]  # bits that say how many changes apply
     change: UInt32[Array, "change 5 *lane"]
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Varying:
-    """Levels whose trajectories are varied. The level axis is first, but for the levels themselves."""
+    """State of the variations, level axis first, except in `levels`."""
 
     levels: Level  # lane axis last
     key: Key[Array, " level"]  # of the variations' random stream
     nearest: Approaches
     episodes: Episodes
     env_steps: Int[Array, " level"]  # of all lanes
-    gap: Float[Array, " level"]  # m, the least one of green and blue so far
-    closed: Int[Array, " level"]  # env steps when it last shrank
-    code: UInt16[Array, "level step"]  # actions of the success, each as one number
-    length: Int[Array, " level"]  # of the success, env steps; 0: there is none
+    gap: Float[Array, " level"]  # m, smallest gap between green and blue so far
+    closed: Int[Array, " level"]  # env steps when the gap last shrank
+    code: UInt16[Array, "level step"]  # codes of the success's actions
+    length: Int[Array, " level"]  # of the success, env steps; 0: none
 
 
 @jax.jit
 def nearest_of(archive: Archive) -> Approaches:
-    """What leads to the entries that are nearest to the goal; after its end the last action goes on."""
+    """Return the trajectories to the archived states nearest to the goal; each repeats its last action to the end."""
     entry = archive.entry
     distance = jnp.where(archive.used & ~jnp.isnan(entry.distance), entry.distance, FAR)
     step = jnp.minimum(jnp.arange(entry.code.shape[-1]), jnp.maximum(entry.steps - 1, 0)[..., None])
@@ -91,14 +91,14 @@ def begin(
     config: SearchConfig,
     rules: TaskParams,
 ) -> Varying:
-    """Levels of which these trajectories are known, before the first is varied.
+    """Start variations from these trajectories.
 
     Args:
-        levels: lane axis last.
+        levels: the levels, lane axis last.
         level_ids: their ids, the seeds of all randomness.
-        nearest: of each level.
-        config: how they are searched.
-        rules: of the task.
+        nearest: the nearest trajectories of each level.
+        config: settings of the search.
+        rules: the task's rules.
     """
     key = jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, Stream.SEARCH), 4))(level_ids)
     count, steps = len(level_ids), nearest.code.shape[-1]
@@ -113,7 +113,7 @@ def begin(
 
 
 def vary(varying: Varying, config: SearchConfig, rules: TaskParams) -> Varying:
-    """`config.rounds` rounds, after which `varying` is used up. Levels that are done stay as they are."""
+    """Vary for `config.rounds` rounds; donates `varying`. Levels that are done stay unchanged."""
     return _vary(varying, config.ends, config.endless, rules)
 
 
@@ -125,7 +125,7 @@ def _vary(varying: Varying, ends: StopLimits, config: SearchConfig, rules: TaskP
 
 
 def vary_round(varying: Varying, ring: Arena, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Varying:
-    """Lanes whose episodes are over begin another; then all play on. `ring` has the levels' lanes."""
+    """Give lanes whose episodes are over new ones, then play all lanes; `ring` has the levels' lanes."""
     active = under_way(varying, ends)
     stays = lambda new, old: jnp.where(active.reshape(-1, *[1] * (old.ndim - 1)), new, old)
     episodes = varying.episodes
@@ -157,19 +157,19 @@ def vary_round(varying: Varying, ring: Arena, ends: StopLimits, config: SearchCo
 
 
 def under_way(varying: Varying, ends: StopLimits) -> Bool[Array, " level"]:
-    """Levels without a success that have env steps left and have lately come nearer to the goal."""
+    """Return which levels are varied on: no success, env steps left, and lately nearer to the goal."""
     going = (varying.length == 0) & (varying.env_steps < ends.variations)
-    less = -(-ends.patience // LESS_PATIENT)  # rounded up: 0 would have no end
+    less = -(-ends.patience // LESS_PATIENT)  # rounded up, because 0 means no limit
     return going & patient(varying.env_steps - varying.closed, less)
 
 
 def together(one: Array, other: Array) -> Array:
-    """Things of each level, one after another."""
+    """Concatenate along the second axis, within each level."""
     return jnp.concatenate([one, other], axis=1)
 
 
 def first_of(some: Approaches) -> Approaches:
-    """The KEPT nearest ones; of several with the same gap only the first, as far as there are others."""
+    """Return the KEPT nearest trajectories; of several with the same gap the first, if enough others exist."""
     order = jnp.argsort(some.gap, axis=-1)
     gaps = jnp.take_along_axis(some.gap, order, axis=-1)
     again = jnp.pad(gaps[:, 1:] == gaps[:, :-1], [(0, 0), (1, 0)])
@@ -181,13 +181,13 @@ def first_of(some: Approaches) -> Approaches:
 
 
 def drawn(key: Key[Array, ""], env_steps: Int[Array, ""], lanes: int) -> Change:
-    """All the chance in one level's round."""
+    """Draw all random numbers of one level's round."""
     bits = jax.random.bits(jax.random.fold_in(key, env_steps), (3 + 5 * CHANGES, lanes))
     return Change(bits[:2], bits[2], bits[3:].reshape(CHANGES, 5, lanes))
 
 
 def renewed(episodes: Episodes, nearest: Approaches, change: Change, ring: Arena, rules: TaskParams) -> Episodes:
-    """The episodes, in the place of those that are over variations of what is nearest."""
+    """Replace episodes that are over with variations of the nearest trajectories."""
     kept = jnp.int32(nearest.gap.shape[1])
     parent = jax.vmap(lambda bits: jnp.minimum(below(bits[0], kept), below(bits[1], kept)))(change.parent)
     code, steps = (jax.vmap(lambda x, at: x[at])(x, parent) for x in (nearest.code, nearest.steps))
@@ -204,7 +204,7 @@ def renewed(episodes: Episodes, nearest: Approaches, change: Change, ring: Arena
 
 
 def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskParams) -> tuple[Walk, Approaches]:
-    """Where a round takes lanes, and how near they came until then."""
+    """Play all lanes for a round; return them and how near they have come."""
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     code, least, steps = (flat(x) for x in episodes.so_far)
     lane, last = jnp.arange(len(code)), code.shape[1] - 1
@@ -228,7 +228,7 @@ def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskPar
 def varied(
     code: UInt16[Array, " step"], steps: Int[Array, ""], change: Change, live: Bool[Array, "6"]
 ) -> UInt16[Array, " step"]:
-    """The actions with one change or more before this step: a stretch is drawn anew, or what follows is moved."""
+    """Apply one or more changes before this step: resample a stretch, or shift what follows in time."""
     first = changed(code, steps, change.change[0], live)
     for number, bits in enumerate(change.change[1:]):
         more = (change.number >> number) & 1 == 1
@@ -239,7 +239,7 @@ def varied(
 def changed(
     code: UInt16[Array, " step"], steps: Int[Array, ""], bits: UInt32[Array, "5"], live: Bool[Array, "6"]
 ) -> UInt16[Array, " step"]:
-    """In half of the cases some live entries are drawn anew for a stretch; else what follows comes sooner or later."""
+    """Resample some live entries for a stretch, in half of the cases; else shift what follows, sooner or later."""
     step, length = jnp.arange(len(code)), jnp.maximum(steps, 1)
     first = below(bits[0], length)
     stretch = jnp.maximum(length >> below(bits[1], jnp.int32(MAX_HALVINGS + 1)), 1)

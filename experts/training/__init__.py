@@ -1,1 +1,1 @@
-"""One PPO expert a level: rollouts, updates, evaluations and stopping, many slots side by side."""
+"""One PPO expert per level: rollouts, updates, evaluations and stopping, many slots side by side."""

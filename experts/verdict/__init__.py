@@ -1,1 +1,1 @@
-"""What is known of a level when the search and its expert are done: evaluation, portability, label."""
+"""Judging a level after search and training: evaluation, portability, label."""

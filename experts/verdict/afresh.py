@@ -1,6 +1,6 @@
-"""How often an expert reaches the goal, by attempts that decide nothing.
+"""Success rates of experts, from attempts that decide nothing.
 
-An evaluation that ends training had enough successes for that, so its own success rate is above the policy's.
+Training ends with an evaluation selected for its successes, so that evaluation's success rate is biased upwards.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ PART = 16  # env steps between checks whether all attempts have ended
 
 
 class AttemptResults(NamedTuple):
-    """First episodes under sampled actions."""
+    """Results of first episodes under sampled actions."""
 
     success_rate: Float[np.ndarray, " level"]  # share of attempts
     env_steps: Int[np.ndarray, " level"]  # of all attempts
@@ -47,14 +47,14 @@ def attempt(
     config: ExpertConfig,
     rules: TaskParams,
 ) -> AttemptResults:
-    """Have each level's policy make `expert.attempts` attempts, of at most a record's length.
+    """Run `expert.attempts` attempts per level, each at most as long as a record.
 
     Args:
-        levels: on the host.
+        levels: the levels, on the host.
         level_ids: their ids, the seeds of all randomness.
         policies: parameters of their experts, on the host.
-        config: of the experts.
-        rules: of the task.
+        config: settings of the experts.
+        rules: the task's rules.
     """
     parts = [AttemptResults(np.zeros(0, np.float32), np.zeros(0, np.int32))]
     for some in blocks(len(level_ids), at_once(config.attempts, IN_CACHE)):

@@ -1,4 +1,4 @@
-"""What an expert in training would do now: attempts to look at. They leave no trace in the training."""
+"""Attempts of an expert in training, to watch. They leave no trace in its training."""
 
 from functools import partial
 from typing import NamedTuple
@@ -18,27 +18,27 @@ from levelproof.levelgen.task.rules import TaskParams
 
 
 class Attempts(NamedTuple):
-    """Where bodies are after each env step, time first; an attempt that has ended rests where it did."""
+    """Poses of bodies after each env step, time first; they freeze when the attempt ends."""
 
     position: Float[Array, "time body 2 attempt"]  # m
     rotation: Float[Array, "time body attempt"]  # rad
-    goal: Bool[Array, " attempt"]  # it reached the goal
+    goal: Bool[Array, " attempt"]  # whether it reached the goal
 
 
 @partial(jax.jit, static_argnames=("config", "rules", "count", "steps"))
 def attempts(
     level: Level, params: Params, key: Key[Array, ""], config: ExpertConfig, rules: TaskParams, count: int, steps: int
 ) -> Attempts:
-    """First episodes under sampled actions.
+    """Play first episodes with sampled actions.
 
     Args:
         level: one level, level axis last.
-        params: of its expert.
-        key: of the samples.
-        config: of the expert.
-        rules: of the task.
-        count: how many attempts.
-        steps: env steps of each.
+        params: parameters of its expert.
+        key: key of the sampled actions.
+        config: settings of the expert.
+        rules: the task's rules.
+        count: number of attempts.
+        steps: env steps of each attempt.
     """
     network, lanes = network_of(level.size, config), repeat(level, count)
     no, never = jnp.zeros(count, bool), jnp.zeros(count)

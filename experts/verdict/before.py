@@ -1,4 +1,4 @@
-"""What needs no expert: levels that doing nothing solves, and levels that are proved unsolvable."""
+"""Levels that need no expert: doing nothing solves them, or a proof says that they are unsolvable."""
 
 from typing import NamedTuple
 
@@ -16,14 +16,14 @@ from levelproof.levelgen.task.rules import TaskParams
 
 
 class PriorVerdicts(NamedTuple):
-    """What is known before training."""
+    """Verdicts without training."""
 
-    verdicts: list[Verdict | None]  # None: an expert has to try
+    verdicts: list[Verdict | None]  # None: the level needs an expert
     failed_by_noop: Bool[np.ndarray, " level"]
 
 
 def decide(levels: Level, rules: TaskParams) -> PriorVerdicts:
-    """Verdicts on levels that need no expert. Every lane on its own, in blocks of one compiled program."""
+    """Judge levels that need no expert, in blocks of one compiled program; lanes are independent."""
     count = levels.role.shape[-1]
     facts = facts_of(levels, rules)
     verdicts: list[Verdict | None] = [None] * count
@@ -40,7 +40,7 @@ def decide(levels: Level, rules: TaskParams) -> PriorVerdicts:
 
 
 def facts_of(levels: Level, rules: TaskParams) -> Facts:
-    """`levelgen.proofs.examine` for any number of levels, on the host; it watches one record's length."""
+    """Run `levelgen.proofs.examine` on any number of levels, for one record's length; return its facts on the host."""
     count, watched = levels.role.shape[-1], min(RECORD_STEPS, rules.max_timesteps)
     parts = [jax.device_get(examine(take(levels, lanes), rules, watched)) for lanes in blocks(count)]
     return jax.tree.map(lambda *xs: np.concatenate(xs, -1)[:count], *parts)

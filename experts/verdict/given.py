@@ -1,4 +1,4 @@
-"""Levels whose actions somebody else found: played again here, and labelled by what comes of it."""
+"""Imported actions: replay them here, and label their levels by the result."""
 
 import jax
 import numpy as np
@@ -20,16 +20,16 @@ MISSED = "the imported actions do not reach the goal here: {}"
 def label_given(
     levels: Level, action: Int[np.ndarray, "256 6 level"], rules: TaskParams
 ) -> tuple[Record, list[Verdict]]:
-    """What the actions do, and what that makes of the levels.
+    """Replay the actions; return the record and the verdicts.
 
-    Where not every episode reaches the goal, but the first does, its actions are the witness. Levels that need no
-    expert are what they always are: the witness of a trivial one does nothing.
+    If the first episode reaches the goal but a later one does not, the first episode, repeated, is the witness.
+    Levels that need no expert are judged as always: the witness of a trivial one does nothing.
     """
     before, failed = decide(levels, rules)
     record = replay(levels, action, rules)
     whole, done, steps = succeeds(record.done, record.goal), np.asarray(record.done), steps_to_goal(record.done)
     at_first = np.take_along_axis(np.asarray(record.goal), steps[None] - 1, 0)[0]
-    fails = done[steps - 1, np.arange(len(steps))]  # no episode ended otherwise
+    fails = done[steps - 1, np.arange(len(steps))]  # False: no episode ended
     new = action.copy()
     for i, verdict in enumerate(before):
         if verdict is not None:

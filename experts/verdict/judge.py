@@ -1,4 +1,4 @@
-"""From what training and evaluation showed of a level to its witness and its verdict."""
+"""Choice of a level's witness candidates, and its verdict, from its training and evaluations."""
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -24,7 +24,7 @@ from levelproof.experts.training.slots import ExpertState
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import Record, steps_to_goal, succeeds
 
-MAX_CANDIDATES = 16  # of an evaluation
+MAX_CANDIDATES = 16  # per evaluation
 
 
 class Evaluation(NamedTuple):
@@ -33,16 +33,16 @@ class Evaluation(NamedTuple):
     action: Int[np.ndarray, "256 6 attempt"]
     done: Bool[np.ndarray, "256 environment"]
     goal: Bool[np.ndarray, "256 environment"]
-    progress: Progress  # of training until then
-    success: Success  # the first: the search's, else training's
-    over: int | Int[np.ndarray, ""] | Int[Array, ""]  # the Cause for which training stopped for good
+    progress: Progress  # of training before it
+    success: Success  # the first, of the search or of training
+    over: int | Int[np.ndarray, ""] | Int[Array, ""]  # Cause why training stopped for good
 
 
 class KeptExpert(NamedTuple):
-    """An expert that can go on later."""
+    """An expert that a larger budget can continue."""
 
     begun: ExpertState
-    curve: list[float]  # so far, as in `TrainedLevel`
+    curve: list[float]  # as in `TrainedLevel`
 
 
 class Witness(NamedTuple):
@@ -51,18 +51,18 @@ class Witness(NamedTuple):
     action: Int[np.ndarray, "256 6"]
     source: Source
     steps: int  # of the first episode
-    portability: float | None = None  # as in `Verdict`; None: not known
+    portability: float | None = None  # as in `Verdict`; None: unknown
 
 
 class TrainedLevel(NamedTuple):
     """A level that has left its slot."""
 
     curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
-    evaluations: list[Evaluation]  # those that solved it, and the last
-    expert: KeptExpert | None = None  # if it is kept
-    candidates: Sequence[Witness] = ()  # for its witness, the shortest first; some have been replayed
+    evaluations: list[Evaluation]  # those that solved the level, and the last
+    expert: KeptExpert | None = None  # if kept
+    candidates: Sequence[Witness] = ()  # possible witnesses, shortest first; some have been replayed
     evaluation_steps: int = 0  # env steps
-    policy: Params | None = None  # of the expert that left; None: there was none
+    policy: Params | None = None  # parameters of its expert; None: no expert
 
 
 def judge(
@@ -72,9 +72,9 @@ def judge(
     config: ExpertConfig,
     failed_by_noop: Bool[np.ndarray, " level"],
 ) -> list[Verdict]:
-    """Verdicts. A witness counts only if its record, by replay, shows what the evaluation showed.
+    """Return verdicts. A witness counts only if its replay, `record`, reaches the goal in as many env steps.
 
-    `chosen` are the witnesses, not yet replayed.
+    `chosen` are the witnesses before replay.
     """
     replays, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
     verdicts = []
@@ -87,9 +87,9 @@ def judge(
 
 
 def candidates_of(evaluations: Sequence[Evaluation], source: Source, config: ExpertConfig) -> list[Witness]:
-    """What could be a level's witness: successes of its evaluations, the shortest first.
+    """Return candidates for a level's witness: successes of its evaluations, shortest first.
 
-    Without one, the success that was rehearsed, which is of this source.
+    If there are none, the candidate is the rehearsed success, which comes from `source`.
     """
     found = [witness for e in evaluations for witness in witnesses_in(e, config)]
     if not found and config.exploration:
@@ -98,18 +98,18 @@ def candidates_of(evaluations: Sequence[Evaluation], source: Source, config: Exp
 
 
 def shortest_first(witnesses: Iterable[Witness]) -> list[Witness]:
-    """Of equals the first stays the first."""
+    """Sort witnesses by length; the sort is stable."""
     return sorted(witnesses, key=lambda witness: witness.steps)
 
 
 def repeating(success: Success, source: Source) -> list[Witness]:
-    """A success again and again, if there is one."""
+    """Return a witness that repeats the success, if there is one."""
     steps = int(success.length)
     return [Witness(repeated(np.asarray(success.action), steps), source, steps)] if steps else []
 
 
 def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
-    """Witnesses of an evaluation, the shortest ones; where none is replayed from moved starts, one."""
+    """Return an evaluation's shortest witnesses; only one if `expert.replays` is 0."""
     attempts = evaluation.action.shape[-1]
     done, goal = evaluation.done[:, :attempts], evaluation.goal[:, :attempts]
     source = lambda attempt: Source.SAMPLED if attempt else Source.MOST_PROBABLE
@@ -120,19 +120,21 @@ def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
     episodes = [(end - start, attempt, start) for attempt in range(attempts)
                 for start, end in successful_episodes(done[:, attempt], goal[:, attempt])]  # fmt: skip
     played = lambda steps, attempt, start: evaluation.action[start : start + steps, :, attempt]
-    distinct = {played(*episode).tobytes(): episode for episode in sorted(episodes, reverse=True)}  # the first stays
+    distinct = {
+        played(*episode).tobytes(): episode for episode in sorted(episodes, reverse=True)
+    }  # keep the first of copies
     shortest = sorted(distinct.values())[: MAX_CANDIDATES if config.replays else 1]
     return [Witness(repeated(played(*episode), episode[0]), source(episode[1]), episode[0]) for episode in shortest]
 
 
 def successful_episodes(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:
-    """First step and the step after the last of every episode that reached the goal."""
+    """Return [start, end) of every episode that reached the goal."""
     ends = np.flatnonzero(done) + 1
     return [(int(start), int(end)) for start, end in pairwise([0, *ends]) if goal[end - 1]]
 
 
 def repeated(action: Int[np.ndarray, "time 6"], steps: int) -> Int[np.ndarray, "256 6"]:
-    """An episode's actions again and again: the world starts anew after each, so each reaches the goal."""
+    """Repeat an episode's actions: the world is reset after each episode, so each reaches the goal."""
     return np.asarray(action, np.int32)[np.arange(RECORD_STEPS) % steps]
 
 
@@ -143,7 +145,7 @@ def verdict_of(
     config: ExpertConfig,
     failed_by_noop: bool,
 ) -> Verdict:
-    """A level's verdict: `episodes` are those of its record."""
+    """Return a level's verdict; `episodes` counts the finished episodes of its record."""
     if not trained.evaluations:
         if witness is None:
             return untrained(Label.UNSOLVED, UNTRAINED, failed_by_noop)
@@ -178,14 +180,14 @@ def verdict_of(
 
 
 def shares(evaluation: Evaluation, config: ExpertConfig) -> tuple[float, float, float]:
-    """Success rates of sampled, of sticky and of moved attempts: of their first episodes.
+    """Return success rates of sampled, sticky and moved attempts, over their first episodes (NaN: no such attempts).
 
-    Episodes after the first would count quick successes several times and slow failures never; and only a first one
-    starts with other velocities. One that has not ended within the record did not succeed. NaN: no such attempts.
+    Later episodes would count quick successes several times and slow failures never, and do not start with perturbed
+    velocities. An episode that does not end within the record is a failure.
     """
     done, goal = evaluation.done, evaluation.goal
     first = done.any(0) & goal[np.argmax(done, 0), np.arange(done.shape[1])]
-    sampled = first[1 : config.attempts]  # the first is the most probable one
+    sampled = first[1 : config.attempts]  # the first takes the most probable actions
     sticky = first[config.attempts : config.attempts + config.sticky_attempts]
     moved = first[config.attempts + config.sticky_attempts :][: config.moved_attempts]
     mean = lambda x: float(x.mean()) if len(x) else float("nan")

@@ -1,7 +1,7 @@
-"""How portable a witness is: the share of its replays that reach the goal from starts moved by one rounding error.
+"""Portability of a witness: the share of its replays that reach the goal from starts perturbed by a rounding error.
 
-A witness is bits of one machine. Another one, or the reference's physics, rounds otherwise, and where a world is
-chaotic the same actions then miss the goal. Of a level's candidates the one that survives most is its witness.
+A witness holds for the bits of one machine. Another machine, or the reference's physics, rounds differently, and in a
+chaotic world the same actions then miss the goal. A level's witness is its most portable candidate.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import State
 
-LATE = 16  # env steps by which a replay may reach the goal later than the candidate
-PORTABLE = 0.95  # share of replays; where fewer survive, a steadier witness is looked for
-IN_CACHE = 32  # lanes, of candidates side by side
+LATE = 16  # env steps that a replay may take longer than the candidate
+PORTABLE = 0.95  # portability below which a more robust witness is sought
+IN_CACHE = 32  # lanes of candidates side by side
 
 
 def choose(
@@ -34,17 +34,16 @@ def choose(
     replays: int,
     rules: TaskParams,
 ) -> list[Witness | None]:
-    """Of each level's candidates the first of those that survive most replays, with its portability.
+    """Choose each level's most portable candidate, the first of several; return it with its portability.
 
-    None survives more than one that survives all, so those after it are not replayed; nor is one whose portability is
-    known.
+    Candidates after one that survives all replays are not replayed, nor are candidates of known portability.
 
     Args:
-        levels: on the host.
+        levels: the levels, on the host.
         level_ids: their ids, the seeds of all randomness.
-        candidates: of each level, perhaps none.
-        replays: of each candidate; 0: the first is chosen, its portability is not known.
-        rules: of the task.
+        candidates: candidates of each level, perhaps none.
+        replays: replays per candidate; 0: choose the first, of unknown portability.
+        rules: the task's rules.
     """
     best = [next(iter(of), None) for of in candidates]
     shares = np.full(len(best), -1.0)
@@ -66,14 +65,14 @@ def choose(
 def survival(
     levels: Level, level_ids: Int[np.ndarray, " level"], witnesses: Sequence[Witness], replays: int, rules: TaskParams
 ) -> Float[np.ndarray, " level"]:
-    """The share of replays that reach the goal, of one witness a level; every level on its own.
+    """Return the share of replays that reach the goal, for one witness per level; levels are independent.
 
     Args:
-        levels: on the host, several times where it has several witnesses.
+        levels: the levels, on the host; a level with several witnesses is repeated.
         level_ids: their ids, the seeds of all randomness.
-        witnesses: of each level.
-        replays: of each witness: their starts are the same for all witnesses of a level.
-        rules: of the task.
+        witnesses: one per level.
+        replays: replays per witness, from the same starts for all witnesses of a level.
+        rules: the task's rules.
     """
     shares, size = [], block_size(len(witnesses), at_once(replays, IN_CACHE))
     for some in blocks(len(witnesses), size):
@@ -101,7 +100,7 @@ def _survival(
 def survivors(
     ring: Arena, start: Walk, action: Int[Array, "256 6 lane"], steps: Int[Array, " lane"], rules: TaskParams
 ) -> Bool[Array, " lane"]:
-    """Whether each lane reaches the goal, at most LATE env steps later than after `steps`; 0: it does not play."""
+    """Return whether each lane reaches the goal within `steps` + LATE env steps; steps 0: the lane does not play."""
     last = jnp.where(steps > 0, jnp.minimum(steps + LATE, RECORD_STEPS), 0)
 
     def step(walk: Walk) -> Walk:
@@ -113,13 +112,13 @@ def survivors(
 
 
 def moved(lanes: Level, level_ids: Int[Array, " level"], replays: int, number: Int[Array, ""] | int = 0) -> State:
-    """First states: every number of a body that can move is one unit in the last place less or more, or as it was.
+    """Perturb first states: change each number of a movable body by -1, 0 or 1 unit in the last place.
 
     Args:
-        lanes: `replays` of each level, level by level.
-        level_ids: of the levels.
-        replays: of each level.
-        number: of these states, of a level.
+        lanes: `replays` lanes per level, level by level.
+        level_ids: ids of the levels.
+        replays: number of states per level.
+        number: index of this set of states; another index gives other states.
     """
     state, model = lanes.state, lanes.model
     movable = model.active & ((model.inverse_mass > 0) | (model.inverse_inertia > 0))

@@ -1,1 +1,1 @@
-"""Proof that a level can be solved: the actions of a success, replayed from the initial state."""
+"""Witnesses prove that a level can be solved: the actions of a success, replayed from the initial state."""

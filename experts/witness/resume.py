@@ -1,6 +1,6 @@
-"""Records made again: from a level and its actions with a checksum of every state, or from states along the way.
+"""Recomputation of records: from a level, its actions and a checksum of every state, or from states along the way.
 
-On the machine and versions that `experts.witness.witness.replay` made a record on, these are its bits.
+On the machine and versions that made a record by `experts.witness.witness.replay`, the bits are the same.
 """
 
 from functools import partial
@@ -22,13 +22,13 @@ from levelproof.levelgen.task.rules import StepResult, TaskParams, TaskState
 from levelproof.physics.buffers import zeros_of
 from levelproof.physics.types import Manifold, State
 
-MOST = 256  # levels that are played side by side
-# of `checksum`
+MAX_LANES = 256  # levels that are played side by side
+# constants of `checksum`
 GOLDEN, MIX_A, MIX_B = (np.uint32(x) for x in (0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35))
 
 
 class Moves(NamedTuple):
-    """What was done in a record, and which episodes came of it."""
+    """Actions of a record, and the ends of its episodes."""
 
     action: Int[np.ndarray, "256 6 level"]
     done: Bool[np.ndarray, "256 level"]
@@ -36,38 +36,38 @@ class Moves(NamedTuple):
 
 
 class KnownStates(NamedTuple):
-    """States of a record to go on from, wherever playing has led to."""
+    """Stored states of a record, which replace the simulated ones."""
 
     state: State  # [256, ..., level]
-    last_distance: Any  # m, [256, level]; None: as the step that leads there gives it
-    known: Bool[np.ndarray, "256 level"]  # which of them there are
+    last_distance: Any  # m, [256, level]; None: as simulated
+    known: Bool[np.ndarray, "256 level"]  # which states are stored
 
 
 class Resumed(NamedTuple):
-    """What playing gave."""
+    """Result of playing a record again."""
 
     fields: dict[str, Any]  # arrays of `Record`, by their paths: [256, ..., level]
-    checksum: UInt32[np.ndarray, "256 level"] | None  # of each row's state, where playing led to it by itself
-    agrees: Bool[np.ndarray, "256 level"]  # whether each step ends its episode as the record has it
+    checksum: UInt32[np.ndarray, "256 level"] | None  # of each row's state, if simulated from the start
+    agrees: Bool[np.ndarray, "256 level"]  # whether each step ends its episode as recorded
 
 
 def resume(
     level: Level, moves: Moves, states: KnownStates | None, rules: TaskParams, fields: frozenset[str]
 ) -> Resumed:
-    """Play a record again, its episodes ending where they did.
+    """Play a record again; its episodes end where the record says.
 
     Args:
         level: levels, level axis last.
-        moves: of their records.
-        states: None where nothing is known but the start.
-        rules: of the task.
-        fields: paths of `Record` that are wanted; what they do not need is not computed.
+        moves: actions and episode ends of their records.
+        states: stored states; None: only the start is known.
+        rules: the task's rules.
+        fields: paths of `Record` to return; anything else is not computed.
     """
     count = moves.action.shape[-1]
     given = level, moves, states, timesteps(moves.done)
     parts = [
         jax.device_get(_resume_block(*take(given, lanes), rules, fields))
-        for lanes in blocks(count, block_size(count, MOST))
+        for lanes in blocks(count, block_size(count, MAX_LANES))
     ]
     return jax.tree.map(lambda *xs: np.concatenate(xs, -1)[..., :count], *parts)
 
@@ -98,21 +98,21 @@ def _resume_block(
 
 
 def timesteps(done: Bool[np.ndarray, "256 level"]) -> Int[np.ndarray, "256 level"]:
-    """Env steps since the episode's start, by where episodes end."""
+    """Return env steps since the episode's start, from the ends of episodes."""
     row = np.arange(RECORD_STEPS, dtype=np.int32)[:, None]
     begins = np.concatenate([np.ones_like(done[:1]), done[:-1]])
     return row - np.maximum.accumulate(np.where(begins, row, 0), axis=0)
 
 
 def checksum(states: TaskState, rows: Any) -> Any:
-    """Of every bit of each state, [row, ..., lane], and of where in the record it stands; of numpy arrays as of JAX's.
+    """Checksum every bit of each state and its position in the record; works on numpy and JAX arrays.
 
-    The words of a state in the order of `TaskState`, each mixed with its number in the record, and all added: any
-    change of one word changes the sum, any other does with probability 1 - 2^-32.
+    The words of a state, in the order of `TaskState`, are each mixed with their index in the record, then added. A
+    change of one word always changes the sum; any other change does so with probability 1 - 2^-32.
 
     Args:
-        states: the states of some rows.
-        rows: which rows of a record they are, int [row, lane]; one lane stands for all.
+        states: states of some rows, [row, ..., lane].
+        rows: indices of these rows in the record, int [row, lane]; one lane stands for all.
 
     Returns:
         uint32 [row, lane].
@@ -128,19 +128,19 @@ def checksum(states: TaskState, rows: Any) -> Any:
 
 
 def _words(x: Any) -> Any:
-    """[row, word, lane]"""
+    """View states as words, uint32 [row, word, lane]."""
     bits = x.view(np.uint32) if x.dtype == np.float32 else x.astype(np.uint32)
     return bits.reshape(len(x), int(np.prod(x.shape[1:-1])), x.shape[-1])
 
 
 def mixed(x: Any) -> Any:
-    """The finalizer of MurmurHash3: every bit of a word decides about half of the others; no two words become one."""
+    """Apply the finalizer of MurmurHash3: a bijection in which every input bit flips about half of the output bits."""
     x = (x ^ (x >> 16)) * MIX_A
     x = (x ^ (x >> 13)) * MIX_B
     return x ^ (x >> 16)
 
 
 def paths_of(record: Any) -> dict[str, Array]:
-    """The arrays of a record by their paths, in its order."""
+    """Return a record's arrays by path, in order."""
     leaves, _ = tree_flatten_with_path(record)
     return {keystr(keys, simple=True, separator="/"): leaf for keys, leaf in leaves}

@@ -1,4 +1,4 @@
-"""Successes: the actions of an episode that reached the goal, of search or training."""
+"""Successes: actions of an episode that reached the goal, in search or training."""
 
 from typing import NamedTuple
 
@@ -12,20 +12,20 @@ from levelproof.levelgen.task.actions import CHOICES
 
 
 class Success(NamedTuple):
-    """A successful episode; episodes start in the level's own state, so its actions reach the goal again."""
+    """A successful episode; every episode starts in the level's first state, so its actions reach the goal again."""
 
-    action: Int[Array, "256 6"]  # zeros after its end
-    length: Int[Array, ""]  # env steps; 0: there is none
+    action: Int[Array, "256 6"]  # zeros after the end
+    length: Int[Array, ""]  # env steps; 0: no success
 
 
 def no_success(count: int) -> Success:
-    """None for each of so many levels, on the host, level first."""
+    """Return empty successes for `count` levels, on the host, level first."""
     action, length = np.zeros((count, RECORD_STEPS, len(CHOICES)), np.int8), np.zeros(count, np.int32)
     return Success(action, length)  # pyright: ignore[reportArgumentType]
 
 
 def remember(known: Success, new: Success) -> Success:
-    """The first one stays."""
+    """Return the known success, or the new one if none is known."""
     return jax.tree.map(lambda a, b: jnp.where(known.length > 0, a, b), known, new)
 
 
@@ -34,11 +34,11 @@ def find(
     goal: Bool[Array, "time environment"],
     timestep: Int[Array, "time environment"],
 ) -> Success:
-    """The first success of a rollout, if there is one that a record can hold.
+    """Find the first success of a rollout that fits a record, if any.
 
     Args:
-        recent: actions, those of the rollout last.
-        goal: steps of the rollout that reached the goal.
+        recent: actions, the rollout's last.
+        goal: whether each step of the rollout reached the goal.
         timestep: env steps of the episode before each step.
     """
     length = timestep + 1
@@ -52,7 +52,7 @@ def find(
 def ending_at(
     action: Int[Array, "time 6 lane"], time: Int[Array, ""], lane: Int[Array, ""], steps: Int[Array, ""]
 ) -> Success:
-    """So many actions of a lane, the last of them at this time; 0: there is no success."""
+    """Cut the `steps` actions of a lane that end at `time`; 0 steps: no success."""
     row = jnp.arange(RECORD_STEPS)
     taken = action[jnp.clip(time + 1 - steps + row, 0, len(action) - 1), :, lane]
     return Success(jnp.where((row < steps)[:, None], taken, 0).astype(jnp.int8), steps.astype(jnp.int32))

@@ -1,8 +1,8 @@
-"""Witnesses: actions that solve a level, and the record that replaying them gives.
+"""Witnesses: actions that solve a level, and the record of replaying them.
 
-A record is RECORD_STEPS env steps with automatic reset to the same level. Records are made by `replay` alone, from a
-level and its actions, always in blocks of LANES lanes of one compiled program: a level's bits do not depend on how
-many others are replayed with it.
+A record is RECORD_STEPS env steps with automatic reset to the same level. Only `replay` makes records, from a level and
+its actions, in blocks of LANES lanes of one compiled program, so that a level's bits do not depend on the number of
+levels replayed with it.
 """
 
 from dataclasses import dataclass
@@ -28,11 +28,11 @@ from levelproof.physics.vector import select, unvec, vec
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Record:
-    """What happened in 256 env steps with automatic reset: numpy arrays, time first, levels (`lane`) last; SI units."""
+    """256 env steps with automatic reset, as numpy arrays: time first, levels (`lane`) last, SI units."""
 
     state: State  # [256, ..., level]: before each action
     manifold: Manifold  # [256, contact, ..., level]: of the physics step that led there; zero at an episode's start
-    joint_point: Float[Array, "256 joint 2 lane"]  # m, where the joint sits on its body a
+    joint_point: Float[Array, "256 joint 2 lane"]  # m, the joint's anchor on body a
     thruster_point: Float[Array, "256 thruster 2 lane"]  # m
     timestep: Int[Array, "256 lane"]  # env steps since the episode's start
     last_distance: Float[Array, "256 lane"]  # m; -1 at an episode's start
@@ -43,14 +43,14 @@ class Record:
 
 
 def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -> Record:
-    """What happens in 256 env steps under these actions, as numpy arrays.
+    """Play 256 env steps with these actions; return numpy arrays.
 
-    The same bits on the same machine and versions, at any count of levels.
+    On one machine and set of versions, the bits are the same for any number of levels.
 
     Args:
         level: levels, level axis last.
-        action: int [256, 6, level], multi-discrete: one entry a binding (`levelgen.task.actions`).
-        rules: of the task.
+        action: int [256, 6, level], multi-discrete: one entry per binding (`levelgen.task.actions`).
+        rules: the task's rules.
     """
     level = jax.tree.map(np.asarray, level)
     actions = np.asarray(action, np.int32)
@@ -60,13 +60,13 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
 
 
 def succeeds(done: ArrayLike, goal: ArrayLike) -> Bool[np.ndarray, "..."]:
-    """Whether episodes ended, and every one that did ended in the goal, of flags [time, ...]."""
+    """Return whether any episode ended and all that did reached the goal, from flags [time, ...]."""
     done, goal = np.asarray(done), np.asarray(goal)
     return np.asarray(done.any(0) & (goal | ~done).all(0))
 
 
 def steps_to_goal(done: ArrayLike) -> Int[np.ndarray, " level"]:
-    """Length of the first episode, env steps, of flags [time, level]."""
+    """Return the length of the first episode, env steps, from flags [time, level]."""
     return np.argmax(np.asarray(done), axis=0) + 1
 
 
@@ -82,12 +82,12 @@ def _replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskPar
 
 
 def onwards(level: Level, after: TaskState, contacts: Any, done: Bool[Array, " lane"]) -> tuple[TaskState, Any]:
-    """Where the next env step starts, and the contacts that led there: none where an episode begins."""
+    """Return the start of the next env step, and the contacts that led there: zero in lanes where an episode begins."""
     return task.restart(level, after, done), jax.tree.map(lambda x: jnp.where(done, jnp.zeros_like(x), x), contacts)
 
 
 def record_of(level: Level, now: TaskState, manifold: Any, action: Int[Array, "6 lane"], outcome: StepResult) -> Record:
-    """A row of a record."""
+    """Make a row of a record."""
     model = level.model
     return Record(
         now.state,
@@ -102,7 +102,7 @@ def record_of(level: Level, now: TaskState, manifold: Any, action: Int[Array, "6
 
 
 def _points(state: State, body: Int[Array, "thing lane"], point: Float[Array, "thing 2 lane"]) -> Array:
-    """Points given in the frames of bodies, in the world."""
+    """Transform points from the frames of bodies to the world."""
     if not len(body):
         return jnp.zeros_like(point)
     pick = lambda x: jnp.stack([select(x, b) for b in body])

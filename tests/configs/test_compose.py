@@ -71,7 +71,7 @@ def test_out_may_be_any_path(text: str) -> None:
         ("task.physics.slop=-5", "task.physics.slop is -5.0: it must be between 0 and"),
         ("task.max_timesteps=3000000000", "task.max_timesteps is 3000000000: it must be between 1 and 1000000"),
         ("distribution.min_revolute_joints=99999999999", "distribution.min_revolute_joints is 99999999999"),
-        ("stop.successes=32", "stop.successes is 32: with expert.attempts=16 give at most 16"),
+        ("stop.successes=32", "stop.successes is 32, more than expert.attempts=16: lower it"),
         ("first_level=2147483647", "they run from 0 to"),
         ("unit=0", "unit is 0"),
         ("workers=-1", "workers is -1"),
