@@ -96,7 +96,7 @@ class Ledger:
             some._seconds[stage] = values[indices] + (values.sum() - values[indices].sum()) / max(len(indices), 1)
         return some
 
-    def of(self, index: int) -> Seconds:
+    def seconds_of(self, index: int) -> Seconds:
         """Return one level's seconds."""
         return Seconds(*(float(values[index]) for values in self._seconds.values()))
 

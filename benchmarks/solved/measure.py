@@ -209,7 +209,7 @@ def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> 
         rows = []
         for i, (level_id, verdict) in enumerate(zip(result.level_ids.tolist(), result.verdicts, strict=True)):
             assert result.ledger is not None
-            cost = result.ledger.of(i)
+            cost = result.ledger.seconds_of(i)
             rows.append(row_of(level_id, verdict, sum(cost) - cost.idle - cost.compiling))
         solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
         told.put(Trained(unit, rows, Summary(len(rows), solved, result.spent), versions(), device()))

@@ -71,7 +71,7 @@ class Submission:
     ) -> None:
         count = len(level_ids)
         self.levels, self.level_ids, self.found, self.keep, self.paused = levels, level_ids, found, keep, paused
-        self.begun = {**begun, **{i: of.expert for i, of in paused.items()}}
+        self.begun = {**begun, **{i: expert.expert for i, expert in paused.items()}}
         self.curves = [list(self.begun[i].curve) if i in self.begun else [] for i in range(count)]
         self.evaluations = [list(paused[i].evaluations) if i in paused else [] for i in range(count)]
         self.experts: list[KeptExpert | None] = [None] * count
@@ -164,8 +164,8 @@ class Pool:
 
     def waiting(self, submission: Submission) -> list[int]:
         """Return indices of the submission's levels that have had no slot, ascending."""
-        coming = (i for of, some in self._coming for i in some if of is submission)
-        return [*(i for _, (of, i) in self._queued() if of is submission), *coming]
+        coming = (i for other, some in self._coming for i in some if other is submission)
+        return [*(i for _, (other, i) in self._queued() if other is submission), *coming]
 
     def withdraw(self, submission: Submission, indices: Collection[int]) -> None:
         """Remove levels that have had no slot."""
@@ -174,12 +174,12 @@ class Pool:
             del self._at[index]
         if self._queue is not None:
             self._queue = self._queue._replace(come=np.int32(self._taken))
-        levels = [level for _, level in queued] + [(of, i) for of, some in self._coming for i in some]
-        left = [(of, i) for of, i in levels if of is not submission or i not in indices]
+        levels = [level for _, level in queued] + [(other, i) for other, some in self._coming for i in some]
+        left = [(other, i) for other, i in levels if other is not submission or i not in indices]
         self._coming = deque()
         for _, same in groupby(left, lambda level: id(level[0])):
-            of, some = zip(*same, strict=True)
-            self._coming.extend((of[0], some[i : i + GROUP]) for i in range(0, len(some), GROUP))
+            other, some = zip(*same, strict=True)
+            self._coming.extend((other[0], some[i : i + GROUP]) for i in range(0, len(some), GROUP))
         submission.under_way.difference_update(indices)
 
     def totals(self, submission: Submission) -> Totals:
@@ -200,17 +200,17 @@ class Pool:
         for number, (mode, index, part, deadline, due, final) in enumerate(zip(*now, strict=True)):
             if mode == Mode.EMPTY:
                 continue
-            of, i = self._at[int(index)]
+            submission, i = self._at[int(index)]
             evaluating = mode == Mode.EVALUATE
             yield (
-                of,
+                submission,
                 i,
                 Paused(
-                    KeptExpert(expert_of(self._slots, number, self.config), list(of.curves[i])),
+                    KeptExpert(expert_of(self._slots, number, self.config), list(submission.curves[i])),
                     Pending(evaluating & due, evaluating & final, deadline),
-                    int(of.evaluated_rollouts[i]) - (int(part) if evaluating else 0),
-                    list(of.evaluations[i]),
-                    row_of(of.found, i),
+                    int(submission.evaluated_rollouts[i]) - (int(part) if evaluating else 0),
+                    list(submission.evaluations[i]),
+                    row_of(submission.found, i),
                 ),
             )
 

@@ -62,11 +62,11 @@ def rework(
             witnesses[i] = witness
 
     if search.polish:
-        improve(range(len(witnesses)), LANES, lambda *of: polish(*of, search.polish, rules))
+        improve(range(len(witnesses)), LANES, lambda *args: polish(*args, search.polish, rules))
     if search.steady and replays:
-        enough = lambda of: OWN if of.source in BY_EXPERT else PORTABLE
-        fragile = [i for i, of in enumerate(witnesses) if of and (of.portability or 0) < enough(of)]
-        improve(fragile, KEPT * STARTS, lambda *of: steady(*of, search.steady, rules))
+        enough = lambda witness: OWN if witness.source in BY_EXPERT else PORTABLE
+        fragile = [i for i, witness in enumerate(witnesses) if witness and (witness.portability or 0) < enough(witness)]
+        improve(fragile, KEPT * STARTS, lambda *args: steady(*args, search.steady, rules))
     return witnesses, env_steps
 
 

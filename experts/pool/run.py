@@ -92,9 +92,11 @@ class TrainingRun:
     def _submit(self) -> None:
         some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
         levels, level_ids = self._some(some)
-        of = lambda known: {i: known[one] for i, one in enumerate(level_ids.tolist()) if one in known}
+        among = lambda known: {i: known[one] for i, one in enumerate(level_ids.tolist()) if one in known}
         found = joined([self.looking.found, *(one.found for one in self._paused.values())], self._order)
-        self.submission = self.pool.submit(levels, level_ids, found, of(self._begun), self._keep, of(self._paused))
+        self.submission = self.pool.submit(
+            levels, level_ids, found, among(self._begun), self._keep, among(self._paused)
+        )
         if self._gone:
             self.leave_out(self._gone)
 
@@ -115,21 +117,23 @@ class TrainingRun:
     def paused(self, in_slots: Iterable[tuple[Submission, int, Paused]]) -> dict[int, Paused]:
         """Return the run's unfinished experts by level id: its own among `in_slots`, and those that wait."""
         undecided = set(self.undecided)
-        waiting = {level_id: of for level_id, of in self._paused.items() if level_id in undecided}
+        waiting = {level_id: paused for level_id, paused in self._paused.items() if level_id in undecided}
         return waiting | {
-            int(self.level_ids[self.left[i]]): of for submission, i, of in in_slots if submission is self.submission
+            int(self.level_ids[self.left[i]]): paused
+            for submission, i, paused in in_slots
+            if submission is self.submission
         }
 
     @property
     def undecided(self) -> list[int]:
         """Ids of levels that wait for an expert or have one; all ids until the search has ended."""
-        of = self.submission
-        return (of.level_ids[sorted(of.under_way)] if of else self.level_ids).tolist()
+        submission = self.submission
+        return (submission.level_ids[sorted(submission.under_way)] if submission else self.level_ids).tolist()
 
     def leave_out(self, level_ids: Collection[int]) -> None:
         """Leave levels to other workers: any of those `unbegun`, or all `undecided` when this worker stops."""
         self._gone.update(level_ids)
-        indices = lambda of: np.flatnonzero(np.isin(of, list(self._gone)))
+        indices = lambda ids: np.flatnonzero(np.isin(ids, list(self._gone)))
         if self.submission is None:
             self.looking.withdraw(indices(self.level_ids[self._looked]))
         else:
@@ -164,9 +168,9 @@ class TrainingRun:
     def _attempted(self, trained: Sequence[TrainedLevel]) -> dict[int, tuple[float, int]]:
         """Measure experts' success rates; return each with its env steps, by index among `left`."""
         policies = {
-            i: of.policy
-            for i, (level, of) in enumerate(zip(self.left, trained, strict=True))
-            if of.policy is not None and int(self.level_ids[level]) not in self._gone
+            i: level.policy
+            for i, (index, level) in enumerate(zip(self.left, trained, strict=True))
+            if level.policy is not None and int(self.level_ids[index]) not in self._gone
         }
         with lap() as took:
             at = self.left[list(policies)]
@@ -189,8 +193,8 @@ class TrainingRun:
         trained = [trained[i] for i in asked]
         actions = np.zeros((RECORD_STEPS, ACTIONS, len(kept)), np.int32)  # a level without a witness does nothing
         candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
-        for i, of in zip(left, trained, strict=True):
-            candidates[i] = of.candidates
+        for i, level in zip(left, trained, strict=True):
+            candidates[i] = level.candidates
         chosen = choose(levels, level_ids, candidates, config.replays, rules)
         chosen, reworked = rework(levels, level_ids, chosen, self.pool.procedure, rules)
         for i, witness in enumerate(chosen):
@@ -211,7 +215,7 @@ class TrainingRun:
         witnessed = np.array([verdict.label in WITNESSED for verdict in known])
         record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
         ended = zip(level_ids[left].tolist(), trained, strict=True)
-        experts = {level_id: of.expert for level_id, of in ended if of.expert is not None}
+        experts = {level_id: level.expert for level_id, level in ended if level.expert is not None}
         return UnitResult(level_ids, levels, record, known, spent_on(known, submission, config), experts)
 
     def _some(self, indices: Int[np.ndarray, " index"]) -> tuple[Level, Int[np.ndarray, " index"]]:

@@ -74,9 +74,9 @@ def arena(levels: Level, lanes: int, redrawn: tuple[float, ...]) -> Arena:
 def contacts(level: Level, second: Role) -> Bool[Array, "contact lane"]:
     """Return which contacts join green and this role, as `levelgen.task.rules.touches` counts them."""
     pairs = pairs_of(level.size)
-    of = lambda pair: has_roles(level, pair.a, pair.b, Role.GREEN, second)
-    polygon = of(pairs.polygon)
-    return jnp.concatenate([polygon, jnp.zeros_like(polygon), of(pairs.circle_polygon), of(pairs.circle)])
+    joins = lambda pair: has_roles(level, pair.a, pair.b, Role.GREEN, second)
+    polygon = joins(pairs.polygon)
+    return jnp.concatenate([polygon, jnp.zeros_like(polygon), joins(pairs.circle_polygon), joins(pairs.circle)])
 
 
 def fresh_walk(lanes: Level) -> Walk:

@@ -175,8 +175,8 @@ def first_of(some: Approaches) -> Approaches:
     again = jnp.pad(gaps[:, 1:] == gaps[:, :-1], [(0, 0), (1, 0)])
     gaps = jnp.where(again, FAR, gaps)
     first = jnp.argsort(gaps, axis=-1)[:, :KEPT]
-    of = lambda x, order: jax.vmap(lambda x, order: x[order])(x, order)
-    kept = jax.tree.map(lambda x: of(x, of(order, first)), some)
+    pick = lambda x, order: jax.vmap(lambda x, order: x[order])(x, order)
+    kept = jax.tree.map(lambda x: pick(x, pick(order, first)), some)
     return kept._replace(gap=of(gaps, first))
 
 

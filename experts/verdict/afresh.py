@@ -60,7 +60,7 @@ def attempt(
     for some in blocks(len(level_ids), at_once(config.attempts, IN_CACHE)):
         params = jax.tree.map(lambda *xs: np.stack(xs), *(policies[i] for i in some))
         parts.append(jax.device_get(_attempt(take(levels, some), level_ids[some], params, config, rules)))
-    return AttemptResults(*(np.concatenate(of)[: len(level_ids)] for of in zip(*parts, strict=True)))
+    return AttemptResults(*(np.concatenate(column)[: len(level_ids)] for column in zip(*parts, strict=True)))
 
 
 @partial(jax.jit, static_argnames=("config", "rules"))

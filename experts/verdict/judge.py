@@ -78,11 +78,11 @@ def judge(
     """
     replays, steps = succeeds(record.done, record.goal), steps_to_goal(record.done)
     verdicts = []
-    for i, (of, choice) in enumerate(zip(trained, chosen, strict=True)):
+    for i, (level, choice) in enumerate(zip(trained, chosen, strict=True)):
         counts = choice is not None and replays[i] and steps[i] == choice.steps
         witness = choice if counts else None
         episodes = int(record.done[:, i].sum())
-        verdicts.append(verdict_of(of, witness, episodes, config, bool(failed_by_noop[i])))
+        verdicts.append(verdict_of(level, witness, episodes, config, bool(failed_by_noop[i])))
     return verdicts
 
 

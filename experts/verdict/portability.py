@@ -45,7 +45,7 @@ def choose(
         replays: replays per candidate; 0: choose the first, of unknown portability.
         rules: the task's rules.
     """
-    best = [next(iter(of), None) for of in candidates]
+    best = [next(iter(some), None) for some in candidates]
     shares = np.full(len(best), -1.0)
     left = [i for i, witness in enumerate(best) if witness is not None and replays]
     rank = 0

@@ -143,7 +143,7 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult, comm
                     Encoding(job.density, job.key_every, job.task),
                 )
         for i, row in enumerate(rows):
-            row["seconds"] = ledger.of(i)._asdict() if result.ledger else None
+            row["seconds"] = ledger.seconds_of(i)._asdict() if result.ledger else None
         write_fragment(paths, rows, job.hash, job.results, densities=[job.stored])
 
 

@@ -10,7 +10,7 @@ import pytest
 from levelproof.experts.ledger import Lap, Ledger, StepCosts, lap
 
 
-def test_what_is_compiled_is_apart_from_what_is_done() -> None:
+def test_lap_separates_compiling_from_work() -> None:
     inner = jax.jit(lambda x: jnp.sin(x) @ jnp.cos(x))  # traced within the other
     program = jax.jit(lambda x: inner(x) + inner(x.T))
     matrix = np.ones((64, 64), np.float32)
@@ -26,7 +26,7 @@ def test_what_is_compiled_is_apart_from_what_is_done() -> None:
     assert second.compiling == 0
 
 
-def test_seconds_are_parted_between_levels() -> None:
+def test_ledger_splits_seconds_between_levels() -> None:
     ledger = Ledger(4)
     ledger.add("search", Lap(8.0))
     ledger.share("search", np.array([0, 10, 30, 0]))
@@ -34,17 +34,17 @@ def test_seconds_are_parted_between_levels() -> None:
     theirs = Ledger(2)
     theirs.put("training", 0, 3.0)
     ledger.take(theirs, np.array([1, 3]))
-    assert [ledger.of(i).search for i in range(4)] == [0, 2, 6, 0]
-    assert [ledger.of(i).replay for i in range(4)] == [0.5] * 4
-    assert [ledger.of(i).training for i in range(4)] == [0, 3, 0, 0]
+    assert [ledger.seconds_of(i).search for i in range(4)] == [0, 2, 6, 0]
+    assert [ledger.seconds_of(i).replay for i in range(4)] == [0.5] * 4
+    assert [ledger.seconds_of(i).training for i in range(4)] == [0, 3, 0, 0]
     assert sum(ledger.total()) == 13.0
     some = ledger.only(np.array([0, 1]))  # others label the rest
-    assert [some.of(i).search for i in range(2)] == [3, 5]
+    assert [some.seconds_of(i).search for i in range(2)] == [3, 5]
     assert sum(some.total()) == 13.0
 
 
 @pytest.mark.parametrize("update", [0.0, 0.3])  # a GPU's slots cost the same, whatever they do
-def test_an_update_is_told_from_playing(update: float) -> None:
+def test_split_separates_updates_from_play(update: float) -> None:
     rng, steps, slots = np.random.default_rng(0), StepCosts(), 4
     for _ in range(200):
         training = int(rng.integers(0, slots + 1))

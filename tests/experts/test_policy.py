@@ -23,7 +23,7 @@ def test_probabilities_of_all_actions_sum_to_one() -> None:
     assert float(entropy(logits, ALL)[0]) == pytest.approx(float(-(np.exp(chances) * chances).sum()), abs=1e-4)
 
 
-def test_entries_that_nothing_obeys_do_not_count() -> None:
+def test_log_probability_ignores_dead_entries() -> None:
     logits = jax.random.normal(jax.random.key(4), (sum(CHOICES), 2))
     live = np.array([False, True, False, False, False, True])[:, None]
     alone = jax.nn.log_softmax(logits[3:6], axis=0)[2] + jax.nn.log_softmax(logits[14:16], axis=0)[1]
@@ -35,7 +35,7 @@ def test_entries_that_nothing_obeys_do_not_count() -> None:
     np.testing.assert_array_equal(entropy(logits, dead), 0)
 
 
-def test_samples_follow_the_probabilities() -> None:
+def test_sample_follows_the_probabilities() -> None:
     logits = jax.random.normal(jax.random.key(2), (sum(CHOICES), 1))
     lanes = 40_000
     uniform = jax.random.uniform(jax.random.key(3), (len(CHOICES), lanes))
@@ -47,6 +47,6 @@ def test_samples_follow_the_probabilities() -> None:
         np.testing.assert_allclose(shares, expected, atol=5 * np.sqrt(0.25 / lanes))
 
 
-def test_most_probable() -> None:
+def test_most_probable_takes_the_first_of_ties() -> None:
     logits = jnp.concatenate([jnp.eye(n)[n - 1] for n in CHOICES])[:, None]
     np.testing.assert_array_equal(policy.most_probable(logits)[:, 0], np.array(CHOICES) - 1)

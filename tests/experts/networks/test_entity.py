@@ -63,8 +63,8 @@ def outputs(network: EntityNetwork, params: Params, level: Level, state: State) 
 
 def plain(params: Params, seen: EntityObservation, lane: int) -> np.ndarray:
     """The same, of one lane: every thing's whole row through its encoder, the mean of the active ones, two layers."""
-    of = lambda x: np.clip(np.asarray(x, np.float64)[..., lane], -LIMIT, LIMIT)
-    polygons, circles, joints, thrusters = map(of, (seen.polygons, seen.circles, seen.joints, seen.thrusters))
+    clipped = lambda x: np.clip(np.asarray(x, np.float64)[..., lane], -LIMIT, LIMIT)
+    polygons, circles, joints, thrusters = map(clipped, (seen.polygons, seen.circles, seen.joints, seen.thrusters))
     bodies, gravity = np.concatenate([polygons[:, :BODY_ROWS], circles[:, :BODY_ROWS]]), polygons[0, -1:]
     from_b = len(joints) // 2  # the first half of the joints is seen from body b
     at = np.asarray(seen.joint_indexes)[:from_b, :, lane], np.asarray(seen.thruster_indexes)[:, lane]
@@ -89,7 +89,7 @@ def plain(params: Params, seen: EntityObservation, lane: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_is_the_plain_formula_on_entities(name: str) -> None:
+def test_entity_network_equals_the_plain_formula(name: str) -> None:
     network, params = network_of(name)
     level = jax.tree.map(jnp.asarray, sample_levels(jnp.arange(LEVELS), network.size))
     state = moved(level.state, np.random.default_rng(0))
@@ -102,7 +102,7 @@ def test_is_the_plain_formula_on_entities(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**31 - 1))
-def test_the_order_of_things_does_not_matter(name: str, seed: int) -> None:
+def test_entity_network_ignores_the_order_of_entities(name: str, seed: int) -> None:
     network, params = network_of(name)
     level = sample_levels(jnp.arange(LEVELS), network.size)
     draws = jax.random.uniform(jax.random.key(seed), (sum(shuffled_rows(network.size)), LEVELS))
@@ -111,7 +111,7 @@ def test_the_order_of_things_does_not_matter(name: str, seed: int) -> None:
     np.testing.assert_allclose(ours, others, atol=FROM_TANH)
 
 
-def test_a_size_may_lack_kinds() -> None:
+def test_entity_network_accepts_sizes_without_some_kinds() -> None:
     """No circles and no thrusters: their encoders have no parameters."""
     size = SIZES["s"]._replace(circles=0, thrusters=0, polygons=7)
     level = empty_level(size, 2)

@@ -32,7 +32,7 @@ def whole_kernel(layer: dict) -> np.ndarray:
     return kernel
 
 
-def test_folding_constant_features_is_the_network_of_the_whole_observation(network) -> None:
+def test_folding_constant_features_keeps_the_network_of_the_whole_observation(network) -> None:
     net, params = network
     rng, lanes = np.random.default_rng(0), 5
     whole = rng.normal(size=(feature_count(SIZE), lanes)).astype(np.float32)
@@ -50,13 +50,13 @@ def test_folding_constant_features_is_the_network_of_the_whole_observation(netwo
     np.testing.assert_allclose(value, plain("value")[0], atol=1e-5)
 
 
-def test_the_first_kernel_starts_with_orthogonal_rows_as_a_whole() -> None:
+def test_first_kernel_has_orthogonal_rows_across_both_parts() -> None:
     params = first(FlatNetwork(SIZE, width=8, depth=2))
     kernel = whole_kernel(params["params"]["policy"]["FirstDense_0"])  # type: ignore[index]
     np.testing.assert_allclose(kernel @ kernel.T, 2 * np.eye(8), atol=1e-5)
 
 
-def test_what_is_constant_of_a_level() -> None:
+def test_constant_selects_features_that_do_not_move() -> None:
     levels = sample_levels(np.arange(3), SIZE)
     features = np.asarray(jax.jit(level_features)(levels))
     np.testing.assert_array_equal(jax.jit(FlatNetwork.constant)(levels), features[STILL])

@@ -25,10 +25,10 @@ def trained(network: Network, at: list[int]) -> list[TrainedLevel]:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("network", Network)
-def test_learns_real_levels_in_any_slot(network: Network) -> None:
+def test_networks_learn_real_levels_in_any_slot(network: Network) -> None:
     every = trained(network, [0, 1, 2, 3])
-    solved = [bool(of.candidates) for of in every]
+    solved = [bool(level.candidates) for level in every]
     assert sum(solved) >= 3
-    assert min(len(of.curve) for of in every) < UPDATES
-    for i, of in zip([2, 0, 1], trained(network, [2, 0, 1]), strict=True):
-        same(of, every[i])
+    assert min(len(level.curve) for level in every) < UPDATES
+    for i, level in zip([2, 0, 1], trained(network, [2, 0, 1]), strict=True):
+        same(level, every[i])

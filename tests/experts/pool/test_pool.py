@@ -53,7 +53,7 @@ def finished(pool: Pool, *submissions: Submission) -> list[Submission]:
     return done
 
 
-def test_each_gets_what_it_would_get_alone(levels: Level, alone: list[TrainedLevel]) -> None:
+def test_submissions_give_the_results_that_each_gives_alone(levels: Level, alone: list[TrainedLevel]) -> None:
     """More levels come than the queue has room for, so its entries are used again."""
     assert capacity_of(CONFIG) < len(IDS)
     pool, parts = new_pool(), [range(20), range(20, 23), range(23, 36), range(0)]
@@ -61,15 +61,15 @@ def test_each_gets_what_it_would_get_alone(levels: Level, alone: list[TrainedLev
     order = finished(pool, *submissions)
     assert order[0] is submissions[3]  # without levels
     assert len(order) == len(parts)
-    trained = [of for submission in submissions for of in submission.trained(CONFIG)]
+    trained = [level for submission in submissions for level in submission.trained(CONFIG)]
     assert len(trained) == len(IDS)
     same(trained, alone)
     for submission in submissions:
-        curves = sum(len(of.curve) for of in submission.trained(CONFIG))
+        curves = sum(len(level.curve) for level in submission.trained(CONFIG))
         assert submission.trained_rollouts == curves
 
 
-def test_levels_that_come_later_take_the_slots_that_are_empty(levels: Level) -> None:
+def test_later_levels_enter_empty_slots(levels: Level) -> None:
     """One level keeps one slot busy; others come while it trains, into the other."""
     pool = new_pool()
     first = pool.submit(*part(levels, range(1)))
@@ -79,7 +79,7 @@ def test_levels_that_come_later_take_the_slots_that_are_empty(levels: Level) -> 
     assert first.idle_rollouts == 1  # of the first rollout alone
 
 
-def test_levels_that_wait_are_taken_out_and_change_no_other(levels: Level, alone: list[TrainedLevel]) -> None:
+def test_withdraw_removes_waiting_levels_and_changes_no_other(levels: Level, alone: list[TrainedLevel]) -> None:
     """From the queue, and from before it; another pool gives them what they would have got here."""
     pool, other = new_pool(), new_pool()
     first, second = pool.submit(*part(levels, range(30))), pool.submit(*part(levels, range(30, 36)))
@@ -98,17 +98,17 @@ def test_levels_that_wait_are_taken_out_and_change_no_other(levels: Level, alone
     same([trained[i] for i in range(36)], alone)
 
 
-def test_an_expert_that_is_paused_at_any_moment_goes_on_to_the_same(levels: Level, alone: list[TrainedLevel]) -> None:
+def test_paused_expert_resumes_to_the_same_result(levels: Level, alone: list[TrainedLevel]) -> None:
     """In a slot of another pool, from a training step or an evaluation, and from the middle of one."""
     pool, evaluated = new_pool(), 0
     submission = pool.submit(*part(levels, range(4)))
     while True:
-        now = {i: of for _, i, of in pool.paused()}
-        evaluated += sum(bool(of.pending.due or of.pending.final) for of in now.values())
+        now = {i: level for _, i, level in pool.paused()}
+        evaluated += sum(bool(level.pending.due or level.pending.final) for level in now.values())
         if evaluated > 1:
             break
         pool.step()
-    steps = sum(len(of.expert.curve) for of in now.values())
+    steps = sum(len(level.expert.curve) for level in now.values())
     assert steps, "one has begun"
     other, at = new_pool(), np.array(sorted(now))
     paused = {row: now[i] for row, i in enumerate(at)}
@@ -146,9 +146,9 @@ def chosen(levels: Level, i: int, trained: TrainedLevel) -> Witness:
     return witness
 
 
-def test_levels_train_on_where_few_replays_survive_and_no_others_do(levels: Level) -> None:
+def test_only_levels_with_fragile_witnesses_train_on(levels: Level) -> None:
     at_once, waited = (trained_by(steadied(updates), levels) for updates in (0, 3))
-    left = [i for i, of in enumerate(at_once) if len(of.curve) < 10]
+    left = [i for i, level in enumerate(at_once) if len(level.curve) < 10]
     assert left
     for i in left:
         before, best = len(at_once[i].curve), chosen(levels, i, at_once[i])
@@ -158,10 +158,10 @@ def test_levels_train_on_where_few_replays_survive_and_no_others_do(levels: Leve
 
 
 @pytest.mark.usefixtures("never_portable")
-def test_a_level_trains_on_for_no_longer_than_that(levels: Level) -> None:
+def test_steady_limits_further_training(levels: Level) -> None:
     """What it was before is in what it becomes, and of the witnesses of all its evaluations the best is kept."""
     at_once, waited = (trained_by(steadied(updates), levels) for updates in (0, 3))
-    early = [i for i, of in enumerate(at_once) if of.candidates and len(of.curve) < 10]
+    early = [i for i, level in enumerate(at_once) if level.candidates and len(level.curve) < 10]
     assert early
     for i in early:
         before, after = at_once[i], waited[i]
@@ -173,13 +173,13 @@ def test_a_level_trains_on_for_no_longer_than_that(levels: Level) -> None:
 
 
 @pytest.mark.usefixtures("never_portable")
-def test_levels_that_train_on_are_the_same_in_any_company_and_after_any_pause(levels: Level) -> None:
+def test_further_training_is_independent_of_neighbours_and_pauses(levels: Level) -> None:
     alone = trained_by(steadied(3), levels)
-    assert any(len(of.evaluations) > 1 for of in alone)
+    assert any(len(level.evaluations) > 1 for level in alone)
     pool = steadied(3)
     parts = [pool.submit(*part(levels, at)) for at in (range(7), range(7, 36))]
     finished(pool, *parts)
-    same([of for submission in parts for of in submission.trained(CONFIG)], alone)
+    same([level for submission in parts for level in submission.trained(CONFIG)], alone)
 
     stopped = steadied(3)
     submission = stopped.submit(levels, IDS)
@@ -194,7 +194,7 @@ def test_levels_that_train_on_are_the_same_in_any_company_and_after_any_pause(le
     later = other.submit(take(levels, at), IDS[at], paused={row: paused[i] for row, i in enumerate(at.tolist())})
     finished(other, later)
     told = lambda trained, at: [
-        of._replace(candidates=[chosen(levels, i, of)]) for i, of in zip(at, trained, strict=True)
+        level._replace(candidates=[chosen(levels, i, level)]) for i, level in zip(at, trained, strict=True)
     ]
     same(told(later.trained(CONFIG), at), told([alone[i] for i in at], at))
 
@@ -210,7 +210,7 @@ def test_totals_grow_to_the_whole(levels: Level) -> None:
     assert seen[-1][:2] == (submission.trained_rollouts * CONFIG.steps_per_update, 5)
 
 
-def test_a_pool_wants_levels_while_fewer_wait_than_there_are_slots(levels: Level) -> None:
+def test_pool_wants_levels_while_fewer_wait_than_slots(levels: Level) -> None:
     pool = new_pool()
     assert [pool.wants(searched) for searched in (0, 1, 5)] == [2, 1, 0]
     pool.submit(*part(levels, range(5)))
@@ -223,7 +223,7 @@ def test_a_pool_wants_levels_while_fewer_wait_than_there_are_slots(levels: Level
     assert pool.wants(0) == 2
 
 
-def test_indices_of_a_queue_are_used_again_in_any_order(levels: Level) -> None:
+def test_queue_reuses_indices_in_any_order(levels: Level) -> None:
     capacity = capacity_of(CONFIG)
     queue = empty_queue(levels, capacity, CONFIG)
     at = np.random.default_rng(0).permutation(capacity)
@@ -241,7 +241,7 @@ def test_indices_of_a_queue_are_used_again_in_any_order(levels: Level) -> None:
     )
 
 
-def test_a_level_that_stays_long_keeps_no_slot_empty(levels: Level) -> None:
+def test_slow_level_keeps_no_slot_empty(levels: Level) -> None:
     """More others come and go meanwhile than the queue has room for."""
     pool = Pool(400 * CONFIG.steps_per_update, untouched(WHOLE), DEFAULT_RULES)
     groups = np.resize(np.arange(len(IDS)), (-(-len(IDS) // GROUP), GROUP))  # for so many at once there is a program

@@ -36,9 +36,9 @@ def levels() -> Level:
 @cache
 def witnesses() -> list[Witness]:
     pairs = zip(*random_successes(levels(), IDS), strict=True)
-    found = [of for pair in pairs for of in repeating(Success(*pair), Source.SCOUT)]
+    found = [witness for pair in pairs for witness in repeating(Success(*pair), Source.SCOUT)]
     shares = survival(levels(), IDS, found, 32, DEFAULT_RULES).tolist()
-    return [of._replace(portability=share) for of, share in zip(found, shares, strict=True)]
+    return [witness._replace(portability=share) for witness, share in zip(found, shares, strict=True)]
 
 
 def test_rework_changes_only_fragile_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,13 +63,13 @@ def test_rework_changes_only_fragile_witnesses(monkeypatch: pytest.MonkeyPatch) 
     searched_randomly(monkeypatch)
     result = label(levels(), IDS, 4096, PROCEDURE)
     verdicts = result.verdicts
-    assert [of.search_steps for of in verdicts] == env_steps.tolist()
+    assert [verdict.search_steps for verdict in verdicts] == env_steps.tolist()
     assert result.spent.searched == env_steps.sum()
     assert (verdicts[FRAGILE].witness, verdicts[FRAGILE].portability) == (Source.SEARCH, better.portability)
     assert verdicts[FRAGILE].cells is None, "nobody searched before"
 
 
-def test_an_experts_own_witness_stays_unless_most_replays_fail() -> None:
+def test_rework_keeps_an_experts_own_witness_unless_most_replays_fail() -> None:
     """Those that are varied are the same actions whoever found them."""
     found, own = witnesses()[FRAGILE], Source.SAMPLED
     assert found.portability is not None
@@ -82,7 +82,7 @@ def test_an_experts_own_witness_stays_unless_most_replays_fail() -> None:
         assert after.source is (own if stays else Source.SEARCH)
 
 
-def test_without_rounds_or_replays_nothing_is_reworked() -> None:
+def test_rework_without_rounds_or_replays_changes_nothing() -> None:
     for procedure in (
         replace(PROCEDURE, search=replace(PROCEDURE.search, steady=0)),
         replace(PROCEDURE, expert=replace(PROCEDURE.expert, replays=0)),

@@ -40,7 +40,7 @@ def result(levels: Level, reports) -> UnitResult:
     return label(levels, IDS, BUDGET, untouched(WHOLE), tell=lambda *now: reports.append(now))
 
 
-def test_verdicts(result: UnitResult) -> None:
+def test_run_returns_consistent_verdicts(result: UnitResult) -> None:
     assert [int(i) for i in result.level_ids] == IDS.tolist()
     labels = {v.label for v in result.verdicts}
     assert labels == {Label.SOLVED, Label.UNSOLVED}, "these levels should show both"
@@ -54,7 +54,7 @@ def test_verdicts(result: UnitResult) -> None:
         assert verdict.label_reason
 
 
-def test_a_solved_level_has_a_witness_and_no_other_has(levels: Level, result: UnitResult) -> None:
+def test_only_solved_levels_have_a_witness(levels: Level, result: UnitResult) -> None:
     record = result.record
     solved = np.array([v.label is Label.SOLVED for v in result.verdicts])
     np.testing.assert_array_equal(succeeds(record.done, record.goal), solved)
@@ -65,7 +65,7 @@ def test_a_solved_level_has_a_witness_and_no_other_has(levels: Level, result: Un
     assert not any(np.any(x[..., ~solved]) for x in jax.tree.leaves(record))
 
 
-def test_a_result_depends_on_the_level_alone(levels: Level, result: UnitResult) -> None:
+def test_result_depends_on_the_level_alone(levels: Level, result: UnitResult) -> None:
     at = [4, 1, 2]
     some = label(jax.tree.map(lambda x: x[..., at], levels), IDS[at], BUDGET, untouched(WHOLE))
     for i, verdict in zip(at, some.verdicts, strict=True):
@@ -87,7 +87,7 @@ def test_progress_is_reported(reports: list[tuple[int, float, int]], result: Uni
     assert result.spent.trained == reports[-1][0]
 
 
-def test_replay_is_the_same_at_every_count(levels: Level) -> None:
+def test_replay_gives_the_same_bits_at_every_count(levels: Level) -> None:
     rng = np.random.default_rng(0)
     count = LANES + 6  # two blocks
     many = jax.tree.map(lambda x: np.resize(np.moveaxis(x, -1, 0), (count, *x.shape[:-1])), levels)
@@ -101,7 +101,7 @@ def test_replay_is_the_same_at_every_count(levels: Level) -> None:
         )
 
 
-def test_a_record_starts_anew_after_each_end(levels: Level) -> None:
+def test_record_resets_after_each_episode(levels: Level) -> None:
     action = np.random.default_rng(1).integers(0, 2, (RECORD_STEPS, 6, len(IDS)))
     record = replay(levels, action)
     for lane in range(len(IDS)):
@@ -116,7 +116,7 @@ def test_a_record_starts_anew_after_each_end(levels: Level) -> None:
             assert record.last_distance[t, lane] == -1
 
 
-def test_levels_that_all_need_no_expert() -> None:
+def test_run_accepts_levels_that_need_no_expert() -> None:
     trivial = np.array([1])
     result = label(sample_levels(jnp.asarray(trivial), SIZES["s"], Distribution()), trivial, BUDGET, untouched(WHOLE))
     assert [v.label for v in result.verdicts] == [Label.TRIVIAL]
@@ -133,12 +133,12 @@ def test_levels_that_all_need_no_expert() -> None:
         (1024, StopConfig(first_rung=2**41), "stop.first_rung is"),
     ],
 )
-def test_a_budget_that_cannot_be_used_is_refused(budget: int, stopping: StopConfig, words: str) -> None:
+def test_pool_rejects_a_budget_that_experts_cannot_use(budget: int, stopping: StopConfig, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         Pool(budget, untouched(stopping), DEFAULT_RULES)
 
 
-def test_the_largest_budget_is_accepted() -> None:
+def test_pool_accepts_the_largest_budget() -> None:
     assert Pool(2**31 - 1, untouched(StopConfig(wait=2**24)), DEFAULT_RULES).updates == 2**22 - 1
 
 
@@ -153,6 +153,6 @@ def test_the_largest_budget_is_accepted() -> None:
         ({"clip": 2.0}, "clip is 2.0"),
     ],
 )
-def test_wrong_hyperparameters_are_refused(change: dict, words: str) -> None:
+def test_expert_config_rejects_invalid_hyperparameters(change: dict, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         ExpertConfig(**change)

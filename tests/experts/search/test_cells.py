@@ -29,11 +29,11 @@ def moves() -> np.ndarray:
 
 def apart(**changed: jax.Array) -> np.ndarray:
     """How far cells have it from the start to the start with this changed, the farthest of its features by level."""
-    of = lambda state: np.asarray(features(levels(), state, CONFIG))
-    return np.abs(of(replace(levels().state, **changed)) - of(levels().state)).max(-1)
+    rows = lambda state: np.asarray(features(levels(), state, CONFIG))
+    return np.abs(rows(replace(levels().state, **changed)) - rows(levels().state)).max(-1)
 
 
-def test_every_body_counts_by_what_it_is() -> None:
+def test_features_weight_bodies_by_role() -> None:
     """All that moves counts in full, but what actuators drive to bring green to blue."""
     moving, goal = moves(), np.isin(np.asarray(levels().role), (Role.GREEN, Role.BLUE))
     acted_on, kinds = np.asarray(driven(levels())), set()
@@ -45,7 +45,7 @@ def test_every_body_counts_by_what_it_is() -> None:
     assert {(True, True, False), (True, False, False), (True, True, True), (True, False, True)} <= kinds
 
 
-def test_speed_and_whole_turns_do_not_count() -> None:
+def test_features_ignore_velocities_and_full_turns() -> None:
     """Nor whether a body has come round once more."""
     state = levels().state
     assert not apart(velocity=state.velocity + 3.0, angular_velocity=state.angular_velocity - 2.0).any()

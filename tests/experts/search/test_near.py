@@ -25,11 +25,11 @@ def goal_at(body: int, *, role: Role = Role.BLUE) -> Level:
     return level
 
 
-def test_circles() -> None:
+def test_gap_of_circles_is_exact() -> None:
     assert measured(switchback()) == pytest.approx(np.hypot(4.5 - 0.6, 4.2 - 0.6) - 0.4)
 
 
-def test_above_the_end_of_a_long_bar_it_is_the_height() -> None:
+def test_gap_above_the_end_of_a_long_bar_is_the_height() -> None:
     """The bar reaches from 0 to 3.6 m; its centre is farther from its end than the ball is."""
     over = goal_at(BAR)
     over.state.position[BALL, :, 0] = 0.3, 2.5
@@ -38,13 +38,13 @@ def test_above_the_end_of_a_long_bar_it_is_the_height() -> None:
     np.testing.assert_allclose(measured(over, turned), [2.5 - 1.6 - 0.2, 1.8 - 1.0 - 0.1 - 0.2], rtol=1e-5)
 
 
-def test_bodies_that_touch_have_no_gap() -> None:
+def test_gap_of_touching_bodies_is_zero() -> None:
     level = goal_at(BAR)
     level.state.position[BALL, :, 0] = 1.8, 1.7
     assert measured(level) == 0
 
 
-def test_polygons_and_triangles() -> None:
+def test_gap_measures_polygons_and_triangles() -> None:
     """Bars one above the other; the fourth corner of a triangle, which means nothing, is far away."""
     bars = goal_at(BAR)
     bars.role[BALL], bars.role[BAR + 1] = Role.PLAIN, Role.GREEN
@@ -55,13 +55,13 @@ def test_polygons_and_triangles() -> None:
     np.testing.assert_allclose(measured(bars, triangle), [3.2 - 1.5 - 0.2, 3.2 - 1.5 - 0.6], rtol=1e-5)
 
 
-def test_the_nearest_of_several_pairs_counts() -> None:
+def test_gap_is_that_of_the_nearest_pair() -> None:
     level = goal_at(BAR)
     level.role[GOAL] = Role.BLUE
     assert measured(level) == pytest.approx(1.5 - 0.1 - 0.6 - 0.2)
 
 
-def test_without_a_pair_nothing_is_near() -> None:
+def test_gap_without_a_pair_is_far() -> None:
     level = goal_at(BAR, role=Role.RED)
     assert measured(level) == pytest.approx(FAR)
     gone = goal_at(BAR)

@@ -34,20 +34,20 @@ def played(ring: Arena, bits: jax.Array) -> tuple[Walk, jax.Array]:
     return walk, decode(code)
 
 
-def test_codes() -> None:
+def test_decode_inverts_encode() -> None:
     code = jnp.arange(np.prod(CHOICES), dtype=jnp.uint16)
     np.testing.assert_array_equal(encode(decode(code)), code)
     assert (np.asarray(decode(code)) < np.array(CHOICES)[:, None]).all()
 
 
-def test_rows_are_exact() -> None:
+def test_rows_round_trip_states_exactly() -> None:
     state = jax.device_get(jax.jit(task.reset)(take(side_by_side(switchback(), valley()), np.array([0, 1, 1]))).state)
     noisy = jax.tree.map(lambda x: x + np.arange(3, dtype=x.dtype) if x.dtype == np.float32 else ~x, state)
     back = jax.jit(lambda state: from_rows(to_rows(state), state))(noisy)
     jax.tree.map(np.testing.assert_array_equal, back, noisy)
 
 
-def test_play_ends_as_the_task_says() -> None:
+def test_play_ends_episodes_as_the_task_does() -> None:
     """Goal, failure, time limit and broken worlds at the same env step, and the same states until then."""
     ring, bits = ring_of_all(), random_bits(3)
     walk, actions = played(ring, bits)
@@ -71,7 +71,7 @@ def test_play_ends_as_the_task_says() -> None:
     np.testing.assert_array_equal(short.ended, np.asarray(done)[:100].any(0))
 
 
-def test_chances() -> None:
+def test_persistent_resamples_with_its_probabilities() -> None:
     """How often an entry stays, and that every choice comes."""
     ring = ring_of_all()
     ring = ring._replace(live=np.ones_like(ring.live))
@@ -83,7 +83,7 @@ def test_chances() -> None:
         np.testing.assert_allclose(moves, np.array(CHANCES) * (1 - 1 / choices), rtol=0.25)
 
 
-def test_dead_entries_stay_zero() -> None:
+def test_play_keeps_dead_entries_zero() -> None:
     ring = ring_of_all()
     _, actions = played(ring, random_bits(0))
     np.testing.assert_array_equal(np.asarray(actions).any((1, 2)), np.asarray(ring.live).any(1))

@@ -67,7 +67,7 @@ def polished() -> Shortened:
     return jax.device_get(polish(levels(), IDS, given(), ENV_STEPS, DEFAULT_RULES))
 
 
-def test_the_shortest_way_is_found() -> None:
+def test_polish_finds_the_shortest_success() -> None:
     success, length = polished().success
     np.testing.assert_array_equal(length, shortest()[1])
     record = replay(levels(), np.moveaxis(np.asarray(success), 0, -1))
@@ -76,13 +76,13 @@ def test_the_shortest_way_is_found() -> None:
     assert not success[:, length[0] :].any()
 
 
-def test_a_level_depends_on_nothing_but_its_id() -> None:
+def test_polish_depends_on_the_level_alone() -> None:
     at = np.array([2, 0, 0, *range(WIDTH - 3)])
     again = polish(levels(), IDS[at], given(), ENV_STEPS, DEFAULT_RULES)
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(again), jax.tree.map(lambda x: x[at], polished()))
 
 
-def test_env_steps_end_it() -> None:
+def test_env_steps_are_limited() -> None:
     steps = polished().env_steps
     assert (steps >= ENV_STEPS).all()
     assert (steps < ENV_STEPS + LANES * 256).all()
@@ -93,23 +93,23 @@ def test_env_steps_end_it() -> None:
     np.testing.assert_array_equal(few.success.length[1:], polished().success.length[1:])
 
 
-def test_a_witness_is_polished() -> None:
+def test_run_polishes_witnesses() -> None:
     """And one that does nothing stays."""
     asked = SearchConfig(polish=ENV_STEPS, steady=0)
     procedure = Procedure(search=asked, expert=ExpertConfig(replays=0))
-    rough = [of for pair in zip(*given(), strict=True) for of in repeating(Success(*pair), Source.SAMPLED)]
+    rough = [witness for pair in zip(*given(), strict=True) for witness in repeating(Success(*pair), Source.SAMPLED)]
     rough[0] = rough[0]._replace(source=Source.NOTHING)
     found, env_steps = rework(levels(), IDS, [*rough[:-1], None], procedure, DEFAULT_RULES)
     assert found[0] is rough[0]
     assert found[-1] is None
     assert env_steps.tolist() == [0, *polished().env_steps[1:-1], 0]
-    for i, of in enumerate(found[1:-1], 1):
-        assert of is not None
-        assert (of.steps, of.source) == (shortest()[1], Source.SEARCH)
-        np.testing.assert_array_equal(of.action[: of.steps], polished().success.action[i, : of.steps])
+    for i, witness in enumerate(found[1:-1], 1):
+        assert witness is not None
+        assert (witness.steps, witness.source) == (shortest()[1], Source.SEARCH)
+        np.testing.assert_array_equal(witness.action[: witness.steps], polished().success.action[i, : witness.steps])
 
 
-def test_settings_that_cannot_be() -> None:
+def test_search_config_rejects_invalid_settings() -> None:
     for wrong in ({"polish": -1}, {"polish": 2**31}, {"steady": -1}):
         with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
             SearchConfig(**wrong)  # pyright: ignore[reportArgumentType]

@@ -73,7 +73,7 @@ def random_play(levels: Level, key: jax.Array) -> jax.Array:
     return play(ring, fresh_walk(ring.lanes), bits, DEFAULT_RULES)[0].reached.reshape(-1, 256) > 0
 
 
-def test_what_random_play_does_not_find() -> None:
+def test_search_finds_what_random_play_does_not() -> None:
     """The search needs a fraction of its env steps in every level; as many of random play find next to nothing."""
     assert (found().success.length[SOLVABLE] > 0).all()
     assert (found().env_steps[SOLVABLE] < CONFIG.env_steps).all()
@@ -83,7 +83,7 @@ def test_what_random_play_does_not_find() -> None:
     np.testing.assert_array_equal(wins, 0)
 
 
-def test_a_tower_is_toppled() -> None:
+def test_search_topples_a_tower() -> None:
     """Not by every search; by random play in fewer than one episode of a thousand."""
     four = take(tower(), np.zeros(4, int))
     searched = search(four, IDS[:4], CONFIG, DEFAULT_RULES)
@@ -92,7 +92,7 @@ def test_a_tower_is_toppled() -> None:
     assert won.mean() < 1e-3
 
 
-def test_what_is_found_replays() -> None:
+def test_successes_of_the_search_replay() -> None:
     """Through the engine's other program, with rewards and contacts: the goal at the last step, nothing before."""
     length = found().success.length[SOLVABLE]
     record = replay(take(levels(), SOLVABLE), np.moveaxis(np.asarray(found().success.action)[SOLVABLE], 0, -1))
@@ -103,14 +103,14 @@ def test_what_is_found_replays() -> None:
     assert (found().success.action[ended] == 0).all()
 
 
-def test_a_level_alone_gives_what_it_gives_among_others() -> None:
+def test_result_depends_on_the_level_alone() -> None:
     """Other neighbours, other rows, other company."""
     for some in ([4], [8, 3, 2], list(range(len(KINDS)))[::-1]):
         alone = search(take(levels(), np.array(some)), IDS[some], CONFIG, DEFAULT_RULES)
         same(alone, jax.tree.map(lambda x, some=some: x[some], found()))
 
 
-def test_units_share_rows() -> None:
+def test_units_share_search_slots() -> None:
     """Levels that come later take the rows that others leave; each gives what it gives alone."""
     searching, units = Searching(CONFIG, DEFAULT_RULES), [np.arange(3), np.arange(3, 4), np.arange(4, len(KINDS))]
     assert not searching.step()
@@ -119,7 +119,7 @@ def test_units_share_rows() -> None:
     for some in units:
         sought.append(searching.submit(take(levels(), some), IDS[some]))
         assert searching.step()
-        seen.append(sum(of.env_steps for of in sought))
+        seen.append(sum(job.env_steps for job in sought))
     waiting = searching.waiting(sought[-1])
     assert searching.wants == AHEAD * side_by_side(CONFIG) - len(waiting)
     left_out, left = searching.submit(levels(), IDS), sought[-1].left
@@ -128,18 +128,18 @@ def test_units_share_rows() -> None:
     assert seen == sorted(set(seen))
     while searching.step():
         pass
-    for some, of in zip(units, sought, strict=True):
-        assert not of.left
-        assert of.ledger.total().search > 0
-        same(searching.result(of), jax.tree.map(lambda x, some=some: x[some], found()))
+    for some, job in zip(units, sought, strict=True):
+        assert not job.left
+        assert job.ledger.total().search > 0
+        same(searching.result(job), jax.tree.map(lambda x, some=some: x[some], found()))
 
 
-def test_another_id_is_another_search() -> None:
+def test_search_depends_on_the_level_id() -> None:
     one = search(take(levels(), np.array([0])), np.array([9], np.int32), CONFIG, DEFAULT_RULES)
     assert (one.success.action[0] != found().success.action[0]).any()
 
 
-def test_no_chance_twice() -> None:
+def test_random_draws_are_never_reused() -> None:
     """Rounds and levels draw their own."""
     keys = begun().key
     deal = jax.jit(draw, static_argnums=2)
@@ -148,7 +148,7 @@ def test_no_chance_twice() -> None:
         assert len({np.asarray(x).tobytes() for x in numbers}) == len(drawn)
 
 
-def test_an_interruption_changes_nothing() -> None:
+def test_interruption_changes_no_result() -> None:
     """To the host and back, as a checkpoint does."""
     twice = explore(explore(begun(), CONFIG, DEFAULT_RULES), CONFIG, DEFAULT_RULES)
     key = jax.random.key_data(twice.key)
@@ -170,7 +170,7 @@ def test_env_steps_add_up() -> None:
     assert (found().grew <= found().env_steps).all()
 
 
-def test_a_level_with_few_cells_leaves_at_a_rung() -> None:
+def test_level_with_few_cells_leaves_at_a_rung() -> None:
     """One cell, and it is over at the first rung; as many as a rung asks for, and it goes on to the next."""
     assert (found().env_steps[KINDS == BROKEN] == CONFIG.first_rung).all()
     broken = take(levels(), np.flatnonzero(KINDS == BROKEN)[:1])
@@ -178,7 +178,7 @@ def test_a_level_with_few_cells_leaves_at_a_rung() -> None:
     assert search(broken, IDS[:1], config, DEFAULT_RULES).env_steps == 16_384
 
 
-def test_when_a_search_ends_is_no_part_of_its_programs() -> None:
+def test_stopping_limits_need_no_recompilation() -> None:
     """Other env steps, rungs or patience compile nothing."""
     programs = lambda: _explore._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
     explore(begun(), CONFIG, DEFAULT_RULES)
@@ -194,7 +194,7 @@ def test_rounds_between_syncs_change_no_result() -> None:
     same(search(levels(), IDS, replace(CONFIG, rounds=3), DEFAULT_RULES), found())
 
 
-def test_a_level_that_comes_no_nearer_leaves() -> None:
+def test_level_without_progress_leaves() -> None:
     config = replace(CONFIG, patience=65_536, per_cell=0)
     now = begun()
     at = lambda waited: replace(
@@ -207,13 +207,13 @@ def test_a_level_that_comes_no_nearer_leaves() -> None:
 
 def test_the_gap_shrinks_on_the_way_to_the_goal() -> None:
     """The least one so far, and when it last shrank; a broken world has none."""
-    now, of = begun(), lambda now: jax.device_get((now.gap, now.closed, now.env_steps))
-    first = last = of(now)
+    now, read = begun(), lambda now: jax.device_get((now.gap, now.closed, now.env_steps))
+    first = last = read(now)
     broken = KINDS[: len(first[0])] == BROKEN
     np.testing.assert_array_equal(first[0] == FAR, broken)
     for _ in range(4):
         now = explore(now, CONFIG, DEFAULT_RULES)
-        gap, closed, env_steps = of(now)
+        gap, closed, env_steps = read(now)
         shrank = gap < last[0]
         assert (closed[shrank] > last[2][shrank]).all()
         np.testing.assert_array_equal(closed[~shrank], last[1][~shrank])
@@ -225,7 +225,7 @@ def test_the_gap_shrinks_on_the_way_to_the_goal() -> None:
     assert (last[1] == 0)[broken].all()
 
 
-def test_a_rung_that_asks_for_next_to_nothing_lets_all_go_on() -> None:
+def test_rung_with_a_loose_limit_stops_no_level() -> None:
     """Cells times the env steps for each would not fit 32 bits."""
     now = begun()
     steps, cells = jnp.full_like(now.env_steps, CONFIG.first_rung), jnp.full_like(now.archive.cells, 3000)
@@ -234,29 +234,36 @@ def test_a_rung_that_asks_for_next_to_nothing_lets_all_go_on() -> None:
     assert not under_way(reached, replace(CONFIG, patience=0, per_cell=1).ends).any()
 
 
-def test_larger_worlds_are_searched_for_fewer_env_steps() -> None:
+def test_scaled_gives_larger_worlds_fewer_env_steps() -> None:
     """The level has one cell, and where no level leaves at a rung it is searched to the end."""
     given = SearchConfig(env_steps=100_000, variations=20_000, patience=4000, bodies=8)
-    of = lambda config: (config.env_steps, config.variations, config.patience)
-    assert of(given.scaled(7)) == of(given.scaled(8)) == of(given) == of(replace(given, bodies=0).scaled(16))
-    assert of(given.scaled(16)) == (25_000, 5000, 1000)
+    limits = lambda config: (config.env_steps, config.variations, config.patience)
+    assert (
+        limits(given.scaled(7))
+        == limits(given.scaled(8))
+        == limits(given)
+        == limits(replace(given, bodies=0).scaled(16))
+    )
+    assert limits(given.scaled(16)) == (25_000, 5000, 1000)
     four = replace(CONFIG, bodies=4, env_steps=207_360, patience=0, per_cell=0)
     at = np.flatnonzero(KINDS == BROKEN)[:1]
     assert search(take(levels(), at), IDS[:1], four, DEFAULT_RULES).env_steps == 40_960  # of 9 bodies
 
 
-def test_a_level_that_has_a_success_stays_as_it_is() -> None:
+def test_explore_leaves_solved_levels_unchanged() -> None:
     now, calls = begun(), -(-int(found().env_steps[SOLVABLE].min()) // (CONFIG.rounds * ROUND))
     for _ in range(calls):
         now = explore(now, CONFIG, DEFAULT_RULES)
     solved = np.flatnonzero(now.length)
     assert len(solved)
-    of = lambda now: jax.tree.map(lambda x: np.array(x)[solved], (now.archive, now.env_steps, now.code, now.length))
-    before = of(now)
-    jax.tree.map(np.testing.assert_array_equal, before, of(explore(now, CONFIG, DEFAULT_RULES)))
+    results = lambda now: jax.tree.map(
+        lambda x: np.array(x)[solved], (now.archive, now.env_steps, now.code, now.length)
+    )
+    before = results(now)
+    jax.tree.map(np.testing.assert_array_equal, before, results(explore(now, CONFIG, DEFAULT_RULES)))
 
 
-def test_a_full_archive_goes_on() -> None:
+def test_full_archive_widens_its_cells() -> None:
     """Cells become wider, entries stay distinct, every one is reached by the actions it is kept with."""
     now = begun()
     for _ in range(4):
@@ -272,13 +279,13 @@ def test_a_full_archive_goes_on() -> None:
         assert archive.used[level].any()
 
 
-def test_a_world_that_breaks_down_leaves_its_start_alone() -> None:
+def test_broken_world_archives_only_its_start() -> None:
     at = np.flatnonzero(KINDS == BROKEN)
     assert (found().success.length[at] == 0).all()
     np.testing.assert_array_equal(found().cells[at], 1)
 
 
-def test_a_state_that_breaks_down_later_does_not_enter() -> None:
+def test_insert_omits_states_that_break_later() -> None:
     """A thruster too strong for the engine's numbers: what is kept are numbers."""
     level = take(levels(), np.array([SWITCHBACK]))
     level.model.thruster_power[...] = 3e38
@@ -289,7 +296,7 @@ def test_a_state_that_breaks_down_later_does_not_enter() -> None:
     assert np.isfinite(archive.entry.feature[archive.used]).all()
 
 
-def test_shortening() -> None:
+def test_shorten_removes_detours() -> None:
     """A success with idle steps before it becomes shorter; one that fails is none; nothing becomes longer."""
     width = side_by_side(CONFIG)
     at = np.resize(SOLVABLE, width)
@@ -318,7 +325,7 @@ def test_shortening() -> None:
      {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000}, {"steady": 2000}, {"width": 1e-46},
      {"growth": 1.00000001}, {"lanes": 2**28}, {"patience": -1}, {"variations": 2**31}],
 )  # fmt: skip
-def test_settings_that_cannot_be(wrong: dict) -> None:
+def test_search_config_rejects_invalid_settings(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
         SearchConfig(**wrong)
 

@@ -68,7 +68,7 @@ def ended() -> Varying:
     return jax.device_get(replace(now, key=jax.random.key_data(now.key)))
 
 
-def test_an_aim_is_corrected() -> None:
+def test_variations_turn_near_misses_into_successes() -> None:
     """What is found replays: the goal at its last step, nothing before. A broken world reaches nothing."""
     end, length = ended(), ended().length
     assert (length[~BROKEN] > 0).all()
@@ -81,7 +81,7 @@ def test_an_aim_is_corrected() -> None:
     assert record.goal[length[at] - 1, np.arange(len(at))].all()
 
 
-def test_both_in_turn() -> None:
+def test_search_runs_variations_after_go_explore() -> None:
     """A search too short to find anything, then variations of what it leaves; each counts its env steps."""
     searching = Searching(CONFIG, DEFAULT_RULES)
     sought = searching.submit(levels(), IDS)
@@ -96,7 +96,7 @@ def test_both_in_turn() -> None:
     assert sought.env_steps == found.env_steps.sum() + found.varied.sum()
 
 
-def test_what_is_kept_is_what_it_says() -> None:
+def test_nearest_trajectories_replay_to_their_gaps() -> None:
     """Each trajectory has its gap at its step and no less before; none is kept twice, the nearest comes first."""
     now = begun()
     for _ in range(2):
@@ -123,7 +123,7 @@ def test_what_is_kept_is_what_it_says() -> None:
     assert (now.gap <= np.maximum(nearest.gap[:, 0] / NEARER, nearest.gap[:, 0])).all()
 
 
-def test_a_level_alone_gives_what_it_gives_among_others() -> None:
+def test_result_depends_on_the_level_alone() -> None:
     """In another row, beside others."""
     order = np.roll(np.arange(WIDTH), 1)
     now = begin(take(levels(), order), IDS[order], misses(), CONFIG, DEFAULT_RULES)
@@ -132,11 +132,11 @@ def test_a_level_alone_gives_what_it_gives_among_others() -> None:
     straight = begun()
     for _ in range(3):
         straight = vary(straight, CONFIG, DEFAULT_RULES)
-    of = lambda now: jax.device_get((now.nearest, now.env_steps, now.gap, now.closed, now.code, now.length))
-    jax.tree.map(lambda one, other: np.testing.assert_array_equal(one, other[order]), of(now), of(straight))
+    results = lambda now: jax.device_get((now.nearest, now.env_steps, now.gap, now.closed, now.code, now.length))
+    jax.tree.map(lambda one, other: np.testing.assert_array_equal(one, other[order]), results(now), results(straight))
 
 
-def test_an_interruption_changes_nothing() -> None:
+def test_interruption_changes_no_result() -> None:
     """To the host and back, as a row that others enter."""
     once = vary(begun(), CONFIG, DEFAULT_RULES)
     plain = jax.tree.map(np.array, replace(once, key=jax.random.key_data(once.key)))
@@ -147,13 +147,13 @@ def test_an_interruption_changes_nothing() -> None:
     jax.tree.map(np.testing.assert_array_equal, bits(resumed), bits(twice))
 
 
-def test_what_begins_has_the_types_of_what_goes_on() -> None:
+def test_begin_has_the_types_of_vary() -> None:
     """Else the first call would take a program of its own."""
     types = lambda now: jax.tree.leaves(jax.tree.map(jax.typeof, now))
     assert types(begun()) == types(vary(begun(), CONFIG, DEFAULT_RULES))
 
 
-def test_env_steps_end_it() -> None:
+def test_env_steps_are_limited() -> None:
     """Every lane's are counted, in whole rounds, until there is a success or none are left."""
     end, call = ended(), ROUND * CONFIG.rounds
     assert (end.env_steps[BROKEN] >= CONFIG.variations).all()
@@ -168,7 +168,7 @@ def test_env_steps_end_it() -> None:
     assert under_way(now, replace(CONFIG, patience=4 * 16_384 + 4).ends).all()
 
 
-def test_no_chance_twice() -> None:
+def test_random_draws_are_never_reused() -> None:
     """Rounds and levels draw their own."""
     keys = begun().key
     some = [drawn(keys[level], jnp.int32(steps), 8) for level in (0, 1) for steps in (0, ROUND)]
@@ -177,7 +177,7 @@ def test_no_chance_twice() -> None:
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2, 3])
-def test_a_change_stays_before_the_nearest_step(kind: int) -> None:
+def test_change_applies_before_the_nearest_step(kind: int) -> None:
     """What is before it and dead entries stay; a redrawn stretch is one action, what is moved comes as it was."""
     rng = np.random.default_rng(kind)
     live = np.array([True, False, True, False, True, False])
@@ -200,7 +200,7 @@ def test_a_change_stays_before_the_nearest_step(kind: int) -> None:
             assert any((after[first + by :] == code[first : 256 - by]).all() for by in range(1, 9))
 
 
-def test_a_variation_has_a_change_or_more() -> None:
+def test_variation_has_at_least_one_change() -> None:
     """As many as its number says."""
     code, live = jnp.zeros(256, jnp.uint16), jnp.ones(ACTIONS, bool)
     bits = np.full((CHANGES, 5), 0, np.uint32)
@@ -212,7 +212,7 @@ def test_a_variation_has_a_change_or_more() -> None:
     assert (np.asarray(both)[60:100] == 5).all()
 
 
-def test_only_the_nearest_stay() -> None:
+def test_first_of_keeps_the_nearest_trajectories() -> None:
     """Of several with the same gap the first, and the others only where there is room."""
     gaps = np.array([[0.5, 0.25, 0.5, 0.25, 1.0] + [0.5] * (KEPT - 1)], np.float32)
     count = gaps.shape[1]

@@ -18,7 +18,7 @@ SIZE = SIZES["s"]
 DYNAMIC = len(dynamic_features(SIZE))
 
 
-def test_advantages() -> None:
+def test_advantages_equal_the_plain_formula() -> None:
     config, rng = ExpertConfig(discount=0.9, gae_lambda=0.8), np.random.default_rng(0)
     value, reward = rng.normal(size=(2, 20, 3)).astype(np.float32)
     done, last = rng.random((20, 3)) < 0.2, rng.normal(size=3).astype(np.float32)
@@ -30,7 +30,7 @@ def test_advantages() -> None:
     np.testing.assert_allclose(ppo.advantages(value, reward, done, last, config), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_samples_keep_every_number_at_its_place() -> None:
+def test_rows_round_trip_samples() -> None:
     rng, time, lanes = np.random.default_rng(1), 4, 3
     moving = rng.normal(size=(time, DYNAMIC, lanes)).astype(np.float32)
     action = rng.integers(0, 2, (time, len(CHOICES), lanes))
@@ -44,7 +44,7 @@ def test_samples_keep_every_number_at_its_place() -> None:
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize("kind", [Network.FLAT, pytest.param(Network.ENTITY, marks=pytest.mark.campaign)])
-def test_learns_a_bandit(kind: Network, seed: int) -> None:
+def test_update_learns_a_bandit(kind: Network, seed: int) -> None:
     """One action entry pays when it is 2: after a few updates it is chosen nearly always."""
     config = ExpertConfig(network=kind, width=16, encoding=16, environments=32, horizon=8, learning_rate=3e-3)
     network, count = network_of(SIZE, config), config.steps_per_update
@@ -73,7 +73,7 @@ def test_learns_a_bandit(kind: Network, seed: int) -> None:
 
 
 @pytest.mark.parametrize(("environments", "horizon"), [(32, 16), (7, 5), (1, 9), (6, 1)])
-def test_shuffling(environments: int, horizon: int) -> None:
+def test_shuffled_gives_each_run_one_sample_per_environment(environments: int, horizon: int) -> None:
     config = ExpertConfig(
         environments=environments,
         horizon=horizon,
@@ -93,7 +93,7 @@ def test_shuffling(environments: int, horizon: int) -> None:
         assert len({tuple(order) for order in orders}) == len(orders)
 
 
-def test_every_sample_can_come_first() -> None:
+def test_shuffled_can_put_every_sample_first() -> None:
     config = ExpertConfig(
         environments=4, horizon=4, minibatches=1, rehearsals=0, attempts=1, sticky_attempts=0, moved_attempts=0
     )

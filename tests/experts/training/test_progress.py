@@ -13,7 +13,7 @@ follow = jax.jit(progress.follow)
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0, 1))
-def test_totals(seed: int, p_done: float, p_goal: float) -> None:
+def test_follow_adds_up_totals(seed: int, p_done: float, p_goal: float) -> None:
     rng, rollouts = np.random.default_rng(seed), 3
     shape = (rollouts, STEPS, ENVIRONMENTS)
     reward = rng.integers(-2, 3, shape).astype(np.float32)
@@ -44,7 +44,7 @@ def test_totals(seed: int, p_done: float, p_goal: float) -> None:
     assert totals.env_steps == rollouts * STEPS * ENVIRONMENTS
 
 
-def test_it_remembers_when_parameters_were_no_longer_finite() -> None:
+def test_watch_records_when_parameters_stop_being_finite() -> None:
     totals = progress.start(ENVIRONMENTS)
     for steps, last, expected in ((10, 1.0, progress.NEVER), (20, np.inf, 20), (30, np.nan, 20), (40, 1.0, 20)):
         params = {"kernel": np.ones((2, 2)), "bias": np.array([0.0, last])}

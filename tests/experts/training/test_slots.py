@@ -67,30 +67,30 @@ def same(a, b) -> None:
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-def test_levels_leave_when_they_are_solved(solved: list[TrainedLevel], whole: list[TrainedLevel]) -> None:
-    steps = [len(of.curve) for of in solved]
+def test_solved_levels_leave_their_slots(solved: list[TrainedLevel], whole: list[TrainedLevel]) -> None:
+    steps = [len(level.curve) for level in solved]
     assert min(steps) < UPDATES, "one of these levels should be solved early"
     assert max(steps) == UPDATES, "one of these levels should not be solved"
-    assert [len(of.curve) for of in whole] == [UPDATES] * len(IDS)
-    for of in solved:
-        assert int(of.evaluations[-1].progress.env_steps) == len(of.curve) * CONFIG.steps_per_update
+    assert [len(level.curve) for level in whole] == [UPDATES] * len(IDS)
+    for level in solved:
+        assert int(level.evaluations[-1].progress.env_steps) == len(level.curve) * CONFIG.steps_per_update
 
 
-def test_an_evaluation_leaves_no_trace_in_training(solved: list[TrainedLevel], whole: list[TrainedLevel]) -> None:
+def test_evaluation_leaves_no_trace_in_training(solved: list[TrainedLevel], whole: list[TrainedLevel]) -> None:
     for early, late in zip(solved, whole, strict=True):
         np.testing.assert_array_equal(early.curve, late.curve[: len(early.curve)])
 
 
 @pytest.mark.parametrize("at", [[5, 1, 3], [6], [2, 6, 5, 4, 0]])
-def test_a_result_depends_neither_on_slot_nor_on_neighbours(
+def test_result_depends_neither_on_slot_nor_on_neighbours(
     levels: Level, solved: list[TrainedLevel], at: list[int]
 ) -> None:
     some, _ = train(take(levels, np.array(at)), IDS[at], UPDATES, CONFIG, SOLVED)
-    for i, of in zip(at, some, strict=True):
-        same(of, solved[i])
+    for i, level in zip(at, some, strict=True):
+        same(level, solved[i])
 
 
-def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
+def test_next_level_enters_a_freed_slot_at_once(levels: Level) -> None:
     """No slot is empty while a level waits, and every level has one slot."""
     queue = queue_of(levels, 2)
     slots = empty_slots(2, queue, CONFIG)
@@ -112,7 +112,7 @@ def test_a_freed_slot_is_taken_at_once(levels: Level) -> None:
         assert (modes[rows, slot[0]] == [Mode.TRAIN] * 2 + [Mode.EVALUATE] * CONFIG.record_rollouts).all()
 
 
-def test_nothing_is_compiled_again(levels: Level) -> None:
+def test_advance_is_compiled_once(levels: Level) -> None:
     """Another number of levels, another budget and another rule use the same program."""
     train(take(levels, np.arange(3)), IDS[:3], 2, CONFIG, SOLVED)
     before = advance._cache_size()
@@ -123,18 +123,18 @@ def test_nothing_is_compiled_again(levels: Level) -> None:
 
 def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[TrainedLevel]) -> None:
     halved, submission = train(levels, IDS, UPDATES, CONFIG, HALVED)
-    never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
+    never = [i for i, level in enumerate(whole) if int(level.evaluations[-1].progress.first_success) < 0]
     assert never
     for i in never:
         assert len(halved[i].curve) in (4, 8)  # at the first rung there is nothing to compare with
-    assert submission.trained_rollouts == sum(len(of.curve) for of in halved)
+    assert submission.trained_rollouts == sum(len(level.curve) for level in halved)
     verdicts = label(levels, IDS, UPDATES * 512, untouched(HALVED)).verdicts
     reasons = {i: verdict.label_reason for i, verdict in enumerate(verdicts) if verdict.label is Label.UNSOLVED}
     assert all("at a rung the best return had not grown" in reasons[i] for i in never)
 
 
-def test_a_fruitless_expert_says_why_it_left(levels: Level, whole: list[TrainedLevel]) -> None:
-    never = [i for i, of in enumerate(whole) if int(of.evaluations[-1].progress.first_success) < 0]
+def test_fruitless_expert_reports_why_it_left(levels: Level, whole: list[TrainedLevel]) -> None:
+    never = [i for i, level in enumerate(whole) if int(level.evaluations[-1].progress.first_success) < 0]
     stopping = replace(HALVED, first_rung=UPDATES * 512, fruitless=5 * 512)
     verdicts = label(levels, IDS, UPDATES * 512, untouched(stopping)).verdicts
     assert never
@@ -147,7 +147,7 @@ def test_a_fruitless_expert_says_why_it_left(levels: Level, whole: list[TrainedL
     assert Label.UNSOLVED in {verdicts[i].label for i in never}
 
 
-def test_a_success_of_training_is_a_witness_where_evaluation_has_none(levels: Level) -> None:
+def test_success_of_training_is_the_witness_if_no_evaluation_succeeds(levels: Level) -> None:
     """Which level that is depends on the machine's rounding, so several budgets are looked at."""
     found = set()
     for updates in (2, 3, 4, 6, 8, 12):
@@ -161,9 +161,9 @@ def test_a_success_of_training_is_a_witness_where_evaluation_has_none(levels: Le
 
 
 @pytest.mark.campaign
-def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[TrainedLevel]) -> None:
+def test_polish_continues_training_after_a_level_is_solved(levels: Level, solved: list[TrainedLevel]) -> None:
     polished, _ = train(levels, IDS, UPDATES, CONFIG, replace(SOLVED, polish=4 * 512))
-    early = [i for i, of in enumerate(solved) if len(of.curve) < UPDATES - 4]
+    early = [i for i, level in enumerate(solved) if len(level.curve) < UPDATES - 4]
     assert early
     for i in early:
         assert len(polished[i].curve) == len(solved[i].curve) + 4
@@ -172,43 +172,45 @@ def test_polishing_goes_on_after_a_level_is_solved(levels: Level, solved: list[T
 
 
 @pytest.mark.parametrize("stopping", [WHOLE, SOLVED, HALVED], ids=["budget", "solved", "halving"])
-def test_going_on_equals_having_trained_through(levels: Level, stopping: StopConfig) -> None:
+def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stopping: StopConfig) -> None:
     """A level that left at a rung, too: it is over, and uses none of the larger budget."""
     through, _ = train(levels, IDS, UPDATES, CONFIG, stopping, keep=True)
     first, _ = train(levels, IDS, UPDATES // 2, CONFIG, stopping, keep=True)
-    left = [i for i, of in enumerate(first) if stopping == WHOLE or not of.candidates]
+    left = [i for i, level in enumerate(first) if stopping == WHOLE or not level.candidates]
     assert (stopping == HALVED) == any(len(first[i].curve) < UPDATES // 2 for i in left)
     begun = {number: first[i].expert for number, i in enumerate(left)}
     later, submission = train(
         take(levels, np.array(left)), IDS[left], UPDATES, CONFIG, stopping, begun=begun, keep=True
     )  # type: ignore[arg-type]
     assert submission.trained_rollouts == sum(len(through[i].curve) - len(first[i].curve) for i in left)
-    for i, of in zip(left, later, strict=True):
-        same(of, through[i])
+    for i, level in zip(left, later, strict=True):
+        same(level, through[i])
 
 
-def test_a_success_before_training_is_rehearsed_from_the_first_update(levels: Level, whole: list[TrainedLevel]) -> None:
+def test_expert_rehearses_an_earlier_success_from_the_first_update(levels: Level, whole: list[TrainedLevel]) -> None:
     """It ends at its goal, so the first of its episodes does; and those lanes do not count as the expert's own."""
     found = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))
     trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=found)
     assert 0 < (found.success.length > 0).sum() < len(IDS)
-    for i, of in enumerate(trained):
-        assert np.array_equal(of.evaluations[-1].success.action, found.success.action[i]) or not found.success.length[i]
+    for i, level in enumerate(trained):
+        assert (
+            np.array_equal(level.evaluations[-1].success.action, found.success.action[i]) or not found.success.length[i]
+        )
         if not found.success.length[i]:
-            same(of.curve, whole[i].curve[:2])
+            same(level.curve, whole[i].curve[:2])
 
 
-def test_a_success_of_a_lane_that_repeats_its_actions_is_not_the_experts_own() -> None:
+def test_success_of_a_sticky_lane_is_not_the_experts_own() -> None:
     """Such a lane mostly ignores what the expert draws, as a lane that rehearses does."""
     ids = np.arange(100, 164)
     trained, _ = train(jax.tree.map(np.asarray, sample_levels(ids, SIZES["s"])), ids, 1, CONFIG, WHOLE)
-    last = [(of.evaluations[-1], of.curve[0]) for of in trained]
+    last = [(level.evaluations[-1], level.curve[0]) for level in trained]
     forced = [share for shown, share in last if shown.success.length and shown.progress.first_success == NEVER]
     assert forced, "in some of these levels no other lane reaches the goal"
     assert all(np.isnan(share) or share == 0 for share in forced)
 
 
-def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level, whole: list[TrainedLevel]) -> None:
+def test_diverged_expert_leaves_and_reports_why(levels: Level, whole: list[TrainedLevel]) -> None:
     begun = {}
     for i, weight in enumerate((np.inf, np.nan)):
         kept = whole[i].expert
@@ -227,7 +229,7 @@ def test_an_expert_whose_numbers_are_not_finite_leaves_and_says_so(levels: Level
 
 
 @pytest.mark.campaign
-def test_all_slots_at_once_as_on_an_accelerator(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vmapped_slots_of_accelerators_give_the_same_results(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same course and nearly the same numbers: sums are taken in another order."""
     queue = queue_of(levels, 3)
 

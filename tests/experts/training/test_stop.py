@@ -28,12 +28,12 @@ def after(updates: int, share: float, stopping: StopConfig, best: float = 0.0, f
 
 
 @pytest.mark.parametrize("stopping", [StopConfig(rule=Rule.BUDGET), SOLVED, HALVING])
-def test_a_budget_ends_in_an_evaluation(stopping: StopConfig) -> None:
+def test_budget_ends_in_an_evaluation(stopping: StopConfig) -> None:
     assert after(99, float("nan"), stopping)[1:] == (False, False)
     assert after(100, float("nan"), stopping)[1:] == (False, True)
 
 
-def test_success_is_worth_an_evaluation() -> None:
+def test_successes_in_training_trigger_an_evaluation() -> None:
     assert after(7, 0.95, SOLVED)[1:] == (True, False)
     assert after(7, 0.85, SOLVED)[1:] == (False, False)
     assert after(7, 1.0, SOLVED, next_evaluation=jnp.int32(8))[1:] == (False, False)
@@ -41,7 +41,7 @@ def test_success_is_worth_an_evaluation() -> None:
 
 
 @pytest.mark.parametrize("stopping", [StopConfig(rule=Rule.BUDGET), SOLVED, HALVING])
-def test_an_expert_that_diverged_leaves(stopping: StopConfig) -> None:
+def test_diverged_expert_leaves(stopping: StopConfig) -> None:
     totals = progress.start(16)._replace(diverged=jnp.int32(1024))
     course, _, final = stop.after_update(
         stop.begin(),
@@ -54,7 +54,7 @@ def test_an_expert_that_diverged_leaves(stopping: StopConfig) -> None:
     assert (bool(final), int(course.over)) == (True, Cause.DIVERGED)
 
 
-def test_a_level_that_its_last_update_brings_to_a_rung_is_over_with_any_budget() -> None:
+def test_expert_stopped_at_a_rung_by_its_last_update_is_over_for_any_budget() -> None:
     totals, course = progress.start(16), stop.begin()._replace(updates=jnp.int32(7), rung_return=jnp.float32(0.5))
     course, _, final = stop.after_update(
         course, totals, jnp.bool_(False), jnp.float32(0.0), jnp.int32(8), rules_of(HALVING, CONFIG)
@@ -62,7 +62,7 @@ def test_a_level_that_its_last_update_brings_to_a_rung_is_over_with_any_budget()
     assert (bool(final), int(course.over)) == (True, Cause.RUNG)
 
 
-def test_at_a_rung_learning_has_to_move() -> None:
+def test_rung_stops_experts_whose_return_has_not_grown() -> None:
     """Rungs are at 4, 8, 16, 32 and 64 updates."""
     low = jnp.float32(0.5)
     assert after(8, 0.0, HALVING, best=0.55, rung_return=low)[1:] == (False, True)
@@ -83,7 +83,7 @@ def test_at_a_rung_learning_has_to_move() -> None:
         (20, progress.NEVER, replace(HALVING, rule=Rule.SOLVED), False),
     ],
 )
-def test_an_expert_that_never_reaches_the_goal_leaves(
+def test_expert_that_never_reaches_the_goal_leaves(
     updates: int, first: int, stopping: StopConfig, leaves: bool
 ) -> None:
     """After 20 updates, whatever success it was given, and whether or not that is a rung."""
@@ -96,11 +96,11 @@ def test_an_expert_that_never_reaches_the_goal_leaves(
     assert (bool(final), int(course.over)) == (leaves, Cause.FRUITLESS if leaves else Cause.NONE)
 
 
-def test_rungs() -> None:
+def test_is_rung_accepts_powers_of_two_of_the_first() -> None:
     assert [u for u in range(1, 200) if bool(stop.is_rung(jnp.int32(u), 3))] == [3, 6, 12, 24, 48, 96, 192]
 
 
-def test_what_follows_from_an_evaluation() -> None:
+def test_after_evaluation_decides_who_leaves_and_when_to_evaluate_next() -> None:
     course = stop.begin()._replace(updates=jnp.int32(10))
     decide = lambda solved, final, stopping: stop.after_evaluation(
         course,
@@ -119,7 +119,7 @@ def test_what_follows_from_an_evaluation() -> None:
     assert int(decide(True, False, replace(SOLVED, polish=1))[2]) == 11, "less than an update is an update"
 
 
-def test_a_last_evaluation_leaves_no_trace_in_what_goes_on() -> None:
+def test_final_evaluation_leaves_no_trace_in_a_continued_expert() -> None:
     """So that more budget later continues as if there had been none."""
     course = stop.begin()._replace(updates=jnp.int32(10), next_evaluation=jnp.int32(9))
     yes, no = jnp.bool_(True), jnp.bool_(False)
@@ -130,7 +130,7 @@ def test_a_last_evaluation_leaves_no_trace_in_what_goes_on() -> None:
     assert (int(due.failed), int(due.next_evaluation)) == (1, 12), "it would have been made with more budget, too"
 
 
-def test_solving_takes_enough_attempts() -> None:
+def test_solves_and_fails_count_attempts() -> None:
     rules = rules_of(StopConfig(successes=7), CONFIG)
     done = np.zeros((256, 16), bool)
     goal = done.copy()
@@ -145,7 +145,7 @@ def test_solving_takes_enough_attempts() -> None:
     assert not bool(stop.solves(done & False, goal & False, rules, CONFIG)), "no episode has ended"
 
 
-def test_what_follows_the_record_decides_nothing() -> None:
+def test_steps_after_the_record_decide_nothing() -> None:
     """Rollouts of an evaluation go on behind it where the horizon does not divide it."""
     done, goal = np.zeros((2, 300, 16), bool)
     done[50] = goal[50] = done[280] = True  # all reach the goal, and fail behind the record
@@ -154,7 +154,7 @@ def test_what_follows_the_record_decides_nothing() -> None:
     assert not bool(stop.fails(done, goal, 300, rules, CONFIG))
 
 
-def test_more_successes_than_attempts_are_refused() -> None:
+def test_check_budget_rejects_more_successes_than_attempts() -> None:
     for rule in (Rule.SOLVED, Rule.HALVING):
         with pytest.raises(ValueError, match=r"stop.successes is 9, more than expert.attempts=8: lower it"):
             check_budget(10_000, CONFIG, StopConfig(rule=rule, successes=9))

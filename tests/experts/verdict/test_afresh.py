@@ -41,28 +41,28 @@ def result(run: TrainingRun) -> UnitResult:
     return run.finish()
 
 
-def test_a_success_rate_is_not_that_of_the_evaluation_that_ended_training(run: TrainingRun, result: UnitResult) -> None:
+def test_success_rate_differs_from_that_of_the_last_evaluation(run: TrainingRun, result: UnitResult) -> None:
     """Where every attempt of that succeeded, others need not."""
     assert run.submission
     ended = zip(run.left, run.submission.trained(CONFIG), strict=True)
-    lucky = [index for index, of in ended if shares(of.evaluations[-1], CONFIG)[0] == 1]
+    lucky = [index for index, level in ended if shares(level.evaluations[-1], CONFIG)[0] == 1]
     rates = np.array([result.verdicts[index].success_rate for index in lucky])
     assert len(rates) > 4
     assert 0.5 < rates.mean() < 1
 
 
-def test_its_env_steps_count(run: TrainingRun, result: UnitResult) -> None:
+def test_attempts_add_their_env_steps(run: TrainingRun, result: UnitResult) -> None:
     assert run.submission
-    for index, of in zip(run.left, run.submission.trained(CONFIG), strict=True):
-        more = result.verdicts[index].evaluation_steps - of.evaluation_steps
+    for index, level in zip(run.left, run.submission.trained(CONFIG), strict=True):
+        more = result.verdicts[index].evaluation_steps - level.evaluation_steps
         assert CONFIG.attempts <= more <= CONFIG.attempts * RECORD_STEPS
-    assert result.spent.evaluated == sum(of.evaluation_steps for of in result.verdicts)
+    assert result.spent.evaluated == sum(level.evaluation_steps for level in result.verdicts)
     assert result.ledger
-    seconds = [result.ledger.of(int(index)).evaluation for index in run.left]
+    seconds = [result.ledger.seconds_of(int(index)).evaluation for index in run.left]
     assert min(seconds) > 0
 
 
-def test_a_success_rate_depends_on_the_level_alone(levels: Level, run: TrainingRun, result: UnitResult) -> None:
+def test_success_rate_depends_on_the_level_alone(levels: Level, run: TrainingRun, result: UnitResult) -> None:
     assert run.submission
     trained, some = run.submission.trained(CONFIG), [7, 2, 5]
     policies = [trained[i].policy for i in some]

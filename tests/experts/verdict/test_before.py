@@ -35,7 +35,9 @@ def indices(verdicts: list[Verdict | None], label: Label) -> list[int]:
     return [i for i, verdict in enumerate(verdicts) if verdict and verdict.label is label]
 
 
-def test_trivial_levels_are_those_that_doing_nothing_solves(levels: Level, verdicts: list[Verdict | None]) -> None:
+def test_decide_labels_levels_trivial_if_doing_nothing_solves_them(
+    levels: Level, verdicts: list[Verdict | None]
+) -> None:
     idle = replay(levels, np.zeros((RECORD_STEPS, 6, COUNT), np.int32))
     trivial = indices(verdicts, Label.TRIVIAL)
     np.testing.assert_array_equal(trivial, np.flatnonzero(succeeds(idle.done, idle.goal)))
@@ -48,7 +50,7 @@ def test_trivial_levels_are_those_that_doing_nothing_solves(levels: Level, verdi
         assert (verdict.env_steps, verdict.success_rate, verdict.failed_by_noop) == (0, 1.0, False)
 
 
-def test_unsolvable_levels_have_a_proof(levels: Level, verdicts: list[Verdict | None]) -> None:
+def test_decide_labels_levels_unsolvable_only_with_a_proof(levels: Level, verdicts: list[Verdict | None]) -> None:
     known = facts_of(levels, DEFAULT_RULES)
     unsolvable = indices(verdicts, Label.UNSOLVABLE)
     np.testing.assert_array_equal(unsolvable, np.flatnonzero(known.proof != Proof.NONE))
@@ -68,7 +70,7 @@ def test_facts_do_not_depend_on_neighbours(levels: Level) -> None:
         np.testing.assert_array_equal(all_of[at], some)
 
 
-def test_nobody_trains_on_what_is_decided(levels: Level, verdicts: list[Verdict | None]) -> None:
+def test_run_trains_no_expert_for_decided_levels(levels: Level, verdicts: list[Verdict | None]) -> None:
     """An expert of this configuration could not even be made: it would need a terabyte."""
     trivial, unsolvable = indices(verdicts, Label.TRIVIAL)[:3], indices(verdicts, Label.UNSOLVABLE)[:2]
     at = np.array([*trivial, *unsolvable])

@@ -36,7 +36,7 @@ def best_of(evaluations: list[Evaluation], source: Source, config: ExpertConfig)
     return next(iter(candidates_of(evaluations, source, config)), None)
 
 
-def test_a_record_is_the_first_attempt_without_failure() -> None:
+def test_best_witness_is_the_first_attempt_without_failure() -> None:
     one = evaluation([(9, True), (20, False)], [(99, True), (199, True)], [(30, True)])
     witness = best_of([one], Source.SCOUT, replace(CONFIG, replays=0))
     assert witness is not None
@@ -44,7 +44,7 @@ def test_a_record_is_the_first_attempt_without_failure() -> None:
     np.testing.assert_array_equal(witness.action[:, 0], np.arange(RECORD_STEPS) + 1000)
 
 
-def test_the_shortest_success_is_repeated() -> None:
+def test_choice_shortest_repeats_the_shortest_success() -> None:
     one = evaluation([(9, True), (14, True), (20, False)], [(99, True)], [(30, True)])
     witness = best_of([one], Source.SCOUT, replace(CONFIG, witness=Choice.SHORTEST))
     assert witness is not None
@@ -52,7 +52,7 @@ def test_the_shortest_success_is_repeated() -> None:
     np.testing.assert_array_equal(witness.action[:12, 0], [10, 11, 12, 13, 14] * 2 + [10, 11])
 
 
-def test_the_best_of_several_evaluations_counts() -> None:
+def test_candidates_come_from_all_evaluations() -> None:
     before, polished = evaluation([(99, True)]), evaluation([(49, True)])
     failed = evaluation([(9, False)])
     for several in ([before, polished], [polished, before], [polished, failed]):
@@ -61,7 +61,7 @@ def test_the_best_of_several_evaluations_counts() -> None:
         assert witness.steps == 50
 
 
-def test_all_that_succeed_are_candidates_the_shortest_first() -> None:
+def test_candidates_are_all_successes_shortest_first() -> None:
     one, two = evaluation([(99, True)], [(9, True), (29, False)], [(30, True)]), evaluation([(30, True)], [(20, True)])
     steps = lambda found: [(witness.steps, witness.source) for witness in found]
     sampled, probable = Source.SAMPLED, Source.MOST_PROBABLE
@@ -75,7 +75,7 @@ def test_all_that_succeed_are_candidates_the_shortest_first() -> None:
         assert witness.action.shape == (RECORD_STEPS, 6)
 
 
-def test_of_many_candidates_the_shortest_are_kept_and_of_copies_one() -> None:
+def test_candidates_are_the_shortest_without_copies() -> None:
     config = replace(CONFIG, witness=Choice.SHORTEST)
     ends = [(end, True) for end in np.cumsum(np.arange(20, 8, -1)).tolist()]
     one = evaluation(ends)
@@ -91,7 +91,7 @@ def test_of_many_candidates_the_shortest_are_kept_and_of_copies_one() -> None:
     assert [witness.steps for witness in candidates_of([copies], Source.SCOUT, config)] == [10]
 
 
-def test_a_rehearsed_success_is_a_witness_only_if_wanted_and_only_where_there_is_no_other() -> None:
+def test_rehearsed_success_is_a_candidate_only_if_allowed_and_without_others() -> None:
     failed, solved = evaluation([(9, False)], success=4), evaluation([(9, True)], success=4)
     assert best_of([failed], Source.SCOUT, replace(CONFIG, exploration=False)) is None
     assert best_of([evaluation([(9, False)])], Source.SCOUT, CONFIG) is None
@@ -100,10 +100,10 @@ def test_a_rehearsed_success_is_a_witness_only_if_wanted_and_only_where_there_is
     assert own is not None
     assert (found.source, found.steps) == (Source.SCOUT, 4)
     assert own.source is Source.MOST_PROBABLE
-    assert [of.source for of in candidates_of([solved], Source.SCOUT, CONFIG)] == [own.source]
+    assert [witness.source for witness in candidates_of([solved], Source.SCOUT, CONFIG)] == [own.source]
 
 
-def test_shares() -> None:
+def test_shares_count_first_episodes_of_each_kind_of_attempt() -> None:
     """Attempts 0 to 2, two sticky ones, two moved ones, one to spare: first episodes count, and those that last."""
     one = evaluation(
         [(9, False)],
@@ -122,14 +122,14 @@ def test_shares() -> None:
     assert np.isnan(nothing[1:]).all()
 
 
-def test_episodes() -> None:
+def test_successful_episodes_returns_their_ranges() -> None:
     done, goal = np.zeros((2, RECORD_STEPS), bool)
     done[[3, 10, 255]], goal[[3, 255]] = True, True
     assert successful_episodes(done, goal) == [(0, 4), (11, 256)]
     assert successful_episodes(done & False, goal & False) == []
 
 
-def test_repeating_fills_the_record() -> None:
+def test_repeated_fills_the_record() -> None:
     action = np.arange(18).reshape(3, 6)
     filled = repeated(action, 3)
     assert filled.shape == (RECORD_STEPS, 6)

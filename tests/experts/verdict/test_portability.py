@@ -56,7 +56,7 @@ def starts(levels: Level) -> Level:
     return jax.device_get(replace(lanes, state=jax.jit(moved, static_argnums=2)(lanes, IDS[at], REPLAYS)))
 
 
-def test_it_is_the_share_of_replays_that_reach_the_goal(
+def test_portability_is_the_share_of_replays_that_reach_the_goal(
     starts: Level, witnesses: list[Witness], shares: np.ndarray
 ) -> None:
     action = np.repeat(np.stack([witness.action for witness in witnesses], -1), REPLAYS, -1)
@@ -69,12 +69,12 @@ def test_it_is_the_share_of_replays_that_reach_the_goal(
     assert shares[FRAGILE] < 0.5
 
 
-def test_starts_are_moved_by_one_unit_in_the_last_place(levels: Level, starts: Level) -> None:
+def test_moved_perturbs_starts_by_one_unit_in_the_last_place(levels: Level, starts: Level) -> None:
     before, after = repeat(take(levels, np.arange(FOUND)), REPLAYS), starts
     model = before.model
     movable = np.asarray(model.active & ((model.inverse_mass > 0) | (model.inverse_inertia > 0)))
     for name in ("position", "rotation", "velocity", "angular_velocity"):
-        x, y = (np.moveaxis(np.asarray(getattr(of.state, name)), 0, -2) for of in (before, after))
+        x, y = (np.moveaxis(np.asarray(getattr(level.state, name)), 0, -2) for level in (before, after))
         near = [x, np.nextafter(x, np.float32(np.inf)), np.nextafter(x, np.float32(-np.inf))]
         assert np.any([y == a for a in near], 0).all()
         if name != "rotation":  # many lie flat, where the next number is none that processors tell from 0
@@ -87,7 +87,7 @@ def test_starts_are_moved_by_one_unit_in_the_last_place(levels: Level, starts: L
 
 
 @pytest.mark.parametrize("at", [[2], [4, 3, 2, 2, 1, 0]])
-def test_it_depends_on_the_level_alone(
+def test_portability_depends_on_the_level_alone(
     levels: Level, witnesses: list[Witness], shares: np.ndarray, at: list[int]
 ) -> None:
     """Every candidate of a level meets the same starts, whatever is replayed beside it."""
@@ -96,7 +96,7 @@ def test_it_depends_on_the_level_alone(
 
 
 @pytest.mark.parametrize(("count", "blocks"), [(2, [16]), (17, [64]), (130, [128, 128])])
-def test_an_accelerator_replays_a_few_candidates_without_filling_itself(
+def test_survival_pads_few_candidates_to_a_small_block_on_accelerators(
     monkeypatch: pytest.MonkeyPatch, count: int, blocks: list[int]
 ) -> None:
     seen = []
@@ -112,7 +112,7 @@ def test_an_accelerator_replays_a_few_candidates_without_filling_itself(
     assert (found.tolist(), seen) == ([*range(count)], blocks)
 
 
-def test_the_most_portable_is_chosen_and_of_equals_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_choose_takes_the_most_portable_candidate_first_of_equals(monkeypatch: pytest.MonkeyPatch) -> None:
     """`steps` names a candidate here, and its number is what survives of it."""
     replayed = []
 
@@ -127,7 +127,7 @@ def test_the_most_portable_is_chosen_and_of_equals_the_first(monkeypatch: pytest
     ]
     levels, ids = np.zeros((1, 5)), np.arange(5)
     chosen = choose(levels, ids, candidates, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
-    told = [(of.steps, of.portability) if of else None for of in chosen]
+    told = [(witness.steps, witness.portability) if witness else None for witness in chosen]
     assert told == [(2, 0.5), None, (4, 1.0), (5, 0.0), (4, 1.0)]
     assert (2, 5) not in replayed
     assert (4, 2) not in replayed, "the one before survived all"
@@ -137,12 +137,12 @@ def test_the_most_portable_is_chosen_and_of_equals_the_first(monkeypatch: pytest
     (again,) = choose(levels[:, :1], ids[:1], some, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
     assert (again, replayed) == (known_one, [(0, 2), (0, 3)]), "what is known is not found out again"
     first = choose(levels, ids, candidates, 0, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
-    assert [(of.steps, of.portability) if of else None for of in first] == [
+    assert [(witness.steps, witness.portability) if witness else None for witness in first] == [
         (1, None), None, (4, None), (5, None), (1, None),
     ]  # fmt: skip
 
 
-def test_a_level_with_two_ways_has_the_portable_one(levels: Level, witnesses: list[Witness]) -> None:
+def test_choose_prefers_the_portable_of_two_candidates(levels: Level, witnesses: list[Witness]) -> None:
     """A way that survives is behind one that never reaches the goal, as if that were this machine's luck."""
     good = witnesses[ROBUST]
     lucky = good._replace(action=np.zeros_like(good.action), steps=good.steps - 1)

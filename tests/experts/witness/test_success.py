@@ -20,7 +20,7 @@ def look(recent, action, goal, timestep, known):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.001, 0.01, 0.1]))
-def test_the_first_success_is_found_with_its_actions(seed: int, p_end: float) -> None:
+def test_find_returns_the_first_success_with_its_actions(seed: int, p_end: float) -> None:
     rng = np.random.default_rng(seed)
     steps = HORIZON * ROLLOUTS
     action = rng.integers(0, 3, (steps, 6, ENVIRONMENTS)).astype(np.int8)
