@@ -34,7 +34,7 @@ def label(
     pool = Pool(budget, procedure, rules)
     run = TrainingRun(pool, levels, level_ids, begun)
     while not pool.step():
-        run.look()
+        run.submit_searched()
         tell(*run.totals())
     result = run.finish()
     solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
@@ -67,7 +67,7 @@ def side_by_side(
             return
         finished = pool.step()
         for run in runs.values():
-            run.look()
+            run.submit_searched()
         tell(runs)
         for name in [name for name, run in runs.items() if run.submission in finished]:
             yield name, runs.pop(name).finish()

@@ -58,7 +58,7 @@ def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Itera
     levels = jax.tree.map(np.asarray, sample_levels(level_ids, SIZES[size]))
     run = TrainingRun(pool, levels, level_ids)
     while not pool.step():
-        run.look()
+        run.submit_searched()
     result, submission = run.finish(), run.submission
     assert submission is not None
     once = replace(pool.config, replays=0)

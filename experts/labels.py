@@ -8,7 +8,7 @@ from levelproof.levelgen.proofs import Proof
 
 
 class Label(StrEnum):
-    """What is known of a level."""
+    """Result of labelling a level."""
 
     SOLVED = "solved"  # a witness was replayed and reached the goal
     UNSOLVED = "unsolved"  # at this budget; no statement about larger ones
@@ -17,7 +17,7 @@ class Label(StrEnum):
 
 
 class Source(StrEnum):
-    """Where a witness comes from."""
+    """Origin of a witness."""
 
     MOST_PROBABLE = "most probable"  # the expert's most probable actions
     SAMPLED = "sampled"  # actions sampled from the expert's policy in its evaluation

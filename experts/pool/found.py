@@ -1,4 +1,4 @@
-"""What is known of levels before their experts train: successes, and the env steps of the search for them."""
+"""The search before experts train: its successes, and their cost in env steps."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -74,42 +74,42 @@ class TrainingRun:
             np.r_[np.flatnonzero(new), np.flatnonzero(~new)]
         )  # of new levels, then resumed ones, as `left` has them
         with self.ledger.timing("search"):
-            self._looked = self.left[new]
-            self.looking = LevelSearch(*self._some(self._looked), pool.searching)
+            self._searched = self.left[new]
+            self.search = LevelSearch(*self._some(self._searched), pool.searching)
         self.submission: Submission | None = None  # of levels that need an expert
-        self._gone: set[int] = set()  # ids of levels that other workers label
-        self.look()
+        self._left_out: set[int] = set()  # ids of levels that other workers label
+        self.submit_searched()
 
-    def look(self) -> None:
+    def submit_searched(self) -> None:
         """Submit the levels to the pool once their search has ended."""
         if self.submission is None:
             with self.ledger.timing("search"):
-                ended = self.looking.ended()
+                ended = self.search.ended()
             if ended:
-                self.ledger.take(self.looking.ledger, self._looked)
+                self.ledger.take(self.search.ledger, self._searched)
                 self._submit()
 
     def _submit(self) -> None:
         some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
         levels, level_ids = self._some(some)
         among = lambda known: {i: known[one] for i, one in enumerate(level_ids.tolist()) if one in known}
-        found = joined([self.looking.found, *(one.found for one in self._paused.values())], self._order)
+        found = joined([self.search.found, *(one.found for one in self._paused.values())], self._order)
         self.submission = self.pool.submit(
             levels, level_ids, found, among(self._begun), self._keep, among(self._paused)
         )
-        if self._gone:
-            self.leave_out(self._gone)
+        if self._left_out:
+            self.leave_out(self._left_out)
 
     @property
     def searching(self) -> int:
         """Number of levels that will come to the pool."""
-        return 0 if self.submission else len(self.left) - len(self._gone)
+        return 0 if self.submission else len(self.left) - len(self._left_out)
 
     @property
     def unbegun(self) -> list[int]:
         """Ids of levels that wait for their search, or for a slot."""
         if self.submission is None:
-            waiting = self.level_ids[self._looked[self.looking.waiting]]
+            waiting = self.level_ids[self._searched[self.search.waiting]]
         else:
             waiting = self.submission.level_ids[self.pool.waiting(self.submission)]
         return [level_id for level_id in waiting.tolist() if level_id not in self._paused]
@@ -132,21 +132,21 @@ class TrainingRun:
 
     def leave_out(self, level_ids: Collection[int]) -> None:
         """Leave levels to other workers: any of those `unbegun`, or all `undecided` when this worker stops."""
-        self._gone.update(level_ids)
-        indices = lambda ids: np.flatnonzero(np.isin(ids, list(self._gone)))
+        self._left_out.update(level_ids)
+        indices = lambda ids: np.flatnonzero(np.isin(ids, list(self._left_out)))
         if self.submission is None:
-            self.looking.withdraw(indices(self.level_ids[self._looked]))
+            self.search.withdraw(indices(self.level_ids[self._searched]))
         else:
             self.pool.withdraw(self.submission, indices(self.submission.level_ids).tolist())
 
     def totals(self) -> Totals:
         """Return the progress of all levels, including those that need no expert."""
-        looked = self.looking.env_steps
+        searched = self.search.env_steps
         if self.submission is None:
-            return Totals(looked, len(self.level_ids) - len(self.left), 0)
+            return Totals(searched, len(self.level_ids) - len(self.left), 0)
         now, waiting = self.pool.totals(self.submission), len(self.submission.level_ids)
-        others = len(self.level_ids) - waiting - len(self._gone)
-        return now._replace(env_steps=now.env_steps + looked, levels=others + now.levels)
+        others = len(self.level_ids) - waiting - len(self._left_out)
+        return now._replace(env_steps=now.env_steps + searched, levels=others + now.levels)
 
     def finish(self) -> UnitResult:
         """Choose witnesses and return verdicts, once the submission has finished; omit levels left to other workers."""
@@ -156,9 +156,9 @@ class TrainingRun:
         attempted = self._attempted(trained)
         with lap() as took:
             result = self._judged(submission, trained, attempted)
-        looks = np.zeros(len(self.level_ids), np.int64)
-        looks[self.left] = submission.found.search_steps
-        self.ledger.share("search", looks)
+        searched = np.zeros(len(self.level_ids), np.int64)
+        searched[self.left] = submission.found.search_steps
+        self.ledger.share("search", searched)
         if len(submission.level_ids):
             self.ledger.take(submission.ledger, self.left)
         ledger = self.ledger.only(np.flatnonzero(np.isin(self.level_ids, result.level_ids)))
@@ -170,7 +170,7 @@ class TrainingRun:
         policies = {
             i: level.policy
             for i, (index, level) in enumerate(zip(self.left, trained, strict=True))
-            if level.policy is not None and int(self.level_ids[index]) not in self._gone
+            if level.policy is not None and int(self.level_ids[index]) not in self._left_out
         }
         with lap() as took:
             at = self.left[list(policies)]
@@ -184,7 +184,7 @@ class TrainingRun:
         self, submission: Submission, trained: list[TrainedLevel], attempted: Mapping[int, tuple[float, int]]
     ) -> UnitResult:
         config, rules = self.pool.config, self.pool.rules
-        kept = np.flatnonzero(~np.isin(self.level_ids, list(self._gone)))
+        kept = np.flatnonzero(~np.isin(self.level_ids, list(self._left_out)))
         levels, level_ids = self._some(kept)
         before, failed = [self.before.verdicts[i] for i in kept], self.before.failed_by_noop[kept]
         found = submission.found
@@ -204,7 +204,7 @@ class TrainingRun:
         witnesses = [chosen[i] for i in left]
         judged = judge(trained, witnesses, take(record, left), config, failed[left])
         verdicts = {
-            i: with_looks(with_attempts(verdict, attempted.get(at)), found, at, int(reworked[i]))
+            i: with_search(with_attempts(verdict, attempted.get(at)), found, at, int(reworked[i]))
             for i, verdict, at in zip(left.tolist(), judged, asked.tolist(), strict=True)
         }
         shares = [None if witness is None else witness.portability for witness in chosen]
@@ -230,7 +230,7 @@ def with_attempts(verdict: Verdict, attempted: tuple[float, int] | None) -> Verd
     return replace(verdict, success_rate=rate, evaluation_steps=verdict.evaluation_steps + env_steps)
 
 
-def with_looks(verdict: Verdict, found: SearchFindings, index: int, reworked: int) -> Verdict:
+def with_search(verdict: Verdict, found: SearchFindings, index: int, reworked: int) -> Verdict:
     """Add results of the search before training, and the env steps of rework."""
     searched = int(found.search_steps[index])
     return replace(

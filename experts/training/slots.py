@@ -27,7 +27,7 @@ from levelproof.levelgen.task.actions import CHOICES
 
 
 class Mode(IntEnum):
-    """What a slot does in a call of `advance`.
+    """State of a slot in a call of `advance`.
 
                over, or paused during an evaluation
             .------------------------------------------.
@@ -43,7 +43,7 @@ class Mode(IntEnum):
 
     due: enough finished episodes of an update reached the goal (`stop.after_update`).
     over: training has stopped for good (`labels.Cause`).
-    final: the expert is over or its budget is used up, so the level leaves after this evaluation.
+    final: the expert is over or its budget is spent, so the level leaves after this evaluation.
     polish: `StopConfig.polish`, training after a level is solved.
 
     Some levels that leave before a final evaluation (`Report.early`) were solved by witnesses that few replays
@@ -73,7 +73,7 @@ class ExpertState(NamedTuple):
 
 
 class Pending(NamedTuple):
-    """What comes next for an expert, besides its `StopState`."""
+    """Next steps of an expert, besides its `StopState`."""
 
     due: Bool[Array, ""] | Bool[np.ndarray, " index"] | np.bool_  # an evaluation, triggered by training
     final: Bool[Array, ""] | Bool[np.ndarray, " index"] | np.bool_  # an evaluation, after which the level leaves
@@ -81,7 +81,7 @@ class Pending(NamedTuple):
 
 
 class EvaluationState(NamedTuple):
-    """An evaluation under way: every environment rolls out a record."""
+    """An unfinished evaluation: every environment rolls out a record."""
 
     part: Int[Array, ""]  # rollouts done
     due: Bool[Array, ""]  # training triggered it

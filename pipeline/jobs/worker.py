@@ -94,7 +94,7 @@ class Worker:
         try:
             finished = self._pool.step()
             for run in self._runs.values():
-                run.look()
+                run.submit_searched()
         except Exception as error:
             units = list(self._runs)
             self._runs, self._pool = {}, pool_for(self._job)

@@ -38,7 +38,7 @@ def train_level(file: LevelFile, procedure: Procedure, budget: int, stop: Event)
     while not stop.is_set():
         ended = pool.step()
         if run.submission is None:
-            run.look()
+            run.submit_searched()
             yield {"stage": "searching", "env_steps": run.totals().env_steps}
             continue
         if ended:

@@ -1,4 +1,4 @@
-"""One small expert for all tests that train: every other configuration is another program to compile."""
+"""One small expert for all tests that train, because every other configuration compiles another program."""
 
 from dataclasses import replace
 
@@ -18,5 +18,5 @@ WHOLE = StopConfig(rule=Rule.BUDGET)
 
 
 def untouched(stopping: StopConfig, config: ExpertConfig = CONFIG) -> Procedure:
-    """Experts of levels in which nobody looked before."""
+    """Procedure without a search."""
     return Procedure(SearchConfig(env_steps=0), config, stopping)

@@ -1,4 +1,4 @@
-"""What levels cost: nothing is lost or counted twice, and each level has its share."""
+"""The ledger loses no seconds, counts none twice, and gives each level its share."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""What follows from a network's logits."""
+"""Distributions from a network's logits."""
 
 import itertools
 

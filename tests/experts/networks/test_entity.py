@@ -1,4 +1,4 @@
-"""The entity network against the plain formula on unfolded entities, and what the order of things does: nothing."""
+"""The entity network equals the plain formula on unfolded entities, and ignores their order."""
 
 from functools import cache, partial
 
@@ -33,13 +33,13 @@ def network_of(name: str) -> tuple[EntityNetwork, Params]:
 
 
 def first(network: EntityNetwork, level: Level) -> Params:
-    """The parameters with which training starts."""
+    """Initial parameters of an expert."""
     constant = jax.jit(network.constant)(level)
     return jax.jit(initial, static_argnums=1)(jax.random.key(0), network, jax.tree.map(lambda x: x[..., 0], constant))
 
 
 def moved(state: State, rng: np.random.Generator) -> State:
-    """Movable bodies somewhere else, at other speeds."""
+    """Levels with other positions and velocities of movable bodies."""
 
     def change(x):
         shift = rng.normal(size=x.shape).astype(np.float32)
@@ -52,7 +52,7 @@ def moved(state: State, rng: np.random.Generator) -> State:
 
 @partial(jax.jit, static_argnums=0)
 def outputs(network: EntityNetwork, params: Params, level: Level, state: State) -> jax.Array:
-    """(logits and value, lane): every lane is a level of its own."""
+    """Logits and value per lane; every lane is a level of its own."""
 
     def one(constant, moving):
         logits, value = forward(network, params, constant, moving[:, None])
@@ -62,7 +62,7 @@ def outputs(network: EntityNetwork, params: Params, level: Level, state: State) 
 
 
 def plain(params: Params, seen: EntityObservation, lane: int) -> np.ndarray:
-    """The same, of one lane: every thing's whole row through its encoder, the mean of the active ones, two layers."""
+    """Plain formula in one lane: every entity's whole row through its encoder, the mean of active ones, two layers."""
     clipped = lambda x: np.clip(np.asarray(x, np.float64)[..., lane], -LIMIT, LIMIT)
     polygons, circles, joints, thrusters = map(clipped, (seen.polygons, seen.circles, seen.joints, seen.thrusters))
     bodies, gravity = np.concatenate([polygons[:, :BODY_ROWS], circles[:, :BODY_ROWS]]), polygons[0, -1:]
@@ -112,7 +112,7 @@ def test_entity_network_ignores_the_order_of_entities(name: str, seed: int) -> N
 
 
 def test_entity_network_accepts_sizes_without_some_kinds() -> None:
-    """No circles and no thrusters: their encoders have no parameters."""
+    """Without circles and thrusters, their encoders have no parameters."""
     size = SIZES["s"]._replace(circles=0, thrusters=0, polygons=7)
     level = empty_level(size, 2)
     network = EntityNetwork(size, width=8, depth=1, encoding=4)

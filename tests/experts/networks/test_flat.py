@@ -1,4 +1,4 @@
-"""The flat network against the plain formula on the whole observation."""
+"""The flat network equals the plain formula on the whole observation."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ MOVING, STILL = dynamic_features(SIZE), resting_features(SIZE)
 
 
 def first(network: FlatNetwork) -> Params:
-    """The parameters with which training starts."""
+    """Initial parameters of an expert."""
     return jax.jit(initial, static_argnums=1)(jax.random.key(0), network, np.zeros(len(STILL), np.float32))
 
 

@@ -1,4 +1,4 @@
-"""How kernels start."""
+"""Initial kernels."""
 
 import jax
 import numpy as np

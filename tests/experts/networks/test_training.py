@@ -1,4 +1,4 @@
-"""Either network, in the slots: it learns, and what comes of a level does not depend on its slot."""
+"""Either network learns in slots, and a level's result does not depend on its slot."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Submissions that share a pool: each gets what it would have got alone, whenever it came."""
+"""Submissions that share a pool: each gets the results that it gets alone, whenever it arrives."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def part(levels: Level, at: range) -> tuple[Level, np.ndarray]:
 
 
 def finished(pool: Pool, *submissions: Submission) -> list[Submission]:
-    """Those of the pool in the order in which they finish, once all of these have."""
+    """Step the pool until these submissions have finished; return all in the order in which they finish."""
     done: list[Submission] = []
     while not set(submissions) <= set(done):
         done += pool.step()
@@ -54,7 +54,7 @@ def finished(pool: Pool, *submissions: Submission) -> list[Submission]:
 
 
 def test_submissions_give_the_results_that_each_gives_alone(levels: Level, alone: list[TrainedLevel]) -> None:
-    """More levels come than the queue has room for, so its entries are used again."""
+    """More levels arrive than the queue can hold, so its entries are reused."""
     assert capacity_of(CONFIG) < len(IDS)
     pool, parts = new_pool(), [range(20), range(20, 23), range(23, 36), range(0)]
     submissions = [pool.submit(*part(levels, at)) for at in parts]
@@ -70,7 +70,7 @@ def test_submissions_give_the_results_that_each_gives_alone(levels: Level, alone
 
 
 def test_later_levels_enter_empty_slots(levels: Level) -> None:
-    """One level keeps one slot busy; others come while it trains, into the other."""
+    """One level occupies one slot; later levels enter the other."""
     pool = new_pool()
     first = pool.submit(*part(levels, range(1)))
     assert pool.step() == []
@@ -80,7 +80,7 @@ def test_later_levels_enter_empty_slots(levels: Level) -> None:
 
 
 def test_withdraw_removes_waiting_levels_and_changes_no_other(levels: Level, alone: list[TrainedLevel]) -> None:
-    """From the queue, and from before it; another pool gives them what they would have got here."""
+    """Levels in the queue and before it; another pool gives them the same results."""
     pool, other = new_pool(), new_pool()
     first, second = pool.submit(*part(levels, range(30))), pool.submit(*part(levels, range(30, 36)))
     for _ in range(3):
@@ -99,7 +99,7 @@ def test_withdraw_removes_waiting_levels_and_changes_no_other(levels: Level, alo
 
 
 def test_paused_expert_resumes_to_the_same_result(levels: Level, alone: list[TrainedLevel]) -> None:
-    """In a slot of another pool, from a training step or an evaluation, and from the middle of one."""
+    """It resumes in another pool's slot, after a training step or amid an evaluation."""
     pool, evaluated = new_pool(), 0
     submission = pool.submit(*part(levels, range(4)))
     while True:
@@ -122,12 +122,12 @@ def test_paused_expert_resumes_to_the_same_result(levels: Level, alone: list[Tra
 
 @pytest.fixture
 def never_portable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No witness survives enough replays."""
+    """Make no witness portable."""
     monkeypatch.setattr("levelproof.experts.pool.pool.PORTABLE", 2)
 
 
 def steadied(updates: int) -> Pool:
-    """In which levels train on for so many updates after they are solved, 10 at most in all."""
+    """A pool in which solved levels train on for `updates` updates, at most 10 in all."""
     stopping = replace(SOLVED, steady=updates * CONFIG.steps_per_update)
     return Pool(10 * CONFIG.steps_per_update, untouched(stopping), DEFAULT_RULES)
 
@@ -159,7 +159,7 @@ def test_only_levels_with_fragile_witnesses_train_on(levels: Level) -> None:
 
 @pytest.mark.usefixtures("never_portable")
 def test_steady_limits_further_training(levels: Level) -> None:
-    """What it was before is in what it becomes, and of the witnesses of all its evaluations the best is kept."""
+    """The learning curve extends the earlier one, and the best witness of all evaluations is kept."""
     at_once, waited = (trained_by(steadied(updates), levels) for updates in (0, 3))
     early = [i for i, level in enumerate(at_once) if level.candidates and len(level.curve) < 10]
     assert early
@@ -242,9 +242,9 @@ def test_queue_reuses_indices_in_any_order(levels: Level) -> None:
 
 
 def test_slow_level_keeps_no_slot_empty(levels: Level) -> None:
-    """More others come and go meanwhile than the queue has room for."""
+    """Meanwhile more levels come and go than the queue can hold."""
     pool = Pool(400 * CONFIG.steps_per_update, untouched(WHOLE), DEFAULT_RULES)
-    groups = np.resize(np.arange(len(IDS)), (-(-len(IDS) // GROUP), GROUP))  # for so many at once there is a program
+    groups = np.resize(np.arange(len(IDS)), (-(-len(IDS) // GROUP), GROUP))  # groups that share a compiled program
     begun = [jax.device_get(begin(take(levels, at), IDS[at], no_success(GROUP), CONFIG)) for at in groups]
     experts = jax.tree.map(lambda *xs: np.concatenate(xs), *begun)
     soon, no = np.int32(1), np.bool_(False)  # they leave after an update

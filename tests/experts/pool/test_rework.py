@@ -1,4 +1,4 @@
-"""Reworked witnesses: a fragile one becomes steady, whatever is beside it, and what that takes is counted."""
+"""Rework makes fragile witnesses robust, whatever their neighbours, and counts its env steps."""
 
 from dataclasses import replace
 from functools import cache
@@ -66,11 +66,11 @@ def test_rework_changes_only_fragile_witnesses(monkeypatch: pytest.MonkeyPatch) 
     assert [verdict.search_steps for verdict in verdicts] == env_steps.tolist()
     assert result.spent.searched == env_steps.sum()
     assert (verdicts[FRAGILE].witness, verdicts[FRAGILE].portability) == (Source.SEARCH, better.portability)
-    assert verdicts[FRAGILE].cells is None, "nobody searched before"
+    assert verdicts[FRAGILE].cells is None, "no search ran before"
 
 
 def test_rework_keeps_an_experts_own_witness_unless_most_replays_fail() -> None:
-    """Those that are varied are the same actions whoever found them."""
+    """The same actions are varied, whatever their source."""
     found, own = witnesses()[FRAGILE], Source.SAMPLED
     assert found.portability is not None
     for source, share, stays in ((own, 0.5, True), (own, 0.45, False), (Source.SCOUT, 0.5, False)):

@@ -1,4 +1,4 @@
-"""What tells two worlds apart: the places and turns of bodies that move, weighted."""
+"""Features of cells: weighted positions and rotations of movable bodies."""
 
 from dataclasses import replace
 from functools import cache
@@ -22,19 +22,19 @@ def levels() -> Level:
 
 
 def moves() -> np.ndarray:
-    """Which bodies do."""
+    """Bodies that can move."""
     model = levels().model
     return np.asarray(model.active & (model.inverse_mass + model.inverse_inertia > 0))
 
 
 def apart(**changed: jax.Array) -> np.ndarray:
-    """How far cells have it from the start to the start with this changed, the farthest of its features by level."""
+    """Largest change of a feature by level, when the start is changed like this."""
     rows = lambda state: np.asarray(features(levels(), state, CONFIG))
     return np.abs(rows(replace(levels().state, **changed)) - rows(levels().state)).max(-1)
 
 
 def test_features_weight_bodies_by_role() -> None:
-    """All that moves counts in full, but what actuators drive to bring green to blue."""
+    """Movable bodies count in full, except those that actuators drive, if neither green nor blue."""
     moving, goal = moves(), np.isin(np.asarray(levels().role), (Role.GREEN, Role.BLUE))
     acted_on, kinds = np.asarray(driven(levels())), set()
     for body in range(len(moving)):
@@ -46,7 +46,7 @@ def test_features_weight_bodies_by_role() -> None:
 
 
 def test_features_ignore_velocities_and_full_turns() -> None:
-    """Nor whether a body has come round once more."""
+    """Velocities and full turns leave features unchanged."""
     state = levels().state
     assert not apart(velocity=state.velocity + 3.0, angular_velocity=state.angular_velocity - 2.0).any()
     assert apart(rotation=state.rotation + TURN).max() < 1e-4

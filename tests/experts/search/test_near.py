@@ -1,4 +1,4 @@
-"""The gap between green and blue: what geometry says it is, and nothing where they touch."""
+"""The gap between green and blue equals the geometric one, and is 0 if they touch."""
 
 import jax
 import numpy as np
@@ -13,7 +13,7 @@ GAP = jax.jit(lambda levels: gap(goals_of(levels), levels.state))
 
 
 def measured(*levels: Level) -> np.ndarray:
-    """By one program: the levels that are too few are the last again."""
+    """Gaps from one compiled program, padded to two levels with the last."""
     many = side_by_side(*levels, *[levels[-1]] * (2 - len(levels)))
     return np.asarray(GAP(many))[: len(levels)]
 

@@ -1,4 +1,4 @@
-"""Random play beside the task's own rules."""
+"""Random play follows the task's own rules."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def random_bits(seed: int) -> jax.Array:
 
 @jax.jit
 def played(ring: Arena, bits: jax.Array) -> tuple[Walk, jax.Array]:
-    """All lanes from their starts, and the actions."""
+    """Play all lanes from their starts; return walk and actions."""
     walk, code = play(ring, fresh_walk(ring.lanes), bits, RULES)
     return walk, decode(code)
 
@@ -48,7 +48,7 @@ def test_rows_round_trip_states_exactly() -> None:
 
 
 def test_play_ends_episodes_as_the_task_does() -> None:
-    """Goal, failure, time limit and broken worlds at the same env step, and the same states until then."""
+    """Goal, failure, time limit and broken worlds come at the same env step, after the same states."""
     ring, bits = ring_of_all(), random_bits(3)
     walk, actions = played(ring, bits)
 
@@ -72,7 +72,7 @@ def test_play_ends_episodes_as_the_task_does() -> None:
 
 
 def test_persistent_resamples_with_its_probabilities() -> None:
-    """How often an entry stays, and that every choice comes."""
+    """Entries are kept at their rate, and every choice occurs."""
     ring = ring_of_all()
     ring = ring._replace(live=np.ones_like(ring.live))
     parts = [played(ring, random_bits(i))[1] for i in range(4)]

@@ -1,4 +1,4 @@
-"""Polishing: a success becomes as short as it can be where that is known, and depends on nothing but its level."""
+"""Polishing finds the shortest success if it is known, and depends on the level alone."""
 
 from functools import cache
 
@@ -46,7 +46,7 @@ def constant(entry: int, choice: int) -> np.ndarray:
 
 @cache
 def shortest() -> tuple[np.ndarray, int]:
-    """Nothing is sooner there than what pushes all the time."""
+    """Return the better constant push and its length; no actions are faster."""
     ways = [constant(entry, 1) for entry in (RIGHT, RIGHT + 1)]
     record = replay(take(levels(), np.zeros(2, int)), np.stack(ways, -1))
     steps = np.where(record.goal.any(0), steps_to_goal(record.goal), 257)
@@ -55,7 +55,7 @@ def shortest() -> tuple[np.ndarray, int]:
 
 @cache
 def given() -> Success:
-    """Waits, then pushes."""
+    """Actions that wait, then push."""
     action, steps = shortest()
     late = np.concatenate([np.zeros((IDLE, ACTIONS), np.int8), action[:-IDLE]])
     late[IDLE + steps :] = 0
@@ -94,7 +94,7 @@ def test_env_steps_are_limited() -> None:
 
 
 def test_run_polishes_witnesses() -> None:
-    """And one that does nothing stays."""
+    """A witness that does nothing stays."""
     asked = SearchConfig(polish=ENV_STEPS, steady=0)
     procedure = Procedure(search=asked, expert=ExpertConfig(replays=0))
     rough = [witness for pair in zip(*given(), strict=True) for witness in repeating(Success(*pair), Source.SAMPLED)]

@@ -1,4 +1,4 @@
-"""Searching levels that random play does not solve: what is found, and that it depends on nothing but the level."""
+"""The search solves levels that random play does not, and its results depend on the level alone."""
 
 from dataclasses import replace
 from functools import cache
@@ -38,7 +38,7 @@ SOLVABLE = np.flatnonzero(KINDS != BROKEN)
 
 
 def search(levels: Level, level_ids: np.ndarray, config: SearchConfig, rules: TaskParams) -> SearchResult:
-    """Every level until it has a success or has had its env steps."""
+    """Search every level to its end."""
     searching = Searching(config, rules)
     sought = searching.submit(levels, level_ids)
     while searching.step():
@@ -67,14 +67,14 @@ def begun() -> Search:
 
 @jax.jit
 def random_play(levels: Level, key: jax.Array) -> jax.Array:
-    """How often an episode in each lane reaches the goal."""
+    """Return whether each of 256 random episodes per level reaches the goal."""
     ring = arena(levels, 256, CONFIG.redrawn)
     bits = jax.random.bits(key, (256, 6, 256 * levels.role.shape[-1]))
     return play(ring, fresh_walk(ring.lanes), bits, DEFAULT_RULES)[0].reached.reshape(-1, 256) > 0
 
 
 def test_search_finds_what_random_play_does_not() -> None:
-    """The search needs a fraction of its env steps in every level; as many of random play find next to nothing."""
+    """In every level the search needs a fraction of its env steps; random play finds almost nothing in as many."""
     assert (found().success.length[SOLVABLE] > 0).all()
     assert (found().env_steps[SOLVABLE] < CONFIG.env_steps).all()
     both = together(switchback(), valley())
@@ -84,7 +84,7 @@ def test_search_finds_what_random_play_does_not() -> None:
 
 
 def test_search_topples_a_tower() -> None:
-    """Not by every search; by random play in fewer than one episode of a thousand."""
+    """Not every search succeeds; random play does in fewer than one episode of a thousand."""
     four = take(tower(), np.zeros(4, int))
     searched = search(four, IDS[:4], CONFIG, DEFAULT_RULES)
     assert (searched.success.length > 0).any()
@@ -93,7 +93,7 @@ def test_search_topples_a_tower() -> None:
 
 
 def test_successes_of_the_search_replay() -> None:
-    """Through the engine's other program, with rewards and contacts: the goal at the last step, nothing before."""
+    """The engine's program with rewards and contacts reaches the goal at the last step, and ends no episode before."""
     length = found().success.length[SOLVABLE]
     record = replay(take(levels(), SOLVABLE), np.moveaxis(np.asarray(found().success.action)[SOLVABLE], 0, -1))
     lane = np.arange(len(SOLVABLE))
@@ -104,14 +104,14 @@ def test_successes_of_the_search_replay() -> None:
 
 
 def test_result_depends_on_the_level_alone() -> None:
-    """Other neighbours, other rows, other company."""
+    """Neighbours, search slots and batch differ."""
     for some in ([4], [8, 3, 2], list(range(len(KINDS)))[::-1]):
         alone = search(take(levels(), np.array(some)), IDS[some], CONFIG, DEFAULT_RULES)
         same(alone, jax.tree.map(lambda x, some=some: x[some], found()))
 
 
 def test_units_share_search_slots() -> None:
-    """Levels that come later take the rows that others leave; each gives what it gives alone."""
+    """Later levels enter the search slots that others leave; each gives its own result."""
     searching, units = Searching(CONFIG, DEFAULT_RULES), [np.arange(3), np.arange(3, 4), np.arange(4, len(KINDS))]
     assert not searching.step()
     assert searching.wants == AHEAD * side_by_side(CONFIG)
@@ -140,7 +140,7 @@ def test_search_depends_on_the_level_id() -> None:
 
 
 def test_random_draws_are_never_reused() -> None:
-    """Rounds and levels draw their own."""
+    """Every round and level has its own draws."""
     keys = begun().key
     deal = jax.jit(draw, static_argnums=2)
     drawn = [deal(keys[level], jnp.int32(env_steps), CONFIG) for level in (0, 1) for env_steps in (0, ROUND)]
@@ -149,7 +149,7 @@ def test_random_draws_are_never_reused() -> None:
 
 
 def test_interruption_changes_no_result() -> None:
-    """To the host and back, as a checkpoint does."""
+    """The state moves to the host and back, as in a checkpoint."""
     twice = explore(explore(begun(), CONFIG, DEFAULT_RULES), CONFIG, DEFAULT_RULES)
     key = jax.random.key_data(twice.key)
     once = explore(begun(), CONFIG, DEFAULT_RULES)
@@ -171,7 +171,7 @@ def test_env_steps_add_up() -> None:
 
 
 def test_level_with_few_cells_leaves_at_a_rung() -> None:
-    """One cell, and it is over at the first rung; as many as a rung asks for, and it goes on to the next."""
+    """With one cell it leaves at the first rung; with as many as required it reaches the next."""
     assert (found().env_steps[KINDS == BROKEN] == CONFIG.first_rung).all()
     broken = take(levels(), np.flatnonzero(KINDS == BROKEN)[:1])
     config = replace(CONFIG, env_steps=40_960, patience=0, first_rung=4096, per_cell=4096)
@@ -179,7 +179,7 @@ def test_level_with_few_cells_leaves_at_a_rung() -> None:
 
 
 def test_stopping_limits_need_no_recompilation() -> None:
-    """Other env steps, rungs or patience compile nothing."""
+    """Other env steps, rungs or patience need no compiling."""
     programs = lambda: _explore._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
     explore(begun(), CONFIG, DEFAULT_RULES)
     before = programs()
@@ -206,7 +206,7 @@ def test_level_without_progress_leaves() -> None:
 
 
 def test_the_gap_shrinks_on_the_way_to_the_goal() -> None:
-    """The least one so far, and when it last shrank; a broken world has none."""
+    """The state has the smallest gap so far, and when it last shrank; a broken world has none."""
     now, read = begun(), lambda now: jax.device_get((now.gap, now.closed, now.env_steps))
     first = last = read(now)
     broken = KINDS[: len(first[0])] == BROKEN
@@ -226,7 +226,7 @@ def test_the_gap_shrinks_on_the_way_to_the_goal() -> None:
 
 
 def test_rung_with_a_loose_limit_stops_no_level() -> None:
-    """Cells times the env steps for each would not fit 32 bits."""
+    """Cells times env steps per cell would overflow 32 bits."""
     now = begun()
     steps, cells = jnp.full_like(now.env_steps, CONFIG.first_rung), jnp.full_like(now.archive.cells, 3000)
     reached = replace(now, env_steps=steps, archive=now.archive._replace(cells=cells))
@@ -235,7 +235,7 @@ def test_rung_with_a_loose_limit_stops_no_level() -> None:
 
 
 def test_scaled_gives_larger_worlds_fewer_env_steps() -> None:
-    """The level has one cell, and where no level leaves at a rung it is searched to the end."""
+    """The level has one cell; without rungs it is searched to the end."""
     given = SearchConfig(env_steps=100_000, variations=20_000, patience=4000, bodies=8)
     limits = lambda config: (config.env_steps, config.variations, config.patience)
     assert (
@@ -264,7 +264,7 @@ def test_explore_leaves_solved_levels_unchanged() -> None:
 
 
 def test_full_archive_widens_its_cells() -> None:
-    """Cells become wider, entries stay distinct, every one is reached by the actions it is kept with."""
+    """Entries stay distinct, and their actions reach them."""
     now = begun()
     for _ in range(4):
         now = explore(now, CONFIG, DEFAULT_RULES)
@@ -286,7 +286,7 @@ def test_broken_world_archives_only_its_start() -> None:
 
 
 def test_insert_omits_states_that_break_later() -> None:
-    """A thruster too strong for the engine's numbers: what is kept are numbers."""
+    """A thruster too strong for the engine's floats: archived states are finite."""
     level = take(levels(), np.array([SWITCHBACK]))
     level.model.thruster_power[...] = 3e38
     now = explore(begin(take(level, np.zeros(side_by_side(CONFIG), int)), IDS[: side_by_side(CONFIG)], CONFIG,
@@ -297,7 +297,7 @@ def test_insert_omits_states_that_break_later() -> None:
 
 
 def test_shorten_removes_detours() -> None:
-    """A success with idle steps before it becomes shorter; one that fails is none; nothing becomes longer."""
+    """A success after idle steps becomes shorter, a failing one is dropped, none becomes longer."""
     width = side_by_side(CONFIG)
     at = np.resize(SOLVABLE, width)
     known = jax.tree.map(lambda x: x[at], found().success)
@@ -331,7 +331,7 @@ def test_search_config_rejects_invalid_settings(wrong: dict) -> None:
 
 
 def test_label_without_expert_rests_on_the_search() -> None:
-    """Every env step is counted."""
+    """All env steps are counted."""
     some = np.array([0, 1, 2])
     procedure = Procedure(CONFIG, ExpertConfig(), StopConfig(rule=Rule.NONE))
     result = label(take(levels(), some), IDS[some], 2048, procedure)

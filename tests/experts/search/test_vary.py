@@ -1,4 +1,4 @@
-"""Varying what came nearest to the goal: near misses become successes, and a level depends on nothing but itself."""
+"""Variations turn near misses into successes, and results depend on the level alone."""
 
 from dataclasses import replace
 from functools import cache
@@ -48,7 +48,7 @@ def levels() -> Level:
 
 
 def misses() -> Approaches:
-    """Of each level, nothing but a shot into the wall."""
+    """Trajectories of each level: a shot into the wall."""
     action = np.zeros((ACTIONS, 256), int)
     action[MOTOR_BINDINGS, :8] = 1
     code = np.broadcast_to(encode(jnp.array(action)), (WIDTH, KEPT, 256)).copy()
@@ -69,7 +69,7 @@ def ended() -> Varying:
 
 
 def test_variations_turn_near_misses_into_successes() -> None:
-    """What is found replays: the goal at its last step, nothing before. A broken world reaches nothing."""
+    """Successes replay: the goal at the last step, no end before. A broken world has none."""
     end, length = ended(), ended().length
     assert (length[~BROKEN] > 0).all()
     assert (length[BROKEN] == 0).all()
@@ -82,7 +82,7 @@ def test_variations_turn_near_misses_into_successes() -> None:
 
 
 def test_search_runs_variations_after_go_explore() -> None:
-    """A search too short to find anything, then variations of what it leaves; each counts its env steps."""
+    """Go-Explore is too short to succeed, then variations follow; both count their env steps."""
     searching = Searching(CONFIG, DEFAULT_RULES)
     sought = searching.submit(levels(), IDS)
     while searching.step():
@@ -97,7 +97,7 @@ def test_search_runs_variations_after_go_explore() -> None:
 
 
 def test_nearest_trajectories_replay_to_their_gaps() -> None:
-    """Each trajectory has its gap at its step and no less before; none is kept twice, the nearest comes first."""
+    """Each trajectory has its smallest gap at its step; all are distinct, the nearest first."""
     now = begun()
     for _ in range(2):
         now = vary(now, CONFIG, DEFAULT_RULES)
@@ -124,7 +124,7 @@ def test_nearest_trajectories_replay_to_their_gaps() -> None:
 
 
 def test_result_depends_on_the_level_alone() -> None:
-    """In another row, beside others."""
+    """The search slot and the neighbours differ."""
     order = np.roll(np.arange(WIDTH), 1)
     now = begin(take(levels(), order), IDS[order], misses(), CONFIG, DEFAULT_RULES)
     for _ in range(3):
@@ -137,7 +137,7 @@ def test_result_depends_on_the_level_alone() -> None:
 
 
 def test_interruption_changes_no_result() -> None:
-    """To the host and back, as a row that others enter."""
+    """The state moves to the host and back, as when other levels enter."""
     once = vary(begun(), CONFIG, DEFAULT_RULES)
     plain = jax.tree.map(np.array, replace(once, key=jax.random.key_data(once.key)))
     back = jax.tree.map(jnp.array, plain)
@@ -148,13 +148,13 @@ def test_interruption_changes_no_result() -> None:
 
 
 def test_begin_has_the_types_of_vary() -> None:
-    """Else the first call would take a program of its own."""
+    """Otherwise the first call would need a program of its own."""
     types = lambda now: jax.tree.leaves(jax.tree.map(jax.typeof, now))
     assert types(begun()) == types(vary(begun(), CONFIG, DEFAULT_RULES))
 
 
 def test_env_steps_are_limited() -> None:
-    """Every lane's are counted, in whole rounds, until there is a success or none are left."""
+    """Env steps of all lanes count, in whole rounds, until a success or the limit."""
     end, call = ended(), ROUND * CONFIG.rounds
     assert (end.env_steps[BROKEN] >= CONFIG.variations).all()
     assert (end.env_steps[BROKEN] < CONFIG.variations + call).all()
@@ -169,7 +169,7 @@ def test_env_steps_are_limited() -> None:
 
 
 def test_random_draws_are_never_reused() -> None:
-    """Rounds and levels draw their own."""
+    """Every round and level has its own draws."""
     keys = begun().key
     some = [drawn(keys[level], jnp.int32(steps), 8) for level in (0, 1) for steps in (0, ROUND)]
     for numbers in zip(*some, strict=True):
@@ -178,7 +178,7 @@ def test_random_draws_are_never_reused() -> None:
 
 @pytest.mark.parametrize("kind", [0, 1, 2, 3])
 def test_change_applies_before_the_nearest_step(kind: int) -> None:
-    """What is before it and dead entries stay; a redrawn stretch is one action, what is moved comes as it was."""
+    """Earlier actions and dead entries stay; a resampled stretch is one action; shifted actions are unchanged."""
     rng = np.random.default_rng(kind)
     live = np.array([True, False, True, False, True, False])
     action = np.where(live[:, None], rng.integers(2, size=(ACTIONS, 256)), 0)
@@ -201,7 +201,7 @@ def test_change_applies_before_the_nearest_step(kind: int) -> None:
 
 
 def test_variation_has_at_least_one_change() -> None:
-    """As many as its number says."""
+    """Their number follows from the bits of `Change.number`."""
     code, live = jnp.zeros(256, jnp.uint16), jnp.ones(ACTIONS, bool)
     bits = np.full((CHANGES, 5), 0, np.uint32)
     bits[:, 2], bits[:, 3] = 63, 5  # all entries, to another action
@@ -213,7 +213,7 @@ def test_variation_has_at_least_one_change() -> None:
 
 
 def test_first_of_keeps_the_nearest_trajectories() -> None:
-    """Of several with the same gap the first, and the others only where there is room."""
+    """Of several with the same gap the first stays, the others only if there is room."""
     gaps = np.array([[0.5, 0.25, 0.5, 0.25, 1.0] + [0.5] * (KEPT - 1)], np.float32)
     count = gaps.shape[1]
     some = Approaches(np.zeros((1, count, 8), np.uint16), gaps, np.arange(count)[None])  # pyright: ignore

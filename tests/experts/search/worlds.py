@@ -1,4 +1,4 @@
-"""Levels by hand that random play does not solve: all of one size, so that one kernel is compiled."""
+"""Hand-made levels that random play does not solve, all of one size, so that one kernel is compiled."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ WEIGHT = 0.16 * 9.81  # N, of the ball
 
 
 def switchback() -> Level:
-    """A ball that two thrusters lift, one to each side, has to fly around two red shelves to the goal above them."""
+    """A ball with a thruster to each side must fly around two red shelves to the goal above them."""
     return world(
         bars=[((1.8, 1.5), (1.8, 0.1), 0.0), ((3.2, 3.2), (1.8, 0.1), 0.0)],
         bar_role=Role.RED,
@@ -28,7 +28,7 @@ def switchback() -> Level:
 
 
 def valley() -> Level:
-    """A ball without friction has to swing up to the goal from a valley; its thrusters are weaker than the slopes."""
+    """A ball without friction must swing up to the goal from a valley; its thrusters are weaker than the slopes."""
     level = world(
         bars=[((0.6, 0.9), (2.5, 0.5), -0.7), ((4.4, 0.9), (2.5, 0.5), 0.7)],
         bar_role=Role.PLAIN,
@@ -76,7 +76,7 @@ def tower() -> Level:
 
 
 def broken() -> Level:
-    """The valley, where the ball is nowhere."""
+    """The valley, with a ball at NaN."""
     level = valley()
     level.state.position[BALL] = np.nan
     return level

@@ -1,4 +1,4 @@
-"""Advantages against a loop, and a bandit that PPO must learn."""
+"""Advantages equal a plain loop, and PPO learns a bandit."""
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +45,7 @@ def test_rows_round_trip_samples() -> None:
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize("kind", [Network.FLAT, pytest.param(Network.ENTITY, marks=pytest.mark.campaign)])
 def test_update_learns_a_bandit(kind: Network, seed: int) -> None:
-    """One action entry pays when it is 2: after a few updates it is chosen nearly always."""
+    """One action entry pays if it is 2; after a few updates it is chosen nearly always."""
     config = ExpertConfig(network=kind, width=16, encoding=16, environments=32, horizon=8, learning_rate=3e-3)
     network, count = network_of(SIZE, config), config.steps_per_update
     features = jax.jit(network.constant)(sample_levels(np.array([seed]), SIZE))

@@ -1,4 +1,4 @@
-"""Running totals against a loop over episodes."""
+"""Running totals equal a loop over episodes."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""Continuous batching on real levels: who leaves when, and that nothing of it shows in a result."""
+"""Continuous batching on real levels: when levels leave, and that results do not depend on it."""
 
 from dataclasses import replace
 from typing import Any
@@ -43,7 +43,7 @@ def train(
 
 
 def queue_of(levels: Level, updates: int) -> LevelQueue:
-    """As in a pool, so that it uses the same program."""
+    """Return a queue of the sizes of a pool, so that they share a program."""
     queue = empty_queue(levels, capacity_of(CONFIG), CONFIG)
     return enter(queue, range(len(IDS)), levels, IDS, no_success(len(IDS)), CONFIG, updates)
 
@@ -91,7 +91,7 @@ def test_result_depends_neither_on_slot_nor_on_neighbours(
 
 
 def test_next_level_enters_a_freed_slot_at_once(levels: Level) -> None:
-    """No slot is empty while a level waits, and every level has one slot."""
+    """No slot is empty while a level waits, and every level gets one slot."""
     queue = queue_of(levels, 2)
     slots = empty_slots(2, queue, CONFIG)
     modes, indices = [], []
@@ -113,7 +113,7 @@ def test_next_level_enters_a_freed_slot_at_once(levels: Level) -> None:
 
 
 def test_advance_is_compiled_once(levels: Level) -> None:
-    """Another number of levels, another budget and another rule use the same program."""
+    """Other numbers of levels, budgets and rules share the program."""
     train(take(levels, np.arange(3)), IDS[:3], 2, CONFIG, SOLVED)
     before = advance._cache_size()
     for stopping in (SOLVED, WHOLE, HALVED):
@@ -148,7 +148,7 @@ def test_fruitless_expert_reports_why_it_left(levels: Level, whole: list[Trained
 
 
 def test_success_of_training_is_the_witness_if_no_evaluation_succeeds(levels: Level) -> None:
-    """Which level that is depends on the machine's rounding, so several budgets are looked at."""
+    """Which level qualifies depends on the machine's rounding, so several budgets are tried."""
     found = set()
     for updates in (2, 3, 4, 6, 8, 12):
         for verdict in label(levels, IDS, updates * 512, untouched(replace(WHOLE, successes=4))).verdicts:
@@ -173,7 +173,7 @@ def test_polish_continues_training_after_a_level_is_solved(levels: Level, solved
 
 @pytest.mark.parametrize("stopping", [WHOLE, SOLVED, HALVED], ids=["budget", "solved", "halving"])
 def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stopping: StopConfig) -> None:
-    """A level that left at a rung, too: it is over, and uses none of the larger budget."""
+    """A level that left at a rung is over, and uses none of the larger budget."""
     through, _ = train(levels, IDS, UPDATES, CONFIG, stopping, keep=True)
     first, _ = train(levels, IDS, UPDATES // 2, CONFIG, stopping, keep=True)
     left = [i for i, level in enumerate(first) if stopping == WHOLE or not level.candidates]
@@ -188,7 +188,7 @@ def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stop
 
 
 def test_expert_rehearses_an_earlier_success_from_the_first_update(levels: Level, whole: list[TrainedLevel]) -> None:
-    """It ends at its goal, so the first of its episodes does; and those lanes do not count as the expert's own."""
+    """The first episode repeats it to the goal; rehearsing lanes do not count as the expert's own."""
     found = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))
     trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=found)
     assert 0 < (found.success.length > 0).sum() < len(IDS)
@@ -201,7 +201,7 @@ def test_expert_rehearses_an_earlier_success_from_the_first_update(levels: Level
 
 
 def test_success_of_a_sticky_lane_is_not_the_experts_own() -> None:
-    """Such a lane mostly ignores what the expert draws, as a lane that rehearses does."""
+    """A sticky lane mostly ignores the expert's samples, as a rehearsing lane does."""
     ids = np.arange(100, 164)
     trained, _ = train(jax.tree.map(np.asarray, sample_levels(ids, SIZES["s"])), ids, 1, CONFIG, WHOLE)
     last = [(level.evaluations[-1], level.curve[0]) for level in trained]
@@ -230,7 +230,7 @@ def test_diverged_expert_leaves_and_reports_why(levels: Level, whole: list[Train
 
 @pytest.mark.campaign
 def test_vmapped_slots_of_accelerators_give_the_same_results(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same course and nearly the same numbers: sums are taken in another order."""
+    """Decisions are equal, numbers nearly so, because sums are taken in another order."""
     queue = queue_of(levels, 3)
 
     def go(advance) -> list:

@@ -1,4 +1,4 @@
-"""The rules by which a level leaves its slot."""
+"""Stopping rules."""
 
 from dataclasses import replace
 
@@ -86,7 +86,7 @@ def test_rung_stops_experts_whose_return_has_not_grown() -> None:
 def test_expert_that_never_reaches_the_goal_leaves(
     updates: int, first: int, stopping: StopConfig, leaves: bool
 ) -> None:
-    """After 20 updates, whatever success it was given, and whether or not that is a rung."""
+    """It leaves after 20 updates, whatever success it rehearses, at a rung or not."""
     stopping = replace(stopping, fruitless=stopping.fruitless and 20_480)
     course, totals = stop.begin()._replace(updates=jnp.int32(updates - 1)), progress.start(16)
     totals, given = totals._replace(first_success=jnp.int32(first)), jnp.bool_(True)
@@ -120,7 +120,7 @@ def test_after_evaluation_decides_who_leaves_and_when_to_evaluate_next() -> None
 
 
 def test_final_evaluation_leaves_no_trace_in_a_continued_expert() -> None:
-    """So that more budget later continues as if there had been none."""
+    """A larger budget continues as if that evaluation had not happened."""
     course = stop.begin()._replace(updates=jnp.int32(10), next_evaluation=jnp.int32(9))
     yes, no = jnp.bool_(True), jnp.bool_(False)
     ended, leaves, _ = stop.after_evaluation(course, no, no, yes, jnp.int32(10), rules_of(SOLVED, CONFIG))
@@ -146,7 +146,7 @@ def test_solves_and_fails_count_attempts() -> None:
 
 
 def test_steps_after_the_record_decide_nothing() -> None:
-    """Rollouts of an evaluation go on behind it where the horizon does not divide it."""
+    """Rollouts of an evaluation extend beyond the record if the horizon does not divide it."""
     done, goal = np.zeros((2, 300, 16), bool)
     done[50] = goal[50] = done[280] = True  # all reach the goal, and fail behind the record
     rules = rules_of(StopConfig(successes=8), CONFIG)

@@ -1,4 +1,4 @@
-"""Success rates: of attempts that decide nothing, whoever makes them beside whom."""
+"""Success rates come from attempts that decide nothing, and do not depend on neighbours."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def run(levels: Level) -> TrainingRun:
     pool = Pool(24 * CONFIG.steps_per_update, untouched(ALL), DEFAULT_RULES)
     run = TrainingRun(pool, levels, IDS)
     while not pool.step():
-        run.look()
+        run.submit_searched()
     return run
 
 
@@ -42,7 +42,7 @@ def result(run: TrainingRun) -> UnitResult:
 
 
 def test_success_rate_differs_from_that_of_the_last_evaluation(run: TrainingRun, result: UnitResult) -> None:
-    """Where every attempt of that succeeded, others need not."""
+    """If all attempts of the last evaluation succeeded, others may still fail."""
     assert run.submission
     ended = zip(run.left, run.submission.trained(CONFIG), strict=True)
     lucky = [index for index, level in ended if shares(level.evaluations[-1], CONFIG)[0] == 1]

@@ -1,4 +1,4 @@
-"""Levels that need no expert: what they are called, what it rests on, and that nobody trains on them."""
+"""Levels that need no expert: their labels, the evidence, and that no expert trains on them."""
 
 import jax
 import numpy as np
@@ -71,7 +71,7 @@ def test_facts_do_not_depend_on_neighbours(levels: Level) -> None:
 
 
 def test_run_trains_no_expert_for_decided_levels(levels: Level, verdicts: list[Verdict | None]) -> None:
-    """An expert of this configuration could not even be made: it would need a terabyte."""
+    """An expert of this configuration would need a terabyte."""
     trivial, unsolvable = indices(verdicts, Label.TRIVIAL)[:3], indices(verdicts, Label.UNSOLVABLE)[:2]
     at = np.array([*trivial, *unsolvable])
     result = label(take(levels, at), at, 10**9, Procedure(expert=ExpertConfig(width=10**6, depth=2)))

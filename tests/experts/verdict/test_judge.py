@@ -1,4 +1,4 @@
-"""Which witness is chosen, and what evaluations say."""
+"""Choice of witness candidates, and statistics of evaluations."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ CONFIG = ExpertConfig(environments=8, rehearsals=2, attempts=3, sticky_attempts=
 
 
 def evaluation(*episodes: list[tuple[int, bool]], success: int = 0, config: ExpertConfig = CONFIG) -> Evaluation:
-    """Environments with these episodes: (last step, whether it reached the goal). Actions count the steps."""
+    """An evaluation with these episodes: (last step, whether it reached the goal). Actions count the steps."""
     done, goal = np.zeros((2, RECORD_STEPS, config.environments), bool)
     for environment, ends in enumerate(episodes):
         for end, reached in ends:
@@ -104,7 +104,7 @@ def test_rehearsed_success_is_a_candidate_only_if_allowed_and_without_others() -
 
 
 def test_shares_count_first_episodes_of_each_kind_of_attempt() -> None:
-    """Attempts 0 to 2, two sticky ones, two moved ones, one to spare: first episodes count, and those that last."""
+    """Attempts 0 to 2, two sticky, two moved, one spare; an unfinished first episode is a failure."""
     one = evaluation(
         [(9, False)],
         [(9, True), (19, True), (29, True)],

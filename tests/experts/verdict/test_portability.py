@@ -1,4 +1,4 @@
-"""How portable witnesses are: survival is what replays of moved starts show, and the choice goes by it."""
+"""Portability: survival equals replays from perturbed starts, and decides the choice."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def shares(levels: Level, witnesses: list[Witness]) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def starts(levels: Level) -> Level:
-    """Of the first levels, moved starts."""
+    """Perturbed starts of the first levels."""
     at = np.arange(FOUND)
     lanes = repeat(take(levels, at), REPLAYS)
     return jax.device_get(replace(lanes, state=jax.jit(moved, static_argnums=2)(lanes, IDS[at], REPLAYS)))
@@ -90,7 +90,7 @@ def test_moved_perturbs_starts_by_one_unit_in_the_last_place(levels: Level, star
 def test_portability_depends_on_the_level_alone(
     levels: Level, witnesses: list[Witness], shares: np.ndarray, at: list[int]
 ) -> None:
-    """Every candidate of a level meets the same starts, whatever is replayed beside it."""
+    """All candidates of a level are replayed from the same starts, whatever their neighbours."""
     some = survival(take(levels, np.array(at)), IDS[at], [witnesses[i] for i in at], REPLAYS, DEFAULT_RULES)
     np.testing.assert_array_equal(some, shares[at])
 
@@ -113,7 +113,7 @@ def test_survival_pads_few_candidates_to_a_small_block_on_accelerators(
 
 
 def test_choose_takes_the_most_portable_candidate_first_of_equals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`steps` names a candidate here, and its number is what survives of it."""
+    """`steps` identifies a candidate here and sets its portability."""
     replayed = []
 
     def known(levels, level_ids, now, replays, rules):
@@ -135,7 +135,7 @@ def test_choose_takes_the_most_portable_candidate_first_of_equals(monkeypatch: p
     known_one = candidates[0][0]._replace(portability=0.75)
     some = [[known_one, *candidates[0][1:]]]
     (again,) = choose(levels[:, :1], ids[:1], some, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
-    assert (again, replayed) == (known_one, [(0, 2), (0, 3)]), "what is known is not found out again"
+    assert (again, replayed) == (known_one, [(0, 2), (0, 3)]), "known portability is not measured again"
     first = choose(levels, ids, candidates, 0, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
     assert [(witness.steps, witness.portability) if witness else None for witness in first] == [
         (1, None), None, (4, None), (5, None), (1, None),
@@ -143,7 +143,7 @@ def test_choose_takes_the_most_portable_candidate_first_of_equals(monkeypatch: p
 
 
 def test_choose_prefers_the_portable_of_two_candidates(levels: Level, witnesses: list[Witness]) -> None:
-    """A way that survives is behind one that never reaches the goal, as if that were this machine's luck."""
+    """The portable candidate comes after one that never reaches the goal, as if it had been luck on this machine."""
     good = witnesses[ROBUST]
     lucky = good._replace(action=np.zeros_like(good.action), steps=good.steps - 1)
     (chosen,) = choose(take(levels, np.array([ROBUST])), IDS[[ROBUST]], [[lucky, good]], REPLAYS, DEFAULT_RULES)

@@ -1,4 +1,4 @@
-"""Successes of training against a loop over what happened."""
+"""Successes of training equal a loop over the rollout."""
 
 import jax
 import numpy as np
