@@ -177,7 +177,7 @@ def first_of(some: Approaches) -> Approaches:
     first = jnp.argsort(gaps, axis=-1)[:, :KEPT]
     pick = lambda x, order: jax.vmap(lambda x, order: x[order])(x, order)
     kept = jax.tree.map(lambda x: pick(x, pick(order, first)), some)
-    return kept._replace(gap=of(gaps, first))
+    return kept._replace(gap=pick(gaps, first))
 
 
 def drawn(key: Key[Array, ""], env_steps: Int[Array, ""], lanes: int) -> Change:
