@@ -1,4 +1,4 @@
-"""Hydra's edge: override strings in, one typed JobConfig out."""
+"""Hydra's edge: override strings in, a typed JobConfig out."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -22,52 +22,52 @@ from levelproof.configs.schema import JobConfig, from_files, hash_of
 from levelproof.levelgen.sampling.distribution import Distribution
 
 JOB = "generate"
-PACKAGE = "levelproof.configs"  # where the yaml files are
-ConfigStore.instance().store(name="code", node=plain(JobConfig()))  # where configs/generate.yaml has defaults from
-# Results that are not settings, or have their own word
-BY_HAND = frozenset({"size", "distribution", "budget", "sampler_version"})
-WORDS = frozenset({"size", "levels", "level_files", "budget", "out", "continue_from"})  # kept as typed: 007 stays 007
-FOLDERS = ("procedure", "distribution")  # of presets
-OF_RANDOM_LEVELS = ("size", "levels", "first_level", "distribution")
+PACKAGE = "levelproof.configs"  # package of the yaml files
+ConfigStore.instance().store(name="code", node=plain(JobConfig()))  # the defaults that configs/generate.yaml names
+# Entries of JobConfig.results that are not settings, or that are handled separately
+NOT_COPIED = frozenset({"size", "distribution", "budget", "sampler_version"})
+VERBATIM = frozenset({"size", "levels", "level_files", "budget", "out", "continue_from"})  # strings: 007 stays 007
+FOLDERS = ("procedure", "distribution")  # folders of presets
+FOR_RANDOM_LEVELS = ("size", "levels", "first_level", "distribution")
 
 
 def compose_job(overrides: Sequence[str]) -> JobConfig:
-    """The job that `overrides` (Hydra's `key=value` strings) describe.
+    """Return the job that `overrides` (Hydra's `key=value` strings) describe.
 
     Raises:
-        ConfigError: an unknown setting or a wrong value, in one sentence.
+        ConfigError: a setting is unknown or has a wrong value.
     """
     job = typed(JobConfig, settings(overrides))
-    given = {_parsed(text).key_or_group.partition(".")[0] for text in overrides} if job.level_files else ()
-    for name in OF_RANDOM_LEVELS:
-        if name in given:
+    names = {_parse(text).key_or_group.partition(".")[0] for text in overrides} if job.level_files else ()
+    for name in FOR_RANDOM_LEVELS:
+        if name in names:
             raise ConfigError(f"{name} is for random levels, level_files for others: leave out one of the two.")
     return job
 
 
 def settings(overrides: Sequence[str]) -> dict[str, Any]:
-    """The composed settings as nested plain mappings, not yet checked."""
-    parsed = [_parsed(text) for text in overrides]
+    """Return the composed settings as nested plain mappings, with values not checked yet."""
+    parsed = [_parse(text) for text in overrides]
     _check_keys(parsed, _known())
-    return _composed([override.input_line or "" for override in parsed])
+    return _compose([override.input_line or "" for override in parsed])
 
 
 @cache
 def _known() -> Mapping[str, Any]:
-    """Every setting, with its default."""
-    return flat(_composed([]))
+    """Return every setting with its default."""
+    return flat(_compose([]))
 
 
 @cache
-def chosen() -> dict[str, str]:
-    """The preset that each folder of configs/ stands for where no other is chosen."""
+def default_presets() -> dict[str, str]:
+    """Return the default preset of each folder of configs/."""
     with initialize_config_module(PACKAGE, version_base="1.3"):
         choices = compose(JOB, return_hydra_config=True).hydra.runtime.choices
     return {name: str(choices[name]) for name in presets()}
 
 
 def presets() -> dict[str, list[str]]:
-    """The files to choose from in each folder of configs/."""
+    """Return the names of the presets in each folder of configs/."""
     folders = [entry for entry in files(PACKAGE).iterdir() if entry.is_dir() and not entry.name.startswith("_")]
     return {
         f.name: sorted(e.name.removesuffix(".yaml") for e in f.iterdir() if e.name.endswith(".yaml")) for f in folders
@@ -75,32 +75,33 @@ def presets() -> dict[str, list[str]]:
 
 
 @cache
-def again(job: JobConfig) -> str:
-    """The shortest command, but for `out` and which levels, with the same results as `job`."""
+def shortest_command(job: JobConfig) -> str:
+    """Return the shortest command with the same results as `job`, without `out` and the choice of levels."""
     fixed, wanted, default = [f"budget={job.budget}"], flat(job.results), flat(_default().results)
     if not job.level_files:
         fixed.insert(0, f"size={job.size}")
     commands = []
     for names in product(*(presets()[folder] for folder in FOLDERS)):
         named = dict(zip(FOLDERS, names, strict=True))
-        words = [f"{folder}={name}" for folder, name in named.items() if name != chosen()[folder]]
+        chosen = [f"{folder}={name}" for folder, name in named.items() if name != default_presets()[folder]]
         start = default | {key: value for preset in named.items() for key, value in _changes(*preset).items()}
-        changed = [typed_as(key, value) for key, value in wanted.items() if key not in BY_HAND and start[key] != value]
-        commands.append(shlex.join(["levelproof", "generate", *fixed, *words, *changed]))
+        changed = [key for key, value in wanted.items() if key not in NOT_COPIED and start[key] != value]
+        overrides = [override_of(key, wanted[key]) for key in changed]
+        commands.append(shlex.join(["levelproof", "generate", *fixed, *chosen, *overrides]))
     return min(commands, key=len)
 
 
-def words_for(results: Mapping[str, Any]) -> list[str]:
-    """The settings, but for the budget, that a job with these `JobConfig.results` has and the default has not."""
+def changed_settings(results: Mapping[str, Any]) -> list[str]:
+    """Return the overrides, without the budget, that turn the default job into one with these `JobConfig.results`."""
     default, known = flat(_default().results), flat(results)
-    changed = [name for name in known if name not in BY_HAND and known[name] != default.get(name, ...)]
+    changed = [name for name in known if name not in NOT_COPIED and known[name] != default.get(name, ...)]
     size = [] if from_files(results) else [f"size={results['size']}"]
-    return [*size, *(typed_as(name, known[name]) for name in changed)]
+    return [*size, *(override_of(name, known[name]) for name in changed)]
 
 
-def typed_as(name: str, value: Any) -> str:
-    """A setting as people type it: the inverse of what `compose_job` reads."""
-    return f"{name}={value if name in WORDS else _in_grammar(value)}"
+def override_of(name: str, value: Any) -> str:
+    """Return a setting as users type it, so that `compose_job` reads the same value."""
+    return f"{name}={value if name in VERBATIM else _in_grammar(value)}"
 
 
 @cache
@@ -109,36 +110,36 @@ def _default() -> JobConfig:
 
 
 @cache
-def _written(folder: str, name: str) -> dict[str, Any]:
-    """What stands in a preset's file: without Hydra, which takes a hundred times as long to compose all settings."""
-    written = OmegaConf.to_container(OmegaConf.load(str(files(PACKAGE) / folder / f"{name}.yaml")))
-    assert isinstance(written, dict)
-    return {str(key): value for key, value in written.items()}
+def _load(folder: str, name: str) -> dict[str, Any]:
+    """Load a preset's YAML without Hydra, which takes 100 times as long, because it composes all settings."""
+    content = OmegaConf.to_container(OmegaConf.load(str(files(PACKAGE) / folder / f"{name}.yaml")))
+    assert isinstance(content, dict)
+    return {str(key): value for key, value in content.items()}
 
 
 def _changes(folder: str, name: str) -> dict[str, Any]:
-    """The settings that a preset changes: those of the group that its folder is called after, or any."""
-    written = _written(folder, name)
-    return flat({folder: written} if folder in JobConfig.__annotations__ else written)
+    """Return the settings that a preset changes: in the group named like its folder, or in any group."""
+    content = _load(folder, name)
+    return flat({folder: content} if folder in JobConfig.__annotations__ else content)
 
 
 @cache
 def distributions() -> dict[str, Distribution]:
-    """The presets in configs/distribution/ by name."""
-    return {name: typed(Distribution, _written("distribution", name)) for name in presets()["distribution"]}
+    """Return the presets in configs/distribution/ by name."""
+    return {name: typed(Distribution, _load("distribution", name)) for name in presets()["distribution"]}
 
 
-def identified(distribution: Distribution) -> tuple[str | None, str]:
-    """Name, where it is a preset's, and short hash of a distribution: the same hash, the same levels for the same ids.
+def name_and_hash(distribution: Distribution) -> tuple[str | None, str]:
+    """Return the name of a distribution, None if it is not a preset, and its short hash.
 
-    One sampler version and size provided. Made from all its settings, so manifests written before a setting was
-    added compare, too.
+    With one sampler version and size, equal hashes mean equal levels for equal ids. All settings are hashed, including
+    defaults, so manifests written before a setting was added stay comparable.
     """
     name = next((name for name, preset in distributions().items() if preset == distribution), None)
     return name, hash_of(plain(distribution))
 
 
-def _composed(overrides: list[str]) -> dict[str, Any]:
+def _compose(overrides: list[str]) -> dict[str, Any]:
     try:
         with initialize_config_module(PACKAGE, version_base="1.3"):
             composed = OmegaConf.to_container(compose(JOB, overrides), resolve=True)
@@ -148,14 +149,14 @@ def _composed(overrides: list[str]) -> dict[str, Any]:
     return {str(key): value for key, value in composed.items()}
 
 
-def _parsed(text: str) -> Override:
-    """One `key=value`; what Hydra's grammar cannot read (`out=my data/é`) is taken as a plain word."""
+def _parse(text: str) -> Override:
+    """Parse one `key=value`; take a value that Hydra's grammar cannot read (`out=my data/é`) as a plain string."""
     key, equals, value = text.partition("=")
     quoted = f"{key}={QuotedString(value, Quote.single).with_quotes()}"
-    as_word = key in WORDS and value[:1] not in "'\""
-    for written in (quoted if as_word else text, quoted) if key and equals else ():
+    verbatim = key in VERBATIM and value[:1] not in "'\""
+    for attempt in (quoted if verbatim else text, quoted) if key and equals else ():
         with suppress(HydraException):
-            override = OverridesParser.create().parse_override(written)
+            override = OverridesParser.create().parse_override(attempt)
             break
     else:
         raise ConfigError(f"cannot read {text!r}: write settings as NAME=VALUE, as in levels=64.")
@@ -180,7 +181,7 @@ def _check_keys(overrides: Sequence[Override], known: Mapping[str, Any]) -> None
 
 
 def _in_grammar(value: Any) -> str:
-    """A value in the grammar of Hydra's overrides; words that mean themselves without quotes."""
+    """Write a value in the grammar of Hydra's overrides; quote strings only if that is necessary."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -189,5 +190,5 @@ def _in_grammar(value: Any) -> str:
         return f"[{','.join(map(_in_grammar, value))}]"
     if not isinstance(value, str):
         return repr(value)
-    alone = value.isidentifier() and OverridesParser.create().parse_override(f"name={value}").value() == value
-    return value if alone else QuotedString(value, Quote.single).with_quotes()
+    unquoted = value.isidentifier() and OverridesParser.create().parse_override(f"name={value}").value() == value
+    return value if unquoted else QuotedString(value, Quote.single).with_quotes()

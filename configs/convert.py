@@ -1,7 +1,7 @@
-"""From Hydra's dictionaries to typed frozen dataclasses, and back to plain data for hashing.
+"""Conversion of Hydra's dictionaries to typed frozen dataclasses, and back to plain data for hashing.
 
-cattrs takes values apart along the dataclasses' annotations; ranges are their own affair (`__post_init__` raises
-ValueError). Here stands what a value may be, and the sentence if it is not. No dictionary travels beyond this
+cattrs structures values by the dataclasses' annotations. This module decides which types a value may have, and words
+the errors; dataclasses check ranges themselves (`__post_init__` raises ValueError). No dictionary travels beyond this
 module's callers.
 """
 
@@ -21,7 +21,7 @@ from levelproof.configs.numbers import SCALES, parse_count
 
 T = TypeVar("T")
 CONVERTER = Converter()
-SCALARS = {  # with the types of values that may be written for them: 1000 is a fine word where words are wanted
+SCALARS = {  # name for messages, and types of accepted values: a string setting accepts 1000
     bool: ("true or false", (bool,)),
     int: ("a whole number", (int,)),
     float: ("a number", (int, float)),
@@ -30,15 +30,15 @@ SCALARS = {  # with the types of values that may be written for them: 1000 is a 
 
 
 def typed(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
-    """An instance of the dataclass `cls` from nested mappings; what is missing takes its default.
+    """Return an instance of the dataclass `cls` from nested mappings; missing fields take their defaults.
 
-    `path` is the name of the group that they are, for messages.
+    `path` names their group in messages.
 
     Raises:
-        ConfigError: an unknown key, a value of the wrong type, or one that the dataclass refuses.
+        ConfigError: a key is unknown, a value has the wrong type, or the dataclass rejects it.
     """
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{path or 'the whole'} is {values!r}, but it is a group of settings.")
+        raise ConfigError(f"{path or 'the configuration'} is {values!r}, but must be a group of settings.")
     try:
         return CONVERTER.structure(values, cls)
     except BaseValidationError as error:
@@ -46,12 +46,12 @@ def typed(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
 
 
 def plain(value: Any) -> Any:
-    """Nested dataclasses and enumerations as JSON's types."""
+    """Convert nested dataclasses and enumerations to JSON's types."""
     return CONVERTER.unstructure(value)
 
 
 def flat(tree: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """`{"a": {"b": 1}}` as `{"a.b": 1}`."""
+    """Flatten nested mappings: `{"a": {"b": 1}}` becomes `{"a.b": 1}`."""
     leaves: dict[str, Any] = {}
     for key, value in tree.items():
         name = _join(path, key)
@@ -64,7 +64,7 @@ def _join(path: str, name: str) -> str:
 
 
 def _sentence(error: Exception, path: str) -> str:
-    """The first thing that is wrong, with the name of its setting."""
+    """Describe the first error, with the name of its setting."""
     notes = [note for note in getattr(error, "__notes__", ()) if isinstance(note, AttributeValidationNote)]
     path = _join(path, notes[0].name) if notes else path
     match error:
@@ -77,7 +77,7 @@ def _sentence(error: Exception, path: str) -> str:
             return f"{path} is missing."
         case ConfigError():
             return str(error)
-    # A value's own error goes on after the setting's name, a dataclass's begins with the name of its field
+    # A value's error continues the sentence after the setting's name; a dataclass's starts with its field's name
     return f"{path} {error}." if notes else f"{_join(path, str(error))}."
 
 
@@ -87,7 +87,7 @@ def _group(cls: type) -> Callable[[Any, Any], Any]:
 
     def read(value: Any, _: Any) -> Any:
         if not isinstance(value, Mapping):
-            raise ValueError(f"is {value!r}, but it is a group of settings: set one of them, as in GROUP.NAME=VALUE")
+            raise ValueError(f"is {value!r}, but must be a group of settings: set one of them, as in GROUP.NAME=VALUE")
         return build(value, cls)
 
     return read
@@ -104,13 +104,13 @@ def _member(value: Any, cls: type[StrEnum]) -> StrEnum:
 
 def _one_of(choices: Sequence[Any], value: Any) -> Any:
     if value not in choices:
-        words = [str(choice) for choice in choices]
-        raise ValueError(f"is {value!r}: choose one of {', '.join(words)}{suggestion(str(value), words)}")
+        names = [str(choice) for choice in choices]
+        raise ValueError(f"is {value!r}: choose one of {', '.join(names)}{suggestion(str(value), names)}")
     return value
 
 
 def _counted(value: Any) -> Any:
-    """The number that people mean by 64k; anything else as it is."""
+    """Parse suffixed counts such as 64k; return anything else unchanged."""
     if isinstance(value, str) and value[-1:] in SCALES:
         with suppress(ConfigError):
             return parse_count(value, "")

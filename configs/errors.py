@@ -1,25 +1,25 @@
-"""What is wrong with a setting."""
+"""Errors in settings, and their messages."""
 
 import difflib
 from collections.abc import Iterable
 
-LONGEST = 800  # characters of a message
+MAX_LENGTH = 800  # characters of a message
 
 
 class ConfigError(ValueError):
-    """A setting is wrong; the message is one sentence that names it."""
+    """An invalid setting; the message is one sentence that names it."""
 
     def __str__(self) -> str:
         return readable(super().__str__())
 
 
 def readable(message: str) -> str:
-    """A message in one line without anything that a terminal would obey, whatever it quotes, and not too long."""
+    """Return a message as one line of bounded length, without control characters, whatever it quotes."""
     line = "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in message)
-    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
+    return line if len(line) <= MAX_LENGTH else f"{line[: MAX_LENGTH // 2]} ... {line[-MAX_LENGTH // 2 :]}"
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
-    """`' (did you mean x?)'` for the closest of `known`, else `''`."""
+    """Return `' (did you mean x?)'` for the word of `known` closest to `word`, or `''` if none is close."""
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f" (did you mean {close[0]}?)" if close else ""

@@ -1,7 +1,7 @@
-"""Every setting with its default, its meaning and its unit, as they stand side by side in the source.
+"""Every setting with its default, meaning and unit, read from the source.
 
-A setting is a field of a frozen dataclass; what it means is the comment beside it, and a comment above fields heads
-them. So whoever changes a default reads what it means, and there is one text to keep true.
+A setting is a field of a frozen dataclass. The comment beside it is its meaning; a comment above it heads that field
+and those that follow. So whoever changes a default sees its meaning, and there is a single text to keep true.
 """
 
 import ast
@@ -14,7 +14,7 @@ from dataclasses import dataclass, is_dataclass
 from enum import Enum
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
-from levelproof.configs.compose import chosen, presets, settings, typed_as
+from levelproof.configs.compose import default_presets, override_of, presets, settings
 from levelproof.configs.convert import flat
 from levelproof.configs.schema import JobConfig
 
@@ -23,22 +23,22 @@ JOB = "job"  # the group of settings without a dot
 
 @dataclass(frozen=True)
 class Setting:
-    """What people may change, by the name that they type."""
+    """A setting or group of presets, as users see it."""
 
-    name: str
-    default: Any  # of JSON's types; of a group of presets, the preset's name
+    name: str  # as typed, with dots
+    default: Any  # one of JSON's types; for presets, the preset's name
     meaning: str  # with its unit
-    choices: Mapping[str, str]  # each with its meaning or ""; empty: any value of the default's type
-    group: str  # what it stands under
+    choices: Mapping[str, str]  # meaning of each choice, or ""; empty: any value of the default's type
+    group: str  # heading under which it is listed
 
     @property
-    def word(self) -> str:
-        """Name and default, as people type it."""
-        return typed_as(self.name, self.default)
+    def override(self) -> str:
+        """Name and default, as users type them."""
+        return override_of(self.name, self.default)
 
     @property
     def text(self) -> str:
-        """Meaning, and the choices that it does not name itself."""
+        """Meaning, followed by all choices unless the meaning names them."""
         if all(choice in self.meaning for choice in self.choices):
             return self.meaning
         explained = [f"{choice}: {meaning}" if meaning else choice for choice, meaning in self.choices.items()]
@@ -46,44 +46,44 @@ class Setting:
 
 
 class Comment(NamedTuple):
-    """What the source says of one name in the body of a class."""
+    """The comments on one name in the body of a class."""
 
-    heading: str  # the comment above it or above an earlier name
-    beside: str
+    heading: str  # the last comment above it or above an earlier name
+    beside: str  # the comment on its own lines
 
 
 def every_setting() -> list[Setting]:
-    """All settings, in the order of the dataclasses: the job's own first, then group after group."""
-    return list(_of(JobConfig, flat(settings([])), ""))
+    """Return all settings in the order of the dataclasses: the job's own first, then group after group."""
+    return list(_settings_of(JobConfig, flat(settings([])), ""))
 
 
 def comments_in(cls: type) -> dict[str, Comment]:
-    """The comments on each field of a dataclass, or member of an enumeration, in order.
+    """Return the comments on each field of a dataclass, or member of an enumeration, in order.
 
     Raises:
-        OSError: the source is not there.
+        OSError: the source is missing.
     """
     source = textwrap.dedent(inspect.getsource(cls))
     above, beside = {}, {}
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
-            (line, column), words = token.start, token.string.removeprefix("#").strip()
-            (beside if token.line[:column].strip() else above)[line] = words
+            (line, column), text = token.start, token.string.removeprefix("#").strip()
+            (beside if token.line[:column].strip() else above)[line] = text
     (definition,) = ast.parse(source).body
     assert isinstance(definition, ast.ClassDef)
-    found, heading, last = {}, "", definition.lineno
+    comments, heading, last = {}, "", definition.lineno
     for node in definition.body:
         lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
         heading = " ".join(above[line] for line in range(last + 1, node.lineno) if line in above) or heading
         last = lines[-1]
         match node:
             case ast.AnnAssign(target=ast.Name(name)) | ast.Assign(targets=[ast.Name(name)]):
-                found[name] = Comment(heading, " ".join(beside[line] for line in lines if line in beside))
-    return found
+                comments[name] = Comment(heading, " ".join(beside[line] for line in lines if line in beside))
+    return comments
 
 
-def _of(cls: type, defaults: Mapping[str, Any], path: str) -> Iterator[Setting]:
-    """The settings of a dataclass, then those of the dataclasses among its fields."""
+def _settings_of(cls: type, defaults: Mapping[str, Any], path: str) -> Iterator[Setting]:
+    """Yield the settings of a dataclass, then those of the dataclasses among its fields."""
     hints, groups = get_type_hints(cls), []
     for field, (heading, meaning) in comments_in(cls).items():
         name = f"{path}.{field}" if path else field
@@ -93,12 +93,12 @@ def _of(cls: type, defaults: Mapping[str, Any], path: str) -> Iterator[Setting]:
             continue
         groups.append((hints[field], name))
         if name in presets():
-            yield Setting(name, chosen()[name], meaning, dict.fromkeys(presets()[name], ""), group)
+            yield Setting(name, default_presets()[name], meaning, dict.fromkeys(presets()[name], ""), group)
     if not path:
-        meaning = "one word for a set of settings"
-        yield Setting("procedure", chosen()["procedure"], meaning, dict.fromkeys(presets()["procedure"], ""), JOB)
+        meaning, names = "preset of scout, search, expert and stop settings", presets()["procedure"]
+        yield Setting("procedure", default_presets()["procedure"], meaning, dict.fromkeys(names, ""), JOB)
     for nested, name in groups:
-        yield from _of(nested, defaults, name)
+        yield from _settings_of(nested, defaults, name)
 
 
 def _choices(hint: Any) -> dict[str, str]:

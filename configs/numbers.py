@@ -9,14 +9,14 @@ SCALES = {"": 1, "k": 1_000, "M": 1_000_000, "B": 1_000_000_000}
 PATTERN = re.compile(r"([0-9]+(?:\.[0-9]+)?)([kMB]?)")
 SECONDS = {"s": 1, "min": 60, "h": 3600}
 DURATION = re.compile(r"([0-9]{1,6}(?:\.[0-9]+)?)(s|min|h)")
-LARGEST = 10**15  # beyond any budget or level count that could finish; stops typing errors
+MAX_COUNT = 10**15  # beyond any budget or number of levels that could finish; catches typing errors
 
 
 def parse_duration(text: str, what: str) -> float:
-    """The seconds that `text` means: `parse_duration("10min", "checkpoint") == 600`.
+    """Parse a duration into seconds: `parse_duration("10min", "checkpoint") == 600`.
 
     Raises:
-        ConfigError: `text` is no positive number with a unit; `what` names the setting.
+        ConfigError: `text` is not a positive number with a unit; `what` names the setting.
     """
     match = DURATION.fullmatch(text)
     if not match or not float(match[1]):
@@ -25,10 +25,10 @@ def parse_duration(text: str, what: str) -> float:
 
 
 def parse_count(text: str | int, what: str) -> int:
-    """The whole number that `text` means, exactly: `parse_count("11.5M", "levels") == 11_500_000`.
+    """Parse a count exactly: `parse_count("11.5M", "levels") == 11_500_000`.
 
     Raises:
-        ConfigError: `text` is no positive whole number, or too large; `what` names the setting.
+        ConfigError: `text` is not a positive whole number, or is too large; `what` names the setting.
     """
     match = PATTERN.fullmatch(str(text))
     if not match:
@@ -36,6 +36,6 @@ def parse_count(text: str | int, what: str) -> int:
     number = Decimal(match[1]) * SCALES[match[2]]
     if number != number.to_integral_value():
         raise ConfigError(f"{what} is {text!r}, which is not a whole number: use fewer decimals.")
-    if not 0 < number <= LARGEST:
-        raise ConfigError(f"{what} is {text!r}: it must be at least 1 and at most {LARGEST:,}.")
+    if not 0 < number <= MAX_COUNT:
+        raise ConfigError(f"{what} is {text!r}: it must be at least 1 and at most {MAX_COUNT:,}.")
     return int(number)

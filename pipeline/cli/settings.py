@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.configs.meanings import every_setting
 
     has_word = lambda text: arguments.word.lower() in text.lower()
-    found = [setting for setting in every_setting() if has_word(f"{setting.word} {setting.text} {setting.group}")]
+    found = [setting for setting in every_setting() if has_word(f"{setting.override} {setting.text} {setting.group}")]
     if not found:
         raise UserError(
             f"No setting contains the word {arguments.word!r}: levelproof settings, without a word, lists all."
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> None:
 def as_text(settings: Iterable["Setting"], columns: int) -> str:
     """Format settings as text in two columns, by group."""
     groups = groupby(settings, lambda setting: setting.group)
-    lines = lambda members: listed(((setting.word, setting.text) for setting in members), columns, INDENT)
+    lines = lambda members: listed(((setting.override, setting.text) for setting in members), columns, INDENT)
     return "\n\n".join("\n".join([group, *lines(members)]) for group, members in groups)
 
 
@@ -61,6 +61,6 @@ def as_markdown(settings: Iterable["Setting"]) -> str:
     """Return the page docs/settings.md."""
     parts = [INTRODUCTION]
     for group, members in groupby(settings, lambda setting: setting.group):
-        lines = [f"| `{setting.word}` | {setting.text} |" for setting in members]
+        lines = [f"| `{setting.override}` | {setting.text} |" for setting in members]
         parts.append("\n".join([f"## {group}", "", "| setting and default | meaning |", "|---|---|", *lines, ""]))
     return "\n".join(parts)

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from levelproof.configs.compose import identified
+from levelproof.configs.compose import name_and_hash
 from levelproof.configs.schema import FROM_RECORDS
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import Label
@@ -112,7 +112,7 @@ def _distribution(manifest: Manifest) -> str:
     distribution = distribution_of(manifest)
     if distribution is None:
         return "imported" if (manifest.config or {})["distribution"] == FROM_RECORDS else "level files"
-    name, short = identified(distribution)
+    name, short = name_and_hash(distribution)
     return f"random, `{name}`" if name else f"random, custom distribution (`{short}`)"
 
 

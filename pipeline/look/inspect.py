@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from rich.console import Console
 
-from levelproof.configs.compose import identified
+from levelproof.configs.compose import name_and_hash
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import DIVERGED, Label
 from levelproof.pipeline.look import cost, duplicates
@@ -95,7 +95,7 @@ def _summary(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str
     return {
         "split": as_typed(split),
         "config_hash": manifest.config_hash,
-        "distribution": dict(zip(("name", "hash"), identified(distribution), strict=True)) if distribution else None,
+        "distribution": dict(zip(("name", "hash"), name_and_hash(distribution), strict=True)) if distribution else None,
         "levels": chosen.num_rows,
         "labels": labels,
         "reasons": {label: kinds_of_reasons(rows["label_reason"]) for label, rows in of_label.items()},

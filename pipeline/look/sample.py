@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from PIL import Image
 
-from levelproof.configs.compose import identified
+from levelproof.configs.compose import name_and_hash
 from levelproof.configs.schema import JobConfig
 from levelproof.levelgen.level import size_of
 from levelproof.levelgen.pictures.raster import Caption, draw, sheet, write_png
@@ -36,7 +36,7 @@ def sample(job: JobConfig, out: Path) -> None:
     page = sheet_of(job)
     with writing_to(out):
         write_png(page, out)
-    name, _ = identified(job.distribution)
+    name, _ = name_and_hash(job.distribution)
     print(f"{out}: levels {ids[0]} to {ids[-1]} of size {job.size}, distribution {name or 'custom'}")
 
 

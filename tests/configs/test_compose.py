@@ -9,7 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from levelproof.configs.compose import FOLDERS, again, chosen, compose_job, distributions, identified, presets
+from levelproof.configs.compose import (
+    FOLDERS,
+    compose_job,
+    default_presets,
+    distributions,
+    name_and_hash,
+    presets,
+    shortest_command,
+)
 from levelproof.configs.convert import flat, plain
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.meanings import every_setting
@@ -169,23 +177,25 @@ def test_decisive_drops_removed_settings_that_match_this_version() -> None:
 )
 def test_again_makes_the_same_results(overrides: list[str]) -> None:
     job = compose_job(overrides)
-    words = shlex.split(again(job))
+    words = shlex.split(shortest_command(job))
     assert words[:2] == ["levelproof", "generate"]
     assert compose_job(words[2:]).results == job.results
 
 
 def test_a_preset_is_called_by_its_name() -> None:
     job = compose_job(["size=m", "distribution=clutter", "budget=5k"])
-    assert again(job) == "levelproof generate size=m budget=5k distribution=clutter"
+    assert shortest_command(job) == "levelproof generate size=m budget=5k distribution=clutter"
     spelled = [f"distribution.{key}={value}" for key, value in dataclasses.asdict(job.distribution).items()]
-    assert again(compose_job(["size=m", "budget=5k", *spelled])) == again(job)
+    assert shortest_command(compose_job(["size=m", "budget=5k", *spelled])) == shortest_command(job)
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_presets_are_read_as_hydra_composes_them(folder: str) -> None:
     for name in presets()[folder]:
         job = compose_job([f"{folder}={name}", "budget=1M"])
-        assert again(job).split()[4:] == ([f"{folder}={name}"] if name != chosen()[folder] else []), again(job)
+        assert shortest_command(job).split()[4:] == (
+            [f"{folder}={name}"] if name != default_presets()[folder] else []
+        ), shortest_command(job)
 
 
 def test_the_default_distribution_is_that_of_kinetix() -> None:
@@ -205,12 +215,12 @@ def test_presets_are_different_and_change_little() -> None:
 
 def test_a_distribution_is_known_by_name_and_hash() -> None:
     job = compose_job(["distribution=clutter", "size=m", "budget=5k"])
-    name, mark = identified(job.distribution)
+    name, mark = name_and_hash(job.distribution)
     assert name == "clutter"
-    assert identified(compose_job(["distribution=clutter", "size=l"]).distribution) == (name, mark)
+    assert name_and_hash(compose_job(["distribution=clutter", "size=l"]).distribution) == (name, mark)
     other = compose_job(["distribution=clutter", "distribution.max_size=0.5"]).distribution
-    assert identified(other)[0] is None
-    assert identified(other)[1] != mark
+    assert name_and_hash(other)[0] is None
+    assert name_and_hash(other)[1] != mark
 
 
 def test_a_unit_by_the_size() -> None:

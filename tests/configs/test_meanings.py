@@ -63,7 +63,7 @@ def test_all_settings_are_there_once() -> None:
 
 
 def test_all_can_be_typed_back() -> None:
-    assert compose_job([setting.word for setting in SETTINGS]) == compose_job([])
+    assert compose_job([setting.override for setting in SETTINGS]) == compose_job([])
 
 
 def test_choices_are_explained_where_the_meaning_does_not() -> None:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from levelproof.configs.errors import ConfigError
-from levelproof.configs.numbers import LARGEST, parse_count
+from levelproof.configs.numbers import MAX_COUNT, parse_count
 
 
 @pytest.mark.parametrize(
@@ -24,7 +24,7 @@ def test_what_is_no_count_is_refused_by_name(text: str) -> None:
         parse_count(text, "budget")
 
 
-@given(st.integers(1, LARGEST))
+@given(st.integers(1, MAX_COUNT))
 def test_every_whole_number_in_range_means_itself(number: int) -> None:
     assert parse_count(str(number), "levels") == number
 
@@ -32,4 +32,4 @@ def test_every_whole_number_in_range_means_itself(number: int) -> None:
 @given(st.text(max_size=12))
 def test_any_text_is_a_count_or_refused(text: str) -> None:
     with suppress(ConfigError):
-        assert 1 <= parse_count(text, "levels") <= LARGEST
+        assert 1 <= parse_count(text, "levels") <= MAX_COUNT

@@ -77,7 +77,7 @@ def test_version_prints_the_version(tmp_path: Path) -> None:
         (["budget=0"], ["budget is '0'", "at least 1"]),
         (["budget=1000"], ["2048"]),
         (["procedure=never"], ["there is no procedure never", "choose one of default, label, masters, published"]),
-        (["stop=budget"], ["stop is 'budget', but it is a group of settings"]),
+        (["stop=budget"], ["stop is 'budget', but must be a group of settings"]),
         (["stop.rule=never"], ["stop.rule", "never"]),
         (["levels=abc"], ["levels is 'abc'", "64k"]),
         (["levls=5"], ["no setting levls", "did you mean levels?"]),
@@ -105,8 +105,8 @@ def test_invalid_command_prints_the_usage(tmp_path: Path, arguments: list[str]) 
         (["inspect", "x", "--were", "a"], "There is no option --were: --help lists the options"),
         (["generate", "out=gcs://bucket/x"], "gcs:/bucket/x/128k/s looks like a URL"),
         (["status", "ftp://host/split"], "ftp:/host/split looks like a URL"),
-        (["show", "x", "7", "-o", "s3://bucket/level.gif"], "Nothing can be written to s3://bucket/level.gif here"),
-        (["inspect", "x", "--plot", "gs://bucket/plot.svg"], "Nothing can be written to gs://bucket/plot.svg here"),
+        (["show", "x", "7", "-o", "s3://bucket/level.gif"], "This command cannot write to s3://bucket/level.gif"),
+        (["inspect", "x", "--plot", "gs://bucket/plot.svg"], "This command cannot write to gs://bucket/plot.svg"),
     ],
 )
 def test_unknown_options_and_urls_are_not_taken_for_folders(tmp_path: Path, arguments: list[str], message: str) -> None:

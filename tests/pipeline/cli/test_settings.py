@@ -24,7 +24,7 @@ def test_generate_help_fits_on_a_screen(capsys: pytest.CaptureFixture[str]) -> N
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 40
     assert max(map(len, lines)) <= 80
-    assignments = {setting.name: setting.word for setting in every_setting()}
+    assignments = {setting.name: setting.override for setting in every_setting()}
     assert len(COMMON) == 10
     for name in COMMON:
         assert any(line.startswith(f"  {assignments[name]}  ") for line in lines), name
@@ -34,7 +34,7 @@ def test_settings_lists_all_with_their_meanings(capsys: pytest.CaptureFixture[st
     assert main(["settings"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     for setting in every_setting():
-        assert f"{setting.word} {' '.join(setting.text.split())}" in text
+        assert f"{setting.override} {' '.join(setting.text.split())}" in text
 
 
 def test_settings_selects_by_a_word(capsys: pytest.CaptureFixture[str]) -> None:
