@@ -1,4 +1,4 @@
-"""Standard output and standard error of a command whose reader may leave before the end, as `head` does."""
+"""Standard streams of a command whose reader may close its end early, as `head` does."""
 
 import os
 import sys
@@ -8,8 +8,10 @@ from typing import Any, TextIO, cast
 
 
 class Outlet:
-    """A standard stream that drops what is written once its reader has left: the command finishes its work, and its
-    exit code says what came of that."""
+    """A standard stream that discards output once its reader has closed it.
+
+    The command then still finishes its work, and its exit code reports the result.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -29,7 +31,7 @@ class Outlet:
             self._drop()
 
     def _drop(self) -> None:
-        """Send what the stream still holds, and all that follows, to the null device."""
+        """Redirect buffered and later output to the null device."""
         self.has_reader = False
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, self._stream.fileno())
@@ -41,22 +43,24 @@ class Outlet:
 
 @contextmanager
 def outlets() -> Iterator[None]:
-    """Make both standard streams outlets in the `with` block, and flush them at its end, which reports no error: the
-    command itself flushes where it can still report one."""
+    """Wrap both standard streams in outlets for the `with` block, and flush them at its end.
+
+    That flush ignores errors: the command itself flushes where it can still report them.
+    """
     with ExitStack() as stack:
         for stream, redirect in (sys.stdout, redirect_stdout), (sys.stderr, redirect_stderr):
-            if stream is not None:  # as it is where the descriptor was closed
+            if stream is not None:  # None if the process started with the descriptor closed
                 outlet = Outlet(stream)
-                stack.callback(_flushed, outlet)
+                stack.callback(_flush, outlet)
                 stack.enter_context(redirect(cast(TextIO, outlet)))
         yield
 
 
-def _flushed(outlet: Outlet) -> None:
+def _flush(outlet: Outlet) -> None:
     with suppress(OSError):
         outlet.flush()
 
 
 def has_reader() -> bool:
-    """Whether the reader of standard output is still there, as far as writing to it has shown."""
+    """Whether no write to standard output has yet found its reader gone."""
     return getattr(sys.stdout, "has_reader", True)

@@ -1,4 +1,4 @@
-"""Folders and files that only their user can write to: what lies there is believed, or even executed."""
+"""Folders and files that only their user can write to, because levelproof trusts or even executes their content."""
 
 import os
 import stat
@@ -7,14 +7,16 @@ from pathlib import Path
 
 from levelproof.pipeline.errors import UserError
 
-OTHERS = stat.S_IWGRP | stat.S_IWOTH
+WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 def own_folder(path: Path, instead: str) -> Path:
-    """A folder of this user's own, made if it is not there; where that cannot be, who uses it says so.
+    """Return a folder that only this user can write to; create it if it is missing.
+
+    If it cannot be created, the first use of the folder reports that.
 
     Raises:
-        UserError: others can write to it; `instead` is what to do about that.
+        UserError: other users can write to it; the message ends with `instead`, which says what to do.
     """
     if not path.exists():
         with suppress(OSError):
@@ -25,15 +27,15 @@ def own_folder(path: Path, instead: str) -> Path:
 
 
 def require_own(path: Path, instead: str) -> None:
-    """Refuse what another user has, or can write to; not where systems know no such users.
+    """Check that another user neither owns a path nor can write to it; do nothing on systems without user ids.
 
     Raises:
-        UserError: so it is; `instead` is what to do about that.
+        UserError: another user does or can; the message ends with `instead`, which says what to do.
     """
     if not hasattr(os, "getuid") or not path.exists():
         return
-    about = path.stat()
-    if about.st_uid not in (os.getuid(), 0):
-        raise UserError(f"{path} belongs to another user, and what lies there is believed: {instead}.")
-    if about.st_mode & OTHERS:
-        raise UserError(f"Other users can write to {path}, and what lies there is believed: {instead}.")
+    status = path.stat()
+    if status.st_uid not in (os.getuid(), 0):
+        raise UserError(f"{path} belongs to another user, but levelproof trusts its content: {instead}.")
+    if status.st_mode & WRITABLE_BY_OTHERS:
+        raise UserError(f"Other users can write to {path}, but levelproof trusts its content: {instead}.")

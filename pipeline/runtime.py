@@ -1,6 +1,6 @@
-"""How JAX computes in a process that runs work units: one thread, and compiled code kept for the next process.
+"""JAX's setup in a process that runs work units: one thread, and compiled code cached for the next process.
 
-Called before JAX starts its backend; changes nothing after that.
+Takes effect only before JAX starts its backend.
 """
 
 import os
@@ -16,35 +16,35 @@ from levelproof.pipeline.compiled import remove_damaged
 from levelproof.pipeline.owned import own_folder
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
-# One process per core, each with one thread, is twice as fast as one process with XLA's own threads; and a sum
-# that is split over threads would make a level's bits depend on the machine's number of cores.
+# One single-threaded process per core is twice as fast as one process with XLA's own threads. Besides, a sum split
+# over threads would make a level's bits depend on the machine's number of cores.
 XLA_FLAGS = (
     "--xla_cpu_multi_thread_eigen=false",
-    "--xla_cpu_prefer_vector_width=512",  # where the processor has it
+    "--xla_cpu_prefer_vector_width=512",  # ignored if the processor lacks such vectors
 )
-# NPROC and PJRT_NPROC size XLA's pool; the others are those of numpy's libraries.
+# NPROC and PJRT_NPROC set the size of XLA's pool; numpy's libraries read the others.
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 NO_GPU = "JAX cannot use one here, as it can with levelproof's extra `gpu`"
-CLAIMING = 2.0  # s of trying to get a core
-CLAIMS: list[socket.socket] = []  # of this process
-# Settings of JAX that change results or refuse the code, by a user's environment variables or configuration
-SETTLED = {
+CLAIM_SECONDS = 2.0  # s for which a worker tries to claim a core
+CLAIMS: list[socket.socket] = []  # sockets that mark this process's core as taken
+# Settings of JAX that change results or reject this code; a user's environment or configuration may have set them
+JAX_SETTINGS = {
     "jax_enable_x64": False,
     "jax_default_matmul_precision": None,
     "jax_numpy_dtype_promotion": "standard",
     "jax_numpy_rank_promotion": "allow",
     "jax_disable_jit": False,
-    "jax_debug_nans": False,  # worlds that break down have NaNs
+    "jax_debug_nans": False,  # diverging worlds contain NaNs
     "jax_debug_infs": False,
 }
-MIN_COMPILE_SECONDS = 0.2  # what compiles faster is not worth a file
+MIN_COMPILE_SECONDS = 0.2  # s; programs that compile faster are not cached
 
 
 def cache_folder() -> Path:
-    """Where compiled code is kept: LEVELPROOF_CACHE_DIR, else the user's cache folder.
+    """Return the folder for compiled code: LEVELPROOF_CACHE_DIR, else the user's cache folder.
 
     Raises:
-        UserError: other users can write to it; JAX executes what it finds there.
+        UserError: other users can write to it; JAX executes the code that it finds there.
     """
     if chosen := os.environ.get(CACHE_VARIABLE):
         path = Path(chosen).expanduser()
@@ -56,27 +56,29 @@ def cache_folder() -> Path:
 
 
 def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = None) -> None:
-    """Set this process up to run work units, on one CPU core or, with None, where the system likes.
+    """Set this process up to run work units.
 
-    JAX computes on the CPU and leaves GPUs alone, or with `device="gpu"` on a GPU if it can use one. Without a `device`
-    JAX_PLATFORMS decides, and if it is not set, the CPU.
+    Args:
+        core: CPU core to pin this process to; None leaves the choice to the system.
+        device: "cpu": JAX ignores GPUs; "gpu": JAX uses a GPU if it can; None: JAX_PLATFORMS decides, by default the
+            CPU.
 
     Raises:
-        UserError: as `cache_folder`.
+        UserError: see `cache_folder`.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = " ".join([flags, *(flag for flag in XLA_FLAGS if flag not in flags)]).strip()
     os.environ.update(dict.fromkeys(THREADS, "1"))
-    if core is not None and sys.platform == "linux":  # no other system can
-        for thread in os.listdir("/proc/self/task"):  # all of this process; those yet to come follow them
+    if core is not None and sys.platform == "linux":  # other systems have no affinity
+        for thread in os.listdir("/proc/self/task"):  # all threads of this process; later ones inherit the affinity
             os.sched_setaffinity(int(thread), {core})
     import jax  # reads the environment above
 
     programs = own_folder(cache_folder() / "jax", "delete it")
     remove_damaged(programs)
-    asked = os.environ.get("JAX_PLATFORMS")
-    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": asked, None: asked or "cpu"}[device])
-    for name, value in SETTLED.items():
+    platforms = os.environ.get("JAX_PLATFORMS")
+    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": platforms, None: platforms or "cpu"}[device])
+    for name, value in JAX_SETTINGS.items():
         jax.config.update(name, value)
     jax.config.update("jax_compilation_cache_dir", str(programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
@@ -84,37 +86,41 @@ def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = 
 
 
 def jax_sees_a_gpu() -> bool:
+    """Whether JAX computes on a GPU; starts its backend."""
     import jax
 
     return jax.default_backend() == "gpu"
 
 
 def own_cores() -> list[int]:
-    """The CPU cores that this process may keep busy: a container's quota may be smaller than their number."""
+    """Return the CPU cores that this process may keep busy; a container's quota may allow fewer than it shows."""
     return _allowed_cores()[: cpu_count()]
 
 
 def own_core(neighbours: int) -> int | None:
-    """A core that this process has to itself among all workers of this machine, until it ends.
+    """Claim a core that no other worker of this machine uses, until this process ends.
 
-    None leaves the core to the system: `neighbours`, the workers that this machine is to have, this one included, are
-    fewer than the cores that they may use, or a container's quota is smaller than those; then others are on them, too.
+    Returns None, which leaves the choice to the system, if there are more cores than workers, or if a container's
+    quota is smaller than its number of cores: other containers then use the same cores.
+
+    Args:
+        neighbours: number of workers that this machine will have, including this one.
     """
     cores = _allowed_cores()
     if sys.platform != "linux" or neighbours < len(cores) or len(own_cores()) < len(cores):
         return None
-    end = time.monotonic() + CLAIMING
+    end = time.monotonic() + CLAIM_SECONDS
     while time.monotonic() < end:
         for core in cores:
             claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             try:
-                claim.bind(f"\0levelproof on core {core}")  # a name and no file: the system frees it with the process
+                claim.bind(f"\0levelproof on core {core}")  # abstract name, not a file: freed when the process ends
             except OSError:
                 claim.close()
                 continue
             CLAIMS.append(claim)
             return core
-        time.sleep(CLAIMING / 10)  # a worker that died before this one may be on its way out
+        time.sleep(CLAIM_SECONDS / 10)  # the worker that this one replaces may still be exiting
     return None
 
 

@@ -1,4 +1,4 @@
-"""How SIGTERM, a batch system's notice, and Ctrl-C end a command: with time to commit, and before it is killed."""
+"""Ending a command on Ctrl-C or SIGTERM, a batch system's notice: with time to commit, before the system kills it."""
 
 import os
 import signal
@@ -9,14 +9,17 @@ from contextlib import contextmanager
 
 from levelproof.pipeline.errors import Exit
 
-GRACE = 20.0  # s from the first signal on, in which workers commit what they can
-LAST = 28.0  # s from the first signal on, after which the process has ended; batch systems kill after 30
+GRACE = 20.0  # s after the first signal in which workers commit what they can
+LAST = 28.0  # s after the first signal by which the process has ended; batch systems kill it after 30
 
 
 class Stop:
-    """A request to stop. The first signal sets `asked` where the code heeds it, and else raises KeyboardInterrupt, as
-    each later signal does. `LAST` seconds after the first the process ends, come what may: neither compiled code nor a
-    system call that hangs can be interrupted."""
+    """A request to stop, made by signals.
+
+    The first signal sets `asked` and, outside of a `heeded` block, raises KeyboardInterrupt, as every later signal
+    does. `LAST` seconds after the first, a timer ends the process, because neither compiled code nor a hanging system
+    call can be interrupted.
+    """
 
     def __init__(self) -> None:
         self.asked = threading.Event()
@@ -27,17 +30,17 @@ class Stop:
 
     @property
     def grace(self) -> float:
-        """Seconds that workers have left to commit, once the stop is asked for."""
+        """Seconds left for workers to commit; valid once `asked` is set."""
         return self._asked_at + GRACE - time.monotonic()
 
     def listen(self) -> None:
-        """Handle both signals, also after a library has set a handler of its own."""
+        """Handle both signals, replacing any handler that a library has set since."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._signalled)
 
     @contextmanager
     def heeded(self) -> Iterator[None]:
-        """Let the `with` block end by itself once `asked` is set; KeyboardInterrupt follows it at the latest."""
+        """Let the `with` block poll `asked` and end by itself; raise KeyboardInterrupt after it if `asked` is set."""
         self.listen()
         self._heeds = True
         try:
@@ -59,7 +62,7 @@ class Stop:
 
 @contextmanager
 def stoppable() -> Iterator[Stop]:
-    """Have SIGTERM and Ctrl-C stop the `with` block; in the main thread only."""
+    """Let SIGTERM and Ctrl-C stop the `with` block; works in the main thread only."""
     stop = Stop()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     stop.listen()

@@ -1,4 +1,4 @@
-"""Paths that stand for URLs: `Path("s3://bucket/split")` is such a one, whatever becomes of its slashes."""
+"""Paths that stand for URLs, such as `Path("s3://bucket/split")`, although `Path` collapses their slashes."""
 
 import re
 from pathlib import Path
@@ -10,18 +10,18 @@ SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 
 
 def require_known(path: Path) -> None:
-    """Raises UserError for a URL of a kind that nothing here reads or writes, lest it be taken for a folder."""
+    """Raise UserError for a URL of an unsupported scheme, which would otherwise be taken for a folder."""
     first = path.parts[0] if path.parts else ""
     if SCHEME.match(first) and first not in (*BUCKETS, *WEB, *HUB):
         known = ", ".join(f"{scheme}//" for scheme in (*BUCKETS, *WEB, *HUB))
-        raise UserError(f"{path} looks like a URL, and not like one that can be used: give a folder, or {known}.")
+        raise UserError(f"{path} looks like a URL of an unknown scheme: give a folder, or a URL of {known}.")
 
 
 def require_here(path: Path) -> None:
-    """Raises UserError for what is no file or folder on this machine."""
+    """Raise UserError for a URL, because the caller writes to this machine only."""
     require_known(path)
     if path.parts and path.parts[0] in (*BUCKETS, *WEB, *HUB):
         raise UserError(
-            f"Nothing can be written to {path.parts[0]}//{'/'.join(path.parts[1:])} here: "
+            f"This command cannot write to {path.parts[0]}//{'/'.join(path.parts[1:])}: "
             "give a file or folder on this machine."
         )

@@ -1,4 +1,4 @@
-"""The version of this program, as it is installed."""
+"""The installed version of levelproof."""
 
 from importlib.metadata import PackageNotFoundError, version
 

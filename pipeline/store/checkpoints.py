@@ -21,7 +21,7 @@ from levelproof.levelgen.identity.keys import level_id_array
 from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.owned import OTHERS, require_own
+from levelproof.pipeline.owned import WRITABLE_BY_OTHERS, require_own
 from levelproof.pipeline.store.disk import flush, regular
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.layout import EXPERTS, MANIFEST, data_path
@@ -49,7 +49,7 @@ def save_experts(path: Path, experts: Mapping[int, KeptExpert]) -> None:
         np.savez(
             file, allow_pickle=False, level_id=np.array(sorted(experts)), curve=curves, **arrays_of(begun, "begun/")
         )
-    path.chmod(path.stat().st_mode & ~OTHERS)
+    path.chmod(path.stat().st_mode & ~WRITABLE_BY_OTHERS)
     flush(path)
 
 

@@ -4,7 +4,7 @@ import os
 import time
 from pathlib import Path
 
-from levelproof.pipeline.compiled import LOOKED, remove_damaged
+from levelproof.pipeline.compiled import LAST_CHECK, remove_damaged
 from tests.pipeline.test_runtime import python
 
 COMPILE = """
@@ -39,10 +39,10 @@ def test_a_truncated_program_is_replaced_without_a_warning(tmp_path: Path) -> No
 
 
 def test_programs_are_read_when_they_have_changed(tmp_path: Path) -> None:
-    program, looked = tmp_path / "jit_f-0-cache", tmp_path / LOOKED
+    program, looked = tmp_path / "jit_f-0-cache", tmp_path / LAST_CHECK
     program.write_bytes(b"damaged")
     remove_damaged(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == [LOOKED]
+    assert [path.name for path in tmp_path.iterdir()] == [LAST_CHECK]
     program.write_bytes(b"damaged")
     os.utime(program, (0, 0))  # a copy that keeps the time of its original
     later = time.time() + 60

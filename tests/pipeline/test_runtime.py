@@ -129,8 +129,8 @@ def test_every_worker_of_a_machine_has_its_own_core(tmp_path: Path) -> None:
 
 def test_settings_of_the_user_that_change_results_are_overruled(tmp_path: Path) -> None:
     program = (
-        "from levelproof.pipeline.runtime import prepare_jax, SETTLED; prepare_jax(); import jax; "
-        "print(all(getattr(jax.config, name) == value for name, value in SETTLED.items()))"
+        "from levelproof.pipeline.runtime import prepare_jax, JAX_SETTINGS; prepare_jax(); import jax; "
+        "print(all(getattr(jax.config, name) == value for name, value in JAX_SETTINGS.items()))"
     )
     theirs = {
         "JAX_ENABLE_X64": "1",
