@@ -24,9 +24,9 @@ from benchmarks.simulated import SimulatedWorker, Work
 from levelproof.configs.compose import compose_job
 from levelproof.configs.numbers import parse_count
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.jobs.plan import costs_of, measured
+from levelproof.pipeline.jobs.plan import costs_of, measure
 from levelproof.pipeline.jobs.schedule import Round, Scheduler, schedule, until_report
-from levelproof.pipeline.jobs.sizing import MOST
+from levelproof.pipeline.jobs.sizing import MAX_FACTOR
 
 UNTIMED, SLOTS = 32, 4  # levels of a unit that nobody has timed, experts side by side: of size s on a core
 HEARING = 1e-3  # s of the driver for a report beside the scheduler's: Ray's call and its answer; assumed
@@ -254,7 +254,7 @@ def run(given: argparse.Namespace) -> Report:
         tables=[Table(head, [row(of) for of in results])],
         notes=[
             f"{levels:,} levels, by the scheduler of `generate` under a simulated clock, in units of its default size: "
-            f"20 to 60 s of a worker, at most {MOST * UNTIMED} levels and a quarter of a worker's share; a "
+            f"20 to 60 s of a worker, at most {MAX_FACTOR * UNTIMED} levels and a quarter of a worker's share; a "
             f"level takes what one of {len(seconds):,} measured ones did, {seconds.mean():.3g} core-seconds on average"
             f"{scaled}. Machines of 64 cores or 8 GPUs are taken away with notice after a day, or as said, and die "
             f"without after 30 days, on average, and another comes {AWAY / 60:.0f} minutes later; processes crash once "
@@ -272,7 +272,7 @@ def run(given: argparse.Namespace) -> Report:
 
 def _measured(given: argparse.Namespace) -> Float[np.ndarray, " level"]:
     if not given.split:
-        return measured(compose_job([*given.settings, "levels=4k"]), Console(stderr=True)).busy
+        return measure(compose_job([*given.settings, "levels=4k"]), Console(stderr=True)).busy
     _, busy, _ = costs_of(given.split)
     if not np.isfinite(busy).all():
         raise UserError(f"Rows of {given.split} do not tell seconds: give a split that this version made.")

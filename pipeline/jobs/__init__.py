@@ -1,1 +1,1 @@
-"""Jobs that make splits: work units, who does them, and what is said meanwhile."""
+"""Jobs that make splits: work units, the executors that run them, and their progress reports."""

@@ -6,29 +6,29 @@ import socket
 
 from levelproof.pipeline.errors import UserError
 
-REACH = 5.0  # s in which a cluster has to answer
+CONNECT_SECONDS = 5.0  # s within which a cluster must accept a connection
 
 
-def existing() -> str:
-    """Its address; empty: none is named."""
+def ray_address() -> str:
+    """Return RAY_ADDRESS; empty if it is not set."""
     return os.environ.get("RAY_ADDRESS", "")
 
 
 def require_reachable(address: str) -> None:
-    """Ray itself tries for minutes.
+    """Check that a cluster accepts connections, because Ray itself would retry for minutes.
 
     Raises:
-        UserError: nobody listens there.
+        UserError: no process listens at the address.
     """
-    if found := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
+    if match := re.fullmatch(r"(?:ray://)?(.+):(\d+)", address):
         try:
-            socket.create_connection((found[1].strip("[]"), int(found[2])), REACH).close()
-        except (OSError, OverflowError, UnicodeError) as error:  # no such port, and what can be no host's name
+            socket.create_connection((match[1].strip("[]"), int(match[2])), CONNECT_SECONDS).close()
+        except (OSError, OverflowError, UnicodeError) as error:  # the last two: invalid port, invalid host name
             raise no_cluster(getattr(error, "strerror", None) or str(error)) from error
 
 
 def no_cluster(reason: str) -> UserError:
     return UserError(
-        f"There is no Ray cluster at RAY_ADDRESS={existing()} ({reason.rstrip('.')}): "
+        f"There is no Ray cluster at RAY_ADDRESS={ray_address()} ({reason.rstrip('.')}): "
         "start one with `ray start --head`, correct the address, or unset it to use this machine."
     )

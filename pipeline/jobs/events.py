@@ -1,4 +1,4 @@
-"""What a job tells of itself while it runs, for whoever watches its split from elsewhere."""
+"""Events that a job records while it runs, so that other processes can watch its split."""
 
 import math
 import time
@@ -12,48 +12,48 @@ from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome
 from levelproof.pipeline.store.events import Event, new_run, tell
 
-EVERY = 5.0  # s between two states that are told
-MOST = 500  # events that are kept, the latest; and before them how the run began
+EVERY = 5.0  # s between two published states
+MAX_EVENTS = 500  # latest events that are kept, besides the start of the run
 
 
 class Events:
-    """The account of one run: how it began, what happened lately, how it is now."""
+    """The events of one run: its start, the latest attempts, and its current state."""
 
     def __init__(
-        self, tally: Tally, scheduler: Scheduler, command: str, tell: Callable[[Sequence[Event]], None]
+        self, tally: Tally, scheduler: Scheduler, command: str, publish: Callable[[Sequence[Event]], None]
     ) -> None:
-        """`tell` makes all events known, in place of those before."""
-        self._tally, self._scheduler, self._tell = tally, scheduler, tell
+        """`publish` replaces the events that it published before."""
+        self._tally, self._scheduler, self._publish = tally, scheduler, publish
         self._began = _event("started", command=command, levels=tally.levels, done=tally.done, solved=tally.solved)
-        self._latest: deque[Event] = deque(maxlen=MOST)
-        self._failures, self._told_at = 0, -math.inf
+        self._latest: deque[Event] = deque(maxlen=MAX_EVENTS)
+        self._failures, self._published_at = 0, -math.inf
 
     def ended(self, outcome: UnitOutcome, given_up: bool = False) -> None:
-        """An attempt at a unit has ended."""
-        of = outcome.summary
-        if of:
-            about: dict[str, Any] = {"levels": of.levels, "solved": of.solved, "seconds": of.seconds._asdict()}
-            self._latest.append(_event("committed", unit=outcome.unit.name, **about))
+        """Record an attempt at a unit that has ended."""
+        if summary := outcome.summary:
+            facts = {"levels": summary.levels, "solved": summary.solved, "seconds": summary.seconds._asdict()}
+            self._latest.append(_event("committed", unit=outcome.unit.name, **facts))
             return
         self._failures += 1
         self._latest.append(
             _event("quarantined" if given_up else "failed", unit=outcome.unit.name, cause=outcome.cause[:200])
         )
 
-    def look(self, rate: float, left: float | None) -> None:
-        """Tell how it is, if that is due: at `rate` env steps/s, with `left` s to go."""
-        if time.monotonic() - self._told_at >= EVERY:
-            self._told_at = time.monotonic()
-            self._tell([self._began, *self._latest, self._state("progress", rate, left)])
+    def refresh(self, rate: float, left: float | None) -> None:
+        """Publish the current state if that is due: at `rate` env steps/s, with `left` s to go."""
+        if time.monotonic() - self._published_at >= EVERY:
+            self._published_at = time.monotonic()
+            self._publish([self._began, *self._latest, self._state("progress", rate, left)])
 
     def over(self, how: str) -> None:
-        self._tell([self._began, *self._latest, self._state("ended", 0.0, None) | {"how": how}])
+        """Publish how the run ended: "done", "stopped" or "failed"."""
+        self._publish([self._began, *self._latest, self._state("ended", 0.0, None) | {"how": how}])
 
     def _state(self, event: str, rate: float, left: float | None) -> dict[str, Any]:
         tally, now = self._tally, time.monotonic()
-        silent: dict[str, list[float]] = defaultdict(list)
-        for worker, of in self._scheduler.workers.items():
-            silent[getattr(worker, "host", str(worker))].append(round(max(0.0, now - of.heard), 1))
+        silent: dict[str, list[float]] = defaultdict(list)  # s since the last report, of each worker by host
+        for worker, assignment in self._scheduler.workers.items():
+            silent[getattr(worker, "host", str(worker))].append(round(max(0.0, now - assignment.heard), 1))
         return _event(
             event,
             levels=tally.levels,
@@ -66,7 +66,7 @@ class Events:
             left=None if left is None else round(left),
             failures=self._failures,
             quarantined=len(self._scheduler.quarantined),
-            workers={host: {"count": len(of), "silent": max(of)} for host, of in silent.items()},
+            workers={host: {"count": len(seconds), "silent": max(seconds)} for host, seconds in silent.items()},
         )
 
 
@@ -75,23 +75,23 @@ def _event(event: str, **facts: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def telling(
+def recording(
     split: Path, board: Board, scheduler: Scheduler, command: str, log: Callable[[Sequence[Event]], None]
 ) -> Iterator[Events]:
-    """Tells what happens meanwhile, beside the split's data and to `log`, and how it ended.
+    """Record the events of the `with` block and how it ended, beside the split's data and in `log`.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: a write failed.
     """
     run = new_run(split)
 
-    def tell_both(events: Sequence[Event]) -> None:
+    def publish(events: Sequence[Event]) -> None:
         tell(run, events)
         log(events)
 
-    events = Events(board.tally, scheduler, command, tell_both)
-    events.look(0.0, None)
-    board.watchers.append(events.look)
+    events = Events(board.tally, scheduler, command, publish)
+    events.refresh(0.0, None)
+    board.watchers.append(events.refresh)
     how = "failed"
     try:
         yield events

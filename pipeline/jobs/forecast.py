@@ -1,7 +1,7 @@
-"""From some levels that were made to all of a job's: hours, bytes, files and solved levels, each with its interval.
+"""Forecast of a job's hours, bytes, files and solved levels from a sample of its levels, each with its interval.
 
-Levels are independent of each other, so what some took says what more take: their mean, drawn again and again with
-replacement, and the scatter of those that are yet to come.
+Levels are independent, so a total over N levels has two sources of uncertainty: the sample's mean, which bootstrap
+resampling estimates, and the scatter of the N levels themselves, with a standard deviation of sqrt(N) times a level's.
 """
 
 import math
@@ -17,69 +17,74 @@ from levelproof.pipeline.store.merge import FILE_BYTES
 from levelproof.pipeline.store.seal import ROWS
 from levelproof.pipeline.words import number
 
-DRAWS = 2000
-LIKELY = 0.9  # of an interval
-SHARDS_OWN, OTHERS = 1, 2  # zarr.json of a shard; job.json and manifest/index.txt of a split
+DRAWS = 2000  # bootstrap resamples
+LIKELY = 0.9  # coverage of an interval
+FILES_OF_SHARD, FILES_OF_SPLIT = 1, 2  # zarr.json; job.json and manifest/index.txt
 
 
 class PerWitness(NamedTuple):
-    """What a witness takes in one density."""
+    """Stored size of a witness in one density."""
 
     bytes: float
-    arrays: int  # of a shard
+    arrays: int  # number of arrays in a shard
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What was measured of some levels."""
+    """Measurements of some levels."""
 
     device: str  # core or GPU
     workers: int
-    wall: float  # s, of everything
-    once: float  # s that a run takes whatever its number of levels: to start, to load programs, to wait for the last
-    compiling: float  # s of a worker that finds nothing compiled
+    wall: float  # s, of the whole measurement
+    once: float  # s that any run takes: to start, to load programs, to wait for the last levels
+    compiling: float  # s of a worker with an empty cache
     busy: Float[np.ndarray, " level"]  # s of a worker, without compiling and idle slots
     solved: Bool[np.ndarray, " level"]
     witnessed: Bool[np.ndarray, " level"]
-    row_bytes: float  # of the manifest
+    row_bytes: float  # bytes of a manifest row
     stored: dict[str, PerWitness]  # by density
 
 
 @dataclass(frozen=True)
-class Guess:
-    """A number that is not known yet: between `low` and `high` in nine of ten cases."""
+class Estimate:
+    """A number with its 90 % interval, from `low` to `high`."""
 
     expected: float
     low: float
     high: float
 
-    def told(self, scale: float = 1.0, tell: Callable[[float], str] = number) -> str:
-        return "{} ({} to {})".format(*(tell(value / scale) for value in (self.expected, self.low, self.high)))
+    def text(self, scale: float = 1.0, form: Callable[[float], str] = number) -> str:
+        """Format the number and its interval, in units of `scale`."""
+        return "{} ({} to {})".format(*(form(value / scale) for value in (self.expected, self.low, self.high)))
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a job would take. Hours of a core or GPU are those for which workers have it."""
+    """Estimated cost of a job. A core or GPU counts for as long as a worker holds it, busy or not."""
 
     levels: int
     workers: int
     unit: int  # levels of a work unit
-    unit_seconds: float  # s of a worker that it takes, lost when the worker dies
-    wall: Guess  # s
-    hours: Guess  # of all workers
-    seconds_per_solved: Guess | None  # None: the sample has none
-    solved: Guess
-    bytes: dict[str, Guess]  # by density, the manifest with it
-    files: dict[str, int]  # of the sealed split
+    unit_seconds: float  # s of a worker per unit, lost when the worker dies
+    wall: Estimate  # s
+    hours: Estimate  # of all workers
+    seconds_per_solved: Estimate | None  # None: the sample has no solved level
+    solved: Estimate
+    bytes: dict[str, Estimate]  # by density, including the manifest
+    files: dict[str, int]  # by density, of the sealed split
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
 
 
 def forecast(sample: Sample, levels: int, workers: int, untimed: int, unit: int | None = None) -> Forecast:
-    """What so many levels would take so many workers like those of the sample.
+    """Estimate the cost of a job on workers like those of the sample.
 
-    `untimed` are levels of a work unit while nobody knows what a level takes; `unit` of any, if it is given.
+    Args:
+        levels: number of levels.
+        workers: number of workers.
+        untimed: number of levels in a work unit before the first one has ended.
+        unit: number of levels in every work unit; None: units are timed.
     """
     rng = np.random.default_rng(0)
     count = len(sample.busy)
@@ -93,14 +98,14 @@ def forecast(sample: Sample, levels: int, workers: int, untimed: int, unit: int 
     witnessed = np.clip(total(sample.witnessed.astype(float)), 0, levels)
     seconds, busy = total(sample.busy), sample.busy.mean() * levels
     unit = unit or unit_levels(sample.busy.mean(), levels, workers, untimed)
-    wall = _guess(seconds / workers + sample.once, busy / workers + sample.once)
-    hours = Guess(*(value * workers / 3600 for value in (wall.expected, wall.low, wall.high)))
+    wall = _estimate(seconds / workers + sample.once, busy / workers + sample.once)
+    hours = Estimate(*(value * workers / 3600 for value in (wall.expected, wall.low, wall.high)))
     any_solved = sample.solved.any()
-    each = _guess(
+    each = _estimate(
         (seconds + workers * sample.once) / np.maximum(solved, 1.0),
         (busy + workers * sample.once) / max(sample.solved.mean() * levels, 1.0),
     )
-    share = sample.witnessed.mean() * levels
+    witnesses = sample.witnessed.mean() * levels
     rows = levels * sample.row_bytes
     return Forecast(
         levels,
@@ -110,21 +115,24 @@ def forecast(sample: Sample, levels: int, workers: int, untimed: int, unit: int 
         wall,
         hours,
         each if any_solved else None,
-        _guess(solved, sample.solved.mean() * levels),
-        {name: _guess(witnessed * of.bytes + rows, share * of.bytes + rows) for name, of in sample.stored.items()},
-        {name: _files(levels, share, of) for name, of in sample.stored.items()},
+        _estimate(solved, sample.solved.mean() * levels),
+        {
+            density: _estimate(witnessed * size.bytes + rows, witnesses * size.bytes + rows)
+            for density, size in sample.stored.items()
+        },
+        {density: _files(levels, witnesses, size) for density, size in sample.stored.items()},
     )
 
 
-def _guess(draws: Float[np.ndarray, " draw"], expected: float) -> Guess:
+def _estimate(draws: Float[np.ndarray, " draw"], expected: float) -> Estimate:
     low, high = np.quantile(draws, [(1 - LIKELY) / 2, (1 + LIKELY) / 2])
-    return Guess(float(expected), float(low), float(high))
+    return Estimate(float(expected), float(low), float(high))
 
 
-def _files(levels: int, witnesses: float, of: PerWitness) -> int:
-    """Of a split that is sealed."""
+def _files(levels: int, witnesses: float, size: PerWitness) -> int:
+    """Return the number of files in the sealed split."""
     fragments = math.ceil(levels / ROWS)
     rows = math.ceil(witnesses / fragments)  # of a shard
-    rows_a_file = 1 << max(0, math.ceil(math.log2(FILE_BYTES / max(of.bytes, 1.0))))
-    shard = SHARDS_OWN + of.arrays * (1 + math.ceil(rows / rows_a_file))
-    return fragments * (1 + (shard if rows else 0)) + OTHERS
+    rows_a_file = 1 << max(0, math.ceil(math.log2(FILE_BYTES / max(size.bytes, 1.0))))
+    shard = FILES_OF_SHARD + size.arrays * (1 + math.ceil(rows / rows_a_file))
+    return fragments * (1 + (shard if rows else 0)) + FILES_OF_SPLIT

@@ -1,4 +1,4 @@
-"""The job of `levelproof generate`: what is left to do, done by workers or in this process, and said to the user."""
+"""The job of `levelproof generate`: plan the missing units, run them on an executor, report to the user."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.experts.steps import EnvSteps
 from levelproof.pipeline.errors import Exit, Failure
-from levelproof.pipeline.jobs.events import Events, telling
+from levelproof.pipeline.jobs.events import Events, recording
 from levelproof.pipeline.jobs.log import logged, require_library
 from levelproof.pipeline.jobs.progress import Board, Tally, say
 from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, schedule
@@ -41,27 +41,32 @@ def generate(
     origins: Mapping[int, Origin] | None = None,
     repaired: Path | None = None,
 ) -> Exit:
-    """Make what is missing of the job's levels, and commit it unit by unit.
+    """Make the job's missing levels, and commit them unit by unit.
 
-    `command` is as typed, for the hint of how to go on; `level_ids` are which levels, if not those of the job;
-    `origins` say where they are, if their ids do not make them; `repaired` is the split, where they are made again.
+    Args:
+        job: what to make.
+        command: the command as typed, which status and notes quote.
+        console: receives progress and messages.
+        level_ids: levels to make; None: those of the job.
+        origins: level files or records by level id; None: levels are sampled.
+        repaired: the split, if this is a repair; None: `job` names it.
 
     Raises:
         UserError, Failure: see `log.require_library`, `runtime.cache_folder`, `store.split.writing` and
-            `store.checkpoints.require_same_experts`; or the disk refuses.
-        KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; what is committed stays.
+            `store.checkpoints.require_same_experts`; or a write failed.
+        KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; committed units stay.
     """
     require_library(job.log)
-    cache_folder()  # where workers refuse it, Ray makes many lines of the sentence
+    cache_folder()  # checked here, because Ray wraps a worker's error in many lines
     require_same_experts(job)
     with stoppable() as stop, writing(job, partial(say, console), repaired) as (split, manifest):
-        asked = [*origins] if origins else (job.level_ids if level_ids is None else level_ids)
-        wanted = ascending(np.fromiter(asked, np.int64, len(asked)))
+        chosen = [*origins] if origins else (job.level_ids if level_ids is None else level_ids)
+        wanted = ascending(np.fromiter(chosen, np.int64, len(chosen)))
         is_done = np.isin(manifest.level_ids, wanted)
         done = manifest.level_ids[is_done]
         require_same_levels(split, origins or {}, done)
         left = len(wanted) - len(done)
-        scheduler = schedule(asked, done, left, job.levels_per_unit, job.unit is None, origins)
+        scheduler = schedule(chosen, done, left, job.levels_per_unit, job.unit is None, origins)
         quarantine.drop_notes(split, manifest.level_ids)
         prune_paused(split, manifest.level_ids, partial(say, console))
         if not repaired:
@@ -69,20 +74,20 @@ def generate(
         if scheduler.waiting:
             solved = manifest.counts(is_done).get(Label.SOLVED, 0)
             board = Board(Tally(len(wanted), len(done), solved), console)
-            there = f", {len(done)} are there already" if len(done) else ""
+            already = f", {len(done)} are there already" if len(done) else ""
             each = f"{many(len(wanted), 'level')} of size {job.size}, {job.budget} env steps each"
-            board.say(f"{each}, into {as_typed(split)}{there}")
+            board.say(f"{each}, into {as_typed(split)}{already}")
             try:
                 with (
                     logged(job, split, board.say) as log,
                     board.shown(),
                     sealing(split, manifest.counting, board.say) as sealer,
-                    telling(split, board, scheduler, shlex.join(command), log) as events,
+                    recording(split, board, scheduler, shlex.join(command), log) as events,
                 ):
                     _work(job, split, scheduler, board, sealer, events, stop)
             except KeyboardInterrupt:
                 done = f"{board.tally.done:,} of {many(len(wanted), 'level')} committed"
-                board.say(f"Stopped: {done}; the same command goes on.")
+                board.say(f"Stopped: {done}; run the same command to continue.")
                 raise
             manifest = read_manifest(split, ["label", "env_steps"], compact=True)
             quarantine.drop_notes(split, manifest.level_ids)
@@ -98,7 +103,7 @@ def generate(
 def _work(
     job: JobConfig, split: Path, scheduler: Scheduler, board: Board, sealer: Sealer, events: Events, stop: Stop
 ) -> None:
-    """Have every unit done or given up, by workers or in this process."""
+    """Run the executor until every unit is committed or given up."""
 
     def settle(outcomes: Sequence[UnitOutcome]) -> None:
         """Account for attempts that ended together."""
@@ -122,7 +127,7 @@ def _work(
         for (cause, last), units in failed.items():
             board.say(f"{levels_text(units).capitalize()} failed ({cause}): {'given up' if last else 'trying again'}.")
         if outcomes:
-            sealer.look(scheduler.first)
+            sealer.advance(scheduler.first)
 
     if job.executor == "inline":
         from levelproof.pipeline.jobs.inline import run
@@ -132,7 +137,7 @@ def _work(
 
 
 def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
-    """What this run's env steps were for."""
+    """Return a sentence on how this run's env steps were used."""
     rows = manifest.table.filter(np.isin(manifest.level_ids, made))
     steps, label = (rows.column(name).to_numpy() for name in ("env_steps", "label"))
     shares = {
@@ -142,12 +147,12 @@ def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
         "of evaluations": spent.evaluated,
         "in empty slots": spent.idle,
     }
-    told = ", ".join(f"{share / sum(spent):.0%} {name}" for name, share in shares.items() if share)
-    return f"{sum(spent):,} env steps: {told}."
+    parts = ", ".join(f"{share / sum(spent):.0%} {name}" for name, share in shares.items() if share)
+    return f"{sum(spent):,} env steps: {parts}."
 
 
 def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, given_up: list[WorkUnit], spent: str) -> None:
-    """Where it is, what came of it, and what to type next. On stdout."""
+    """Print where the split is, its labels, and the next command to type."""
     labels, folder = manifest.counts(np.isin(manifest.level_ids, wanted)), shlex.quote(as_typed(split))
     total = sum(labels.values())
     counts = ", ".join(f"{count} {label}" for label, count in labels.items())

@@ -1,4 +1,4 @@
-"""The job of `levelproof import`: another program's trajectories, played again here, as a split."""
+"""The job of `levelproof import`: replay another program's trajectories here, and store them as a split."""
 
 import shlex
 from collections import Counter
@@ -37,67 +37,68 @@ from levelproof.pipeline.store.runs import runs
 from levelproof.pipeline.store.split import writing
 from levelproof.pipeline.words import many
 
-UNIT_BYTES = 2**28  # of the records of a unit, as the reference has them; they are in memory a few times
-TOLD = 3  # records that are left out, each with its reason
+UNIT_BYTES = 2**28  # bytes of a unit's records in the reference's format; memory holds a few copies
+REPORTED = 3  # maximum number of skipped records that are reported one by one
 
 
 class UnitOfRows(NamedTuple):
     """Rows of an array that are committed together."""
 
     array: StoredArray
-    first: int  # row
-    unit: WorkUnit  # the ids of its rows, whatever becomes of them
+    first: int  # index of its first row
+    unit: WorkUnit  # the ids of its rows, including those that will be skipped
 
 
 @stoppable()
 def import_folder(folder: Path, out: Path, console: Console) -> Exit:
-    """Make the split `out` of the trajectories in `folder`, or go on with it.
+    """Import the trajectories in `folder` into the split `out`, or continue an import.
 
     Raises:
-        UserError: `folder` has no trajectories that can be read, `out` is no name for a split of them, or it is
-            written to, was made otherwise or of another folder.
-        Failure: a chunk is damaged, or the disk refuses; what is committed stays.
+        UserError: `folder` has no readable trajectories; `out` does not end in a budget and their size; or another
+            command writes to `out`, or made it, or imported it from another folder.
+        Failure: a chunk is damaged, or a write failed; committed units stay.
     """
     require_folder(out, "import to it")
     if not can_be_noted(str(folder.absolute())):
-        raise UserError(f"Cannot import {folder}: no terminal shows its name, so give it another one.")
+        raise UserError(f"Cannot import {folder}: its name has characters that no terminal shows, so rename it.")
     try:
-        found = open_folder(folder.expanduser().absolute())
+        source = open_folder(folder.expanduser().absolute())
     except FormatError as error:
         raise UserError(f"Cannot import {folder}: {error}.") from None
-    job = _job(found, out)
-    command = ["levelproof", "import", str(found.path), "-o", str(out)]
+    job = _job(source, out)
+    command = ["levelproof", "import", str(source.path), "-o", str(out)]
     prepare_jax()
     with writing(job, partial(say, console)) as (split, manifest):
-        parts = list(_parts(found))
+        parts = list(_parts(source))
         left = [part for part in parts if not _is_done(part, manifest)]
-        _require_same_folder(found, parts, split)
-        note_job(split, job, command, [(0, found.rows - 1)])
+        _require_same_folder(source, parts, split)
+        note_job(split, job, command, [(0, source.rows - 1)])
         done = len(parts) - len(left)
-        there = f", {done} of {len(parts)} units are there already" if done else ""
-        say(console, f"{many(found.rows, 'trajectory')} of size {job.size} into {split}{there}")
-        out_of: Counter[str] = Counter()
+        already = f", {done} of {len(parts)} units are there already" if done else ""
+        say(console, f"{many(source.rows, 'trajectory')} of size {job.size} into {split}{already}")
+        skipped: Counter[str] = Counter()  # number of records by reason
         shown = track(left, "units of trajectories", console=console, transient=True, disable=not console.is_terminal)
-        firsts = [*(part.unit.level_ids[0] for part in left[1:]), None]  # of what is to come after each
+        firsts = [*(part.unit.level_ids[0] for part in left[1:]), None]  # first level id after each unit
         try:
             with sealing(split, manifest.counting, partial(say, console)) as sealer:
                 for part, first in zip(shown, firsts, strict=False):
-                    out_of.update(_import(job, split, found, part, shlex.join(command), console, sum(out_of.values())))
+                    reported = sum(skipped.values())
+                    skipped.update(_import(job, split, source, part, shlex.join(command), console, reported))
                     sealer.committed(part.unit)
-                    sealer.look(first)
+                    sealer.advance(first)
         except KeyboardInterrupt:
-            say(console, "Stopped: what is committed stays, and the same command goes on.")
+            say(console, "Stopped: committed units stay; run the same command to continue.")
             raise
         except FormatError as error:
-            raise Failure(f"Cannot go on with {folder}: {error}; mend it, and the same command goes on.") from None
+            raise Failure(f"Cannot continue with {folder}: {error}; fix it, then run the same command.") from None
         manifest = read_manifest(split, ["label"])
         note_job(split, job, command, runs(manifest.level_ids))
-        _closing(found, split, manifest)
+        _closing(source, split, manifest)
     return Exit.DONE
 
 
 def _job(folder: Folder, out: Path) -> ImportConfig:
-    """Raises UserError where a split of these trajectories cannot be called so."""
+    """Return the job that imports a folder; raise UserError if `out` does not end in a budget and the right size."""
     size, absolute = name_of(folder.size), out.expanduser().absolute()
     parent = out.parent.parent if len(out.parts) > 1 else absolute.parent.parent
     example = f"name the split so, as in -o data/1M/{size}"
@@ -111,7 +112,7 @@ def _job(folder: Folder, out: Path) -> ImportConfig:
 
 
 def _parts(folder: Folder) -> Iterator[UnitOfRows]:
-    """All trajectories; their ids are their places, one after another."""
+    """Yield the units of all trajectories; their ids count them from 0 over all arrays."""
     record = RECORD_STEPS * dtype_of(folder.size).itemsize
     rows, first_id = max(UNIT_BYTES // record // LANES * LANES, LANES), 0
     for array in folder.arrays:
@@ -127,33 +128,38 @@ def _is_done(part: UnitOfRows, manifest: Manifest) -> bool:
 
 
 def _require_same_folder(folder: Folder, parts: list[UnitOfRows], split: Path) -> None:
-    """Raises UserError where the split has other trajectories at the first places of its units."""
+    """Raise UserError if the split has trajectories of another folder at the first ids of its units."""
     rows = read_manifest(split, ["file"], [part.unit.level_ids[0] for part in parts]).table.to_pylist()
     files = {row["level_id"]: row["file"] for row in rows}
     for part in parts:
         wanted = _file(folder, part.array, part.first)
         if (file := files.get(part.unit.level_ids[0], wanted)) != wanted:
-            raise UserError(f"{split} has {file} where {wanted} would be: one folder makes one split, as it is.")
+            raise UserError(
+                f"{split} has {file} where {wanted} would be: one folder makes one split, so import into another one."
+            )
 
 
 def _import(
-    job: ImportConfig, split: Path, folder: Folder, part: UnitOfRows, command: str, console: Console, told: int
+    job: ImportConfig, split: Path, folder: Folder, part: UnitOfRows, command: str, console: Console, reported: int
 ) -> list[str]:
-    """Commit a part; the reasons why some of it is left out."""
+    """Commit a unit without its unusable records; return the reasons for which they are unusable.
+
+    `reported` records have been reported one by one already.
+    """
     ids = part.unit.level_ids
-    found = read_trajectories(part.array, part.first, part.first + len(ids))
-    good = np.flatnonzero([not what for what in found.wrong])
+    trajectories = read_trajectories(part.array, part.first, part.first + len(ids))
+    good = np.flatnonzero([not reason for reason in trajectories.wrong])
     files = [_file(folder, part.array, part.first + i) for i in range(len(ids))]
-    wrong = [(file, what) for file, what in zip(files, found.wrong, strict=True) if what]
-    for file, what in wrong[: max(TOLD - told, 0)]:
-        say(console, f"Left out: {file}, {what}.")
+    wrong = [(file, reason) for file, reason in zip(files, trajectories.wrong, strict=True) if reason]
+    for file, reason in wrong[: max(REPORTED - reported, 0)]:
+        say(console, f"Left out: {file}, {reason}.")
     if len(good):
-        levels = take(found.level, good)
-        record, verdicts = label_given(levels, found.action[..., good], job.task)
+        levels = take(trajectories.level, good)
+        record, verdicts = label_given(levels, trajectories.action[..., good], job.task)
         origins = tuple(Origin("", files[i], job.size) for i in good)
         result = UnitResult(np.array(ids)[good], levels, record, verdicts, EnvSteps())
         commit(job, split, WorkUnit(ids, origins), result, command)
-    return [what for _, what in wrong]
+    return [reason for _, reason in wrong]
 
 
 def _file(folder: Folder, array: StoredArray, row: int) -> str:
@@ -161,7 +167,7 @@ def _file(folder: Folder, array: StoredArray, row: int) -> str:
 
 
 def _closing(folder: Folder, split: Path, manifest: Manifest) -> None:
-    """What came of it, and what to type next. On stdout."""
+    """Print the split's labels, and the next command to type."""
     labels = manifest.counts(np.ones(len(manifest.level_ids), bool))
     total, reached = sum(labels.values()), sum(count for label, count in labels.items() if label in WITNESSED)
     counts = ", ".join(f"{count} {label}" for label, count in labels.items())

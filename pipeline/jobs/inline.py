@@ -13,11 +13,11 @@ HERE = "this process"
 
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
-    """Work until nothing is left to do; `stop` is heeded."""
+    """Run all units in this process, or until `stop` is asked for."""
     prepare_jax(device=job.device)
     if job.device == "gpu" and not jax_sees_a_gpu():
         board.say(f"This process uses a CPU core, not a GPU: {NO_GPU}.")
-    from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
+    from levelproof.pipeline.jobs.worker import Worker  # its imports read JAX's settings, so they come after them
 
     with stop.heeded():
         worker = Worker(job, split)

@@ -1,4 +1,4 @@
-"""The job of `levelproof generate level_files=FOLDER`: a split for each size of the levels that are there."""
+"""The job of `levelproof generate level_files=FOLDER`: one split for each size among the level files."""
 
 import multiprocessing
 from collections.abc import Sequence
@@ -17,34 +17,34 @@ from levelproof.pipeline.runtime import prepare_jax
 
 
 def generate_from_files(job: JobConfig, command: Sequence[str], console: Console) -> Exit:
-    """Label the levels of `job.level_files`, size after size. Files that cannot be used are told and left out.
+    """Label the levels of `job.level_files`, one size after another; report and leave out unusable files.
 
-    Returns INPUT where one was left out, else what came of the splits.
+    Returns INPUT if a file was left out, else the largest exit code of the splits.
 
     Raises:
-        UserError: no file can be used, or as `generate`.
-        Failure: as `generate`.
+        UserError: no file can be used; or see `generate`.
+        Failure: see `generate`.
     """
     folder = Path(job.level_files).expanduser()
     if job.executor == "inline":
         prepare_jax(device=job.device)
         listing = levels_below(folder, job)
     else:
-        listing = _listed_elsewhere(folder, job)
+        listing = _list_in_subprocess(folder, job)
     for sentence in (*listing.copies, *listing.refused):
         say(console, sentence)
     if not listing.levels:
-        raise UserError(f"None of the level files in {folder} can be used, for the reasons above: mend one of them.")
-    ends = [
+        raise UserError(f"None of the level files in {folder} can be used, for the reasons above: fix one of them.")
+    exits = [
         generate(replace(job, size=size), command, console, origins=origins) for size, origins in listing.levels.items()
     ]
     if listing.refused:
         say(console, f"{len(listing.refused)} of the level files in {folder} were left out, for the reasons above.")
         return Exit.INPUT
-    return max(ends)
+    return max(exits)
 
 
-def _listed_elsewhere(folder: Path, job: JobConfig) -> Listing:
-    """`levels_below`, read by a process of its own: Ray forks this one, which must not have started JAX by then."""
+def _list_in_subprocess(folder: Path, job: JobConfig) -> Listing:
+    """Call `levels_below` in another process: Ray forks this one, which must not have started JAX before."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), prepare_jax, (None, "cpu")) as process:
         return process.submit(levels_below, folder, job).result()

@@ -1,4 +1,4 @@
-"""Whether a worker's program is the driver's: only then are its levels those of any other worker."""
+"""Checking that a worker runs the driver's program: only then do its levels equal those of any other worker."""
 
 import hashlib
 import socket
@@ -11,18 +11,18 @@ from levelproof.pipeline.store.provenance import versions
 from levelproof.pipeline.store.remote import absolute, as_typed
 
 Program = dict[str, str]  # versions by name
-SAME = ("levelproof", "jax", "jaxlib", "sampler")  # of `provenance.versions`
+COMPARED = ("levelproof", "jax", "jaxlib", "sampler")  # names in `provenance.versions`
 FOLDERS = ("physics", "levelgen", "experts", "configs", "pipeline")
 
 
 def program_of(job: JobConfig) -> Program:
-    """What has to be the same where a job's levels are made."""
-    known = {name: str(versions()[name]) for name in SAME}
+    """Return the versions and hashes that must be equal in all processes that make a job's levels."""
+    known = {name: str(versions()[name]) for name in COMPARED}
     return known | {"source": _source(), "configuration": job.hash}
 
 
-def unlike(program: Program, job: JobConfig) -> str:
-    """What differs between this program, of a worker, and the driver's, in a sentence; empty: nothing."""
+def mismatch(program: Program, job: JobConfig) -> str:
+    """Return a sentence on what differs between this worker's program and the driver's (`program`); empty: nothing."""
     here = program_of(job)
     for name, there in program.items():
         if here.get(name) != there:
@@ -33,15 +33,15 @@ def unlike(program: Program, job: JobConfig) -> str:
     return ""
 
 
-def seen_from_elsewhere(job: JobConfig) -> JobConfig:
-    """The job as a worker in another folder has to read it: no path is relative."""
-    known = lambda path: path and as_typed(absolute(Path(path)))
-    return replace(job, out=known(job.out), continue_from=known(job.continue_from))
+def with_absolute_paths(job: JobConfig) -> JobConfig:
+    """Make a job's paths absolute, because workers run in another folder."""
+    resolve = lambda path: path and as_typed(absolute(Path(path)))
+    return replace(job, out=resolve(job.out), continue_from=resolve(job.continue_from))
 
 
 @cache
 def _source() -> str:
-    """A digest of this program's files: two checkouts may have one version."""
+    """Return a digest of this program's source files, because two checkouts may have the same version."""
     digest, root = hashlib.sha256(), Path(__file__).parents[2]
     for path in sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.py")):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())

@@ -1,4 +1,4 @@
-"""Scalars of a run for TensorBoard or Weights & Biases, where `log` asks for them: made of the events that it tells."""
+"""Scalars of a run for TensorBoard or Weights & Biases (the setting `log`), computed from the run's events."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,12 +15,14 @@ from levelproof.pipeline.store.remote import is_remote
 
 LIBRARIES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 FOLDER, PROJECT = "log", "levelproof"
-# Env steps of these kinds took the seconds of these stages
+# Kinds of env steps by the stage whose seconds they took
 STAGES = {"search": ("searched",), "training": ("trained",), "evaluation": ("evaluated",)}
 
 
 class ScalarWriter(Protocol):
-    place: str  # where people find them
+    """A logging library's writer."""
+
+    place: str  # folder or URL where users find the scalars
 
     def write(self, scalars: Mapping[str, float]) -> None: ...
 
@@ -28,7 +30,7 @@ class ScalarWriter(Protocol):
 
 
 def require_library(log: str) -> None:
-    """Raises UserError where the library is missing that `log` needs."""
+    """Raise UserError if the library that `log` needs is missing."""
     try:
         if log in LIBRARIES:
             import_module(LIBRARIES[log])
@@ -38,9 +40,9 @@ def require_library(log: str) -> None:
 
 @contextmanager
 def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[Callable[[Sequence[Event]], None]]:
-    """Takes the events of a run, from `started` to how it is now, and logs scalars of the latest.
+    """Yield a function that takes the events of a run so far and logs scalars of the latest.
 
-    What the library or the disk refuses is said once, and the run goes on without.
+    If the library or the disk fails, the user is told once, and the run continues without a log.
     """
     writer: ScalarWriter | None = None
     done = False
@@ -50,9 +52,9 @@ def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[
         nonlocal writer
         try:
             yield
-        except Exception as error:  # of any kind that libraries may raise
+        except Exception as error:  # libraries raise types of their own
             writer, reason = None, (str(error).strip().splitlines() or [type(error).__name__])[-1].rstrip(".")
-            say(f"Cannot log to {job.log} ({reason}): the run goes on without.")
+            say(f"Cannot log to {job.log} ({reason}): the run continues without a log.")
 
     def take(events: Sequence[Event]) -> None:
         nonlocal done
@@ -62,11 +64,11 @@ def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[
                 writer.write(scalars(events[0], events[-1]))
 
     if job.log != "none":
-        # A store takes no files that grow
+        # Object stores cannot append to files
         folder = Path(FOLDER, *split.parts[-2:]) if is_remote(split) else split / FOLDER
         with harmless():
             if not is_remote(split) and folder.is_symlink():
-                raise UserError(f"{folder} is a link, and the folders of a split must be in it")
+                raise UserError(f"{folder} is a link, but a split's folders must lie inside it")
             opened = (TensorBoardWriter if job.log == "tensorboard" else WandbWriter)(job, folder)
             say(f"Scalars for {job.log}: {opened.place}")
             writer = opened
@@ -79,7 +81,7 @@ def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[
 
 
 def scalars(began: Event, state: Event) -> dict[str, float]:
-    """Numbers to plot, by their names; what is not known yet is not among them."""
+    """Return the numbers to plot by name, without those that are not known yet."""
     done, elapsed = state["done"], state["time"] - began["time"]
     numbers = {
         "levels/committed": done,
@@ -88,21 +90,23 @@ def scalars(began: Event, state: Event) -> dict[str, float]:
         "env_steps/total": state["env_steps"],
         "failures/attempts": state["failures"],
         "failures/units_given_up": state["quarantined"],
-        "workers": sum(of["count"] for of in state["workers"].values()),
+        "workers": sum(host["count"] for host in state["workers"].values()),
     }
     if done:
         numbers["levels/solved_share"] = state["solved"] / done
     if state["rate"]:
         numbers["env_steps/per_second"] = state["rate"]
     for stage, kinds in STAGES.items():
-        if seconds := state["seconds"][stage]:  # of one busy worker
+        if seconds := state["seconds"][stage]:  # summed over workers, so this is the speed of one busy worker
             numbers[f"env_steps/per_second_of_{stage}"] = sum(state["spent"][kind] for kind in kinds) / seconds
     return numbers
 
 
 class TensorBoardWriter:
-    """A file of TensorBoard's events, against levels committed. Without tensorboardX' thread, which a full disk kills
-    and whose queue then holds whoever writes."""
+    """A file of TensorBoard events; the step is the number of levels committed.
+
+    Bypasses tensorboardX's writer thread: a full disk kills that thread, and its full queue then blocks the caller.
+    """
 
     def __init__(self, _: JobConfig, folder: Path) -> None:
         writer, self._summary, self._events = (
@@ -124,7 +128,7 @@ class TensorBoardWriter:
 
 
 class WandbWriter:
-    """A run of Weights & Biases, against levels committed; WANDB_PROJECT, WANDB_MODE and the like are heeded."""
+    """A run of Weights & Biases; the step is the number of levels committed. WANDB_PROJECT, WANDB_MODE etc. apply."""
 
     def __init__(self, job: JobConfig, folder: Path) -> None:
         wandb = import_module("wandb")

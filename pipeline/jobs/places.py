@@ -1,4 +1,4 @@
-"""Where workers have a place: the machines of a cluster, as Ray lists them, and their memory. Knows nothing of Ray."""
+"""Number of workers for each machine of a cluster, by its cores or GPUs and its memory. Knows nothing of Ray."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -8,23 +8,23 @@ from typing import Any
 from levelproof.levelgen.level import SIZES
 from levelproof.physics.types import Size
 
-Machine = Mapping[str, Any]  # as Ray describes it
+Machine = Mapping[str, Any]  # a machine's entry in Ray's list of nodes
 GB = 10**9  # bytes
-# Bytes of a worker by the number of bodies, at most. Compiling takes the most: 1.35 GB were measured for s, 1.64 for l
+# Largest number of bodies, and bytes of a worker. Compiling takes the most: measured 1.35 GB for s and 1.64 for l
 BYTES = ((SIZES["s"].bodies, 1.5 * GB), (SIZES["l"].bodies, 1.8 * GB))
-MAX_BYTES = 2.5 * GB  # of a worker of larger sizes; an estimate
+MAX_BYTES = 2.5 * GB  # of a worker for larger sizes; an estimate
 
 
 def bytes_of_worker(size: Size) -> int:
-    """Memory that a worker for levels of this size needs."""
-    return int(next((each for most, each in BYTES if size.bodies <= most), MAX_BYTES))
+    """Return the memory that a worker for levels of this size needs, in bytes."""
+    return int(next((needed for bodies, needed in BYTES if size.bodies <= bodies), MAX_BYTES))
 
 
-def places(machines: Mapping[str, Machine], kind: str, most: int, memory: int) -> Counter[str]:
-    """Number of workers by machine, `most` in all, spread over as many machines as possible.
+def workers_by_machine(machines: Mapping[str, Machine], kind: str, most: int, memory: int) -> Counter[str]:
+    """Spread at most `most` workers evenly over the machines; return their number by machine.
 
-    Each worker has a core or a GPU (`kind`, Ray's name for it) and `memory` bytes to itself. A machine with too little
-    memory for one worker still gets one.
+    Each worker has its own core or GPU (`kind`, "CPU" or "GPU") and `memory` bytes. A machine with too little memory
+    for one worker still gets one.
     """
     count = {name: min(_units(of, kind), max(1, _fit(of, memory))) for name, of in machines.items()}
     turns = sorted((turn, name) for name, number in count.items() for turn in range(number))  # one on each, then more
@@ -32,19 +32,19 @@ def places(machines: Mapping[str, Machine], kind: str, most: int, memory: int) -
 
 
 def shortage(machine: Machine, kind: str, most: int, memory: int) -> str:
-    """A sentence that says that memory leaves cores or GPUs of a machine without a worker; empty: it does not."""
+    """Return a sentence if too little memory leaves cores or GPUs of a machine without a worker; else an empty one."""
     units, fit = _units(machine, kind), _fit(machine, memory)
     if fit >= min(units, most):
         return ""
     host, free = machine["NodeManagerHostname"], machine["Resources"]["memory"]
     return (
         f"{host} has {free / GB:.1f} GB of memory free, and a worker of this size needs {memory / GB:.1f} GB: "
-        f"it gets {max(1, fit)} of {min(units, most)} workers."
+        f"it runs {max(1, fit)} of {min(units, most)} workers."
     )
 
 
-def share_of_memory(machine: Machine, memory: int) -> int:
-    """Bytes to reserve for a worker: as many as it needs, if the machine has as many."""
+def memory_to_reserve(machine: Machine, memory: int) -> int:
+    """Return the bytes to reserve for a worker: those that it needs, but at most those that the machine has."""
     return int(min(memory, machine["Resources"].get("memory", memory)))
 
 
@@ -53,5 +53,5 @@ def _units(machine: Machine, kind: str) -> int:
 
 
 def _fit(machine: Machine, memory: int) -> int:
-    """Number of workers for which a machine has memory."""
+    """Return the number of workers that fit into a machine's memory."""
     return int(min(machine["Resources"].get("memory", inf) / memory, 2**31))

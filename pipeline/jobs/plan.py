@@ -1,4 +1,4 @@
-"""The job of `levelproof plan`: makes some of a job's levels, as `generate` does, and says what all would take."""
+"""The job of `levelproof plan`: make some of a job's levels, as `generate` does, and estimate the cost of all."""
 
 import io
 import json
@@ -31,68 +31,69 @@ from levelproof.pipeline.store.scratch import scratch
 from levelproof.pipeline.store.shard import stored_bytes, write_shard
 from levelproof.pipeline.words import duration, many
 
-SECONDS = 60.0  # of making levels, about
-MOST = 4096  # levels
-STORED = 256  # witnesses that are written in every density
-UNITS = (3600.0, "hours"), (60.0, "minutes"), (1.0, "seconds")  # s, the first that is short enough
+SECONDS = 60.0  # approximate time to spend on the sample
+MAX_SAMPLE = 4096  # levels
+STORED = 256  # maximum number of witnesses written in every density
+UNITS = (3600.0, "hours"), (60.0, "minutes"), (1.0, "seconds")  # s; the first that gives more than 1.5 is used
 
 
 def plan(job: JobConfig, as_json: bool, console: Console) -> None:
-    """Print what a job would take, and what that rests on.
+    """Print the estimated cost of a job, and the sample behind it.
 
     Raises:
-        UserError: levels that no id makes.
+        UserError: the job is not for random levels.
         Failure: none of the sample's levels could be made.
     """
     if job.level_files:
-        raise UserError("plan is for random levels: of level files, `generate` labels a few, and `inspect` tells more.")
-    sample = measured(job, console)
-    found = forecast(sample, len(job.level_ids), job.workers or sample.workers, job.levels_per_unit, job.unit)
+        raise UserError("plan is for random levels: for level files, `generate` a few and `inspect` their costs.")
+    sample = measure(job, console)
+    cost = forecast(sample, len(job.level_ids), job.workers or sample.workers, job.levels_per_unit, job.unit)
     if as_json:
-        of = {"levels": len(sample.busy), "workers": sample.workers, "wall": sample.wall, "once": sample.once}
-        print(json.dumps(found.as_json() | {"device": sample.device, "sample": of, "likely": LIKELY}, indent=2))
+        basis = {"levels": len(sample.busy), "workers": sample.workers, "wall": sample.wall, "once": sample.once}
+        print(json.dumps(cost.as_json() | {"device": sample.device, "sample": basis, "likely": LIKELY}, indent=2))
     else:
-        print("\n".join(told(job, sample, found)))
+        print("\n".join(report_lines(job, sample, cost)))
 
 
-def told(job: JobConfig, sample: Sample, of: Forecast) -> list[str]:
-    """In lines for people."""
-    scale, unit = next((one for one in UNITS if of.wall.expected > 1.5 * one[0]), UNITS[-1])
+def report_lines(job: JobConfig, sample: Sample, cost: Forecast) -> list[str]:
+    """Return the forecast as lines for people."""
+    scale, unit = next((one for one in UNITS if cost.wall.expected > 1.5 * one[0]), UNITS[-1])
+    per_solved = cost.seconds_per_solved
     lines = {
-        "wall time": f"{of.wall.told(scale)} {unit} with {many(of.workers, 'worker')}",
-        f"{sample.device}-hours": of.hours.told(),
-        "levels a work unit": f"{of.unit:,}, {duration(of.unit_seconds)} of a worker",
-        "solved levels": of.solved.told(tell="{:,.0f}".format),
-        f"{sample.device}-seconds a solved level": of.seconds_per_solved.told() if of.seconds_per_solved else "unknown",
+        "wall time": f"{cost.wall.text(scale)} {unit} with {many(cost.workers, 'worker')}",
+        f"{sample.device}-hours": cost.hours.text(),
+        "levels a work unit": f"{cost.unit:,}, {duration(cost.unit_seconds)} of a worker",
+        "solved levels": cost.solved.text(form="{:,.0f}".format),
+        f"{sample.device}-seconds a solved level": per_solved.text() if per_solved else "unknown",
         **{
-            f"GB, density={name}": f"{of.bytes[name].told(1e9)} in {many(of.files[name], 'file')}, sealed"
-            for name in of.bytes
+            f"GB, density={name}": f"{cost.bytes[name].text(1e9)} in {many(cost.files[name], 'file')}, sealed"
+            for name in cost.bytes
         },
     }
     return [
-        f"{many(of.levels, 'level')} of size {job.size}, {job.budget} env steps each:",
+        f"{many(cost.levels, 'level')} of size {job.size}, {job.budget} env steps each:",
         *(f"  {name + ':':30} {text}" for name, text in lines.items()),
-        f"From {len(sample.busy)} of them, made on {sample.workers} {sample.device}s here in {duration(sample.wall)}; "
-        f"in {LIKELY:.0%} of cases it is within the interval. All workers are taken to be like those here, "
-        f"{duration(sample.once)} to go for starting and for the last levels, and programs to be compiled "
-        f"({duration(sample.compiling)} a worker otherwise).",
+        f"Measured on {len(sample.busy)} of them, made on {sample.workers} {sample.device}s here in "
+        f"{duration(sample.wall)}; {LIKELY:.0%} of outcomes fall within the intervals. This assumes workers as fast as "
+        f"those here, {duration(sample.once)} for starting and for the last levels, and programs already compiled "
+        f"(else {duration(sample.compiling)} more per worker).",
     ]
 
 
-def measured(job: JobConfig, console: Console, seconds: float = SECONDS) -> Sample:
-    """What some of a job's first levels take here: a few that say how many are made in so many seconds, then those."""
+def measure(job: JobConfig, console: Console, seconds: float = SECONDS) -> Sample:
+    """Make some of a job's first levels: a few to learn how many fit into `seconds`, then that many."""
     levels, unit = len(job.level_ids), job.levels_per_unit
     here = 1 if job.executor == "inline" else min(job.workers or len(own_cores()), len(own_cores()))
-    with scratch() as folder, _told(console, seconds):
+    with scratch() as folder, _announced(console, seconds):
         split, begun = split_path(str(folder), job.budget, job.size), time.monotonic()
         some = min(levels, here * unit)
-        first = _made(job, folder, some, here)
-        here = _workers_of(split)  # fewer where memory or GPUs do not suffice for one a core
+        first = _make(job, folder, some, here)
+        here = _workers_of(split)  # fewer if memory or GPUs do not suffice for one per core
         _, busy, _ = costs_of(split)
         more = int(seconds * here / max(busy.mean(), 1e-6)) // unit * unit
-        count, wall = min(levels, MOST, max(some, more)), first
+        count, wall = min(levels, MAX_SAMPLE, max(some, more)), first
         if count > some:
-            wall = _made(job, folder, count, here)
+            wall = _make(job, folder, count, here)
         table, busy, compiling = costs_of(split)
         new = busy[some:] if count > some else busy
         labels = np.array(table.column("label").to_pylist())
@@ -111,8 +112,8 @@ def measured(job: JobConfig, console: Console, seconds: float = SECONDS) -> Samp
         )
 
 
-def _made(job: JobConfig, folder: Path, count: int, workers: int) -> float:
-    """Seconds in which `generate` makes those of a job's first levels that are not there."""
+def _make(job: JobConfig, folder: Path, count: int, workers: int) -> float:
+    """Generate what is missing of a job's first `count` levels; return the seconds that it took."""
     here, quiet = replace(job, out=str(folder), workers=workers, log="none"), Console(quiet=True)
     begun = time.monotonic()
     with redirect_stdout(io.StringIO()):
@@ -121,45 +122,52 @@ def _made(job: JobConfig, folder: Path, count: int, workers: int) -> float:
 
 
 def _workers_of(split: Path) -> int:
-    """How many the latest run had."""
+    """Return the number of workers of the latest run."""
     (*_, last) = events_of(runs_in(split)[-1])
-    return max(1, sum(of["count"] for of in last["workers"].values()))
+    return max(1, sum(host["count"] for host in last["workers"].values()))
 
 
 def costs_of(split: Path) -> tuple[pa.Table, np.ndarray, np.ndarray]:
-    """The sample's rows, what each level took of a worker, and what was compiled meanwhile."""
+    """Return the sample's rows, and for each the seconds of a worker without and for compiling.
+
+    Raises:
+        Failure: there are no rows.
+    """
     table = read_manifest(split).table
     if not table.num_rows:
-        raise Failure("None of the levels could be made here: `levelproof generate` with the same words says why.")
+        raise Failure(
+            "None of the levels could be made here: run `levelproof generate` with these settings to see why."
+        )
     column = table.column("seconds")
-    of = Seconds(*(pc.struct_field(column, stage).to_numpy().astype(float) for stage in Seconds._fields))  # pyright: ignore[reportAttributeAccessIssue]
-    return table, np.asarray(of.working), np.asarray(of.compiling)
+    cost = Seconds(*(pc.struct_field(column, stage).to_numpy().astype(float) for stage in Seconds._fields))  # pyright: ignore[reportAttributeAccessIssue]
+    return table, np.asarray(cost.working), np.asarray(cost.compiling)
 
 
 def _row_bytes(table: pa.Table) -> float:
+    """Return the mean compressed size of a manifest row, in bytes."""
     whole = pa.BufferOutputStream()
     pq.write_table(table, whole, compression="zstd")
     return whole.getvalue().size / table.num_rows
 
 
 def _stored(job: JobConfig, split: Path, table: pa.Table, folder: Path) -> dict[str, PerWitness]:
-    """What witnesses take in each density; nothing where there are none."""
+    """Return the stored size of a witness by density; empty if the sample has none."""
     rows = table.filter(table.column("shard").is_valid())[:STORED]
     if not rows.num_rows:
         return {}
     arrays, ids = read_rows(split, rows), rows.column("level_id").to_pylist()
-    found = {}
+    sizes = {}
     for density in ("full",) if job.task.frame_skip > MAX_FRAME_SKIP else ("full", "resume", "witness"):
         path = folder / f"{density}.zarr"
         write_shard(path, ids, arrays, Encoding(density, job.key_every, job.task))
-        found[density] = PerWitness(stored_bytes(path) / len(ids), sum(entry.is_dir() for entry in path.iterdir()))
-    return found
+        sizes[density] = PerWitness(stored_bytes(path) / len(ids), sum(entry.is_dir() for entry in path.iterdir()))
+    return sizes
 
 
 @contextmanager
-def _told(console: Console, seconds: float) -> Iterator[None]:
-    """Say that it takes a while."""
-    text = f"making some of the levels here, for about {duration(seconds)} and what it takes to compile ..."
+def _announced(console: Console, seconds: float) -> Iterator[None]:
+    """Tell the user that the `with` block takes a while."""
+    text = f"making some of the levels here, which takes about {duration(seconds)} and the time to compile ..."
     if not console.is_terminal:
         say(console, text.capitalize())
         yield

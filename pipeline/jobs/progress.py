@@ -1,4 +1,4 @@
-"""What people see while a job runs: a bar on a terminal, plain lines elsewhere. On stderr. Knows nothing of workers."""
+"""Progress of a job, on stderr: a bar on a terminal, plain lines elsewhere. Knows nothing of workers."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -13,34 +13,34 @@ from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
 from levelproof.pipeline.words import duration
 
 LINE_EVERY = 30.0  # s between plain lines
-LINE_AFTER = 2.0  # s between one and the next commit that is told; the last commit always is
-STOPPING = "Stopping: what is decided is committed first; Ctrl-C ends it at once."
-PACE_OVER = 60.0  # s over which env steps/s and the time left are estimated
+LINE_AFTER = 2.0  # s between plain lines that report commits; the last commit is always reported
+STOPPING = "Stopping once decided levels are committed; press Ctrl-C to quit now."
+PACE_OVER = 60.0  # s over which env steps/s and the remaining time are averaged
 
 
 @dataclass
 class Tally:
-    """How far a job is."""
+    """Counts of a job's progress."""
 
     levels: int  # wanted
-    done: int  # committed, those of earlier runs included
+    done: int  # committed, including those of earlier runs
     solved: int
     running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
     spent: EnvSteps = field(default_factory=EnvSteps)  # on this run's committed units
-    seconds: Seconds = NO_SECONDS  # of workers, on the same
+    seconds: Seconds = NO_SECONDS  # of workers, on the same units
 
     def follow(self, round: Round) -> None:
-        """A worker reports. Units that ended are told to `ended`, too."""
+        """Account for a worker's round. The caller passes units that ended to `ended` itself."""
         self.forget(cut.unit for cut in round.cuts)
         self.running.update(round.totals)
 
     def forget(self, units: Iterable[WorkUnit]) -> None:
-        """Units are no longer under way."""
+        """Discard the progress of units that no longer run."""
         for unit in units:
             self.running.pop(unit, None)
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
-        """A unit was committed, or an attempt at it failed (`None`)."""
+        """Account for a unit that was committed, or whose attempt failed (`summary` is None)."""
         self.running.pop(unit, None)
         if summary:
             self.done += summary.levels
@@ -50,12 +50,12 @@ class Tally:
 
     @property
     def steps(self) -> int:
-        """Env steps of this run, as a bar counts them."""
+        """Env steps of this run, committed or not."""
         return self.spent.shown + sum(steps for steps, _, _ in self.running.values())
 
     @property
     def share(self) -> float:
-        """Of the whole job, 0 to 1; levels under way count by the part of their budget that they have had."""
+        """Finished share of the job, 0 to 1; a running level counts by the share of its budget that it has used."""
         return min(1.0, (self.done + sum(levels for _, levels, _ in self.running.values())) / self.levels)
 
     @property
@@ -68,7 +68,7 @@ class Tally:
         return self.solved + sum(solved for _, _, solved in self.running.values())
 
     def text(self, rate: float, left: float | None) -> str:
-        """In words, at `rate` env steps/s and with `left` s to go; None: unknown yet."""
+        """Describe the progress, at `rate` env steps/s and with `left` s to go (None: not known yet)."""
         pace = f"{rate:,.0f} env steps/s"
         if self.trained == self.levels:
             tail = "done" if self.done == self.levels else "writing"
@@ -80,7 +80,7 @@ class Tally:
 
 
 def say(console: Console, text: str) -> None:
-    """A line that stays, as it is."""
+    """Print a permanent line verbatim."""
     console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -92,17 +92,17 @@ class Board:
         columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
         self._bar = Progress(*columns, console=console)
         self._task = self._bar.add_task("starting", total=1)
-        # Estimates only. They begin with the first env steps and levels of this run: compiling is no pace
+        # For estimates only; they begin with the first env steps of this run, so compiling does not count
         self._pace = Progress(get_time=clock, speed_estimate_period=PACE_OVER, disable=True)
         self._steps = self._pace.add_task("env steps", total=None)
         self._levels = self._pace.add_task("levels", total=tally.levels, completed=tally.done)
-        self.watchers: list[Callable[[float, float | None], None]] = []  # told env steps/s and s to go, at every look
+        self.watchers: list[Callable[[float, float | None], None]] = []  # get env steps/s and s to go, at each refresh
 
     def shown(self) -> AbstractContextManager[object]:
         return self._bar if self._console.is_terminal else nullcontext()
 
     def refresh(self, every: float = LINE_EVERY) -> None:
-        """Bring the bar up to date, or say a line, if none was said in the last `every` seconds."""
+        """Update the bar, or print a line unless one was printed in the last `every` seconds."""
         steps, levels = self._pace.tasks
         if self.tally.steps != steps.completed:
             self._pace.update(self._steps, completed=self.tally.steps)
@@ -117,10 +117,11 @@ class Board:
             self.say(text)
 
     def say(self, text: str) -> None:
-        """A line that stays."""
+        """Print a permanent line."""
         say(self._console, text)
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
+        """Pass an attempt to the tally, and show the new numbers if it committed levels."""
         self.tally.ended(unit, summary)
         if summary:
             self.refresh(0.0 if self.tally.done == self.tally.levels else LINE_AFTER)

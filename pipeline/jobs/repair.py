@@ -1,4 +1,4 @@
-"""`levelproof verify SPLIT --repair`: what is damaged or missing is taken out, and made again as it was made before."""
+"""`levelproof verify SPLIT --repair`: delete what is damaged, and regenerate it and what is missing bit for bit."""
 
 import multiprocessing
 import shlex
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from levelproof.configs.compose import compose_job, words_for
+from levelproof.configs.compose import changed_settings, compose_job
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count
 from levelproof.configs.schema import FROM_RECORDS, JobConfig, from_files, hash_of
@@ -26,31 +26,37 @@ from levelproof.pipeline.store.runs import merged, runs, told_levels
 from levelproof.pipeline.store.split import locked, taken
 from levelproof.pipeline.verify.findings import Findings
 
-SETTINGS = ("executor", "workers", "unit", "device")  # of `generate`, that a repair may have
+SETTINGS = ("executor", "workers", "unit", "device")  # settings of `generate` that a repair accepts
 
 
 @stoppable()
 def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
-    """Verify a split, and make again what is wrong with it. Killed at any moment, it goes on where it was.
+    """Verify a split, and regenerate its damaged and missing levels; after a kill, the same command continues.
 
-    `settings` are those of SETTINGS that are not to have their defaults. Levels that cannot be made again here stay
-    as they are and are told.
+    Levels that cannot be regenerated here are reported and stay as they are.
 
-    Returns FAILED where some are left, else what came of making the others.
+    Returns FAILED if there are such levels, else the exit code of generating the others.
+
+    Args:
+        split: folder of the split.
+        settings: `NAME=VALUE` for names in SETTINGS; the others keep their defaults.
+        console: receives progress and messages.
 
     Raises:
-        UserError: no split, a setting that is none of these, it was imported, or somebody is writing to it.
-        Failure: it was made with other settings than this program knows, or the disk refuses.
+        UserError: there is no split, it was imported, another command writes to it, or a setting is not in SETTINGS.
+        Failure: it was made with settings that this program does not accept, or a write failed.
     """
-    if wrong := [word for word in settings if word.partition("=")[0] not in SETTINGS]:
-        raise UserError(f"A repair has the settings of its split, not {wrong[0]}: it takes {', '.join(SETTINGS)} only.")
-    findings = _examined(split, inline="executor=inline" in settings)
+    if wrong := [setting for setting in settings if setting.partition("=")[0] not in SETTINGS]:
+        raise UserError(
+            f"A repair uses the settings of its split: leave out {wrong[0]}; {', '.join(SETTINGS)} may change."
+        )
+    findings = _examine_split(split, inline="executor=inline" in settings)
     print(findings.report(split))
     if not findings.wrong:
         return Exit.DONE
-    _require_made(split, findings)
+    _require_generated(split, findings)
     job = _job(split, findings, settings)
-    left = _left(findings)
+    left = _not_regenerated(findings)
     lost = findings.lost - findings.unrepairable.keys()
     if files := from_files(job.results):
         ids = lost & findings.origins.keys()
@@ -60,23 +66,23 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
         _note(split, job, findings)
         take_out(split, lost, findings.changed, list(findings.fragments))
     with taken(split, partial(say, console)):
-        pass  # what nothing names any more goes
+        pass  # taking it deletes the data that no fragment names any more
     origins = {i: findings.origins[i] for i in sorted(ids)} if files else None
-    end = generate(job, _command(split), console, sorted(ids), origins, split) if ids else Exit.DONE
+    code = generate(job, _command(split), console, sorted(ids), origins, split) if ids else Exit.DONE
     for sentence in left:
         print(sentence)
-    return Exit.FAILED if left else end
+    return Exit.FAILED if left else code
 
 
-def _examined(split: Path, inline: bool) -> Findings:
-    """`examine`, by a process of its own where Ray is to fork this one, which must not have started JAX by then."""
+def _examine_split(split: Path, inline: bool) -> Findings:
+    """Examine the split; if Ray will fork this process, which must not have started JAX before, in another process."""
     if inline:
         return _examine(split)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        found = process.submit(_examine, split)
+        findings = process.submit(_examine, split)
         try:
-            return found.result()
-        except KeyboardInterrupt:  # SIGTERM reaches this process alone
+            return findings.result()
+        except KeyboardInterrupt:  # SIGTERM reaches only this process
             for child in multiprocessing.active_children():
                 child.terminate()
             raise
@@ -88,38 +94,44 @@ def _examine(split: Path) -> Findings:
     return examine(split, Console(stderr=True))
 
 
-def _require_made(split: Path, findings: Findings) -> None:
-    """Refuse a split of which this program has made nothing: whose actions are lost, nobody here can make again."""
+def _require_generated(split: Path, findings: Findings) -> None:
+    """Raise UserError for an imported split, because this program cannot regenerate lost actions."""
     if (findings.config or {}).get("distribution") == FROM_RECORDS:
         raise UserError(
-            f"The split {split} was imported, so nothing here makes its levels again: delete it, and import the folder "
-            f"that they come from with `levelproof import FOLDER -o {split}`."
+            f"The split {split} was imported, so its levels cannot be regenerated: delete it, and import its folder of "
+            f"trajectories again with `levelproof import FOLDER -o {split}`."
         )
 
 
 def _job(split: Path, findings: Findings, settings: Sequence[str]) -> JobConfig:
-    """The job that makes the split's levels as they were made."""
+    """Return the job that made the split.
+
+    Raises:
+        Failure: its settings are lost, or this program does not accept them.
+    """
     config = findings.config
     if config is None:
         raise Failure(
-            f"No file of {split} says any more with which settings it was made: "
-            "delete it, and run the `levelproof generate` that made it again."
+            f"The settings of {split} are lost, because no readable file has them: "
+            "delete the split, and repeat the `levelproof generate` that made it."
         )
     keep = [f"keep_experts={any(path.parent.name == EXPERTS for path in data_paths(split))}".lower()]
     files = [f"level_files={split}"] if from_files(config) else []
     budget = f"budget={findings.budget or _budget(split, config['budget'])}"
     try:
-        job = compose_job([*words_for(config), budget, *keep, *files, *findings.stored.split(), *settings])
+        job = compose_job([*changed_settings(config), budget, *keep, *files, *findings.stored.split(), *settings])
         job = replace(job, size=config["size"])
     except (ConfigError, ValueError, KeyError, TypeError) as error:
-        raise Failure(f"The settings of {split} are none of this levelproof ({error}): use the one of then.") from None
+        raise Failure(
+            f"This levelproof does not accept the settings of {split} ({error}): use the version that made it."
+        ) from None
     if job.hash != hash_of(config):
-        raise Failure(f"This levelproof would make {split} with other settings: repair it with the one that made it.")
+        raise Failure(f"This levelproof would make {split} with other settings: use the version that made it.")
     return job
 
 
 def _budget(split: Path, env_steps: int) -> str:
-    """As it was typed: the name of the folder, if it is where it was made."""
+    """Return the budget as typed, which is the folder's name, unless the split was moved."""
     name = split.absolute().parent.name
     try:
         return name if parse_count(name, "budget") == env_steps else str(env_steps)
@@ -127,20 +139,20 @@ def _budget(split: Path, env_steps: int) -> str:
         return str(env_steps)
 
 
-def _left(findings: Findings) -> list[str]:
-    """What cannot be made again here."""
-    left = []
+def _not_regenerated(findings: Findings) -> list[str]:
+    """Return sentences on the levels that cannot be regenerated here."""
+    sentences = []
     for reason in dict.fromkeys(findings.unrepairable.values()):
-        ids = [level_id for level_id, of in findings.unrepairable.items() if of == reason]
-        left.append(f"Not made again: {told_levels(runs(ids))}, for {reason}.")
+        ids = [level_id for level_id, why in findings.unrepairable.items() if why == reason]
+        sentences.append(f"Not regenerated: {told_levels(runs(ids))}, for {reason}.")
     ids = [i for i in findings.lost if from_files(findings.config or {}) and i not in findings.origins]
-    if gone := (findings.missing if from_files(findings.config or {}) else []) + runs(ids):
-        left.append(f"Not made again: {told_levels(gone)}, whose level files no row names.")
-    return left
+    if nameless := (findings.missing if from_files(findings.config or {}) else []) + runs(ids):
+        sentences.append(f"Not regenerated: {told_levels(nameless)}, whose level files no row names.")
+    return sentences
 
 
 def _note(split: Path, job: JobConfig, findings: Findings) -> None:
-    """Have what is lost wanted beside what was, before anything goes: whoever goes on makes it."""
+    """Add the lost levels to those that the split wants, before any data is deleted: a later run then makes them."""
     note = sound_note(split)
     wanted = note.level_ids.tolist() if note else findings.present
     note_job(split, job, _command(split), merged(wanted, runs(sorted(findings.lost))))

@@ -1,6 +1,6 @@
-"""What is left to do: work units, their attempts and their quarantine; and who gets which, in `Scheduler`.
+"""Work units, their attempts and quarantine, and `Scheduler`, which decides which worker gets which unit.
 
-Knows nothing of files, of Ray, or of the time.
+Knows nothing of files, Ray, or the time.
 """
 
 from collections import deque
@@ -18,38 +18,39 @@ from levelproof.pipeline.store.layout import unit_name
 from levelproof.pipeline.store.origins import Origin
 from levelproof.pipeline.store.runs import ascending, runs, told_levels, without
 
-# How many units a worker may have at once, those included that failed as often: a unit that kills its worker takes
-# fewer with it each time, and none that has not failed. One more failure, and a unit is quarantined.
-COMPANY = (64, 8, 1)
-ROUND = 1.0  # s that a worker trains between reports; a step that is compiled takes longer
-REPORTS = 100.0  # a second that the driver takes: of more workers each reports less often
-STRETCH = 2**13  # levels that are planned together, of which units are cut once their size is known
-PARTS = 8  # of a unit, below which it is not cut where there are too few for all workers
-TIMED_PARTS = 4  # the same where times decide its size: every worker comes for parts, so each is to take 10 s
-JAX_NOTE = "\n--------------------\n"  # begins what JAX adds to an error about tracebacks
-LEAST_SHARE = 2  # levels that a worker has not begun, below which it is not asked to share them
+# Maximum number of units that a worker has at once, by the failed attempts at each. Units with different numbers of
+# failures never share a worker. So a unit that kills its worker takes fewer others with it each time, and none that
+# has not failed. After len(MAX_UNITS) failures a unit is quarantined.
+MAX_UNITS = (64, 8, 1)
+ROUND = 1.0  # s that a worker trains between reports; a step that compiles takes longer
+REPORTS = 100.0  # reports per second that the driver can take; with more workers, each reports less often
+STRETCH = 2**13  # levels planned together if units are timed; units are cut from them once their size is known
+PARTS = 8  # a unit is not cut below 1/PARTS of its size, even if there are too few for all workers
+TIMED_PARTS = 4  # the same for timed units: each part should take 10 s, because workers ask for every one
+JAX_NOTE = "\n--------------------\n"  # precedes the note on tracebacks that JAX adds to an error
+MIN_SHARE = 2  # unstarted levels of a worker below which it is not asked to share them
 
 
 @dataclass(frozen=True)
 class WorkUnit:
-    """Levels done together and committed together: ids of one multiple of the job's `unit`, or as many from files."""
+    """Levels made and committed together: ids within one multiple of the job's `unit`, or as many level files."""
 
     level_ids: tuple[int, ...] | range  # ascending
-    origins: tuple[Origin, ...] = field(default=(), compare=False, repr=False)  # of each; empty: ids make them
+    origins: tuple[Origin, ...] = field(default=(), compare=False, repr=False)  # by level; empty: sampled levels
 
     @property
     def name(self) -> str:
         return unit_name(self.level_ids[0], self.level_ids[-1])
 
     def only(self, level_ids: Collection[int]) -> "WorkUnit | None":
-        """Its levels that are among these; None: there are none."""
+        """Return the part of this unit with these levels; None if it has none of them."""
         at = [i for i, level_id in enumerate(self.level_ids) if level_id in level_ids]
         ids, origins = tuple(self.level_ids[i] for i in at), tuple(self.origins[i] for i in at if self.origins)
         return WorkUnit(ids, origins) if ids else None
 
     def split(self, count: int) -> "tuple[WorkUnit, WorkUnit | None]":
-        """Its first `count` levels, and the others, if there are any. Of a range both are ranges."""
-        first, rest = (WorkUnit(self.level_ids[of], self.origins[of]) for of in (slice(count), slice(count, None)))
+        """Return the first `count` levels and the rest, or None if there is none. A range is split into ranges."""
+        first, rest = (WorkUnit(self.level_ids[cut], self.origins[cut]) for cut in (slice(count), slice(count, None)))
         return first, rest if rest.level_ids else None
 
 
@@ -59,34 +60,34 @@ def plan_units(
     unit: int,
     origins: Mapping[int, Origin] | None = None,
 ) -> Iterator[WorkUnit]:
-    """Units that cover what is wanted and not done, ascending; made as they are asked for.
+    """Yield units, ascending, that cover the level ids that are wanted and not done.
 
-    A unit never crosses an absolute multiple of `unit`, so jobs that start elsewhere cut at the same ids. Ids of levels
-    with origins lie far apart: of those a unit has as many as it may.
+    A unit never crosses an absolute multiple of `unit`, so jobs with other first levels cut at the same ids. Levels
+    with origins have ids far apart, so their units simply take `unit` levels each.
     """
-    there = ascending(np.fromiter(done, np.int64, len(done)))
+    committed = ascending(np.fromiter(done, np.int64, len(done)))
     if origins is None:
-        return _by_multiple(without(runs(wanted), there), unit)
-    left = np.setdiff1d(np.asarray(wanted, np.int64), there)
+        return _by_multiple(without(runs(wanted), committed), unit)
+    left = np.setdiff1d(np.asarray(wanted, np.int64), committed)
     parts = (left[i : i + unit].tolist() for i in range(0, len(left), unit))
     return (WorkUnit(tuple(part), tuple(origins[i] for i in part)) for part in parts)
 
 
 def _by_multiple(runs: Iterable[tuple[int, int]], unit: int) -> Iterator[WorkUnit]:
-    """Units of these runs of ids. Ids that follow one another are a range, however many they are."""
+    """Yield units of these runs of ids. A unit of consecutive ids stores a range, so its memory is constant."""
     pieces = (
         range(max(first, number * unit), min(last, number * unit + unit - 1) + 1)
         for first, last in runs
         for number in range(first // unit, last // unit + 1)
     )
-    for _, of in groupby(pieces, lambda piece: piece[0] // unit):
-        some = list(of)
-        yield WorkUnit(tuple(chain(*some)) if some[1:] else some[0])
+    for _, group in groupby(pieces, lambda piece: piece[0] // unit):
+        ranges = list(group)
+        yield WorkUnit(tuple(chain(*ranges)) if ranges[1:] else ranges[0])
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What travels back from a committed unit."""
+    """A committed unit's totals, as the driver gets them."""
 
     levels: int
     solved: int
@@ -100,105 +101,109 @@ class UnitOutcome:
 
     unit: WorkUnit
     summary: Summary | None = None  # None: it failed
-    reason: str = ""  # of the failure, for the quarantine file
-    fatal: str = ""  # a sentence, where no further attempt can succeed
+    reason: str = ""  # traceback of the failure, for the quarantine file
+    fatal: str = ""  # a sentence that stops the run, if no further attempt can succeed
 
     @property
     def cause(self) -> str:
-        """The last line of the reason that is about the failure; JAX adds some about itself."""
+        """The last line of the reason, without the note that JAX adds."""
         lines = self.reason.split(JAX_NOTE)[0].strip().splitlines()
         return lines[-1] if lines else self.fatal
 
 
-Settle = Callable[[Sequence[UnitOutcome]], None]  # takes note of attempts that ended together
+Settle = Callable[[Sequence[UnitOutcome]], None]  # accounts for attempts that ended together
 
 
 class Cut(NamedTuple):
-    """A unit of which a worker has given levels back."""
+    """A unit from which a worker has given levels back."""
 
-    unit: WorkUnit  # as it was
-    kept: WorkUnit | None  # what the worker goes on with
-    back: WorkUnit | None  # what is to be done by others
+    unit: WorkUnit  # before the cut
+    kept: WorkUnit | None  # continues on the worker
+    back: WorkUnit | None  # returns to the scheduler
 
 
 @dataclass(frozen=True)
 class Round:
-    """What a worker reports of some time at work."""
+    """A worker's report on one round."""
 
     outcomes: list[UnitOutcome]  # of the units that ended
-    totals: dict[WorkUnit, tuple[int, float, int]]  # of the others: env steps, levels, solved levels so far
-    wants: int  # levels more for which it has room
-    spare: int = 0  # levels that it has not begun
-    cuts: list[Cut] = field(default_factory=list)  # what it has given back
-    leaves: bool = False  # it goes, with all that it could keep committed
+    totals: dict[WorkUnit, tuple[int, float, int]]  # of running units: env steps, levels, solved levels so far
+    wants: int  # further levels for which it has room
+    spare: int = 0  # unstarted levels
+    cuts: list[Cut] = field(default_factory=list)  # units from which it has given levels back
+    leaves: bool = False  # the worker ends now; it has committed what it could
 
 
 @dataclass(frozen=True)
 class Order:
-    """What a worker is told."""
+    """The driver's instructions for a worker's next round."""
 
-    units: list[WorkUnit]  # to begin with
-    give: int = 0  # levels to give back, of those that it has not begun
+    units: list[WorkUnit]  # to begin
+    give: int = 0  # unstarted levels to give back
 
 
 @dataclass
 class Assignment:
-    """What one worker has."""
+    """The units of one worker, and what it last reported."""
 
     units: dict[WorkUnit, None] = field(default_factory=dict)  # in the order in which it got them
-    wants: int = 1  # levels more for which it has room
-    spare: int = 0  # levels that it has not begun, as it last said
+    wants: int = 1  # further levels for which it has room
+    spare: int = 0  # unstarted levels
     asked: int = 0  # levels to give back
-    heard: float = 0.0  # s, when it was last told something, or reported
-    slowness: float | None = None  # how many times as long as on others its levels take; None: it has ended no unit
+    heard: float = 0.0  # s, time of the last order or report
+    slowness: float | None = None  # its time per level divided by other workers'; None: it has ended no unit
 
 
 class Scheduler:
-    """Which worker gets which units. It is told who joins, what each reports, who is lost, and the time.
+    """Decides which worker gets which units. The executor reports joins, rounds and losses, and passes the time.
 
-    A worker has units while it has room for their levels, so what waits on the driver is not what waits on workers.
-    Towards the end units are cut to a worker's share of what is left, and who has nothing gets what others have not
-    begun. A level's result does not depend on its unit, so neither changes any.
+    A worker gets units while it has room for their levels; all others wait here. Towards the end, units are cut to a
+    worker's share of what is left, and idle workers get levels that others have not begun. A level's result does not
+    depend on its unit, so this changes no result.
 
-    Where it is to find the size of units, it cuts them from stretches of levels, by what the latest ones have taken.
+    If units are timed, they are cut from stretches of levels, by the time that the latest units took.
 
-    Its memory and time depend on how many workers there are and how many units have failed, not on how many wait.
+    Memory and time grow with the numbers of workers and of failed units, not with the number of waiting units.
     """
 
     def __init__(self, units: Iterable[WorkUnit], levels: int, unit: int = 1, timed: bool = False) -> None:
-        """Of units, ascending, that have so many levels together; whole ones have `unit`.
+        """Schedule units.
 
-        If `timed`, they are stretches, and `unit` is the size of a unit while nobody knows what a level takes.
+        Args:
+            units: ascending.
+            levels: number of levels in all units.
+            unit: number of levels in a whole unit; if `timed`, of a unit before the first one has ended.
+            timed: `units` are stretches, from which units are cut by the time that levels take.
         """
         self._fresh = iter(units)
         self._next = next(self._fresh, None)
-        self._again: list[deque[WorkUnit]] = [deque() for _ in COMPANY]  # by failed attempts; first: parts of units
+        self._returned: list[deque[WorkUnit]] = [deque() for _ in MAX_UNITS]  # by failed attempts; at 0: parts of units
         self.waiting, self._unit = levels, unit  # levels
-        self._size = UnitSize(levels, unit) if timed else None  # None: units have the size that they came with
-        self.attempts: dict[WorkUnit, int] = {}  # that failed
+        self._size = UnitSize(levels, unit) if timed else None  # None: units keep their size
+        self.attempts: dict[WorkUnit, int] = {}  # failed attempts
         self.quarantined: list[WorkUnit] = []
-        self.workers: dict[Any, Assignment] = {}  # by whatever tells them apart
+        self.workers: dict[Any, Assignment] = {}  # by the executor's handles
         self._idle: set[Any] = set()  # workers without units
 
     @property
     def over(self) -> bool:
-        """Whether nobody has or will get anything."""
+        """Whether no unit is running or waiting."""
         return not self.waiting and len(self._idle) == len(self.workers)
 
     @property
     def first(self) -> int | None:
-        """The lowest level id of the units that are yet to end for the first time; None: there is none."""
-        under_way = (unit for of in self.workers.values() for unit in of.units if unit not in self.attempts)
-        units = chain(under_way, self._again[0], [self._next] if self._next else [])
+        """The lowest level id of the units whose first attempt has not ended; None: there is none."""
+        running = (unit for mine in self.workers.values() for unit in mine.units if unit not in self.attempts)
+        units = chain(running, self._returned[0], [self._next] if self._next else [])
         return min((unit.level_ids[0] for unit in units), default=None)
 
     def join(self, worker: Any, now: float) -> None:
-        """A worker is there, and has nothing."""
+        """Add a worker, which has no units yet."""
         self.workers[worker] = Assignment(heard=now)
         self._idle.add(worker)
 
     def order(self, worker: Any, now: float) -> Order:
-        """What to tell a worker that has nothing more to report."""
+        """Assign units to a worker that has reported; return its order."""
         mine, new = self.workers[worker], []
         mine.heard = now
         while unit := self._take(mine):
@@ -209,7 +214,7 @@ class Scheduler:
         return Order(new, mine.asked)
 
     def report(self, worker: Any, round: Round, now: float) -> None:
-        """What a worker has done of what it has. Its failures are told to `failed` by whom they concern, too."""
+        """Account for a worker's round. The executor passes failed outcomes to `failed` itself."""
         mine = self.workers[worker]
         for unit, kept, back in round.cuts:
             del mine.units[unit]
@@ -219,32 +224,32 @@ class Scheduler:
         for outcome in round.outcomes:
             del mine.units[outcome.unit]
             if self._size and outcome.summary:
-                of = outcome.summary
-                mine.slowness = self._size.note(of.levels, of.seconds.working, mine.slowness)
+                summary = outcome.summary
+                mine.slowness = self._size.note(summary.levels, summary.seconds.working, mine.slowness)
         mine.wants, mine.spare, mine.asked, mine.heard = round.wants, round.spare, 0, now
         if not mine.units:
             self._idle.add(worker)
 
     def leave(self, worker: Any) -> None:
-        """A worker goes that could say so; others do what it still has."""
+        """Remove a worker that left in order; its units wait again."""
         for unit in self._remove(worker):
             self._put_back(unit)
 
     def lost(self, worker: Any, reason: str) -> list[UnitOutcome]:
-        """A worker died, and its units failed."""
+        """Remove a worker that died; return its units as failed outcomes."""
         return [UnitOutcome(unit, reason=reason) for unit in self._remove(worker)]
 
     def failed(self, unit: WorkUnit) -> bool:
-        """Note a failed attempt; the unit waits again, or True when it is now quarantined.
+        """Count a failed attempt; return whether the unit is now quarantined, else it waits again.
 
-        It waits whole, so that an attempt finds what an earlier one has committed. But the last attempt is at parts no
-        larger than untimed units: one level that always fails takes few others into quarantine.
+        It stays whole, so that an attempt finds what an earlier one has committed. Only the last attempt is made at
+        parts no larger than untimed units, so that a level that always fails takes few others into quarantine.
         """
         self.attempts[unit] = attempts = self.attempts.get(unit, 0) + 1
-        if attempts == len(COMPANY):
+        if attempts == len(MAX_UNITS):
             self.quarantined.append(unit)
             return True
-        rest, last = unit, attempts == len(COMPANY) - 1
+        rest, last = unit, attempts == len(MAX_UNITS) - 1
         while rest:
             part, rest = rest.split(self._unit) if self._size and last else (rest, None)
             self.attempts[part] = attempts
@@ -252,39 +257,42 @@ class Scheduler:
         return False
 
     def share(self) -> None:
-        """Have workers asked to give levels back, half of what each has not begun, where others have nothing."""
+        """If workers are idle, ask others to return half of their unstarted levels."""
         if self.waiting or not self._idle:
             return
-        untried = lambda of: self.attempts.keys().isdisjoint(of.units)
+        never_failed = lambda other: self.attempts.keys().isdisjoint(other.units)
         part = self._size.now(len(self.workers), 1.0) // TIMED_PARTS if self._size else 1
-        least = lambda of: max(LEAST_SHARE, 2 * part / (of.slowness or 1.0))
-        can = (of for of in self.workers.values() if of.spare >= least(of) and untried(of))
-        for of in nlargest(len(self._idle), can, key=lambda of: of.spare):
-            of.asked = -(-of.spare // 2)
+        minimum = lambda other: max(MIN_SHARE, 2 * part / (other.slowness or 1.0))
+        able = (other for other in self.workers.values() if other.spare >= minimum(other) and never_failed(other))
+        for other in nlargest(len(self._idle), able, key=lambda other: other.spare):
+            other.asked = -(-other.spare // 2)
 
     def silent(self, since: float) -> list[Any]:
-        """Workers that have units and have not been heard of since then."""
-        return [worker for worker, of in self.workers.items() if of.units and of.heard < since]
+        """Return the workers that have units but have neither reported nor got an order since then."""
+        return [worker for worker, mine in self.workers.items() if mine.units and mine.heard < since]
 
     def _take(self, mine: Assignment) -> WorkUnit | None:
-        """The next unit for a worker; None when it wants none, others have none, or none may join what it has."""
+        """Return the next unit for a worker.
+
+        None if it wants none, if it has some while others are idle, or if no waiting unit may join those that it has.
+        """
         if mine.units and (mine.wants <= 0 or self._idle):
             return None
-        failures = {self.attempts.get(unit, 0) for unit in mine.units}  # one number at most
-        if failures and len(mine.units) >= COMPANY[max(failures)]:
+        failures = {self.attempts.get(unit, 0) for unit in mine.units}  # at most one number
+        if failures and len(mine.units) >= MAX_UNITS[max(failures)]:
             return None
-        for attempts in failures or range(len(COMPANY)):
-            if self._again[attempts]:
-                return self._part(self._again[attempts].popleft(), mine.slowness)
+        for attempts in failures or range(len(MAX_UNITS)):
+            if self._returned[attempts]:
+                return self._part(self._returned[attempts].popleft(), mine.slowness)
             if not attempts and self._next:
                 unit, self._next = self._next, next(self._fresh, None)
                 return self._part(unit, mine.slowness)
         return None
 
     def _part(self, unit: WorkUnit, slowness: float | None) -> WorkUnit:
-        """The unit, or its beginning: at most the levels of a unit of this worker now, and its share of all that waits.
+        """Return the unit or its first part: at most this worker's unit size and its share of all waiting levels.
 
-        What has failed stays whole.
+        Units that have failed stay whole.
         """
         count = len(unit.level_ids)
         self.waiting -= count
@@ -297,13 +305,13 @@ class Scheduler:
             size = -(-size // 2)
         part, rest = unit.split(size)
         if rest:
-            self._again[0].appendleft(rest)
+            self._returned[0].appendleft(rest)
             self.waiting += count - size
         return part
 
     def _put_back(self, unit: WorkUnit | None) -> None:
         if unit:
-            self._again[self.attempts.get(unit, 0)].append(unit)
+            self._returned[self.attempts.get(unit, 0)].append(unit)
             self.waiting += len(unit.level_ids)
 
     def _remove(self, worker: Any) -> list[WorkUnit]:
@@ -312,7 +320,7 @@ class Scheduler:
 
 
 def until_report(order: Order, workers: int) -> float:
-    """s after which a worker with this order reports, one of so many, if none of its units ends before."""
+    """Return the seconds after which a worker reports, one of `workers`, if none of its units ends before."""
     return ROUND if order.give else max(ROUND, workers / REPORTS)
 
 
@@ -324,10 +332,10 @@ def schedule(
     timed: bool,
     origins: Mapping[int, Origin] | None = None,
 ) -> Scheduler:
-    """A scheduler of what is wanted and not done, so many levels; `unit` and `timed` are those of `Scheduler`."""
+    """Return a scheduler of the `levels` levels that are wanted and not done; `unit` and `timed` as in `Scheduler`."""
     return Scheduler(plan_units(wanted, done, STRETCH if timed else unit, origins), levels, unit, timed)
 
 
 def levels_text(units: Iterable[WorkUnit]) -> str:
-    """Their levels, for people: `levels 0 to 31, 96 to 127`."""
+    """Describe the levels of units for people: `levels 0 to 31, 96 to 127`."""
     return told_levels(runs([level_id for unit in units for level_id in unit.level_ids]))

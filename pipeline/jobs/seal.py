@@ -1,4 +1,4 @@
-"""Who seals: `levelproof seal`, and `levelproof generate` beside its workers."""
+"""The jobs that seal: `levelproof seal`, and `levelproof generate` while its workers run."""
 
 import shlex
 import threading
@@ -32,14 +32,19 @@ from levelproof.pipeline.words import many
 def seal_split(
     split: Path, rows: int | None, console: Console, density: Density | None = None, key_every: int = KEY_EVERY
 ) -> None:
-    """Seal all of a split that is not, in fragments of about so many rows (default: `store.seal.ROWS`).
+    """Seal all unsealed fragments of a split, then write the manifest's index.
 
-    With a `density`, what is stored otherwise is converted, sealed or not. At the end the manifest has its index.
+    Args:
+        split: folder or URL.
+        rows: approximate number of rows in a sealed fragment; None: `store.seal.ROWS`.
+        console: receives progress and messages.
+        density: convert all records stored otherwise to this density, sealed or not; None: keep densities.
+        key_every: env steps between key frames of density "witness".
 
     Raises:
-        UserError: there is no split, it cannot be written, or somebody writes to it.
-        Failure: it is damaged, or the disk refuses. What is sealed by then stays so; nothing is lost.
-        KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; the same holds.
+        UserError: there is no split, it cannot be written, or another command is writing to it.
+        Failure: the split is damaged, or a write failed; nothing is lost, and sealed fragments stay sealed.
+        KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; again nothing is lost.
     """
     if rows is not None and rows < 1:
         raise UserError(f"A sealed fragment cannot have {rows} rows: give --rows a number from 1.")
@@ -74,12 +79,12 @@ def seal_split(
 
 
 class _Stopped(Exception):
-    """The job ends before a fragment is sealed."""
+    """The job ends while a fragment is being sealed."""
 
 
 @contextmanager
 def sealing(split: Path, fragments: Iterable[Fragment], tell: Callable[[str], None]) -> Iterator["Sealer"]:
-    """A `Sealer` beside a job. In the end it seals all that there is enough of; where the job fails, it stops."""
+    """Run a `Sealer` during the `with` block. At its end, seal every full group; if the block fails, stop at once."""
     sealer = Sealer(split, fragments, tell)
     try:
         yield sealer
@@ -89,58 +94,61 @@ def sealing(split: Path, fragments: Iterable[Fragment], tell: Callable[[str], No
 
 
 class Sealer:
-    """Seals what a job has committed, in a thread, while its workers go on.
+    """Seals committed fragments in a thread, while the job's workers run.
 
-    What goes wrong is told once and ends the sealing, never the job.
+    An error is reported once and ends the sealing, never the job.
     """
 
     def __init__(self, split: Path, fragments: Iterable[Fragment], tell: Callable[[str], None]) -> None:
-        """Of a split with these fragments."""
+        """`fragments` are those of the split so far; `tell` receives a message for the user."""
         self._split, self._tell = split, tell
         self._pieces = {fragment.path: Piece.of(fragment) for fragment in fragments}
         self._thread, self._stop = ThreadPoolExecutor(1), threading.Event()
-        self._at_work: tuple[list[Piece], Future[Piece]] | None = None
+        self._running: tuple[list[Piece], Future[Piece]] | None = None
         self._broken = False
 
     def committed(self, unit: WorkUnit) -> None:
+        """Add a unit's new fragment."""
         path = fragment_path(self._split, unit.name)
         self._pieces[path] = Piece(path, len(unit.level_ids), False)
 
-    def look(self, first: int | None) -> None:
-        """Take note of what was sealed, and begin with the next if there is enough of it before the units to come:
-        the lowest of their level ids is `first`; None: none is waited for."""
-        if self._at_work and not self._at_work[1].done():
+    def advance(self, first: int | None) -> None:
+        """Account for a finished seal, and start the next if enough fragments lie below level id `first`.
+
+        No unit below `first` will be committed any more; None: no unit at all.
+        """
+        if self._running and not self._running[1].done():
             return
-        self._take_note()
+        self._account()
         end = None if first is None else fragment_path(self._split, unit_name(first, first))
         group = store.due((piece for piece in self._pieces.values() if end is None or piece.path < end), store.ROWS)
         if group and not self._broken:
-            self._at_work = group, self._thread.submit(self._seal, group)
+            self._running = group, self._thread.submit(self._seal, group)
 
     def finish(self) -> None:
-        """Seal all that there is enough of; nothing is to come."""
-        self.look(None)
-        while self._at_work:
-            self._at_work[1].exception()  # waits
-            self.look(None)
+        """Seal every full group; no unit will be committed any more."""
+        self.advance(None)
+        while self._running:
+            self._running[1].exception()  # waits
+            self.advance(None)
 
     def stop(self) -> None:
-        """End at once; what is half sealed goes."""
+        """Stop at once and delete a half-written sealed fragment."""
         self._stop.set()
         self._thread.shutdown()
 
     def _seal(self, group: list[Piece]) -> Piece:
         with told_of(self._split):
-            return seal(self._split, group, self._go_on)
+            return seal(self._split, group, self._check_stop)
 
-    def _go_on(self, _: int) -> None:
+    def _check_stop(self, _: int) -> None:
         if self._stop.is_set():
             raise _Stopped
 
-    def _take_note(self) -> None:
-        if self._at_work is None:
+    def _account(self) -> None:
+        if self._running is None:
             return
-        (group, future), self._at_work = self._at_work, None
+        (group, future), self._running = self._running, None
         error = future.exception()
         if error is None:
             for piece in group:
@@ -150,4 +158,4 @@ class Sealer:
         self._broken = True
         reason = str(error) if isinstance(error, LevelproofError) else f"{type(error).__name__}: {error}"
         split = shlex.quote(as_typed(self._split))
-        self._tell(f"Not sealed ({reason.rstrip('.')}): `levelproof seal {split}` seals it when this has ended.")
+        self._tell(f"Not sealed ({reason.rstrip('.')}): run `levelproof seal {split}` when this job has ended.")

@@ -1,6 +1,6 @@
 """One work unit: sample its levels, train their experts, replay every witness, write the shard, commit the fragment.
 
-Idempotent: an attempt that dies anywhere leaves at most a shard that no fragment names. Knows nothing of workers.
+Idempotent: an attempt that dies at any point leaves at most a shard that no fragment names. Knows nothing of workers.
 """
 
 import math
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from levelproof.configs.compose import again
+from levelproof.configs.compose import shortest_command
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import WITNESSED, Label, Verdict
 from levelproof.experts.ledger import Ledger
@@ -48,7 +48,7 @@ from levelproof.pipeline.store.shard import write_shard
 
 
 def pool_for(job: JobConfig) -> Pool:
-    """Where a job's experts train, those of several units side by side."""
+    """Return a pool in which a job's experts train, those of several units side by side."""
     return Pool(job.env_steps, job.procedure, job.task)
 
 
@@ -56,7 +56,7 @@ def begin_unit(job: JobConfig, split: Path, unit: WorkUnit, pool: Pool) -> Train
     """Sample or read a unit's levels and submit to the pool those that need an expert.
 
     Raises:
-        Failure: levels cannot be read, or the experts to resume.
+        Failure: levels, or the experts to resume, cannot be read.
         StoreFailure: the store does not answer.
     """
     ids, ledger = level_id_array(unit.level_ids), Ledger(len(unit.level_ids))
@@ -71,7 +71,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
 
     Raises:
         Failure: a witness does not replay.
-        OSError: the disk refuses; nothing is committed.
+        OSError: a write failed; nothing is committed.
     """
     result = run.finish()
     assert result.ledger is not None
@@ -85,7 +85,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
 
 
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
-    """A failed attempt as a value: exceptions do not travel between processes."""
+    """Return a failed attempt as a value, because exceptions may not survive the way to another process."""
     reason, fatal = "".join(traceback.format_exception(error)), ""
     if isinstance(error, (LockRefused, SourceUnseen, LevelUnavailable, LeaseLost, StoreFailure, CheckpointUnread)):
         fatal = str(error)
@@ -95,18 +95,18 @@ def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
 
 
 def check_witnesses(result: UnitResult, task: TaskParams) -> None:
-    """The commit gate: every witness, replayed from its level and its actions, is its record and reaches the goal.
+    """Check that every witness, replayed from its level and actions, reproduces its record and reaches the goal.
 
     Raises:
-        Failure: one is not, or does not.
+        Failure: a witness does not.
     """
-    again = replay(result.levels, result.record.action, task)
-    wrong, reached = unlike_fields(result.record, again), succeeds(again.done, again.goal)
+    replayed = replay(result.levels, result.record.action, task)
+    wrong, reached = unlike_fields(result.record, replayed), succeeds(replayed.done, replayed.goal)
     for i, (level_id, verdict) in enumerate(zip(result.level_ids, result.verdicts, strict=True)):
         if verdict.label not in WITNESSED:
             continue
         if verdict.label == Label.TRIVIAL and result.record.action[..., i].any():
-            raise Failure(f"The witness of level {level_id}, which is called trivial, does something.")
+            raise Failure(f"Level {level_id} is labelled trivial, but its witness acts.")
         if i in wrong:
             raise Failure(f"The witness of level {level_id} does not replay: its {wrong[i]} differs.")
         if not reached[i]:
@@ -114,12 +114,13 @@ def check_witnesses(result: UnitResult, task: TaskParams) -> None:
 
 
 def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult, command: str = "") -> None:
-    """The shard first, under this attempt's own name, then the fragment that names it.
+    """Write the shard, under this attempt's own name, then the fragment that names it; skip committed levels.
 
-    `command` makes the rows again, where no `generate` or `regenerate` of each does.
+    Args:
+        command: reproduces all rows, if no `generate` or `regenerate` of a single row does.
 
     Raises:
-        OSError: the disk refuses; nothing is committed.
+        OSError: a write failed; nothing is committed.
     """
     while there := committed_levels(split, unit.name) & {*unit.level_ids}:
         left, result = unit.only(set(unit.level_ids) - there), _without(result, there)
@@ -150,7 +151,7 @@ def commit(job: JobConfig, split: Path, unit: WorkUnit, result: UnitResult, comm
 def _rows(
     job: JobConfig, unit: WorkUnit, result: UnitResult, kept: list[int], paths: Attempt, folder: Path, command: str
 ) -> list[dict[str, Any]]:
-    """The rows of a unit, but for what they cost; `kept` are the levels that the shard has."""
+    """Return a unit's rows without their costs; `kept` are the indices of the levels in the shard."""
     rows = [manifest_row(job, int(i), v) for i, v in zip(result.level_ids, result.verdicts, strict=True)]
     for row, content, signature in zip(rows, content_hashes(result.levels), signatures(result.levels), strict=True):
         row |= {"content_hash": content, "signature": signature}
@@ -165,7 +166,7 @@ def _rows(
 
 
 def _without(result: UnitResult, level_ids: Collection[int]) -> UnitResult:
-    """What came of the others."""
+    """Return the result without these levels."""
     lanes = np.array([i for i, level_id in enumerate(result.level_ids.tolist()) if level_id not in level_ids], int)
     return replace(
         result,
@@ -179,21 +180,21 @@ def _without(result: UnitResult, level_ids: Collection[int]) -> UnitResult:
 
 
 def _command(job: JobConfig, origin: Origin, level_id: int) -> str:
-    """What labels a level again that no id makes: a level file by itself, an imported one by its split."""
+    """Return the command that labels an unsampled level again: from its level file, or from its imported split."""
     if not RECORD.fullmatch(origin.file):
-        return f"{again(job)} {shlex.quote(f'level_files={origin.file}')}"
-    _, _, words = again(job).split(maxsplit=2)
-    return f"levelproof regenerate {shlex.quote(f'manifest={origin.split}')} {words} where='level_id = {level_id}'"
+        return f"{shortest_command(job)} {shlex.quote(f'level_files={origin.file}')}"
+    _, _, settings = shortest_command(job).split(maxsplit=2)
+    return f"levelproof regenerate {shlex.quote(f'manifest={origin.split}')} {settings} where='level_id = {level_id}'"
 
 
 def shard_arrays(levels: Level, record: Record, kept: list[int]) -> dict[str, np.ndarray]:
-    """Every field of the levels with these indices, by its name in the shard."""
+    """Return all fields of the levels with these indices, by their names in the shard."""
     arrays = arrays_of(levels, "level/") | arrays_of(record, "record/")
     return {name: values[..., kept] for name, values in arrays.items()}
 
 
 def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, Any]:
-    """A level's row, without its identity and without a shard. Null where a verdict has no number."""
+    """Return a level's row without its hashes and shard; null for numbers that the verdict lacks."""
     known = {name: _finite_or_null(value) for name, value in asdict(verdict).items()}
     return known | {
         "level_id": level_id,
@@ -207,12 +208,12 @@ def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, A
         "versions": versions(),
         "device": device(),
         "seconds": None,
-        "command": f"{again(job)} first_level={level_id} levels=1",
+        "command": f"{shortest_command(job)} first_level={level_id} levels=1",
     }
 
 
 def _finite_or_null(value: Any) -> Any:
-    """NaN and infinities say that nothing was counted; in a manifest, null says so."""
+    """Replace NaN and infinities, which mean that nothing was counted, by null, as in manifests."""
     if isinstance(value, list):
         return [_finite_or_null(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

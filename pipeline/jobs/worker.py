@@ -1,6 +1,6 @@
-"""A worker's loop: it begins the units it is given, trains them side by side in one pool, and commits what finishes.
+"""A worker's loop: begin the ordered units, train them side by side in one pool, commit each when it is finished.
 
-The same in this process and in a Ray worker. Knows nothing of either.
+The same code runs in this process and in a Ray worker, and knows nothing of either.
 """
 
 import contextlib
@@ -17,20 +17,20 @@ from levelproof.pipeline.store.paused import save_paused
 
 
 class Worker:
-    """Units under way in this process."""
+    """The units that this process trains."""
 
     def __init__(self, job: JobConfig, split: Path) -> None:
         self._job, self._split = job, split
         self._pool = pool_for(job)
         self._runs: dict[WorkUnit, TrainingRun] = {}
         self._keep_at = time.monotonic() + job.checkpoint_seconds
-        self.stopping = False  # set by whoever wants it to leave soon
+        self.stopping = False  # set by the executor to make the worker leave after the current step
 
     def work(self, order: Order, seconds: float, ended: Callable[[], bool] = lambda: False) -> Round:
-        """Give levels back and begin units as ordered, then train for so many seconds, or until a unit ends or the
-        round has `ended`.
+        """Give levels back and begin units as ordered, then train for `seconds`.
 
-        A failure of one unit is that unit's outcome. One of the step that all share is the outcome of each.
+        Training stops early when a unit ends, when `ended` returns True, or when the worker is `stopping`. If a unit
+        fails, only its own outcome says so; if the step that all units share fails, every outcome does.
         """
         until = time.monotonic() + seconds
         cuts = self._give(order.give)
@@ -42,12 +42,13 @@ class Worker:
         if self.stopping:
             return self.leave(outcomes, cuts)
         now = {unit: run.totals() for unit, run in self._runs.items()}
-        plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}  # for a driver without JAX
+        # Plain tuples, because the driver imports no JAX
+        plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}
         wants = self._pool.wants(sum(run.searching for run in self._runs.values()))
         return Round(outcomes, plain, wants, sum(len(run.unbegun) for run in self._runs.values()), cuts)
 
     def leave(self, outcomes: Sequence[UnitOutcome] = (), cuts: Sequence[Cut] = ()) -> Round:
-        """Commit what is decided of the units under way; they are cut for it."""
+        """Commit the decided levels of all running units, and cut off the undecided ones."""
         if self._job.checkpoint:
             self._keep()
         last = [self._cut(unit, run.undecided) for unit, run in list(self._runs.items())]
@@ -55,8 +56,10 @@ class Worker:
         return Round([*outcomes, *ended], {}, 0, cuts=[*cuts, *last], leaves=True)
 
     def _keep(self) -> None:
-        """Experts under way, beside the split: who takes up their levels later goes on with them. What refuses is tried
-        again later."""
+        """Save unfinished experts beside the split, so that whichever worker gets their levels next resumes them.
+
+        A save that fails is retried at the next interval.
+        """
         self._keep_at = time.monotonic() + self._job.checkpoint_seconds
         in_slots = list(self._pool.paused())
         for unit, run in self._runs.items():
@@ -65,7 +68,7 @@ class Worker:
                     save_paused(self._split, unit.name, paused, self._job)
 
     def _give(self, levels: int) -> list[Cut]:
-        """Give back so many levels that have not begun, if there are, of the latest units first."""
+        """Give back up to `levels` levels that have not begun, from the latest units first."""
         cuts = []
         for unit, run in reversed(self._runs.items()):
             some = run.unbegun[-levels:] if levels > 0 else []
@@ -74,7 +77,7 @@ class Worker:
         return [self._cut(unit, some) for unit, some in cuts]
 
     def _cut(self, unit: WorkUnit, level_ids: Collection[int]) -> Cut:
-        """Go on without these levels of a unit."""
+        """Drop these levels from a unit and continue with the others."""
         run = self._runs.pop(unit)
         run.leave_out(level_ids)
         kept, back = unit.only(set(unit.level_ids).difference(level_ids)), unit.only(level_ids)
@@ -90,7 +93,7 @@ class Worker:
         return None
 
     def _step(self) -> list[UnitOutcome]:
-        """A step of the search or a rollout of every expert; the outcomes of the units that it finished."""
+        """Advance the pool by one step; return the outcomes of the units that finished."""
         try:
             finished = self._pool.step()
             for run in self._runs.values():

@@ -17,9 +17,9 @@ from rich.console import Console
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs import cluster
 from levelproof.pipeline.jobs.address import require_reachable
-from levelproof.pipeline.jobs.likeness import program_of, seen_from_elsewhere, unlike
+from levelproof.pipeline.jobs.likeness import mismatch, program_of, with_absolute_paths
 from levelproof.pipeline.jobs.progress import Board, Tally
-from levelproof.pipeline.jobs.schedule import COMPANY, Scheduler, WorkUnit
+from levelproof.pipeline.jobs.schedule import MAX_UNITS, Scheduler, WorkUnit
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pace import patience
@@ -49,7 +49,7 @@ def test_a_level_that_kills_its_worker_takes_no_other_with_it(tmp_path: Path) ->
     assert "The worker died" in note.read_text()
     assert f"Given up: level {DEADLY}, for the reason in {SPLIT}/quarantine/{note.name}" in done.stdout
     deaths = [line for line in done.stderr.splitlines() if "The worker died" in line]
-    assert len(deaths) == len(COMPANY), done.stderr  # a line each, however many levels it took
+    assert len(deaths) == len(MAX_UNITS), done.stderr  # a line each, however many levels it took
     assert deaths[-1].startswith(f"Level {DEADLY} failed")
     assert deaths[-1].endswith(": given up.")
 
@@ -58,7 +58,7 @@ def test_a_level_that_kills_its_worker_takes_no_other_with_it(tmp_path: Path) ->
 @pytest.mark.slow
 def test_workers_that_cannot_start_stop_the_run(tmp_path: Path) -> None:
     done = fragile(-1, tmp_path)
-    assert_refused(done, 1, "No worker can start (The worker died", "executor=inline may tell more")
+    assert_refused(done, 1, "No worker can start (The worker died", "try executor=inline")
     assert not (tmp_path / SPLIT / "quarantine").exists()
 
 
@@ -140,10 +140,10 @@ def test_a_worker_that_starts_late_commits_for_its_own_driver_only(tmp_path: Pat
 
 def test_workers_read_no_relative_path() -> None:
     """They run in another folder than the command."""
-    job = seen_from_elsewhere(made_job("data", "continue_from=data/5k/s"))
+    job = with_absolute_paths(made_job("data", "continue_from=data/5k/s"))
     assert job.out == str(Path("data").absolute())
     assert job.continue_from == str(Path("data/5k/s").absolute())
-    assert seen_from_elsewhere(made_job()).continue_from == ""
+    assert with_absolute_paths(made_job()).continue_from == ""
 
 
 def test_there_are_as_many_workers_as_machines_have_room_for_now(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,9 +211,9 @@ def test_others_go_on_with_what_a_worker_has_whose_machine_is_refused(monkeypatc
 def test_a_worker_with_another_program_is_refused_in_a_sentence() -> None:
     job = made_job()
     program = program_of(job)
-    assert unlike(program, job) == ""
+    assert mismatch(program, job) == ""
     for name, other in (("jax", "0.1"), ("levelproof", "7"), ("configuration", "abc"), ("source", "def")):
-        refusal = unlike(program | {name: other}, job)
+        refusal = mismatch(program | {name: other}, job)
         assert f" has {name} {program[name]}, and this command {name} {other}: install" in refusal
         assert socket.gethostname() in refusal
 
@@ -244,7 +244,7 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
         process.terminate()
         _, err = process.communicate(timeout=patience(COMMAND_SECONDS))
         assert process.returncode == 130, err
-        assert " is gone; others go on with level" in err
+        assert " is lost; others take over level" in err
         assert "Traceback" not in err
 
         rows = read_manifest(tmp_path / SPLIT).table.to_pylist()

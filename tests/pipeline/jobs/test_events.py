@@ -6,7 +6,7 @@ import pytest
 
 from levelproof.experts.steps import EnvSteps, Seconds
 from levelproof.pipeline.jobs import events as events_file
-from levelproof.pipeline.jobs.events import MOST, Events
+from levelproof.pipeline.jobs.events import MAX_EVENTS, Events
 from levelproof.pipeline.jobs.progress import Tally
 from levelproof.pipeline.jobs.schedule import Order, Scheduler, Summary, UnitOutcome, WorkUnit
 
@@ -14,7 +14,7 @@ from levelproof.pipeline.jobs.schedule import Order, Scheduler, Summary, UnitOut
 def test_the_latest_events_and_the_state_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events_file, "EVERY", 0.0)
     told: list[list] = []
-    units = [WorkUnit(range(2 * i, 2 * i + 2)) for i in range(3 * MOST)]
+    units = [WorkUnit(range(2 * i, 2 * i + 2)) for i in range(3 * MAX_EVENTS)]
     tally, scheduler = Tally(len(units) * 2, 0, 0), Scheduler(iter(units), len(units) * 2, 2)
     scheduler.join("here", 0.0)
     assert isinstance(scheduler.order("here", 0.0), Order)
@@ -25,18 +25,18 @@ def test_the_latest_events_and_the_state_are_told(monkeypatch: pytest.MonkeyPatc
     jax_s = "\n--------------------\nFor simplicity, JAX has removed its internal frames.\n"
     events.ended(UnitOutcome(units[0], reason=f"Traceback\n\nValueError: of this one{jax_s}"))
     events.ended(UnitOutcome(units[0], reason="ValueError: again"), given_up=True)
-    events.look(1234.4, 60.2)
+    events.refresh(1234.4, 60.2)
     (began, *latest, state) = told[-1]
-    assert (began["event"], began["command"], len(latest)) == ("started", "levelproof generate", MOST)
-    assert latest[0]["unit"] == units[-MOST + 2].name
+    assert (began["event"], began["command"], len(latest)) == ("started", "levelproof generate", MAX_EVENTS)
+    assert latest[0]["unit"] == units[-MAX_EVENTS + 2].name
     assert latest[0]["seconds"]["training"] == 0.5
     assert [(of["event"], of["cause"]) for of in latest[-2:]] == [
         ("failed", "ValueError: of this one"),
         ("quarantined", "ValueError: again"),
     ]
-    assert (state["event"], state["done"], state["solved"]) == ("progress", 6 * MOST, 3 * MOST)
-    assert (state["rate"], state["left"], state["failures"], state["env_steps"]) == (1234, 60, 2, 300 * MOST)
-    assert (state["spent"]["trained"], state["seconds"]["training"]) == (300 * MOST, 1.5 * MOST)
+    assert (state["event"], state["done"], state["solved"]) == ("progress", 6 * MAX_EVENTS, 3 * MAX_EVENTS)
+    assert (state["rate"], state["left"], state["failures"], state["env_steps"]) == (1234, 60, 2, 300 * MAX_EVENTS)
+    assert (state["spent"]["trained"], state["seconds"]["training"]) == (300 * MAX_EVENTS, 1.5 * MAX_EVENTS)
     assert state["workers"]["here"]["count"] == 1
     assert sum(len(json.dumps(event)) for event in told[-1]) < 2**20
     events.over("stopped")

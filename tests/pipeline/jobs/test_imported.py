@@ -158,7 +158,7 @@ def test_a_stopped_import_goes_on(once: Path, tmp_path: Path, monkeypatch: pytes
         patch.setattr(module, "commit", once_only)
         done = here(words, tmp_path)
     assert done.returncode == 130
-    assert "the same command goes on" in done.stderr
+    assert "run the same command to continue" in done.stderr
     assert read_status(tmp_path / "data/1M/s")["done"] < ROWS == read_status(tmp_path / "data/1M/s")["wanted"]
     done = here(words, tmp_path)
     assert "1 of 2 units are there already" in done.stderr
@@ -188,7 +188,7 @@ def test_what_is_no_level_is_left_out_and_told(once: Path, tmp_path: Path) -> No
     assert f"{ROWS - 4} levels of" in done.stdout
     assert "4 were left out." in done.stdout
     said = [line for line in done.stderr.splitlines() if line.startswith("Left out:")]
-    assert len(said) == module.TOLD
+    assert len(said) == module.REPORTED
     assert "odd/array#1, its actions are not actions of this task." in said[0]
     assert "#2, its polygon/position has a value that is not a finite 32-bit number." in said[1]
     assert "#3, its model/joint_a has values out of range for this size." in said[2]

@@ -86,7 +86,7 @@ def test_a_log_that_fails_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Mo
         log([BEGAN, STATE])
     assert [line for line in said if "No space left" in line] == [said[-1]]
     assert said[-1].startswith("Cannot log to tensorboard")
-    assert said[-1].endswith("the run goes on without.")
+    assert said[-1].endswith("the run continues without a log.")
 
 
 def test_a_log_folder_that_leads_out_of_the_split_is_not_written_to(tmp_path: Path) -> None:

@@ -5,7 +5,14 @@ import subprocess
 import sys
 
 from levelproof.levelgen.level import size_of
-from levelproof.pipeline.jobs.places import GB, Machine, bytes_of_worker, places, share_of_memory, shortage
+from levelproof.pipeline.jobs.places import (
+    GB,
+    Machine,
+    bytes_of_worker,
+    memory_to_reserve,
+    shortage,
+    workers_by_machine,
+)
 from tests.pace import patience
 from tests.pipeline.command import COMMAND_SECONDS, ROOT
 
@@ -36,7 +43,7 @@ crew.follow_cluster()
 assert len(crew._handles) == 1, crew._handles
 gpu, memory = said
 assert gpu == "Workers use CPU cores, not GPUs: after 1 s of waiting, others still hold all of them.", gpu
-assert memory.endswith("has 2.0 GB of memory free, and a worker of this size needs 1.5 GB: it gets 1 of 2 workers.")
+assert memory.endswith("has 2.0 GB of memory free, and a worker of this size needs 1.5 GB: it runs 1 of 2 workers.")
 cluster.GPU_PATIENCE = 600.0
 ray.kill(holder)
 assert cluster._why_no_gpu() == NO_GPU  # it is free, and none that JAX can use
@@ -51,21 +58,21 @@ def machine(cores: int, memory: float | None = None, gpus: int = 0) -> Machine:
 
 def test_workers_are_as_many_as_there_are_cores_and_memory_for() -> None:
     machines = {"a": machine(8, 8.5 * GB), "b": machine(2, 100 * GB), "c": machine(4)}
-    assert places(machines, "CPU", 100, NEED) == {"a": 4, "b": 2, "c": 4}
-    assert places(machines, "CPU", 4, NEED) == {"a": 2, "b": 1, "c": 1}
-    assert places({"a": machine(8, 100 * GB, gpus=2)}, "GPU", 100, NEED) == {"a": 2}
+    assert workers_by_machine(machines, "CPU", 100, NEED) == {"a": 4, "b": 2, "c": 4}
+    assert workers_by_machine(machines, "CPU", 4, NEED) == {"a": 2, "b": 1, "c": 1}
+    assert workers_by_machine({"a": machine(8, 100 * GB, gpus=2)}, "GPU", 100, NEED) == {"a": 2}
 
 
 def test_a_machine_with_little_memory_gets_one_worker_which_reserves_all_of_it() -> None:
     small = machine(2, 1 * GB)
-    assert places({"a": small}, "CPU", 100, NEED) == {"a": 1}
-    assert share_of_memory(small, NEED) == 1 * GB
-    assert share_of_memory(machine(2, 9 * GB), NEED) == share_of_memory(machine(2), NEED) == NEED
-    assert places({"head": machine(0, 9 * GB)}, "CPU", 100, NEED) == {}
+    assert workers_by_machine({"a": small}, "CPU", 100, NEED) == {"a": 1}
+    assert memory_to_reserve(small, NEED) == 1 * GB
+    assert memory_to_reserve(machine(2, 9 * GB), NEED) == memory_to_reserve(machine(2), NEED) == NEED
+    assert workers_by_machine({"head": machine(0, 9 * GB)}, "CPU", 100, NEED) == {}
 
 
 def test_a_shortage_is_told_where_it_leaves_a_core_without_a_worker() -> None:
-    sentence = "a has 4.5 GB of memory free, and a worker of this size needs 2.0 GB: it gets 2 of 4 workers."
+    sentence = "a has 4.5 GB of memory free, and a worker of this size needs 2.0 GB: it runs 2 of 4 workers."
     assert shortage(machine(4, 4.5 * GB), "CPU", 100, NEED) == sentence
     assert shortage(machine(4, 4.5 * GB), "CPU", 2, NEED) == ""
     assert shortage(machine(4, 8 * GB), "CPU", 100, NEED) == ""

@@ -10,7 +10,7 @@ import pytest
 from levelproof.configs.compose import compose_job
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.jobs.regenerate import kept_words, split_words
+from levelproof.pipeline.jobs.regenerate import kept_settings, split_arguments
 from levelproof.pipeline.store.checkpoints import load_experts, require_same_experts
 from levelproof.pipeline.store.layout import new_attempt
 from levelproof.pipeline.store.manifest import begin_fragment, read_manifest
@@ -128,12 +128,12 @@ def test_experts_that_a_dead_attempt_left_are_removed(folder: Path, tmp_path: Pa
 )
 def test_mistakes_are_named(words: list[str], sentence: str) -> None:
     with pytest.raises(UserError, match=sentence):
-        split_words(words)
+        split_arguments(words)
 
 
 def test_a_preset_that_is_named_replaces_all_settings_of_its_kind() -> None:
     made = made_job("data", "procedure=label", "expert.width=64", "distribution=vehicles", "task.max_timesteps=100")
-    again = lambda *settings: compose_job([*kept_words(made.results, settings), *settings])
+    again = lambda *settings: compose_job([*kept_settings(made.results, settings), *settings])
     same, masters = again(), again("procedure=masters")
     assert (same.procedure, same.distribution, same.task) == (made.procedure, made.distribution, made.task)
     assert masters.procedure == made_job("data", "procedure=masters").procedure

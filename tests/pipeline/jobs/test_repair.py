@@ -213,7 +213,7 @@ def test_what_cannot_be_made_again_is_told_and_stays(copied: Callable[[Path], Pa
     before = data_files(split)
     done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
     assert done.returncode == 1
-    assert "Not made again: level" in done.stdout
+    assert "Not regenerated: level" in done.stdout
     assert "it was made on another stack, of cpu: of another kind" in done.stdout
     assert data_files(split) == before
 
@@ -221,4 +221,4 @@ def test_what_cannot_be_made_again_is_told_and_stays(copied: Callable[[Path], Pa
 @pytest.mark.parametrize("word", ["size=m", "budget=1M", "out=x", "nonsense"])
 def test_settings_of_a_split_cannot_be_changed_by_a_repair(word: str, tmp_path: Path) -> None:
     done = here(["verify", str(tmp_path), "--repair", word], tmp_path)
-    assert_refused(done, 2, "A repair has the settings of its split", "executor, workers, unit")
+    assert_refused(done, 2, "A repair uses the settings of its split", "executor, workers, unit")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from levelproof.experts.steps import EnvSteps, Seconds
 from levelproof.pipeline.jobs.schedule import (
-    COMPANY,
+    MAX_UNITS,
     Cut,
     Round,
     Scheduler,
@@ -90,13 +90,13 @@ def test_units_that_kill_their_worker_are_given_up_and_no_other(
     assert all(kills.intersection(unit.level_ids) for unit in scheduler.quarantined)
     assert kills & set(range(levels)) <= given_up
     assert sorted([*done, *given_up]) == list(range(levels))
-    assert deaths <= len(COMPANY) * len(scheduler.quarantined)
+    assert deaths <= len(MAX_UNITS) * len(scheduler.quarantined)
 
 
 def test_a_unit_that_failed_has_less_company_each_time() -> None:
     scheduler = scheduler_of(100, 1, workers=1)
     scheduler.report(0, finished([]), 0.0)
-    for attempt, most in enumerate(COMPANY):
+    for attempt, most in enumerate(MAX_UNITS):
         while True:  # those that have failed less come first, and none of them joins one that has failed more
             units = scheduler.order(0, 0.0).units
             (attempts,) = {scheduler.attempts.get(unit, 0) for unit in units}
@@ -105,10 +105,10 @@ def test_a_unit_that_failed_has_less_company_each_time() -> None:
             scheduler.report(0, finished(units), 0.0)
         assert len(units) == most
         for outcome in scheduler.lost(0, "died"):
-            assert scheduler.failed(outcome.unit) == (most == COMPANY[-1])
+            assert scheduler.failed(outcome.unit) == (most == MAX_UNITS[-1])
         scheduler.join(0, 0.0)
         scheduler.report(0, finished([]), 0.0)
-    assert len(scheduler.quarantined) == COMPANY[-1]
+    assert len(scheduler.quarantined) == MAX_UNITS[-1]
 
 
 def test_a_worker_gets_units_while_it_has_room() -> None:

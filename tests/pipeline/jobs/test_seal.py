@@ -39,7 +39,7 @@ def make(source: Path, split: Path) -> Make:
     def committed(sealer: Sealer, unit: WorkUnit, coming: Collection[WorkUnit]) -> None:
         commit_copy(source, unit.level_ids[0], split)
         sealer.committed(unit)
-        sealer.look(min((of.level_ids[0] for of in coming), default=None))
+        sealer.advance(min((of.level_ids[0] for of in coming), default=None))
 
     return committed
 
@@ -62,9 +62,9 @@ def test_a_unit_that_failed_is_not_waited_for_and_one_that_comes_is(split: Path,
     with sealing(split, read_manifest(split, []).fragments, print) as sealer:
         for unit in UNITS[3:6]:
             make(sealer, unit, UNITS[2:3])
-        sealer.look(2)
+        sealer.advance(2)
         assert not any(fragment.sealed for fragment in read_manifest(split).fragments), "level 2 may come"
-        sealer.look(None)  # it has failed
+        sealer.advance(None)  # it has failed
         sealer.finish()
         assert [fragment.rows for fragment in read_manifest(split).fragments] == [3, 1, 1]
         make(sealer, UNITS[2], [])
@@ -80,7 +80,7 @@ def test_trouble_is_told_once_and_never_ends_the_job(split: Path, make: Make) ->
             make(sealer, UNITS[i], UNITS[i + 1 :])
     (sentence,) = said
     assert sentence.startswith(f"Not sealed (The shard {shard} is missing or damaged")
-    assert sentence.endswith(f"`levelproof seal {split}` seals it when this has ended.")
+    assert sentence.endswith(f"run `levelproof seal {split}` when this job has ended.")
     assert len(read_manifest(split).level_ids) == len(UNITS)
 
 

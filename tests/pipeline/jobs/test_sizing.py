@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from levelproof.pipeline.jobs.sizing import MOST, STEP, UNITS_EACH, UnitSize, unit_levels
+from levelproof.pipeline.jobs.sizing import MAX_FACTOR, STEP, UNITS_EACH, UnitSize, unit_levels
 
 MANY = 10**9  # levels, of which a share never limits a unit
 
@@ -15,8 +15,8 @@ def test_unit_takes_20_to_60_seconds_unless_a_limit_holds(
 ) -> None:
     count = unit_levels(seconds, levels, workers, untimed)
     share = levels // (UNITS_EACH * max(workers, 1))
-    assert 1 <= count <= max(1, min(share, MOST * untimed))
-    if count < min(share, MOST * untimed):
+    assert 1 <= count <= max(1, min(share, MAX_FACTOR * untimed))
+    if count < min(share, MAX_FACTOR * untimed):
         assert count * seconds >= 20
     if count > 1:
         assert count * seconds <= 60
