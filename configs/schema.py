@@ -1,4 +1,4 @@
-"""A job's configuration: what to make, typed and frozen, and the hash of what decides its results."""
+"""A job's configuration, typed and frozen, and the hash of the settings that decide its results."""
 
 import hashlib
 import json
@@ -21,14 +21,15 @@ from levelproof.levelgen.task.rules import TaskParams
 
 HASH_DIGITS = 16
 Density = Literal["full", "resume", "witness"]  # how much of a record is stored
-KEY_EVERY = 32  # env steps between key frames, by default
-KEYS_EVERY = tuple(2**i for i in range(1, 9))  # what they may be: they divide a record
-MAX_FRAME_SKIP = 64  # where records are simulated again by those who read them
-MAX_BODIES = 48  # the most that was tried; compiling takes minutes from there
-# Levels of an untimed work unit by the number of bodies: about as long to train, multiples of the experts side by side
+KEY_EVERY = 32  # default env steps between key frames
+KEYS_EVERY = tuple(2**i for i in range(1, 9))  # allowed values: each divides a record's 256 steps
+MAX_FRAME_SKIP = 64  # for densities whose readers re-simulate records
+MAX_BODIES = 48  # the largest number that was tried; compiling takes minutes there
+# Largest number of bodies, and levels of an untimed work unit: units take about equally long, and have multiples of
+# the number of experts that train side by side
 UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MAX_BODIES, 4))
 
-# Where, how many, by whom and on what machine: these change neither a level nor its expert, so one split may mix them.
+# Settings of place, amount and machine: they change neither a level nor its expert, so a split may mix their values
 WITHOUT_EFFECT = frozenset(
     {
         "levels",
@@ -49,37 +50,37 @@ WITHOUT_EFFECT = frozenset(
         "search.rounds",
     }
 )
-RENAMED: Mapping[str, str] = {}  # names of settings in earlier versions, with a dot: those of today
+RENAMED: Mapping[str, str] = {}  # today's dotted names of settings by their names in earlier versions
 REMOVED: Mapping[str, Any] = {"scout.rounds": 0}  # settings of earlier versions: the value that matches this version
-# In the results of levels that no id makes, where those of random levels have their distribution
+# Values of `distribution` in the results of jobs whose levels are not sampled
 FROM_FILES, FROM_RECORDS = "files", "import"
-OF_RECORDS = ("size", "budget", "task", "sampler_version")  # what decides results where nobody searches or trains
+OF_RECORDS = ("size", "budget", "task", "sampler_version")  # settings that decide the results of an import
 
 
 @dataclass(frozen=True)
 class JobConfig:
-    """What `levelproof generate` makes."""
+    """The settings of a job of `levelproof generate`."""
 
-    size: str = "s"  # s, m, l, or how many polygons (4 are scenery), circles, joints, thrusters, as in 8-8-8-4
-    levels: str = "64"  # how many, with consecutive ids
-    first_level: int = 0  # id of the first of them
+    size: str = "s"  # s, m, l, or numbers of polygons (4 are scenery), circles, joints and thrusters, as in 8-8-8-4
+    levels: str = "64"  # number of levels, with consecutive ids
+    first_level: int = 0  # id of the first level
     level_files: str = ""  # a level file, or a folder of them, to label instead of random levels; empty: random levels
-    budget: str = "128k"  # environment steps an expert may use; names the folder
-    out: str = "data"  # folder, or URL of an object store; the split is written to {out}/{budget}/{size}
-    unit: int | None = None  # levels per work unit, lost when its worker dies; null: 20 to 60 s of a worker, as timed
-    executor: Literal["ray", "inline"] = "ray"  # ray: a worker per core or GPU; inline: this process, for debugging
-    device: Literal["cpu", "gpu"] = "cpu"  # a core, or a GPU, for each worker; gpu: if one is free and JAX can use it
+    budget: str = "128k"  # env steps an expert may use; also names the folder
+    out: str = "data"  # folder or object store's URL; the split is written to {out}/{budget}/{size}
+    unit: int | None = None  # levels per work unit, lost if its worker dies; null: as many as take 20 to 60 s, as timed
+    executor: Literal["ray", "inline"] = "ray"  # ray: one worker per core or GPU; inline: this process, for debugging
+    device: Literal["cpu", "gpu"] = "cpu"  # of each worker; cpu: a core; gpu: a GPU, if one is free and JAX can use it
     workers: int = 0  # maximum number; 0: one per core that memory allows, or with device=gpu one per GPU
-    checkpoint: str = ""  # how often experts under way are kept, as in 10min, to go on with; empty: never
-    keep_experts: bool = False  # keep experts, too, so that a larger budget can go on with them
-    density: Density = "full"  # what is stored of a record: full (all), resume (states), witness (actions, key frames)
-    key_every: int = KEY_EVERY  # env steps of an episode between key frames of density=witness: a power of 2 up to 256
-    continue_from: str = ""  # a split made with keep_experts=true, whose experts go on; empty: none
-    log: Literal["none", "tensorboard", "wandb"] = "none"  # scalars of a run, for TensorBoard or Weights & Biases
-    distribution: Distribution = field(default_factory=Distribution)  # what random levels are like
-    task: TaskParams = field(default_factory=TaskParams)  # what a level asks for
-    search: SearchConfig = field(default_factory=SearchConfig)  # the search before an expert trains
-    expert: ExpertConfig = field(default_factory=ExpertConfig)  # who solves it
+    checkpoint: str = ""  # interval for saving unfinished experts to resume, such as 10min; empty: never
+    keep_experts: bool = False  # store experts in the split, so that a larger budget can resume them
+    density: Density = "full"  # stored part of a record: full (all), resume (states), witness (actions, key frames)
+    key_every: int = KEY_EVERY  # env steps between key frames, for density=witness: a power of 2 from 2 to 256
+    continue_from: str = ""  # a split made with keep_experts=true, whose experts are resumed; empty: none
+    log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of a run's scalars: TensorBoard or Weights & Biases
+    distribution: Distribution = field(default_factory=Distribution)  # distribution of random levels
+    task: TaskParams = field(default_factory=TaskParams)  # rules of the task
+    search: SearchConfig = field(default_factory=SearchConfig)  # search before training
+    expert: ExpertConfig = field(default_factory=ExpertConfig)  # training of experts
     stop: StopConfig = field(default_factory=StopConfig)  # when a level leaves its slot
 
     def __post_init__(self) -> None:
@@ -107,13 +108,13 @@ class JobConfig:
             raise ConfigError(f"size is {self.size}: experts train among at most {MAX_BODIES} polygons and circles.")
         if not self.level_files and not control_weights(size, self.distribution):
             raise ConfigError(
-                f"size is {self.size}: it has no room for what must act, of which {', '.join(CONTROL_WEIGHTS)} in "
-                "distribution are the weights (a motor needs a joint and a third body beside the scenery)."
+                f"size is {self.size}: it has no room for the actuators that {', '.join(CONTROL_WEIGHTS)} in "
+                "distribution require (a motor needs a joint and a third body beside the scenery)."
             )
 
     @property
     def levels_per_unit(self) -> int:
-        """Levels of a work unit; if `unit` is null, while nobody knows what a level takes."""
+        """Levels of a work unit; if units are timed, of the units before the first one has ended."""
         if self.unit is not None:
             return self.unit
         bodies = size_of(self.size).bodies
@@ -121,7 +122,7 @@ class JobConfig:
 
     @property
     def checkpoint_seconds(self) -> float:
-        """Infinite: experts under way are not kept."""
+        """Interval for saving unfinished experts, s; infinite: they are not saved."""
         return parse_duration(self.checkpoint, "checkpoint") if self.checkpoint else math.inf
 
     @property
@@ -130,12 +131,12 @@ class JobConfig:
 
     @property
     def procedure(self) -> Procedure:
-        """How its levels get their labels."""
+        """The settings of how levels are labelled."""
         return Procedure(self.search, self.expert, self.stop)
 
     @property
     def stored(self) -> str:
-        """How its records are stored."""
+        """The density of its records, as settings."""
         return stored_as(self.density, self.key_every)
 
     @property
@@ -145,7 +146,7 @@ class JobConfig:
 
     @property
     def results(self) -> dict[str, Any]:
-        """Everything that decides a level's results, as JSON's types."""
+        """All settings that decide a level's results, as JSON's types."""
         kept = decisive({f.name: plain(getattr(self, f.name)) for f in fields(self)})
         if self.level_files:
             kept["distribution"] = FROM_FILES
@@ -153,18 +154,18 @@ class JobConfig:
 
     @property
     def hash(self) -> str:
-        """Short hash of `results`: other hash, other split."""
+        """Short hash of `results`; a split has a single hash."""
         return hash_of(self.results)
 
 
 def stored_as(density: Density, key_every: int = KEY_EVERY) -> str:
-    """A density in the words of settings."""
+    """Write a density as settings are typed."""
     return f"density={density}" + (f" key_every={key_every}" if density == "witness" else "")
 
 
 @dataclass(frozen=True)
 class ImportConfig(JobConfig):
-    """What `levelproof import` makes: levels, the folder `level_files` of records, are labelled by actions it has."""
+    """The settings of a job of `levelproof import`: `level_files` is a folder of records, whose actions label them."""
 
     @property
     def results(self) -> dict[str, Any]:
@@ -173,20 +174,20 @@ class ImportConfig(JobConfig):
 
 
 def from_files(results: Mapping[str, Any]) -> bool:
-    """Whether a job with these `JobConfig.results` labels levels that no id makes: level files, or imported ones."""
+    """Whether a job with these `JobConfig.results` has levels that are not sampled: level files, or imported ones."""
     return results.get("distribution") in (FROM_FILES, FROM_RECORDS)
 
 
 def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) -> dict[str, Any]:
-    """Keep the settings that decide results, under today's names, whichever version wrote them down.
+    """Return the settings that decide results, under today's names, whichever version wrote them.
 
-    Splits record the `JobConfig.results` of the version that made them. Readers compare what this returns of them, so
-    a setting that loses its effect, takes another name or is removed leaves a split the same. A removed setting with a
-    value that this version cannot reproduce is kept, so that the configurations differ.
+    Splits record the `JobConfig.results` of the version that made them. Readers compare splits by this function's
+    result, so that a setting may lose its effect, change its name or be removed without making a split a different
+    one. A removed setting whose value this version cannot reproduce is kept, so that the configurations differ.
 
     Args:
-        settings: nested, as JSON has them.
-        renamed: today's names by earlier ones, all with dots.
+        settings: nested mappings, as in JSON.
+        renamed: today's dotted names by earlier ones.
 
     Raises:
         ValueError: a setting lies below a value.
@@ -207,6 +208,6 @@ def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) 
 
 
 def hash_of(results: dict[str, Any]) -> str:
-    """SHA-256 over canonical JSON, shortened to HASH_DIGITS hexadecimal digits."""
+    """Return the SHA-256 of canonical JSON, shortened to HASH_DIGITS hexadecimal digits."""
     text = json.dumps(results, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:HASH_DIGITS]

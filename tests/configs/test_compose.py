@@ -1,4 +1,4 @@
-"""Override strings in, one typed job out; every mistake one sentence."""
+"""compose_job: override strings in, a typed job or an error of one sentence out."""
 
 import dataclasses
 import shlex
@@ -27,18 +27,18 @@ from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.task.rules import TaskParams
 
 
-def test_no_overrides_make_the_small_default_dataset() -> None:
+def test_compose_job_without_overrides_returns_the_small_default_dataset() -> None:
     job = compose_job([])
     assert (job.size, job.level_ids, job.env_steps, job.budget, job.out) == ("s", range(64), 128_000, "128k", "data")
     assert (job.executor, job.workers) == ("ray", 0)
 
 
-def test_the_defaults_are_those_of_the_dataclasses() -> None:
+def test_compose_job_takes_defaults_from_the_dataclasses() -> None:
     job = compose_job([])
     assert (job.distribution, job.task, job.expert) == (Distribution(), TaskParams(), ExpertConfig())
 
 
-def test_overrides_reach_every_depth() -> None:
+def test_compose_job_applies_overrides_at_every_depth() -> None:
     job = compose_job(["size=m", "levels=1k", "first_level=5", "expert.learning_rate=1e-3", "task.physics.slop=0.02"])
     assert (job.size, job.level_ids) == ("m", range(5, 1005))
     assert job.expert.learning_rate == 1e-3
@@ -46,7 +46,7 @@ def test_overrides_reach_every_depth() -> None:
 
 
 @pytest.mark.parametrize("text", ["a b", "é/x", "~/x=y", "a,b", "{x}", "$HOME", "[1]", "007", "a'b"])
-def test_out_may_be_any_path(text: str) -> None:
+def test_compose_job_accepts_any_path_as_out(text: str) -> None:
     assert compose_job([f"out={text}"]).out == text
 
 
@@ -56,8 +56,8 @@ def test_out_may_be_any_path(text: str) -> None:
         ("size=x", "size is .x.: choose one of s, m, l, or write how many polygons"),
         ("size=5-2-1-1", "size is 5-2-1-1: write s instead"),
         ("size=4-1-1-1", "size is 4-1-1-1: 4 polygons and 1 circles leave no room"),
-        ("size=8-8-0-0", "size is 8-8-0-0: it has no room for what must act"),
-        ("size=5-1-1-0", "size is 5-1-1-0: it has no room for what must act"),
+        ("size=8-8-0-0", "size is 8-8-0-0: it has no room for the actuators"),
+        ("size=5-1-1-0", "size is 5-1-1-0: it has no room for the actuators"),
         ("size=25-24-1-1", "size is 25-24-1-1: experts train among at most 48 polygons and circles"),
         ("size=99-1-1-1", "at most 64 polygons"),
         ("levels=abc", "levels is 'abc': write a whole number such as"),
@@ -93,14 +93,14 @@ def test_out_may_be_any_path(text: str) -> None:
         ("task=3", "group of settings"),
     ],
 )
-def test_mistakes_are_named(override: str, sentence: str) -> None:
+def test_compose_job_names_the_wrong_setting(override: str, sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
         compose_job([override])
 
 
 @given(st.text(max_size=20))
 @settings(deadline=None)
-def test_any_text_is_a_setting_or_refused(text: str) -> None:
+def test_compose_job_accepts_any_text_or_raises_one_sentence(text: str) -> None:
     sentence = ""
     try:
         compose_job([text])
@@ -109,7 +109,7 @@ def test_any_text_is_a_setting_or_refused(text: str) -> None:
     assert "\n" not in sentence
 
 
-def test_the_hash_follows_results_and_nothing_else() -> None:
+def test_job_hash_changes_only_with_settings_that_decide_results() -> None:
     job = compose_job([])
     for same in (
         "levels=7",
@@ -136,20 +136,20 @@ def test_the_hash_follows_results_and_nothing_else() -> None:
         assert compose_job([other]).hash != job.hash, other
 
 
-def test_every_setting_that_decides_results_is_hashed() -> None:
+def test_job_results_contain_all_settings_but_those_without_effect() -> None:
     job = compose_job([])
     names = set(flat(plain(job)))
     assert names - set(flat(job.results)) == WITHOUT_EFFECT
     assert "stop.rule" in names - WITHOUT_EFFECT
 
 
-def test_settings_of_the_machine_are_not_hashed() -> None:
-    """`test_the_number_of_slots_changes_no_result` and `test_rounds_between_syncs_change_no_result` hold these two."""
+def test_job_hash_ignores_settings_of_the_machine() -> None:
+    """Tests of experts/pool and experts/search show that these two change no result."""
     machine = {setting.name for setting in every_setting() if setting.group.endswith(": machine")}
     assert machine == {name for name in WITHOUT_EFFECT if "." in name} == {"expert.slots", "search.rounds"}
 
 
-def test_settings_of_an_earlier_version_take_the_names_of_today() -> None:
+def test_decisive_renames_settings_of_earlier_versions() -> None:
     old = {"size": "s", "budget": 128_000, "expert": {"slots": 4, "units": 64}, "scout": {"tries": 3}}
     renamed = {"expert.units": "expert.width", "scout.tries": "search.tries", "rooms": "expert.slots"}
     now = decisive(old | {"rooms": 2}, renamed)
@@ -175,14 +175,14 @@ def test_decisive_drops_removed_settings_that_match_this_version() -> None:
         ["distribution=clutter", "distribution.max_size=0.5"],
     ],
 )
-def test_again_makes_the_same_results(overrides: list[str]) -> None:
+def test_shortest_command_reproduces_the_results(overrides: list[str]) -> None:
     job = compose_job(overrides)
-    words = shlex.split(shortest_command(job))
-    assert words[:2] == ["levelproof", "generate"]
-    assert compose_job(words[2:]).results == job.results
+    arguments = shlex.split(shortest_command(job))
+    assert arguments[:2] == ["levelproof", "generate"]
+    assert compose_job(arguments[2:]).results == job.results
 
 
-def test_a_preset_is_called_by_its_name() -> None:
+def test_shortest_command_names_presets() -> None:
     job = compose_job(["size=m", "distribution=clutter", "budget=5k"])
     assert shortest_command(job) == "levelproof generate size=m budget=5k distribution=clutter"
     spelled = [f"distribution.{key}={value}" for key, value in dataclasses.asdict(job.distribution).items()]
@@ -190,7 +190,7 @@ def test_a_preset_is_called_by_its_name() -> None:
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
-def test_presets_are_read_as_hydra_composes_them(folder: str) -> None:
+def test_presets_load_as_hydra_composes_them(folder: str) -> None:
     for name in presets()[folder]:
         job = compose_job([f"{folder}={name}", "budget=1M"])
         assert shortest_command(job).split()[4:] == (
@@ -198,12 +198,11 @@ def test_presets_are_read_as_hydra_composes_them(folder: str) -> None:
         ), shortest_command(job)
 
 
-def test_the_default_distribution_is_that_of_kinetix() -> None:
+def test_default_distribution_equals_the_kinetix_preset() -> None:
     assert compose_job([]).distribution == distributions()["kinetix"] == Distribution()
 
 
-def test_presets_are_different_and_change_little() -> None:
-    """Overrides of the defaults only; none repeats a default."""
+def test_distribution_presets_differ_and_repeat_no_default() -> None:
     presets = distributions()
     assert len(set(presets.values())) == len(presets) >= 5
     default = dataclasses.asdict(Distribution())
@@ -213,17 +212,17 @@ def test_presets_are_different_and_change_little() -> None:
         assert all(value != default[str(key)] for key, value in written.items()), name
 
 
-def test_a_distribution_is_known_by_name_and_hash() -> None:
+def test_name_and_hash_identifies_a_distribution() -> None:
     job = compose_job(["distribution=clutter", "size=m", "budget=5k"])
-    name, mark = name_and_hash(job.distribution)
+    name, digest = name_and_hash(job.distribution)
     assert name == "clutter"
-    assert name_and_hash(compose_job(["distribution=clutter", "size=l"]).distribution) == (name, mark)
+    assert name_and_hash(compose_job(["distribution=clutter", "size=l"]).distribution) == (name, digest)
     other = compose_job(["distribution=clutter", "distribution.max_size=0.5"]).distribution
     assert name_and_hash(other)[0] is None
-    assert name_and_hash(other)[1] != mark
+    assert name_and_hash(other)[1] != digest
 
 
-def test_a_unit_by_the_size() -> None:
+def test_levels_per_unit_depend_on_the_size() -> None:
     units = {
         size: compose_job([f"size={size}"]).levels_per_unit
         for size in ("s", "m", "l", "6-2-1-1", "8-8-8-4", "24-24-9-9")
@@ -232,7 +231,7 @@ def test_a_unit_by_the_size() -> None:
     assert compose_job(["size=l", "unit=3"]).levels_per_unit == 3
 
 
-def test_a_distribution_that_lets_nothing_act_in_a_size_is_refused() -> None:
-    with pytest.raises(ConfigError, match="size is 5-5-2-0: it has no room for what must act"):
+def test_compose_job_rejects_a_distribution_whose_actuators_do_not_fit_the_size() -> None:
+    with pytest.raises(ConfigError, match="size is 5-5-2-0: it has no room for the actuators"):
         compose_job(["size=5-5-2-0", "distribution=thrusters"])
     assert compose_job(["size=5-5-2-0", "distribution=vehicles"]).size == "5-5-2-0"

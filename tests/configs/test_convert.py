@@ -1,4 +1,4 @@
-"""Nested mappings to typed frozen dataclasses and back."""
+"""typed and plain: nested mappings to typed frozen dataclasses and back."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -52,11 +52,11 @@ outers = st.builds(
 
 
 @given(outers)
-def test_plain_and_back(value: Outer) -> None:
+def test_typed_inverts_plain(value: Outer) -> None:
     assert typed(Outer, plain(value)) == value
 
 
-def test_whole_numbers_as_people_type_them() -> None:
+def test_typed_parses_suffixed_counts() -> None:
     assert typed(Outer, {"count": "1.5k", "limit": "10M"}) == Outer(1500, limit=10_000_000)
 
 
@@ -84,7 +84,7 @@ def test_whole_numbers_as_people_type_them() -> None:
         ({"counts": 1}, "count is missing"),
     ],
 )
-def test_wrong_values_are_named(values: dict[str, Any], sentence: str) -> None:
+def test_typed_names_the_wrong_value(values: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ConfigError, match=f"^{sentence}") as raised:
         typed(Outer, values)
     assert str(raised.value).count("\n") == 0
@@ -92,23 +92,23 @@ def test_wrong_values_are_named(values: dict[str, Any], sentence: str) -> None:
     assert not str(raised.value).endswith("..")
 
 
-def test_the_name_of_the_group_goes_before() -> None:
+def test_typed_prefixes_errors_with_the_name_of_the_group() -> None:
     with pytest.raises(ConfigError, match=r"^task\.rate is 'x'"):
         typed(Inner, {"rate": "x"}, "task")
     with pytest.raises(ConfigError, match=r"^task.rate is -1.0: it must not be negative\.$"):
         typed(Inner, {"rate": -1}, "task")
 
 
-def test_whole_numbers_are_fine_where_numbers_or_words_are_wanted() -> None:
+def test_typed_accepts_integers_as_floats_and_strings() -> None:
     value = typed(Outer, {"count": 1, "name": 1000, "inner": {"rate": 1}})
     assert value.name == "1000"
     assert isinstance(value.inner.rate, float)
 
 
-def test_flat_names_leaves_by_their_paths() -> None:
+def test_flat_names_leaves_by_dotted_paths() -> None:
     assert flat({"a": {"b": 1, "c": {"d": [2]}}, "e": 3}) == {"a.b": 1, "a.c.d": [2], "e": 3}
 
 
-def test_suggestion_is_empty_for_a_stranger() -> None:
+def test_suggestion_is_empty_without_a_close_word() -> None:
     assert suggestion("zzz", ["levels"]) == ""
     assert "levels" in suggestion("levls", ["levels"])

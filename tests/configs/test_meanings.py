@@ -1,4 +1,4 @@
-"""What settings mean, read from beside their defaults."""
+"""Meanings of settings, read from the comments beside their defaults."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -14,7 +14,7 @@ SETTINGS = every_setting()
 
 @dataclass(frozen=True)
 class Sample:
-    """With a # in its docstring."""
+    """A class with a # in its docstring."""
 
     bare: int = 0
     # a heading
@@ -29,7 +29,7 @@ class Sample:
     last: int = 1
 
     def method(self) -> int:
-        inside: int = 1  # no setting
+        inside: int = 1  # not a setting
         return inside
 
 
@@ -40,7 +40,7 @@ class Kind(StrEnum):
     B = "b"
 
 
-def test_comments_are_those_beside_and_above() -> None:
+def test_comments_in_returns_comments_beside_and_above() -> None:
     assert comments_in(Sample) == {
         "bare": Comment("", ""),
         "one": Comment("a heading of two lines", 'm; of a "#"'),
@@ -51,22 +51,22 @@ def test_comments_are_those_beside_and_above() -> None:
 
 
 @pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: setting.name)
-def test_every_setting_says_what_it_means(setting: Setting) -> None:
+def test_every_setting_has_a_meaning(setting: Setting) -> None:
     assert len(setting.meaning) > 8
     assert not setting.choices or str(setting.default) in setting.choices
 
 
-def test_all_settings_are_there_once() -> None:
+def test_every_setting_lists_each_setting_once() -> None:
     names = [setting.name for setting in SETTINGS]
     assert len(names) == len(set(names))
     assert set(names) == {*flat(settings([])), *presets()}
 
 
-def test_all_can_be_typed_back() -> None:
+def test_overrides_of_all_defaults_compose_the_default_job() -> None:
     assert compose_job([setting.override for setting in SETTINGS]) == compose_job([])
 
 
-def test_choices_are_explained_where_the_meaning_does_not() -> None:
+def test_setting_text_lists_choices_that_the_meaning_lacks() -> None:
     text = {setting.name: setting.text for setting in SETTINGS}
     assert "flat: all features side by side; entity: " in text["expert.network"]
     assert text["procedure"].endswith("(default, label, masters, published)")
