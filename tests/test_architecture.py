@@ -115,14 +115,14 @@ def allowed(inner: str, outer: str) -> bool:
     )
 
 
-def test_there_is_something_to_look_at() -> None:
+def test_rooms_and_sources_exist() -> None:
     assert {path.parts[len(ROOT.parts)] for path in SOURCES} == set(PRODUCT)
     assert all((ROOT / name.replace(".", "/")).with_suffix(".py").is_file() or (ROOT / name.replace(".", "/")).is_dir()
                for name in MAY_IMPORT)  # fmt: skip
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_imports_run_one_way(path: Path) -> None:
+def test_imports_run_downwards(path: Path) -> None:
     inner = room(".".join(["levelproof", *path.relative_to(ROOT).with_suffix("").parts]))
     assert inner
     assert not libraries(path) & set(ROOMS), "import levelproof.<room>"
@@ -133,7 +133,7 @@ def test_imports_run_one_way(path: Path) -> None:
     assert not wrong
 
 
-def test_the_product_and_nothing_else_is_installed_and_checked() -> None:
+def test_wheel_and_type_checker_cover_the_product_only() -> None:
     tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
     assert tools["hatch"]["build"]["targets"]["wheel"]["packages"] == ["levelproof"]
     assert "levelproof" in tools["pyright"]["include"]
@@ -142,23 +142,23 @@ def test_the_product_and_nothing_else_is_installed_and_checked() -> None:
 
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="this is no clone")
-def test_no_run_has_left_a_folder_in_the_repository() -> None:
+def test_repository_has_no_unknown_folder() -> None:
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
     assert {path.partition("/")[0] for path in listed.splitlines() if "/" in path} == FOLDERS
 
 
-def test_measuring_does_not_import_the_tests() -> None:
+def test_benchmarks_import_no_tests() -> None:
     assert [name_of(path) for path in python_files("benchmarks") if "tests" in libraries(path)] == []
 
 
 @pytest.mark.parametrize(("library", "allowed"), [("ray", RAY_IN), ("hydra", HYDRA_IN), ("omegaconf", HYDRA_IN)])
-def test_a_library_stays_at_its_edge(library: str, allowed: set[str]) -> None:
+def test_library_is_imported_only_at_its_edge(library: str, allowed: set[str]) -> None:
     users = {name_of(path) for path in SOURCES if library in libraries(path)}
     assert users
     assert users <= allowed
 
 
-def test_the_door_has_no_logic() -> None:
+def test_levelproof_package_has_no_logic() -> None:
     """Names and where they live; what a module needs to import them late; the command."""
     assert [path.name for path in python_files("levelproof")] == ["__init__.py", "__main__.py"]
     tree = ast.parse((ROOT / "levelproof/__init__.py").read_text())
@@ -173,7 +173,7 @@ def test_the_door_has_no_logic() -> None:
             ast.literal_eval(node.value)
 
 
-def test_no_class_name_stands_twice() -> None:
+def test_class_names_are_unique() -> None:
     """One word for one thing: a reader who meets a name knows which file it is from."""
     homes = defaultdict(list)
     for path in SOURCES:
@@ -185,7 +185,7 @@ def test_no_class_name_stands_twice() -> None:
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_files_are_short_finished_and_say_what_they_are(path: Path) -> None:
+def test_files_are_short_finished_and_documented(path: Path) -> None:
     text = path.read_text()
     assert len(text.splitlines()) <= LONGEST
     assert not re.search(r"\b(TODO|FIXME|XXX)\b", text)

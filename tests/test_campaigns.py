@@ -52,14 +52,14 @@ def order(output: str) -> list[str]:
     return [file for number, file in enumerate(files) if number == 0 or file != files[number - 1]]
 
 
-def test_a_seed_shuffles_files_and_keeps_their_tests_together(folder: Path) -> None:
+def test_shuffle_orders_files_by_seed_and_keeps_their_tests_together(folder: Path) -> None:
     first, again, other = (order(run_pytest(folder, f"--shuffle={seed}")) for seed in ("1f0a", "1f0a", "77c3"))
     assert first == again
     assert first != other
     assert sorted(first) == sorted(other) == sorted(map(str, range(FILES)))
 
 
-def test_the_summary_names_campaigns_that_were_not_reached(folder: Path) -> None:
+def test_summary_names_campaigns_that_were_not_reached(folder: Path) -> None:
     for processes in ((), ("-n2", "--no-loadscope-reorder")):
         output = run_pytest(folder, "--shuffle=1f0a", "--within=-1", *processes)
         assert f"  {4 * FILES}: not reached: no test begins after -1 s\n" in output
@@ -67,5 +67,5 @@ def test_the_summary_names_campaigns_that_were_not_reached(folder: Path) -> None
             assert f"    test_{number}.py: test_first, test_second (3 cases)\n" in output
 
 
-def test_campaigns_that_were_reached_are_not_named(folder: Path) -> None:
+def test_summary_omits_campaigns_that_were_reached(folder: Path) -> None:
     assert "not reached" not in run_pytest(folder, "--within=1000")

@@ -62,20 +62,20 @@ def test_workflows_and_hooks_call_the_scripts() -> None:
     assert [hook["entry"] for hook in hooks] == [".ci/check format", ".ci/check lint", ".ci/check types"]
 
 
-def test_the_check_workflow_runs_every_supported_python() -> None:
+def test_check_workflow_runs_every_supported_python() -> None:
     workflow = yaml.safe_load((ROOT / ".github/workflows/check.yml").read_text())
     supported = [found[1] for entry in PROJECT["classifiers"] if (found := re.search(r":: (3\.\d+)$", entry))]
     assert workflow["jobs"]["check"]["strategy"]["matrix"]["python"] == supported
 
 
-def test_the_citation_has_the_version_and_authors_of_the_project() -> None:
+def test_citation_has_the_version_and_authors_of_the_project() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == PROJECT["version"]
     assert citation["authors"] == PROJECT["authors"]
     assert citation["license"] == PROJECT["license"]
 
 
-def test_the_changelog_names_kinds_of_changes() -> None:
+def test_changelog_uses_known_kinds_of_changes() -> None:
     kinds = re.findall(r"^### (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert kinds
     assert set(kinds) <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}

@@ -61,7 +61,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
-def test_a_page_s_commands_run_in_their_order(page: Path, made: Path, tmp_path: Path) -> None:
+def test_commands_of_a_page_run_in_order(page: Path, made: Path, tmp_path: Path) -> None:
     for words in commands(page):
         for name in re.findall(r"data/\w+/\w+|kinetix/\w+/\w+|level\.json|\bmine\b|\bhandmade\b", " ".join(words)):
             makes = words[0] == "import" and f"-o {name}" in " ".join(words)

@@ -41,18 +41,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_readme_has_python() -> None:
+def test_readme_has_python() -> None:
     assert PAGES[0].name == "README.md"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_a_page_s_python_runs_from_top_to_bottom(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_of_a_page_runs_from_top_to_bottom(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     exec(compile("\n".join(blocks(page)), str(page), "exec"), {"__name__": "__main__"})
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_a_page_imports_of_ours_the_door_alone(page: Path) -> None:
+def test_python_of_a_page_imports_only_the_levelproof_package(page: Path) -> None:
     nodes = list(ast.walk(ast.parse("\n".join(blocks(page)))))
     modules = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
     modules += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
@@ -61,14 +61,14 @@ def test_a_page_imports_of_ours_the_door_alone(page: Path) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("page", NOTEBOOKS, ids=lambda page: page.stem)
-def test_a_notebook_runs_from_top_to_bottom(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notebook_runs_from_top_to_bottom(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     cells = json.loads(page.read_text())["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     exec(compile("\n\n".join(code), str(page), "exec"), {"__name__": "__main__"})
 
 
-def test_the_docs_are_a_site_without_a_broken_link(tmp_path: Path) -> None:
+def test_docs_build_without_a_broken_link(tmp_path: Path) -> None:
     words = ["-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run([sys.executable, *words], cwd=ROOT, env=environment, capture_output=True, text=True)

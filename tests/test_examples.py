@@ -26,18 +26,18 @@ def commands(path: Path) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.iterdir()), ids=lambda path: path.name)
-def test_a_job_s_settings_are_settings(path: Path) -> None:
+def test_examples_use_valid_settings(path: Path) -> None:
     assert commands(path)
     for words in commands(path):
         assert compose_job(words).checkpoint_seconds == 600
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
-def test_a_script_is_one(path: Path) -> None:
+def test_scripts_parse(path: Path) -> None:
     subprocess.run(["bash", "-n", str(path)], check=True)
 
 
-def test_kubernetes_gets_a_job_of_ray() -> None:
+def test_kubernetes_example_is_a_ray_job() -> None:
     job = yaml.safe_load((FOLDER / "kubernetes.yaml").read_text())
     assert (job["apiVersion"], job["kind"]) == ("ray.io/v1", "RayJob")
     cluster = job["spec"]["rayClusterSpec"]
@@ -76,7 +76,7 @@ def log(folder: Path) -> list[str]:
     return (folder / "log").read_text().splitlines()
 
 
-def test_a_spot_machine_runs_the_same_command_until_it_is_done(tmp_path: Path, stand_ins: dict[str, str]) -> None:
+def test_spot_script_repeats_the_command_until_it_is_done(tmp_path: Path, stand_ins: dict[str, str]) -> None:
     (tmp_path / "codes").write_text("137\n130\n0\n")
     done = subprocess.run(["bash", str(FOLDER / "spot.sh")], cwd=tmp_path, env=stand_ins, timeout=patience(60))
     assert done.returncode == 0
@@ -90,7 +90,7 @@ def test_a_spot_machine_runs_the_same_command_until_it_is_done(tmp_path: Path, s
 
 
 @pytest.mark.parametrize(("name", "again"), [("slurm-array", "requeue 7_1"), ("slurm-ray", "requeue 7"), ("spot", "")])
-def test_the_end_of_an_allocation_stops_the_command_and_queues_it_again(
+def test_scripts_stop_the_command_at_the_end_of_an_allocation_and_requeue_it(
     tmp_path: Path, stand_ins: dict[str, str], name: str, again: str
 ) -> None:
     (tmp_path / "codes").write_text("wait\n")

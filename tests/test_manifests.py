@@ -23,24 +23,24 @@ WORLDS = dict(np.load(FOLDER / "128k-s-levels.npz"))
 IDS = np.array([row["level_id"] for row in ROWS])
 
 
-def test_it_describes_the_default_dataset() -> None:
+def test_manifest_describes_the_default_dataset() -> None:
     assert IDS.tolist() == list(range(64))
     assert {row["config_hash"] for row in ROWS} == {compose_job([]).hash}, "make it again: manifests/README.md"
     assert {row["label"] for row in ROWS} == {"solved", "unsolved", "trivial", "unsolvable"}
 
 
-def test_it_has_null_where_there_is_no_number() -> None:
+def test_manifest_has_null_instead_of_nan() -> None:
     assert [row for row in ROWS if row["label"] == "trivial" and row["best_return"] is not None] == []
     numbers = [x for row in ROWS for x in [*row.values(), *row["learning_curve"]] if isinstance(x, float)]
     assert np.isfinite(numbers).all()
 
 
-def test_every_level_starts_as_it_did() -> None:
+def test_sampler_reproduces_the_initial_worlds() -> None:
     for name, values in arrays_of(sample_levels(IDS, SIZES["s"])).items():
         np.testing.assert_allclose(values, WORLDS[name], rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-def test_the_docs_example_is_its_gallery() -> None:
+def test_example_in_the_docs_is_the_manifests_gallery() -> None:
     """Its pages are the program's own, its data are of these rows."""
     links = {path.name: path.resolve() for path in EXAMPLE.iterdir() if path.is_symlink()}
     assert links == {path.name: path.resolve() for path in SITE.iterdir()}
@@ -53,7 +53,7 @@ def test_the_docs_example_is_its_gallery() -> None:
 
 
 @pytest.mark.slow
-def test_three_levels_come_out_as_they_did() -> None:
+def test_three_levels_keep_their_labels() -> None:
     """Two that were solved early and one where the goal was never reached: no change of last bits decides these."""
     by_expert = [row for row in ROWS if row["label"] == "solved" and row["steps_to_first_success"] is not None]
     early = sorted(by_expert, key=lambda row: row["steps_to_first_success"])[1:3]

@@ -24,7 +24,7 @@ def test_patience_grows_with_the_slowness_and_never_shrinks(monkeypatch: pytest.
         assert patience(10) == seconds
 
 
-def test_wait_until_ends_when_its_patience_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wait_until_fails_when_its_patience_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(pace.SLOWNESS, "4")
     begin = time.monotonic()
     with pytest.raises(AssertionError, match="within 1 s: a sign"):

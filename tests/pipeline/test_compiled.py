@@ -22,7 +22,7 @@ def programs(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.glob("*-cache")}
 
 
-def test_a_truncated_program_is_replaced_without_a_warning(tmp_path: Path) -> None:
+def test_truncated_program_is_recompiled_without_a_warning(tmp_path: Path) -> None:
     folder = tmp_path / "jax"
     python(COMPILE, tmp_path)
     whole = programs(folder)
@@ -38,7 +38,7 @@ def test_a_truncated_program_is_replaced_without_a_warning(tmp_path: Path) -> No
     assert programs(folder) == again
 
 
-def test_programs_are_read_when_they_have_changed(tmp_path: Path) -> None:
+def test_remove_damaged_reads_programs_that_changed_since_the_last_check(tmp_path: Path) -> None:
     program, looked = tmp_path / "jit_f-0-cache", tmp_path / LAST_CHECK
     program.write_bytes(b"damaged")
     remove_damaged(tmp_path)

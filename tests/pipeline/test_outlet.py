@@ -43,32 +43,32 @@ def levelproof(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[s
     )
 
 
-def test_verify_fails_on_a_damaged_split_although_its_reader_left(split: Path, unread: int) -> None:
+def test_verify_keeps_its_exit_code_when_its_reader_leaves(split: Path, unread: int) -> None:
     done = levelproof("verify", str(split), stdout=unread)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "Error" not in done.stderr
 
 
-def test_an_error_that_nobody_reads_keeps_its_exit_code(tmp_path: Path, unread: int) -> None:
+def test_error_keeps_its_exit_code_when_its_reader_leaves(tmp_path: Path, unread: int) -> None:
     assert levelproof("status", str(tmp_path / "nowhere"), stderr=unread).returncode == 2
 
 
-def test_a_closed_stdout_is_no_error(split: Path) -> None:
+def test_closed_stdout_is_not_an_error(split: Path) -> None:
     command = f"{sys.executable} -m levelproof status {split} >&-"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_full_disk_below_stdout_is_an_error(split: Path) -> None:
+def test_full_disk_below_stdout_is_an_error(split: Path) -> None:
     with open("/dev/full", "w") as full:
         done = levelproof("status", str(split), stdout=full)
     assert done.returncode == 1
     assert done.stderr.startswith("Error: OSError")
 
 
-def test_a_watch_ends_when_its_reader_leaves(split: Path, unread: int) -> None:
+def test_watch_ends_when_its_reader_leaves(split: Path, unread: int) -> None:
     """Although the run that it watches goes on."""
     workers = {"a machine": {"count": 2, "silent": 1.5}}
     numbers = dict.fromkeys(("levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined"), 1)

@@ -17,7 +17,7 @@ from tests.pipeline.made import made_job, made_split
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="the system has no such users")
 
 
-def test_a_folder_is_made_for_its_user_alone(tmp_path: Path) -> None:
+def test_own_folder_is_created_for_its_user_alone(tmp_path: Path) -> None:
     before = os.umask(0o002)  # as many systems have it
     try:
         made = own_folder(tmp_path / "deeper/cache", "delete it")
@@ -28,7 +28,9 @@ def test_a_folder_is_made_for_its_user_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o720, 0o702, 0o777])
-def test_a_cache_that_others_write_to_is_not_used(tmp_path: Path, mode: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_generate_rejects_a_cache_that_others_can_write_to(
+    tmp_path: Path, mode: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cache = tmp_path / "cache"
     cache.mkdir()
     cache.chmod(mode)
@@ -38,7 +40,7 @@ def test_a_cache_that_others_write_to_is_not_used(tmp_path: Path, mode: int, mon
     assert not (tmp_path / "data").exists()
 
 
-def test_nor_are_programs_that_others_could_have_put_into_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepare_jax_rejects_programs_that_others_can_write_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     (tmp_path / "jax").mkdir()
     (tmp_path / "jax").chmod(0o777)
@@ -47,7 +49,7 @@ def test_nor_are_programs_that_others_could_have_put_into_it(tmp_path: Path, mon
         prepare_jax()
 
 
-def test_another_user_s_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_folder_rejects_another_users_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     cache_folder()
     about = tmp_path.stat().st_uid
@@ -59,7 +61,7 @@ def test_another_user_s_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.Mo
         cache_folder()  # an administrator's: who is one may write anywhere
 
 
-def test_experts_that_others_write_to_do_not_go_on(tmp_path: Path) -> None:
+def test_experts_that_others_can_write_to_are_rejected(tmp_path: Path) -> None:
     split = made_split(tmp_path, [[Label.SOLVED]])
     (split / "experts").mkdir(exist_ok=True)
     (split / "experts").chmod(0o777)

@@ -42,17 +42,17 @@ def python(program: str, folder: Path, **environment: str) -> str:
     return done.stdout
 
 
-def test_factorisations_side_by_side_do_not_deadlock(tmp_path: Path) -> None:
+def test_batched_factorisations_do_not_deadlock(tmp_path: Path) -> None:
     python(FACTORISE, tmp_path)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
-def test_xla_has_one_thread_to_compute(tmp_path: Path) -> None:
+def test_xla_computes_on_one_thread(tmp_path: Path) -> None:
     assert int(python(COUNT, tmp_path)) <= 1
 
 
 @pytest.mark.skipif(sys.platform != "linux" or len(own_cores()) < 2, reason="looks at /proc; needs a second core")
-def test_runs_with_fewer_workers_than_cores_do_not_meet_on_one(tmp_path: Path) -> None:
+def test_own_core_pins_no_worker_if_cores_are_left_over(tmp_path: Path) -> None:
     program = (
         "from levelproof.pipeline.runtime import own_core, prepare_jax; prepare_jax(own_core(1)); "
         "import os; print(*os.sched_getaffinity(0))"
@@ -61,7 +61,7 @@ def test_runs_with_fewer_workers_than_cores_do_not_meet_on_one(tmp_path: Path) -
     assert len(one | two) > 1
 
 
-def test_flags_of_the_user_stay(tmp_path: Path) -> None:
+def test_prepare_jax_keeps_the_users_flags(tmp_path: Path) -> None:
     program = (
         "from levelproof.pipeline.runtime import prepare_jax as prepare; prepare(); prepare(); "
         "import os; print(os.environ['XLA_FLAGS'])"
@@ -70,7 +70,7 @@ def test_flags_of_the_user_stay(tmp_path: Path) -> None:
     assert flags == ["--xla_dump_to=/nowhere", *XLA_FLAGS]
 
 
-def test_compiled_code_is_kept_where_it_was_asked_for(tmp_path: Path) -> None:
+def test_prepare_jax_caches_programs_in_the_chosen_folder(tmp_path: Path) -> None:
     program = (
         "from levelproof.pipeline import runtime; runtime.MIN_COMPILE_SECONDS = 0; runtime.prepare_jax(); import jax; "
     )
@@ -78,7 +78,7 @@ def test_compiled_code_is_kept_where_it_was_asked_for(tmp_path: Path) -> None:
     assert list((tmp_path / "jax").iterdir())
 
 
-def test_the_cache_is_in_the_user_s_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_folder_is_the_users_unless_it_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(CACHE_VARIABLE)
     monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
     if sys.platform == "linux":
@@ -88,9 +88,7 @@ def test_the_cache_is_in_the_user_s_cache_folder(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("quota", [64, 4, 1])
-def test_workers_are_as_many_as_the_quota_of_a_container_keeps_busy(
-    monkeypatch: pytest.MonkeyPatch, quota: int
-) -> None:
+def test_own_cores_respect_a_containers_quota(monkeypatch: pytest.MonkeyPatch, quota: int) -> None:
     monkeypatch.setattr(runtime, "_allowed_cores", lambda: list(range(64)))
     monkeypatch.setattr(runtime, "cpu_count", lambda: quota)
     assert len(own_cores()) == quota
@@ -102,7 +100,7 @@ def test_workers_are_as_many_as_the_quota_of_a_container_keeps_busy(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="no other system can")
-def test_every_worker_of_a_machine_has_its_own_core(tmp_path: Path) -> None:
+def test_own_core_gives_each_worker_another_core(tmp_path: Path) -> None:
     """Of a mask that leaves some out; what a worker had is free when it has died."""
     program = (
         "import sys; from levelproof.pipeline import runtime; runtime._allowed_cores = lambda: [5, 7]; "
@@ -127,7 +125,7 @@ def test_every_worker_of_a_machine_has_its_own_core(tmp_path: Path) -> None:
         again.kill()
 
 
-def test_settings_of_the_user_that_change_results_are_overruled(tmp_path: Path) -> None:
+def test_prepare_jax_overrides_settings_that_change_results(tmp_path: Path) -> None:
     program = (
         "from levelproof.pipeline.runtime import prepare_jax, JAX_SETTINGS; prepare_jax(); import jax; "
         "print(all(getattr(jax.config, name) == value for name, value in JAX_SETTINGS.items()))"
@@ -144,7 +142,7 @@ def test_settings_of_the_user_that_change_results_are_overruled(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("device", ["'cpu'", "None", "'gpu'"])
-def test_jax_leaves_gpus_alone_unless_they_are_asked_for(tmp_path: Path, device: str) -> None:
+def test_prepare_jax_ignores_gpus_unless_they_are_asked_for(tmp_path: Path, device: str) -> None:
     program = (
         "from levelproof.pipeline.runtime import prepare_jax; import jax; "
         f"prepare_jax(); prepare_jax(device={device}); "

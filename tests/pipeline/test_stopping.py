@@ -20,7 +20,7 @@ def asked(number: signal.Signals) -> None:
 
 
 @pytest.mark.parametrize("beside", ["1", "0"])
-def test_sigterm_ends_a_job_while_its_seal_hangs(tmp_path: Path, beside: str) -> None:
+def test_sigterm_ends_a_job_whose_seal_hangs(tmp_path: Path, beside: str) -> None:
     process = start([str(tmp_path), "1", beside], tmp_path, module="tests.pipeline.slow_seal")
     assert process.stdout
     assert process.stdout.readline() == f"{HUNG}\n", process.communicate()
@@ -33,7 +33,7 @@ def test_sigterm_ends_a_job_while_its_seal_hangs(tmp_path: Path, beside: str) ->
 
 
 @pytest.mark.parametrize("number", BOTH)
-def test_a_signal_interrupts_what_does_not_heed_it(number: signal.Signals) -> None:
+def test_signal_raises_keyboard_interrupt_outside_a_heeded_block(number: signal.Signals) -> None:
     before = [signal.getsignal(each) for each in BOTH]
     with pytest.raises(KeyboardInterrupt), stoppable() as stop:
         asked(number)
@@ -44,7 +44,7 @@ def test_a_signal_interrupts_what_does_not_heed_it(number: signal.Signals) -> No
 
 
 @pytest.mark.parametrize("number", BOTH)
-def test_the_first_signal_leaves_time_to_what_heeds_it(number: signal.Signals) -> None:
+def test_first_signal_only_sets_asked_in_a_heeded_block(number: signal.Signals) -> None:
     heeded = False
     with pytest.raises(KeyboardInterrupt), stoppable() as stop:  # noqa: PT012
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as Ray sets a handler of its own
@@ -57,7 +57,7 @@ def test_the_first_signal_leaves_time_to_what_heeds_it(number: signal.Signals) -
     assert heeded
 
 
-def test_the_second_signal_interrupts_what_heeds_the_first() -> None:
+def test_second_signal_interrupts_a_heeded_block() -> None:
     with pytest.raises(KeyboardInterrupt), stoppable() as stop, stop.heeded():  # noqa: PT012
         asked(signal.SIGTERM)
         asked(signal.SIGINT)
@@ -65,7 +65,7 @@ def test_the_second_signal_interrupts_what_heeds_the_first() -> None:
 
 
 @pytest.mark.slow
-def test_the_driver_ends_rounds_to_stop(tmp_path: Path) -> None:
+def test_driver_cancels_rounds_to_stop(tmp_path: Path) -> None:
     """A worker hears of nothing else before the end of its round."""
     alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long
     command = ["generate", "levels=8", "unit=1", "budget=100M", "workers=1", *alone]

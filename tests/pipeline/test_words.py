@@ -12,5 +12,5 @@ from levelproof.pipeline.words import many
         (1, "trajectory", "1 trajectory"), (2, "trajectory", "2 trajectories"), (2, "witness", "2 witnesses"),
     ],
 )  # fmt: skip
-def test_one_and_many(count: int, noun: str, told: str) -> None:
+def test_many_inflects_the_noun(count: int, noun: str, told: str) -> None:
     assert many(count, noun) == told

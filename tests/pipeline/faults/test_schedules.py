@@ -23,11 +23,11 @@ def run(first: int, count: int) -> None:
     assert f"{count} schedules, 0 failed" in done.stdout
 
 
-def test_some_schedules_change_nothing() -> None:
+def test_some_fault_schedules_change_nothing() -> None:
     run(10_000, 20)
 
 
-def test_a_line_that_a_kill_left_half_written_tells_of_nothing(tmp_path: Path) -> None:
+def test_lose_power_ignores_a_half_written_log_line(tmp_path: Path) -> None:
     log, kept, gone = tmp_path / "log", tmp_path / "kept", tmp_path / "gone"
     line = lambda path: f"\nwrite\t{path}\t{path}\t\tFalse\twhole"
     seen = set()
@@ -44,5 +44,5 @@ def test_a_line_that_a_kill_left_half_written_tells_of_nothing(tmp_path: Path) -
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("first", range(0, 8 * EACH, EACH))
-def test_five_hundred_schedules_change_nothing(first: int) -> None:
+def test_five_hundred_fault_schedules_change_nothing(first: int) -> None:
     run(first, EACH)

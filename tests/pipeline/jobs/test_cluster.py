@@ -38,7 +38,7 @@ def fragile(deadly: int, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_a_level_that_kills_its_worker_takes_no_other_with_it(tmp_path: Path) -> None:
+def test_level_that_kills_its_worker_is_quarantined_alone(tmp_path: Path) -> None:
     done = fragile(DEADLY, tmp_path)
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
@@ -56,13 +56,13 @@ def test_a_level_that_kills_its_worker_takes_no_other_with_it(tmp_path: Path) ->
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_workers_that_cannot_start_stop_the_run(tmp_path: Path) -> None:
+def test_run_fails_if_no_worker_can_start(tmp_path: Path) -> None:
     done = fragile(-1, tmp_path)
     assert_refused(done, 1, "No worker can start (The worker died", "try executor=inline")
     assert not (tmp_path / SPLIT / "quarantine").exists()
 
 
-def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_generate_names_an_unreachable_cluster(tmp_path: Path) -> None:
     done = run(SETTINGS, tmp_path, address="127.0.0.1:9")
     assert_refused(
         done, 2, "There is no Ray cluster at RAY_ADDRESS=127.0.0.1:9 (Connection refused)", "ray start --head"
@@ -70,13 +70,13 @@ def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a folder in which even root can make nothing")
-def test_a_folder_of_ray_s_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_generate_names_a_ray_folder_that_is_not_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_TMPDIR", "/proc/sys/ray")
     assert_refused(run(SETTINGS, tmp_path), 1, "Ray cannot start", "/proc/sys/ray", "RAY_TMPDIR")
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:99999", "a..b:6379"])
-def test_an_address_that_cannot_be_one_is_named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_require_reachable_names_an_invalid_address(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", address)
     with pytest.raises(UserError, match=f"There is no Ray cluster at RAY_ADDRESS={re.escape(address)} "):
         require_reachable(address)
@@ -127,7 +127,7 @@ with only_writer(split, print):
 
 
 @pytest.mark.slow
-def test_a_worker_that_starts_late_commits_for_its_own_driver_only(tmp_path: Path) -> None:
+def test_late_worker_commits_only_for_its_own_driver(tmp_path: Path) -> None:
     split = tmp_path / SPLIT
     split.mkdir(parents=True)
     program = [sys.executable, "-c", CUT_OFF, str(split)]
@@ -138,7 +138,7 @@ def test_a_worker_that_starts_late_commits_for_its_own_driver_only(tmp_path: Pat
     assert not fragment_paths(split)
 
 
-def test_workers_read_no_relative_path() -> None:
+def test_with_absolute_paths_resolves_every_path() -> None:
     """They run in another folder than the command."""
     job = with_absolute_paths(made_job("data", "continue_from=data/5k/s"))
     assert job.out == str(Path("data").absolute())
@@ -146,7 +146,7 @@ def test_workers_read_no_relative_path() -> None:
     assert with_absolute_paths(made_job()).continue_from == ""
 
 
-def test_there_are_as_many_workers_as_machines_have_room_for_now(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crew_follows_the_room_of_its_machines(monkeypatch: pytest.MonkeyPatch) -> None:
     cores: dict[str, int] = {"head": 0}
     named = lambda name, number: {"NodeID": name, "NodeManagerHostname": name, "Resources": {"CPU": number}}
     nodes = lambda: [named(name, number) | {"Alive": True} for name, number in cores.items()]
@@ -180,7 +180,9 @@ def test_there_are_as_many_workers_as_machines_have_room_for_now(monkeypatch: py
     assert there(crew) == ["b"]
 
 
-def test_a_machine_is_left_out_when_several_of_its_workers_are_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crew_excludes_a_machine_when_several_of_its_workers_are_refused_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     why = "The worker on a has jax 0.1, and this command jax 0.2: install the same."
     answers = {"a0": why, "a1": why, "b0": "", "b1": ""}
     monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
@@ -192,7 +194,7 @@ def test_a_machine_is_left_out_when_several_of_its_workers_are_refused_at_once(m
     assert [(handle.node, handle.up) for handle in crew._handles] == [("b", True), ("b", True)]
 
 
-def test_others_go_on_with_what_a_worker_has_whose_machine_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crew_hands_on_the_units_of_workers_on_a_refused_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """It began before somebody installed another program there."""
     monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
     scheduler = Scheduler([WorkUnit((0, 1, 2))], 6)
@@ -208,7 +210,7 @@ def test_others_go_on_with_what_a_worker_has_whose_machine_is_refused(monkeypatc
     assert [*scheduler.workers] == [elsewhere]
 
 
-def test_a_worker_with_another_program_is_refused_in_a_sentence() -> None:
+def test_mismatch_names_what_differs() -> None:
     job = made_job()
     program = program_of(job)
     assert mismatch(program, job) == ""
@@ -220,7 +222,7 @@ def test_a_worker_with_another_program_is_refused_in_a_sentence() -> None:
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
+def test_run_survives_machines_that_join_and_leave(tmp_path: Path) -> None:
     """Ray's own nodes: a head without a core, one that joins a waiting run, and one more before the first is lost.
 
     They run in another folder than the command, which names the split that goes on relatively.
@@ -264,7 +266,7 @@ def test_a_cluster_whose_machines_come_and_go(tmp_path: Path) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_prometheus_gets_the_progress_from_ray(tmp_path: Path) -> None:
+def test_ray_exports_progress_to_prometheus(tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="ray[default] is not there, which tells Prometheus")
     from ray.cluster_utils import Cluster
 
@@ -297,7 +299,7 @@ def test_prometheus_gets_the_progress_from_ray(tmp_path: Path) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_a_worker_that_stalls_is_given_up_and_another_does_its_levels(tmp_path: Path) -> None:
+def test_crew_replaces_a_stalled_worker(tmp_path: Path) -> None:
     alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long
     command = ["generate", f"levels={LEVELS}", "unit=1", "budget=1M", "workers=1", *alone]
     process = start([str(LEVELS), str(patience(STALLED)), *command], tmp_path, module="tests.pipeline.fragile")
@@ -313,7 +315,7 @@ def test_a_worker_that_stalls_is_given_up_and_another_does_its_levels(tmp_path: 
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_machines_that_die_and_join_and_a_driver_that_comes_back_change_no_bit(tmp_path: Path) -> None:
+def test_lost_machines_and_a_restarted_driver_change_no_bit(tmp_path: Path) -> None:
     from ray.cluster_utils import Cluster
 
     memory: dict[str, Any] = {"object_store_memory": 80 * 2**20}

@@ -35,7 +35,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_manifest_names_size_and_distribution(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_manifest_names_size_and_distribution(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = read_manifest(made / SPLIT).table.to_pylist()
     assert [row["size"] for row in rows] == [SIZE] * 4
     assert rows[0]["command"] == f"levelproof generate size={SIZE} budget=5k distribution=free first_level=5 levels=1"
@@ -46,14 +46,14 @@ def test_the_manifest_names_size_and_distribution(made: Path, capsys: pytest.Cap
 
 
 @pytest.mark.parametrize("size", ["4-2-0-1", "6-0-1-1", "5-2-1-0"])
-def test_a_size_without_things_of_a_kind(tmp_path: Path, size: str) -> None:
+def test_sizes_without_joints_thrusters_or_circles_generate_and_verify(tmp_path: Path, size: str) -> None:
     done = here(["generate", f"size={size}", "levels=4", "unit=4", "budget=5k", "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
     done = here(["verify", f"data/5k/{size}"], tmp_path)
     assert done.returncode == 0, done.stdout
 
 
-def test_every_question_is_answered(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_work_on_a_custom_size(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     split, level, picture = made / SPLIT, made / "level.json", made / "level.png"
     facts = read_status(split)
     assert (facts["wanted"], facts["done"]) == (4, 4)
@@ -70,7 +70,7 @@ def test_every_question_is_answered(made: Path, capsys: pytest.CaptureFixture[st
     assert f"a level of size {SIZE}" in capsys.readouterr().out
 
 
-def test_a_rows_command_makes_the_row_again(made: Path) -> None:
+def test_command_of_a_row_reproduces_the_row(made: Path) -> None:
     row = next(row for row in read_manifest(made / SPLIT).table.to_pylist() if row["shard"])
     words = shlex.split(row["command"])[1:]
     done = here([*words, "executor=inline", "out=again"], made)
@@ -86,7 +86,7 @@ def test_a_rows_command_makes_the_row_again(made: Path) -> None:
     assert all(same_bits(values, two[name]).all() for name, values in one.items())
 
 
-def test_another_distribution_needs_another_folder(made: Path) -> None:
+def test_generate_rejects_another_distribution_in_the_same_folder(made: Path) -> None:
     done = here(["generate", f"size={SIZE}", "levels=4", "budget=5k", "executor=inline"], made)
     assert_refused(done, 2, "distribution.max_fixed_chance was 0", "out=NAME")
 
@@ -112,5 +112,5 @@ def test_sample_draws_a_sheet(tmp_path: Path) -> None:
         (["levels=1", "-o", "/dev/null/sheet.png"], "Cannot write /dev/null/sheet.png"),
     ],
 )
-def test_sample_says_what_is_wrong(tmp_path: Path, words: list[str], sentence: str) -> None:
+def test_sample_names_the_mistake(tmp_path: Path, words: list[str], sentence: str) -> None:
     assert_refused(here(["sample", *words], tmp_path), 2, sentence)

@@ -11,7 +11,7 @@ from levelproof.pipeline.jobs.progress import Tally
 from levelproof.pipeline.jobs.schedule import Order, Scheduler, Summary, UnitOutcome, WorkUnit
 
 
-def test_the_latest_events_and_the_state_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_events_publish_the_start_the_latest_events_and_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events_file, "EVERY", 0.0)
     told: list[list] = []
     units = [WorkUnit(range(2 * i, 2 * i + 2)) for i in range(3 * MAX_EVENTS)]

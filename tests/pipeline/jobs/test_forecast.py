@@ -22,7 +22,7 @@ def sample(busy: np.ndarray, solved: np.ndarray, **changes: object) -> Sample:
     return Sample(**(of | {"busy": busy, "solved": solved, "witnessed": solved, "stored": stored} | changes))  # pyright: ignore[reportArgumentType]
 
 
-def test_nine_intervals_of_ten_hold_what_comes() -> None:
+def test_forecast_intervals_cover_nine_of_ten_outcomes() -> None:
     rng, held = np.random.default_rng(0), 0
     for _ in range(50):
         seconds = rng.gamma(0.4, 2.0, 4256)
@@ -32,7 +32,7 @@ def test_nine_intervals_of_ten_hold_what_comes() -> None:
     assert 38 <= held <= 50
 
 
-def test_numbers_follow_levels_and_workers() -> None:
+def test_forecast_scales_with_levels_and_workers() -> None:
     seconds = np.tile([0.5, 1.5], 100)
     of = forecast(sample(seconds, seconds < 1), 6_000_000, 64, 32)
     assert of.wall.expected == pytest.approx(6_000_000 / 64 + 5)
@@ -47,7 +47,7 @@ def test_numbers_follow_levels_and_workers() -> None:
     assert forecast(sample(seconds, np.zeros(200, bool)), 100, 2, 32).seconds_per_solved is None
 
 
-def test_unit_is_that_of_the_scheduler_unless_it_is_given() -> None:
+def test_forecast_unit_equals_the_schedulers_unless_it_is_set() -> None:
     half = sample(np.full(50, 0.5), np.ones(50, bool))
     for levels, workers in (6_000_000, 64), (1000, 8), (3, 2):
         assert forecast(half, levels, workers, 32).unit == unit_levels(0.5, levels, workers, 32)
@@ -55,7 +55,7 @@ def test_unit_is_that_of_the_scheduler_unless_it_is_given() -> None:
     assert (of.unit, of.unit_seconds) == (7, 3.5)
 
 
-def test_files_are_those_that_sealing_makes(tmp_path: Path) -> None:
+def test_forecast_files_equal_those_that_sealing_makes(tmp_path: Path) -> None:
     split = made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]] * 4)
     seal_split(split, None, Console(quiet=True))
     (shard,) = (split / "shards").iterdir()

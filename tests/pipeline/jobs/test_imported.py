@@ -47,7 +47,7 @@ def rows_of(split: Path) -> list[dict]:
     return read_manifest(split).table.to_pylist()
 
 
-def test_every_trajectory_is_a_row_that_says_where_it_was(once: Path) -> None:
+def test_import_makes_a_row_with_the_source_of_every_trajectory(once: Path) -> None:
     rows = rows_of(once / "data/1M/s")
     assert [row["level_id"] for row in rows] == list(range(ROWS))
     assert [row["file"] for row in rows] == [f"{once}/theirs/{name}" for name in NAMES]
@@ -56,7 +56,7 @@ def test_every_trajectory_is_a_row_that_says_where_it_was(once: Path) -> None:
     assert {(row["size"], row["budget"], row["env_steps"]) for row in rows} == {("s", "1M", 0)}
 
 
-def test_labels_are_what_a_replay_of_the_actions_shows(once: Path) -> None:
+def test_import_labels_levels_by_replaying_the_actions(once: Path) -> None:
     split = once / "data/1M/s"
     level, record = to_ours(trajectories_in(once / "theirs"))
     again = replay(level, record.action)
@@ -82,7 +82,7 @@ def test_labels_are_what_a_replay_of_the_actions_shows(once: Path) -> None:
             np.testing.assert_array_equal(kept["record/action"][steps, :, 0], record.action[0, :, i])
 
 
-def test_every_level_is_looked_at_again(once: Path, folder: Path) -> None:
+def test_verify_checks_every_imported_level(once: Path, folder: Path) -> None:
     findings = examine(once / "data/1M/s")
     assert (findings.levels, findings.witnesses, findings.sentences) == (ROWS, findings.same_bits, [])
     shutil.rmtree(once / "theirs.gone", ignore_errors=True)
@@ -94,7 +94,7 @@ def test_every_level_is_looked_at_again(once: Path, folder: Path) -> None:
     assert "cannot be made again" in wrong
 
 
-def test_commands_work_on_it(once: Path, tmp_path: Path) -> None:
+def test_commands_work_on_an_imported_split(once: Path, tmp_path: Path) -> None:
     split = once / "data/1M/s"
     rows = rows_of(split)
     unsolved = next(row for row in rows if row["label"] == "unsolved")
@@ -107,7 +107,7 @@ def test_commands_work_on_it(once: Path, tmp_path: Path) -> None:
     assert len(trajectories_in(tmp_path / "k")) == sum(row["label"] == "solved" for row in rows)
 
 
-def test_no_other_job_writes_into_it(folder: Path) -> None:
+def test_other_jobs_cannot_write_to_an_imported_split(folder: Path) -> None:
     generate = ["generate", "budget=1M", "executor=inline", "levels=1"]
     assert_refused(here(generate, folder), 2, "distribution was import, now absent", "out=NAME")
     shutil.copytree(folder / "theirs", folder / "others")
@@ -117,7 +117,7 @@ def test_no_other_job_writes_into_it(folder: Path) -> None:
 
 
 @pytest.mark.campaign
-def test_it_is_not_repaired(folder: Path) -> None:
+def test_repair_rejects_an_imported_split(folder: Path) -> None:
     split = folder / "data/1M/s"
     shutil.rmtree(next((split / "shards").iterdir()))
     before = sorted(path for path in split.rglob("*"))
@@ -127,7 +127,7 @@ def test_it_is_not_repaired(folder: Path) -> None:
     assert sorted(path for path in split.rglob("*")) == before
 
 
-def test_its_levels_are_labelled_at_another_budget(once: Path, tmp_path: Path) -> None:
+def test_regenerate_labels_imported_levels_at_another_budget(once: Path, tmp_path: Path) -> None:
     words = [f"manifest={once / 'data/1M/s'}", "budget=5k", "procedure=label", "executor=inline"]
     done = here(["regenerate", *words, "where=label != 'solved'"], tmp_path)
     assert done.returncode == 0, done.stderr
@@ -144,7 +144,7 @@ def test_its_levels_are_labelled_at_another_budget(once: Path, tmp_path: Path) -
     assert rows_of(tmp_path / "again/data/5k/s")[0] | {name: row[name] for name in of_the_run} == row
 
 
-def test_a_stopped_import_goes_on(once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_import_continues_after_a_stop(once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     committed, commit = [], module.commit
 
     def once_only(job, split, unit, *rest) -> None:
@@ -167,7 +167,7 @@ def test_a_stopped_import_goes_on(once: Path, tmp_path: Path, monkeypatch: pytes
     assert [[row[name] for name in same] for row in got] == [[row[name] for name in same] for row in want]
 
 
-def test_what_is_no_level_is_left_out_and_told(once: Path, tmp_path: Path) -> None:
+def test_import_reports_and_skips_invalid_records(once: Path, tmp_path: Path) -> None:
     """An array of all, uncompressed and with an axis more, of which the reference reads that as well."""
     made = trajectories_in(once / "theirs")
     plain = np.dtype([(name, made.dtype[name].base, made.dtype[name].shape[1:]) for name in made.dtype.names or ()])
@@ -198,7 +198,7 @@ def test_what_is_no_level_is_left_out_and_told(once: Path, tmp_path: Path) -> No
     assert [row["content_hash"] for row in rows_of(tmp_path / "data/1M/s")] == want
 
 
-def test_a_split_is_named_by_budget_and_size(once: Path, tmp_path: Path) -> None:
+def test_import_requires_a_split_named_by_budget_and_size(once: Path, tmp_path: Path) -> None:
     words = ["import", str(once / "theirs"), "-o"]
     assert_refused(here([*words, "data/1M/m"], tmp_path), 2, "levels of size s", "-o data/1M/s")
     assert_refused(here([*words, "data/much/s"], tmp_path), 2, "budget is 'much'", "-o data/1M/s")
@@ -207,7 +207,7 @@ def test_a_split_is_named_by_budget_and_size(once: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.campaign
-def test_folders_that_the_reference_s_code_wrote(reference: Path, tmp_path: Path) -> None:
+def test_import_reads_folders_that_the_reference_wrote(reference: Path, tmp_path: Path) -> None:
     """Most of what reaches the goal there does so here. Of other sizes, golden folders are read."""
     solved, others = 24, 4
     file = oracle.sampled_levels(reference, "s")

@@ -81,7 +81,7 @@ def folder(once: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(once, tmp_path / "files"))
 
 
-def test_rows_are_named_by_file_and_content(once: Path) -> None:
+def test_rows_have_the_file_and_an_id_from_the_content(once: Path) -> None:
     rows = rows_of(once / "data/5k/s")
     assert {name: row["label"] for name, row in rows.items()} == {"a.json": "trivial", "b c.json": "unsolvable"}
     assert rows_of(once / "data/5k/7-2-1-2").keys() == {"larger.json"}
@@ -94,7 +94,7 @@ def test_rows_are_named_by_file_and_content(once: Path) -> None:
     assert len(read_manifest(once / "data/5k/s").fragments) == 1, "ids far apart share a unit"
 
 
-def test_a_second_run_does_nothing_wherever_the_files_are(folder: Path) -> None:
+def test_second_run_does_nothing_after_the_files_have_moved(folder: Path) -> None:
     (folder / "mine").rename(folder / "elsewhere")
     before = rows_of(folder / "data/5k/s")
     done = here(["generate", "level_files=elsewhere", *WORDS], folder)
@@ -108,7 +108,7 @@ def test_a_second_run_does_nothing_wherever_the_files_are(folder: Path) -> None:
     assert not examine(folder / "data/5k/s").wrong
 
 
-def test_a_rows_command_makes_it_again(once: Path, tmp_path: Path) -> None:
+def test_command_of_a_row_labels_its_file_again(once: Path, tmp_path: Path) -> None:
     row = rows_of(once / "data/5k/s")["b c.json"]
     done = here([*shlex.split(row["command"])[1:], "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
@@ -116,7 +116,7 @@ def test_a_rows_command_makes_it_again(once: Path, tmp_path: Path) -> None:
     assert repr(again) == repr(next(of for of in lasting(once / "data/5k/s") if of["level_id"] == row["level_id"]))
 
 
-def test_every_level_is_made_again_and_looked_at(once: Path, folder: Path) -> None:
+def test_verify_checks_every_level_against_its_file(once: Path, folder: Path) -> None:
     split = folder / "data/5k/s"
     findings = examine(split)
     assert (findings.levels, findings.witnesses, findings.sentences) == (2, 1, [])
@@ -128,7 +128,7 @@ def test_every_level_is_made_again_and_looked_at(once: Path, folder: Path) -> No
     assert any("is missing or damaged" in sentence for sentence in examine(split).wrong)
 
 
-def test_it_is_repaired_from_the_files(folder: Path) -> None:
+def test_repair_reads_lost_levels_from_their_files(folder: Path) -> None:
     """A shard that is gone, and then the fragment, whose rows alone know where the files are."""
     split = folder / "data/5k/s"
     before, (shard,) = lasting(split), (split / "shards").iterdir()
@@ -143,7 +143,7 @@ def test_it_is_repaired_from_the_files(folder: Path) -> None:
     assert "whose level files no row names" in done.stdout
 
 
-def test_without_shard_and_file_a_level_is_gone(tmp_path: Path) -> None:
+def test_level_without_shard_and_file_is_reported_as_lost(tmp_path: Path) -> None:
     file = write(tmp_path / "mine", UNSOLVABLE, "b.json")
     assert here(["generate", f"level_files={file}", *WORDS], tmp_path).returncode == 0
     split = tmp_path / "data/5k/s"
@@ -163,13 +163,13 @@ def test_without_shard_and_file_a_level_is_gone(tmp_path: Path) -> None:
     assert_refused(here(again, tmp_path), 2, "b.json", "its file is missing")
 
 
-def test_a_worker_that_does_not_see_a_file_stops_the_job(tmp_path: Path) -> None:
+def test_unreadable_level_file_is_fatal(tmp_path: Path) -> None:
     with pytest.raises(LevelUnavailable) as error:
         level_at(Origin("c1:0", str(tmp_path / "gone.json"), "s"))
     assert "all machines share" in failure(tmp_path, WorkUnit((0,)), error.value).fatal
 
 
-def test_levels_are_regenerated_from_shard_and_file(once: Path, tmp_path: Path) -> None:
+def test_regenerate_reads_levels_from_shards_and_files(once: Path, tmp_path: Path) -> None:
     split = once / "data/5k/s"
     done = here(["regenerate", f"manifest={split}", "budget=8k", "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
@@ -180,7 +180,7 @@ def test_levels_are_regenerated_from_shard_and_file(once: Path, tmp_path: Path) 
         assert [after[name][column] for column in same] == [row[column] for column in same]
 
 
-def test_questions_are_answered(once: Path, tmp_path: Path) -> None:
+def test_commands_work_on_a_split_of_level_files(once: Path, tmp_path: Path) -> None:
     split = once / "data/5k/s"
     facts = survey(split, RowQuery("file LIKE '%a.json'"))
     assert (facts["levels"], facts["distribution"]) == (1, None)
@@ -197,7 +197,7 @@ def test_questions_are_answered(once: Path, tmp_path: Path) -> None:
     assert done.stdout.startswith(f"{tmp_path / 'levels'}: 2 levels. "), done.stderr
 
 
-def test_what_cannot_be_is_refused(folder: Path) -> None:
+def test_generate_rejects_wrong_settings_and_folders_of_level_files(folder: Path) -> None:
     for word in ("size=s", "levels=3", "first_level=1", "distribution=free", "distribution.motor_chance=1"):
         with pytest.raises(ConfigError, match="is for random levels"):
             compose_job(["level_files=mine", word])
@@ -209,7 +209,7 @@ def test_what_cannot_be_is_refused(folder: Path) -> None:
     assert_refused(here([*generate, "level_files=mine/bad.json"], folder), 2, "None of the level files")
 
 
-def test_two_levels_with_one_id_are_told_apart(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_levels_with_one_id_are_reported(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("levelproof.pipeline.read.level_files.level_id_for", lambda _: 7)
     write(tmp_path / "two", TRIVIAL, "a.json")
     write(tmp_path / "two", UNSOLVABLE, "b.json")
@@ -222,7 +222,7 @@ def test_two_levels_with_one_id_are_told_apart(folder: Path, tmp_path: Path, mon
     assert_refused(done, 2, "happen to have the same id", "out=NAME")
 
 
-def test_units_take_levels_with_origins_as_they_come() -> None:
+def test_plan_units_group_level_files_whatever_their_ids() -> None:
     origins = {i: Origin(f"c1:{i}", f"{i}.json", "s") for i in range(0, 1000, 100)}
     units = list(plan_units(sorted(origins), {300}, 4, origins))
     assert [len(unit.level_ids) for unit in units] == [4, 4, 1]
@@ -230,7 +230,7 @@ def test_units_take_levels_with_origins_as_they_come() -> None:
 
 
 @pytest.mark.campaign
-def test_workers_read_the_files_and_ray_forks_no_process_with_jax(once: Path, tmp_path: Path) -> None:
+def test_ray_workers_read_level_files_and_no_process_with_jax_forks(once: Path, tmp_path: Path) -> None:
     words = ["generate", f"level_files={once / 'mine'}", *WORDS, "executor=ray", "workers=1", "unit=1"]
     done = run(words, tmp_path)
     assert done.returncode == 2, done.stderr

@@ -43,7 +43,7 @@ def tensorboard_file(folder: Path) -> Iterator[tuple[str, int, float]]:
         at += length + 16
 
 
-def test_scalars_are_what_the_events_tell() -> None:
+def test_scalars_match_the_events() -> None:
     assert scalars(BEGAN, STATE) == {
         "levels/committed": 4,
         "levels/solved": 3,
@@ -62,7 +62,9 @@ def test_scalars_are_what_the_events_tell() -> None:
     assert first.keys().isdisjoint({"levels/solved_share", "env_steps/per_second"})
 
 
-def test_beside_a_split_in_a_store_they_are_in_this_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_logged_writes_to_the_working_folder_if_the_split_is_in_a_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     said: list[str] = []
     with logged(made_job("data", "log=tensorboard"), Path("s3://bucket/data/128k/s"), said.append) as log:
@@ -74,7 +76,7 @@ def test_beside_a_split_in_a_store_they_are_in_this_folder(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize("refuses", ["from the first", "later", "at the end"])
-def test_a_log_that_fails_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refuses: str) -> None:
+def test_logged_reports_a_failing_log_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refuses: str) -> None:
     def refuse(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -89,7 +91,7 @@ def test_a_log_that_fails_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Mo
     assert said[-1].endswith("the run continues without a log.")
 
 
-def test_a_log_folder_that_leads_out_of_the_split_is_not_written_to(tmp_path: Path) -> None:
+def test_logged_rejects_a_log_folder_that_is_a_link(tmp_path: Path) -> None:
     for name in ("split", "elsewhere"):
         (tmp_path / name).mkdir()
     (tmp_path / "split/log").symlink_to(tmp_path / "elsewhere")
@@ -102,7 +104,7 @@ def test_a_log_folder_that_leads_out_of_the_split_is_not_written_to(tmp_path: Pa
 
 
 @pytest.mark.parametrize(("log", "library"), [("tensorboard", "tensorboardX"), ("wandb", "wandb")])
-def test_without_its_library_nothing_begins(
+def test_generate_refuses_to_start_without_the_log_library(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: str, library: str
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)

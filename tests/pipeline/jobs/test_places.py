@@ -56,14 +56,14 @@ def machine(cores: int, memory: float | None = None, gpus: int = 0) -> Machine:
     return {"NodeManagerHostname": "a", "Resources": resources}
 
 
-def test_workers_are_as_many_as_there_are_cores_and_memory_for() -> None:
+def test_workers_by_machine_fit_cores_and_memory() -> None:
     machines = {"a": machine(8, 8.5 * GB), "b": machine(2, 100 * GB), "c": machine(4)}
     assert workers_by_machine(machines, "CPU", 100, NEED) == {"a": 4, "b": 2, "c": 4}
     assert workers_by_machine(machines, "CPU", 4, NEED) == {"a": 2, "b": 1, "c": 1}
     assert workers_by_machine({"a": machine(8, 100 * GB, gpus=2)}, "GPU", 100, NEED) == {"a": 2}
 
 
-def test_a_machine_with_little_memory_gets_one_worker_which_reserves_all_of_it() -> None:
+def test_machine_with_little_memory_gets_one_worker_that_reserves_all_of_it() -> None:
     small = machine(2, 1 * GB)
     assert workers_by_machine({"a": small}, "CPU", 100, NEED) == {"a": 1}
     assert memory_to_reserve(small, NEED) == 1 * GB
@@ -71,7 +71,7 @@ def test_a_machine_with_little_memory_gets_one_worker_which_reserves_all_of_it()
     assert workers_by_machine({"head": machine(0, 9 * GB)}, "CPU", 100, NEED) == {}
 
 
-def test_a_shortage_is_told_where_it_leaves_a_core_without_a_worker() -> None:
+def test_shortage_reports_memory_that_leaves_a_core_without_a_worker() -> None:
     sentence = "a has 4.5 GB of memory free, and a worker of this size needs 2.0 GB: it runs 2 of 4 workers."
     assert shortage(machine(4, 4.5 * GB), "CPU", 100, NEED) == sentence
     assert shortage(machine(4, 4.5 * GB), "CPU", 2, NEED) == ""
@@ -79,13 +79,13 @@ def test_a_shortage_is_told_where_it_leaves_a_core_without_a_worker() -> None:
     assert shortage(machine(4), "CPU", 100, NEED) == ""
 
 
-def test_larger_sizes_need_more_memory() -> None:
+def test_bytes_of_worker_grow_with_the_size() -> None:
     needs = [bytes_of_worker(size_of(size)) for size in ("s", "m", "l", "20-28-8-4")]
     assert needs == sorted(needs)
     assert needs[0] < needs[-1]
 
 
-def test_a_gpu_that_others_hold_is_not_waited_for() -> None:
+def test_crew_does_not_wait_for_a_gpu_that_others_hold() -> None:
     command = [sys.executable, "-c", HELD]
     environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
     environment |= {

@@ -10,7 +10,7 @@ from tests.pipeline.command import TINY, assert_refused, here
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_a_job_is_planned_and_nothing_is_left_behind(tmp_path: Path) -> None:
+def test_plan_prints_a_forecast_and_leaves_no_file(tmp_path: Path) -> None:
     done = here(["plan", *TINY, "executor=inline", "workers=3", "--json"], tmp_path)
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
@@ -25,6 +25,6 @@ def test_a_job_is_planned_and_nothing_is_left_behind(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_level_files_are_not_planned(tmp_path: Path) -> None:
+def test_plan_rejects_level_files(tmp_path: Path) -> None:
     done = here(["plan", "level_files=mine"], tmp_path)
     assert_refused(done, 2, "plan is for random levels")

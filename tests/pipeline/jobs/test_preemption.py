@@ -43,7 +43,7 @@ def env_steps(out: str) -> int:
     ("executor", "number"),
     [("inline", signal.SIGINT), ("inline", signal.SIGKILL), ("ray", signal.SIGTERM), ("ray", signal.SIGKILL)],
 )
-def test_the_same_command_goes_on_where_experts_were(
+def test_same_command_resumes_unfinished_experts(
     undisturbed: tuple[Path, int], tmp_path: Path, number: signal.Signals, executor: str
 ) -> None:
     split, command = tmp_path / SPLIT, [*COMMAND, f"executor={executor}"]

@@ -17,7 +17,7 @@ def tally(done: int = 0) -> Tally:
     return Tally(levels=64, done=done, solved=done // 2)
 
 
-def test_the_share_grows_with_the_levels() -> None:
+def test_tally_share_grows_with_decided_levels() -> None:
     now = tally()
     assert now.share == 0
     now.running[UNIT] = (8_000, 7.5, 3)
@@ -29,7 +29,7 @@ def test_the_share_grows_with_the_levels() -> None:
     assert (now.share, now.done, now.solved_so_far) == (pytest.approx(16 / 64), 16, 5)
 
 
-def test_a_failed_attempt_takes_its_progress_back() -> None:
+def test_tally_discards_the_progress_of_a_failed_attempt() -> None:
     now = tally()
     now.running[UNIT] = (8_000, 8.0, 3)
     now.ended(UNIT, None)
@@ -42,7 +42,7 @@ def board_at(now: Tally, time: list[float]) -> tuple[Board, io.StringIO]:
     return Board(now, Console(file=text), clock=lambda: time[0]), text
 
 
-def test_rate_and_time_left_do_not_count_the_compiling() -> None:
+def test_board_estimates_exclude_compiling() -> None:
     now, time = tally(), [0.0]
     board, text = board_at(now, time)
     for second in range(100):
@@ -56,7 +56,7 @@ def test_rate_and_time_left_do_not_count_the_compiling() -> None:
     assert text.getvalue().endswith("800 env steps/s · about 69 s left\n")  # (64 - 8.8) / 0.8
 
 
-def test_levels_of_earlier_runs_are_no_pace() -> None:
+def test_board_pace_excludes_levels_of_earlier_runs() -> None:
     now = tally(done=32)
     assert now.share == 0.5
     board, text = board_at(now, [10.0])
@@ -64,7 +64,7 @@ def test_levels_of_earlier_runs_are_no_pace() -> None:
     assert text.getvalue() == "32/64 levels · 16 solved · 0 env steps/s · compiling\n"
 
 
-def test_a_pause_is_no_compiling() -> None:
+def test_board_keeps_its_pace_during_a_pause() -> None:
     """An evaluation may take longer than the pace is averaged over."""
     now, time = tally(), [0.0]
     board, text = board_at(now, time)
@@ -77,7 +77,7 @@ def test_a_pause_is_no_compiling() -> None:
     assert "100 env steps/s · about 62 s left" in text.getvalue().splitlines()[-1]
 
 
-def test_lines_where_there_is_no_terminal() -> None:
+def test_board_prints_few_lines_without_a_terminal() -> None:
     text = io.StringIO()
     board = Board(tally(), Console(file=text))
     with board.shown():
@@ -91,7 +91,7 @@ def test_lines_where_there_is_no_terminal() -> None:
     assert lines[1] == "64/64 levels · 16 solved · done"
 
 
-def test_commits_are_told_when_the_last_line_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_board_prints_a_commit_once_the_last_line_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
     text = io.StringIO()
     board = Board(tally(), Console(file=text))
     monkeypatch.setattr("levelproof.pipeline.jobs.progress.LINE_AFTER", 0.0)
@@ -100,13 +100,13 @@ def test_commits_are_told_when_the_last_line_is_old(monkeypatch: pytest.MonkeyPa
     assert "16/64 levels · 5 solved" in text.getvalue().splitlines()[1]
 
 
-def test_what_is_trained_is_still_to_be_written() -> None:
+def test_tally_text_says_writing_until_all_levels_are_committed() -> None:
     now = Tally(levels=16, done=0, solved=0)
     now.running[UNIT] = (16_000, 16.0, 5)
     assert now.text(0.0, None) == "16/16 levels · 5 solved · writing"
 
 
-def test_a_bar_on_a_terminal() -> None:
+def test_board_shows_a_bar_on_a_terminal() -> None:
     text = io.StringIO()
     board = Board(tally(), Console(file=text, force_terminal=True, width=160))
     with board.shown():
@@ -115,7 +115,7 @@ def test_a_bar_on_a_terminal() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (89, "89 s"), (90, "2 min"), (5400, "1.5 h")])
-def test_durations(seconds: float, text: str) -> None:
+def test_duration_picks_a_unit(seconds: float, text: str) -> None:
     assert duration(seconds) == text
 
 
@@ -131,5 +131,5 @@ def test_durations(seconds: float, text: str) -> None:
         (-2e6, "-2,000,000"),
     ],
 )
-def test_numbers(value: float, text: str) -> None:
+def test_number_keeps_three_digits(value: float, text: str) -> None:
     assert number(value) == text

@@ -39,7 +39,7 @@ def rows_of(split: Path) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_going_on_equals_having_trained_through(folder: Path) -> None:
+def test_resumed_training_equals_uninterrupted_training(folder: Path) -> None:
     unsolved = [row["level_id"] for row in rows_of(folder / "data/8k/s") if row["label"] == Label.UNSOLVED]
     assert unsolved
     where = "where=label = 'unsolved'"
@@ -59,7 +59,7 @@ def test_going_on_equals_having_trained_through(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_experts_come_back_bit_for_bit(folder: Path) -> None:
+def test_load_experts_restores_the_state_at_which_training_ended(folder: Path) -> None:
     job = made_job("data", *SETTINGS, "budget=8k")
     rows = read_manifest(folder / "data/8k/s").table.to_pylist()
     paths = {row["experts"] for row in rows if row["experts"]}
@@ -74,7 +74,7 @@ def test_experts_come_back_bit_for_bit(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_cannot_go_on_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_require_same_experts_rejects_experts_that_cannot_be_resumed(folder: Path, tmp_path: Path) -> None:
     source = folder / "data/8k/s"
 
     def refused(*settings: str) -> str:
@@ -91,7 +91,7 @@ def test_what_cannot_go_on_is_refused(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_damaged_checkpoint_is_named(folder: Path, tmp_path: Path) -> None:
+def test_load_experts_names_a_damaged_file(folder: Path, tmp_path: Path) -> None:
     path = next((folder / "data/8k/s/experts").iterdir())
     copy, whole = tmp_path / "damaged", path.read_bytes()
     middle = len(whole) // 2
@@ -104,7 +104,7 @@ def test_a_damaged_checkpoint_is_named(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_experts_that_a_dead_attempt_left_are_removed(folder: Path, tmp_path: Path) -> None:
+def test_generate_deletes_experts_of_a_dead_attempt(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "data", tmp_path / "data")
     experts = tmp_path / "data/8k/s/experts"
     named = set(experts.iterdir())
@@ -126,12 +126,12 @@ def test_experts_that_a_dead_attempt_left_are_removed(folder: Path, tmp_path: Pa
         (["manifest=data/8k/s", "budget=1M", "continue=perhaps"], "continue is perhaps"),
     ],
 )
-def test_mistakes_are_named(words: list[str], sentence: str) -> None:
+def test_split_arguments_names_the_mistake(words: list[str], sentence: str) -> None:
     with pytest.raises(UserError, match=sentence):
         split_arguments(words)
 
 
-def test_a_preset_that_is_named_replaces_all_settings_of_its_kind() -> None:
+def test_kept_settings_omits_groups_that_a_preset_replaces() -> None:
     made = made_job("data", "procedure=label", "expert.width=64", "distribution=vehicles", "task.max_timesteps=100")
     again = lambda *settings: compose_job([*kept_settings(made.results, settings), *settings])
     same, masters = again(), again("procedure=masters")
@@ -140,7 +140,7 @@ def test_a_preset_that_is_named_replaces_all_settings_of_its_kind() -> None:
     assert (masters.distribution, masters.task) == (made.distribution, made.task)
 
 
-def test_a_manifest_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_regenerate_names_a_missing_split(tmp_path: Path) -> None:
     done = here(["regenerate", "manifest=data/8k/s", "budget=1M"], tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("Error: There is no split at data/8k/s")

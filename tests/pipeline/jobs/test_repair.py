@@ -109,7 +109,7 @@ def data_files(split: Path) -> set[tuple[Path, int]]:
     return {(file, file.stat().st_mtime_ns) for file in files}
 
 
-def test_several_damages_are_repaired_together(whole: Path, copied: Callable[[Path], Path]) -> None:
+def test_repair_restores_a_shard_a_fragment_and_the_note_at_once(whole: Path, copied: Callable[[Path], Path]) -> None:
     """A chunk of a shard, a fragment that cannot be read, and the note; the third unit stays as it is."""
     split, chance = copied(whole), random.Random(0)
     first, second, third = fragment_paths(split)
@@ -127,7 +127,7 @@ def test_several_damages_are_repaired_together(whole: Path, copied: Callable[[Pa
 
 
 @pytest.mark.campaign
-def test_workers_repair(whole: Path, copied: Callable[[Path], Path]) -> None:
+def test_repair_runs_on_ray_workers(whole: Path, copied: Callable[[Path], Path]) -> None:
     """Two on Ray, in processes that have not started JAX when they are forked."""
     split = copied(whole)
     for path in fragment_paths(split)[:2]:
@@ -140,7 +140,7 @@ def test_workers_repair(whole: Path, copied: Callable[[Path], Path]) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", ["whole", "sealed", "witness"])
-def test_each_kind_of_file_is_repaired(
+def test_repair_restores_each_kind_of_file(
     kind: str, whole: Path, copied: Callable[[Path], Path], request: pytest.FixtureRequest
 ) -> None:
     """One after another: a flip in every file of the first fragment's data, and in it; then each of them gone."""
@@ -168,7 +168,7 @@ class Killed(BaseException):
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", ["whole", "sealed"])
-def test_a_repair_that_is_killed_goes_on(
+def test_repair_continues_after_a_kill_at_any_step(
     kind: str, whole: Path, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before and after everything that it does to the disk."""
@@ -198,7 +198,7 @@ def test_a_repair_that_is_killed_goes_on(
 
 
 @pytest.mark.campaign
-def test_what_cannot_be_made_again_is_told_and_stays(copied: Callable[[Path], Path], whole: Path) -> None:
+def test_repair_reports_and_keeps_levels_of_another_stack(copied: Callable[[Path], Path], whole: Path) -> None:
     """Of another stack."""
     split = copied(whole)
     (path, *_) = fragment_paths(split)
@@ -219,6 +219,6 @@ def test_what_cannot_be_made_again_is_told_and_stays(copied: Callable[[Path], Pa
 
 
 @pytest.mark.parametrize("word", ["size=m", "budget=1M", "out=x", "nonsense"])
-def test_settings_of_a_split_cannot_be_changed_by_a_repair(word: str, tmp_path: Path) -> None:
+def test_repair_rejects_settings_that_decide_results(word: str, tmp_path: Path) -> None:
     done = here(["verify", str(tmp_path), "--repair", word], tmp_path)
     assert_refused(done, 2, "A repair uses the settings of its split", "executor, workers, unit")

@@ -72,7 +72,7 @@ def assert_all_gone(pids: set[int]) -> None:
     wait_until(lambda: not any((state := status(pid)) and state[0] != "Z" for pid in pids), 30, "processes are left")
 
 
-def test_an_undisturbed_run_is_whole(undisturbed: Path) -> None:
+def test_undisturbed_run_commits_every_level(undisturbed: Path) -> None:
     manifest = read_manifest(undisturbed)
     assert manifest.level_ids.tolist() == list(range(LEVELS))
     assert "solved" in manifest.labels
@@ -88,14 +88,14 @@ def test_with_a_worker_for_each_core_the_same_comes_out(undisturbed: Path, tmp_p
 
 
 @pytest.mark.campaign
-def test_in_other_units_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
+def test_unit_size_changes_no_result(undisturbed: Path, tmp_path: Path) -> None:
     assert run(["generate", "levels=1", "first_level=2", "budget=5k", "executor=inline"], tmp_path).returncode == 0
     assert run(["generate", f"levels={LEVELS}", "unit=16", "budget=5k", "executor=inline"], tmp_path).returncode == 0
     assert_same_content(tmp_path / SPLIT, undisturbed)
 
 
 @pytest.mark.parametrize("executor", ["inline", pytest.param("ray", marks=pytest.mark.campaign)])
-def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path, executor: str) -> None:
+def test_command_killed_by_sigkill_continues_to_the_same_bits(undisturbed: Path, tmp_path: Path, executor: str) -> None:
     process = start([*COMMAND, ALONE, f"executor={executor}"], tmp_path)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
     family = {pid for pid in descendants(process.pid) if "Agent" not in title(pid)}
@@ -110,7 +110,9 @@ def test_kill_9_of_the_command_and_again(undisturbed: Path, tmp_path: Path, exec
 
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.campaign), signal.SIGTERM])
-def test_kill_9_of_a_worker_then_stopped_and_again(undisturbed: Path, tmp_path: Path, number: signal.Signals) -> None:
+def test_run_with_a_killed_worker_stops_and_continues_to_the_same_bits(
+    undisturbed: Path, tmp_path: Path, number: signal.Signals
+) -> None:
     """Another worker takes what the dead one had, and is at work when the run is stopped. They listen on loopback."""
     process = start([*COMMAND, ALONE], tmp_path, preexec_fn=heed_ctrl_c)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
@@ -137,7 +139,7 @@ def test_kill_9_of_a_worker_then_stopped_and_again(undisturbed: Path, tmp_path: 
     assert not (tmp_path / SPLIT / "quarantine").exists()
 
 
-def test_the_command_itself_does_not_start_jax(tmp_path: Path) -> None:
+def test_driver_does_not_start_jax(tmp_path: Path) -> None:
     """On a GPU it would take the memory that the worker needs; and threads and cache are set before JAX starts."""
     program = (
         "from levelproof.configs.compose import compose_job; compose_job([]); "

@@ -22,7 +22,7 @@ from levelproof.pipeline.jobs.schedule import (
 
 
 @given(st.integers(0, 200), st.integers(1, 100), st.sets(st.integers(0, 300)), st.integers(1, 40))
-def test_units_cover_what_is_left_once_and_never_cross_a_multiple(
+def test_plan_units_cover_what_is_left_once_and_never_cross_a_multiple(
     first: int, count: int, done: set[int], unit: int
 ) -> None:
     wanted = range(first, first + count)
@@ -34,14 +34,14 @@ def test_units_cover_what_is_left_once_and_never_cross_a_multiple(
 
 
 @given(st.integers(1, 60), st.integers(1, 20), st.data())
-def test_jobs_that_start_elsewhere_cut_at_the_same_places(count: int, unit: int, data: st.DataObject) -> None:
+def test_plan_units_cut_at_the_same_ids_for_any_first_level(count: int, unit: int, data: st.DataObject) -> None:
     start = unit * data.draw(st.integers(0, 5))
     whole = {work.name for work in plan_units(range(start + unit * count), set(), unit)}
     assert {work.name for work in plan_units(range(start, start + unit * count), set(), unit)} <= whole
 
 
 @given(st.integers(1, 60), st.integers(1, 20), st.sets(st.integers(0, 59)))
-def test_names_of_what_is_left_are_new(count: int, unit: int, committed: set[int]) -> None:
+def test_plan_units_give_new_names_to_what_is_left(count: int, unit: int, committed: set[int]) -> None:
     """A fragment holds the first and the last level of its name, so what is left never takes a name that is there."""
     units = list(plan_units(range(count), set(), unit))
     kept = [work for i, work in enumerate(units) if i in committed]
@@ -81,7 +81,7 @@ def drain(scheduler: Scheduler, workers: int, kills: Collection[int]) -> tuple[l
 
 
 @given(st.integers(1, 400), st.integers(1, 3), st.integers(1, 4), st.sets(st.integers(0, 400), max_size=5))
-def test_units_that_kill_their_worker_are_given_up_and_no_other(
+def test_scheduler_quarantines_only_units_that_kill_their_worker(
     levels: int, unit: int, workers: int, kills: set[int]
 ) -> None:
     scheduler = scheduler_of(levels, unit)
@@ -93,7 +93,7 @@ def test_units_that_kill_their_worker_are_given_up_and_no_other(
     assert deaths <= len(MAX_UNITS) * len(scheduler.quarantined)
 
 
-def test_a_unit_that_failed_has_less_company_each_time() -> None:
+def test_scheduler_gives_failed_units_fewer_companions_each_time() -> None:
     scheduler = scheduler_of(100, 1, workers=1)
     scheduler.report(0, finished([]), 0.0)
     for attempt, most in enumerate(MAX_UNITS):
@@ -111,7 +111,7 @@ def test_a_unit_that_failed_has_less_company_each_time() -> None:
     assert len(scheduler.quarantined) == MAX_UNITS[-1]
 
 
-def test_a_worker_gets_units_while_it_has_room() -> None:
+def test_scheduler_orders_units_while_a_worker_has_room() -> None:
     scheduler = scheduler_of(12, 4, workers=1)
     (first,) = scheduler.order(0, 0.0).units  # however little room there is
     assert not scheduler.order(0, 0.0).units
@@ -124,7 +124,7 @@ def test_a_worker_gets_units_while_it_has_room() -> None:
     assert scheduler.order(0, 0.0).units  # the next worker in its place begins anew
 
 
-def test_towards_the_end_units_are_cut_to_a_worker_s_share() -> None:
+def test_scheduler_cuts_units_to_a_workers_share_towards_the_end() -> None:
     scheduler = scheduler_of(160, 32, workers=2)
     sizes = []
     while not scheduler.over:
@@ -136,7 +136,7 @@ def test_towards_the_end_units_are_cut_to_a_worker_s_share() -> None:
     assert scheduler_of(160, 32, workers=1).order(0, 0.0).units[0].level_ids == range(32)
 
 
-def test_what_a_worker_has_not_begun_goes_to_one_that_has_nothing() -> None:
+def test_scheduler_moves_unstarted_levels_to_idle_workers() -> None:
     scheduler = scheduler_of(32, 32, workers=1)
     (unit,) = scheduler.order(0, 0.0).units
     scheduler.report(0, Round([], {unit: (0, 0.0, 0)}, wants=0, spare=24), 0.0)
@@ -154,7 +154,7 @@ def test_what_a_worker_has_not_begun_goes_to_one_that_has_nothing() -> None:
     assert [*scheduler.workers[0].units] == [kept]
 
 
-def test_a_worker_that_leaves_is_no_failure_and_one_that_is_silent_is_known() -> None:
+def test_scheduler_counts_no_failure_for_leaving_workers_and_lists_silent_ones() -> None:
     scheduler = scheduler_of(8, 4, workers=2)
     first, second = (scheduler.order(worker, 1.0).units[0] for worker in (0, 1))
     assert scheduler.silent(1.0) == []
@@ -167,7 +167,7 @@ def test_a_worker_that_leaves_is_no_failure_and_one_that_is_silent_is_known() ->
     assert {i for unit in scheduler.order(1, 6.0).units for i in unit.level_ids} >= set(first.level_ids)
 
 
-def test_the_driver_does_not_grow_with_what_waits() -> None:
+def test_scheduler_memory_does_not_grow_with_waiting_levels() -> None:
     """A million levels, of which none is there before it is asked for."""
     tracemalloc.start()
     scheduler = Scheduler(plan_units(range(2**20), [], 32), 2**20, 32)
@@ -214,7 +214,7 @@ def test_timed_units_cover_what_is_left_once_under_names_of_their_own(
     assert max((len(unit.level_ids) for unit in units), default=0) <= most
 
 
-def test_timed_job_goes_on_with_units_of_other_sizes_after_a_kill() -> None:
+def test_timed_job_continues_with_units_of_other_sizes_after_a_kill() -> None:
     before = run_through(schedule(range(2000), [], 2000, 32, timed=True), [0.5, 0.5])
     done = [level_id for unit in before[: len(before) // 2] for level_id in unit.level_ids]
     after = run_through(schedule(range(2000), done, 2000 - len(done), 32, timed=True), [5.0])
@@ -222,7 +222,7 @@ def test_timed_job_goes_on_with_units_of_other_sizes_after_a_kill() -> None:
     assert not {unit.name for unit in after} & {unit.name for unit in before[: len(before) // 2]}
 
 
-def test_timed_units_take_20_to_60_seconds_and_given_ones_keep_their_size() -> None:
+def test_timed_units_take_20_to_60_seconds_and_untimed_ones_keep_their_size() -> None:
     sizes = [len(unit.level_ids) for unit in run_through(schedule(range(8192), [], 8192, 32, timed=True), [0.5])]
     assert sizes[:3] == [32, 80, 80]
     given = [len(unit.level_ids) for unit in run_through(schedule(range(8192), [], 8192, 64, timed=False), [0.5])]
@@ -249,7 +249,7 @@ def test_level_that_always_fails_takes_no_more_than_an_untimed_unit_into_quarant
     assert len(unit.level_ids) <= 32
 
 
-def test_levels_are_told_in_runs() -> None:
+def test_levels_text_lists_runs_of_ids() -> None:
     assert levels_text([WorkUnit((7,))]) == "level 7"
     assert levels_text([WorkUnit((4, 5)), WorkUnit((2, 3)), WorkUnit((9,))]) == "levels 2 to 5, 9"
     assert levels_text([WorkUnit((i,)) for i in range(0, 20, 2)]) == "levels 0, 2, 4, 6 and 6 more runs of levels"

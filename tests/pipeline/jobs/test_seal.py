@@ -44,7 +44,7 @@ def make(source: Path, split: Path) -> Make:
     return committed
 
 
-def test_units_are_sealed_while_others_come(split: Path, make: Make) -> None:
+def test_sealer_seals_units_while_others_are_committed(split: Path, make: Make) -> None:
     said: list[str] = []
     coming = UNITS[2:]
     random.Random(0).shuffle(coming)
@@ -58,7 +58,7 @@ def test_units_are_sealed_while_others_come(split: Path, make: Make) -> None:
     assert not said
 
 
-def test_a_unit_that_failed_is_not_waited_for_and_one_that_comes_is(split: Path, make: Make) -> None:
+def test_sealer_waits_for_running_units_but_not_for_failed_ones(split: Path, make: Make) -> None:
     with sealing(split, read_manifest(split, []).fragments, print) as sealer:
         for unit in UNITS[3:6]:
             make(sealer, unit, UNITS[2:3])
@@ -71,7 +71,7 @@ def test_a_unit_that_failed_is_not_waited_for_and_one_that_comes_is(split: Path,
     assert read_manifest(split).level_ids.tolist() == [0, 1, 2, 3, 4, 5]
 
 
-def test_trouble_is_told_once_and_never_ends_the_job(split: Path, make: Make) -> None:
+def test_sealer_reports_an_error_once_and_never_ends_the_job(split: Path, make: Make) -> None:
     said: list[str] = []
     shard = next((split / "shards").iterdir())
     (shard / "act/c/0/0/0").write_bytes(b"x")
@@ -84,7 +84,7 @@ def test_trouble_is_told_once_and_never_ends_the_job(split: Path, make: Make) ->
     assert len(read_manifest(split).level_ids) == len(UNITS)
 
 
-def test_a_job_that_fails_leaves_no_half_sealed_fragment(split: Path, make: Make) -> None:
+def test_sealing_leaves_no_half_sealed_fragment_after_a_failed_job(split: Path, make: Make) -> None:
     def interrupted() -> None:
         with sealing(split, read_manifest(split, []).fragments, print) as sealer:
             for i in range(2, 8):

@@ -46,12 +46,14 @@ def solved_index(result: UnitResult) -> int:
     return [verdict.label for verdict in result.verdicts].index(Label.SOLVED)
 
 
-def test_real_witnesses_pass_the_gate(job: JobConfig, result: UnitResult) -> None:
+def test_check_witnesses_accepts_real_witnesses(job: JobConfig, result: UnitResult) -> None:
     check_witnesses(result, job.task)
 
 
 @pytest.mark.parametrize("name", ["reward", "last_distance", "timestep", "done"])
-def test_a_record_that_differs_in_one_bit_does_not_pass(job: JobConfig, result: UnitResult, name: str) -> None:
+def test_check_witnesses_rejects_a_record_that_differs_in_one_bit(
+    job: JobConfig, result: UnitResult, name: str
+) -> None:
     index = solved_index(result)
     values = np.array(getattr(result.record, name))
     at = values[200:201, index : index + 1]
@@ -63,13 +65,13 @@ def test_a_record_that_differs_in_one_bit_does_not_pass(job: JobConfig, result: 
         check_witnesses(wrong, job.task)
 
 
-def test_a_level_that_is_another_does_not_pass(job: JobConfig, result: UnitResult) -> None:
+def test_check_witnesses_rejects_records_of_other_levels(job: JobConfig, result: UnitResult) -> None:
     turned = jax.tree.map(lambda x: np.roll(x, 1, axis=-1), result.levels)
     with pytest.raises(Failure, match="does not replay"):
         check_witnesses(dataclasses.replace(result, levels=turned), job.task)
 
 
-def test_a_record_that_replays_but_misses_the_goal_does_not_pass(job: JobConfig, result: UnitResult) -> None:
+def test_check_witnesses_rejects_a_record_that_misses_the_goal(job: JobConfig, result: UnitResult) -> None:
     """Doing nothing gives a faithful record; called solved, it is caught by the goal."""
     verdicts = [dataclasses.replace(verdict, label=Label.SOLVED) for verdict in result.verdicts]
     idle = replay(result.levels, np.zeros_like(result.record.action), job.task)
@@ -77,7 +79,7 @@ def test_a_record_that_replays_but_misses_the_goal_does_not_pass(job: JobConfig,
         check_witnesses(dataclasses.replace(result, record=idle, verdicts=verdicts), job.task)
 
 
-def test_a_trivial_level_whose_witness_does_something_does_not_pass(job: JobConfig, result: UnitResult) -> None:
+def test_check_witnesses_rejects_a_trivial_level_whose_witness_acts(job: JobConfig, result: UnitResult) -> None:
     called = [
         dataclasses.replace(v, label=Label.TRIVIAL if v.label is Label.SOLVED else v.label) for v in result.verdicts
     ]
@@ -85,7 +87,7 @@ def test_a_trivial_level_whose_witness_does_something_does_not_pass(job: JobConf
         check_witnesses(dataclasses.replace(result, verdicts=called), job.task)
 
 
-def test_a_shard_holds_what_was_trained(tmp_path: Path, job: JobConfig) -> None:
+def test_commit_writes_every_field_of_solved_levels_to_the_shard(tmp_path: Path, job: JobConfig) -> None:
     result = made_result([4, 5, 7], [Label.UNSOLVED, Label.SOLVED, Label.SOLVED])
     commit(job, tmp_path, WorkUnit((4, 5, 7)), result)
     (name,) = read_manifest(tmp_path).shards
@@ -97,7 +99,7 @@ def test_a_shard_holds_what_was_trained(tmp_path: Path, job: JobConfig) -> None:
         assert all(same_bits(back[name], values[..., [1, 2]]).all() for name, values in arrays_of(tree).items())
 
 
-def test_a_unit_without_solved_levels_has_no_shard(tmp_path: Path, job: JobConfig) -> None:
+def test_commit_writes_no_shard_without_solved_levels(tmp_path: Path, job: JobConfig) -> None:
     commit(job, tmp_path, WorkUnit((4,)), made_result([4], [Label.UNSOLVED]))
     manifest = read_manifest(tmp_path)
     assert manifest.labels.tolist() == ["unsolved"]

@@ -56,7 +56,7 @@ def failing(work: Any, error: Exception, unit: WorkUnit | None = None, after: in
     return maybe
 
 
-def test_units_are_committed_with_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
+def test_worker_commits_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
     worker = Worker(job, tmp_path)
     rounds = [worker.work(Order(UNITS), 0.0)]
     while rounds[-1].totals:
@@ -92,7 +92,7 @@ def test_units_are_committed_with_a_row_for_every_level(tmp_path: Path, job: Job
     assert [round.wants for round in rounds[-1:]] == [Worker(job, tmp_path).work(Order([]), 0.0).wants]
 
 
-def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: JobConfig) -> None:
+def test_unit_has_the_same_rows_and_bits_beside_others_and_alone(tmp_path: Path, job: JobConfig) -> None:
     """Beside others and by itself."""
     for name, units in ("beside", UNITS), ("alone", UNITS[:1]):
         (tmp_path / name).mkdir()
@@ -107,9 +107,7 @@ def test_the_same_unit_again_gives_the_same_rows_and_bits(tmp_path: Path, job: J
             assert all(same_bits(values, b[name]).all() for name, values in a.items())
 
 
-def test_levels_given_back_and_levels_left_undecided_are_made_by_another_to_the_same_bits(
-    tmp_path: Path, job: JobConfig
-) -> None:
+def test_other_worker_makes_returned_and_undecided_levels_to_the_same_bits(tmp_path: Path, job: JobConfig) -> None:
     job = replace(job, search=SearchConfig(env_steps=0))
     unit = WorkUnit(range(16))
     (tmp_path / "cut").mkdir()
@@ -137,7 +135,7 @@ def test_levels_given_back_and_levels_left_undecided_are_made_by_another_to_the_
     assert repr(lasting(tmp_path / "alone")) == repr(lasting(tmp_path / "cut"))
 
 
-def test_levels_that_wait_for_their_search_are_made_by_another_to_the_same_bits(tmp_path: Path, job: JobConfig) -> None:
+def test_other_worker_makes_levels_that_wait_for_their_search_to_the_same_bits(tmp_path: Path, job: JobConfig) -> None:
     unit = WorkUnit(range(16))
     for name in ("cut", "alone"):
         (tmp_path / name).mkdir()
@@ -155,7 +153,7 @@ def test_levels_that_wait_for_their_search_are_made_by_another_to_the_same_bits(
     assert repr(lasting(tmp_path / "alone")) == repr(lasting(tmp_path / "cut"))
 
 
-def test_experts_that_are_kept_go_on_where_they_were(tmp_path: Path, job: JobConfig) -> None:
+def test_worker_resumes_experts_that_another_saved(tmp_path: Path, job: JobConfig) -> None:
     job = replace(job, search=SearchConfig(env_steps=0), checkpoint="1h")
     unit = WorkUnit(range(8))
     for name in ("alone", "kept"):
@@ -186,7 +184,7 @@ def test_experts_that_are_kept_go_on_where_they_were(tmp_path: Path, job: JobCon
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o666])
-def test_a_checkpoint_that_cannot_be_read_ends_the_job(tmp_path: Path, job: JobConfig, mode: int) -> None:
+def test_unreadable_checkpoint_is_fatal(tmp_path: Path, job: JobConfig, mode: int) -> None:
     path = checkpoint_path(tmp_path, UNITS[0].name)
     path.parent.mkdir()
     path.write_bytes(b"levelproof checkpoint 2 of another format\n")
@@ -197,9 +195,7 @@ def test_a_checkpoint_that_cannot_be_read_ends_the_job(tmp_path: Path, job: JobC
 
 
 @pytest.mark.parametrize("phase", ["begin_unit", "finish_unit"])
-def test_a_unit_that_fails_fails_alone(
-    tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch, phase: str
-) -> None:
+def test_failing_unit_fails_alone(tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch, phase: str) -> None:
     works = getattr(worker_module, phase)
     monkeypatch.setattr(worker_module, phase, failing(works, ValueError("of this one"), UNITS[1]))
     found = outcomes(Worker(job, tmp_path), UNITS)
@@ -210,14 +206,14 @@ def test_a_unit_that_fails_fails_alone(
     assert read_manifest(tmp_path).level_ids.tolist() == [0, 1, 2, 4, 5]
 
 
-def test_a_disk_that_refuses_is_fatal(tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_fatal(tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     full = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr(worker_module, "finish_unit", failing(None, full))
     found = outcomes(Worker(job, tmp_path), UNITS[1:2])
     assert found[UNITS[1]].fatal.startswith(f"Cannot write to {tmp_path}, the disk is full")
 
 
-def test_a_step_that_fails_fails_all_that_share_it_and_no_later_one(
+def test_failing_step_fails_running_units_but_no_later_one(
     tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     advance, worker = pool_module.advance, Worker(job, tmp_path)
@@ -231,7 +227,7 @@ def test_a_step_that_fails_fails_all_that_share_it_and_no_later_one(
     assert read_manifest(tmp_path).level_ids.tolist() == [3]
 
 
-def test_a_worker_without_units_has_nothing_to_report(tmp_path: Path, job: JobConfig) -> None:
+def test_worker_without_units_reports_an_empty_round(tmp_path: Path, job: JobConfig) -> None:
     nothing = Worker(job, tmp_path).work(Order([]), 60.0)
     assert nothing == Round([], {}, nothing.wants)
     assert nothing.wants > 0
