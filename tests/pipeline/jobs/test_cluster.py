@@ -1,4 +1,4 @@
-"""Workers that die and clusters that shrink, on real Ray: everything that can be done is done."""
+"""Workers that die and clusters that grow and shrink, mostly on real Ray: every level that can be made is made."""
 
 import os
 import re
@@ -29,7 +29,7 @@ from tests.pipeline.made import lasting, made_job
 LEVELS, DEADLY = 8, 2
 SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k")
 SPLIT = Path("data/5k/s")
-STALLED = 150  # s; compiling keeps a worker of a fast machine silent for less
+STALLED = 150  # s; longer than compiling keeps a worker of a fast machine silent
 
 
 def fragile(deadly: int, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -49,7 +49,7 @@ def test_level_that_kills_its_worker_is_quarantined_alone(tmp_path: Path) -> Non
     assert "The worker died" in note.read_text()
     assert f"Given up: level {DEADLY}, for the reason in {SPLIT}/quarantine/{note.name}" in done.stdout
     deaths = [line for line in done.stderr.splitlines() if "The worker died" in line]
-    assert len(deaths) == len(MAX_UNITS), done.stderr  # a line each, however many levels it took
+    assert len(deaths) == len(MAX_UNITS), done.stderr  # one line per death, however many levels failed
     assert deaths[-1].startswith(f"Level {DEADLY} failed")
     assert deaths[-1].endswith(": given up.")
 
@@ -69,7 +69,7 @@ def test_generate_names_an_unreachable_cluster(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="needs a folder in which even root can make nothing")
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a folder in which even root cannot create files")
 def test_generate_names_a_ray_folder_that_is_not_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_TMPDIR", "/proc/sys/ray")
     assert_refused(run(SETTINGS, tmp_path), 1, "Ray cannot start", "/proc/sys/ray", "RAY_TMPDIR")
@@ -82,8 +82,8 @@ def test_require_reachable_names_an_invalid_address(address: str, monkeypatch: p
         require_reachable(address)
 
 
-# A command that still runs when another one has its folder, which was made again before any worker starts. Its worker
-# commits ready-made results by the real commit.
+# A driver whose folder is recreated and taken over by another command before its worker starts. The worker commits
+# ready-made results by the real commit.
 CUT_OFF = """
 import os, pathlib, shutil, sys
 from rich.console import Console
@@ -139,7 +139,7 @@ def test_late_worker_commits_only_for_its_own_driver(tmp_path: Path) -> None:
 
 
 def test_with_absolute_paths_resolves_every_path() -> None:
-    """They run in another folder than the command."""
+    """Workers run in another folder than the command."""
     job = with_absolute_paths(made_job("data", "continue_from=data/5k/s"))
     assert job.out == str(Path("data").absolute())
     assert job.continue_from == str(Path("data/5k/s").absolute())
@@ -160,10 +160,10 @@ def test_crew_follows_the_room_of_its_machines(monkeypatch: pytest.MonkeyPatch) 
     )
     there = lambda crew: sorted(handle.node for handle in crew._handles)
     for changes, most, two in (
-        ({}, [], []),  # they wait for machines that join
+        ({}, [], []),  # the crew waits for machines to join
         ({"a": 2}, ["a", "a"], ["a", "a"]),
         ({"b": 2}, ["a", "a", "b", "b"], ["a", "b"]),
-        ({"b": 8}, ["a", "a", "b", "b", "b", "b"], ["a", "b"]),  # of six units, each
+        ({"b": 8}, ["a", "a", "b", "b", "b", "b"], ["a", "b"]),  # one worker for each of six units
         ({"a": 0}, ["b"] * 6, ["b", "b"]),
     ):
         cores |= changes
@@ -174,7 +174,7 @@ def test_crew_follows_the_room_of_its_machines(monkeypatch: pytest.MonkeyPatch) 
     crew._handles[0].up = True
     cores |= {"b": 0, "c": 3}
     crew.follow_cluster()
-    assert there(crew) == ["b", "c", "c", "c"], "one that is at work stays"
+    assert there(crew) == ["b", "c", "c", "c"], "a running worker stays"
     crew._refuse(crew._handles[-1], "The worker on c has jax 0.1, and this command jax 0.2: install the same.")
     crew.follow_cluster()
     assert there(crew) == ["b"]
@@ -195,15 +195,15 @@ def test_crew_excludes_a_machine_when_several_of_its_workers_are_refused_at_once
 
 
 def test_crew_hands_on_the_units_of_workers_on_a_refused_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It began before somebody installed another program there."""
+    """The running worker began before another program was installed on its machine."""
     monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
     scheduler = Scheduler([WorkUnit((0, 1, 2))], 6)
     crew = cluster.Crew(made_job("data", "unit=1"), SPLIT, scheduler, Board(Tally(3, 0, 0), Console()))
-    at_work, late, elsewhere = crew._handles = [cluster.WorkerHandle(node, node) for node in "aab"]
-    at_work.up = elsewhere.up = True
-    for worker in (at_work, elsewhere):
+    running, late, elsewhere = crew._handles = [cluster.WorkerHandle(node, node) for node in "aab"]
+    running.up = elsewhere.up = True
+    for worker in (running, elsewhere):
         scheduler.join(worker, 0.0)
-    assert scheduler.order(at_work, 0.0).units == [WorkUnit((0, 1, 2))]
+    assert scheduler.order(running, 0.0).units == [WorkUnit((0, 1, 2))]
     crew._refuse(late, "The worker on a has jax 0.1, and this command jax 0.2: install the same.")
     assert crew._handles == [elsewhere]
     assert scheduler.order(elsewhere, 0.0).units == [WorkUnit((0, 1, 2))]
@@ -223,9 +223,9 @@ def test_mismatch_names_what_differs() -> None:
 @pytest.mark.campaign
 @pytest.mark.slow
 def test_run_survives_machines_that_join_and_leave(tmp_path: Path) -> None:
-    """Ray's own nodes: a head without a core, one that joins a waiting run, and one more before the first is lost.
+    """Start a head without a core; add a node to the waiting run, add another, then remove the first.
 
-    They run in another folder than the command, which names the split that goes on relatively.
+    Workers run in another folder than the command, which names the split to continue from by a relative path.
     """
     from ray.cluster_utils import Cluster
 
@@ -259,7 +259,7 @@ def test_run_survives_machines_that_join_and_leave(tmp_path: Path) -> None:
         assert f"The experts in {tmp_path / SPLIT / trained['experts']} cannot be read" in note.read_text()
 
         own = run(["generate", "levels=1", "budget=5k", "out=own"], tmp_path)
-        assert own.returncode == 0, own.stderr  # a cluster that RAY_ADDRESS does not name is let be
+        assert own.returncode == 0, own.stderr  # it ignores a cluster that RAY_ADDRESS does not name
     finally:
         machines.shutdown()
 
@@ -267,7 +267,7 @@ def test_run_survives_machines_that_join_and_leave(tmp_path: Path) -> None:
 @pytest.mark.campaign
 @pytest.mark.slow
 def test_ray_exports_progress_to_prometheus(tmp_path: Path) -> None:
-    pytest.importorskip("aiohttp", reason="ray[default] is not there, which tells Prometheus")
+    pytest.importorskip("aiohttp", reason="needs ray[default], which exports metrics to Prometheus")
     from ray.cluster_utils import Cluster
 
     with socket.socket() as probe:
@@ -275,14 +275,14 @@ def test_ray_exports_progress_to_prometheus(tmp_path: Path) -> None:
         port = probe.getsockname()[1]
     node: dict[str, Any] = {"object_store_memory": 80 * 2**20, "num_cpus": 1, "metrics_export_port": port}
     machines = Cluster(initialize_head=True, head_node_args=node | {"include_dashboard": False})
-    told: dict[str, float] = {}
+    gauges: dict[str, float] = {}
 
     def scraped() -> bool:
         with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/metrics", timeout=patience(10)) as answer:
             for line in answer.read().decode().splitlines():
-                if found := re.fullmatch(r'ray_levelproof_(\w+)\{.*split="5k/s".*\} (\S+)', line):
-                    told[found[1]] = float(found[2])
-        return told.get("levels", 0) > 0
+                if match := re.fullmatch(r'ray_levelproof_(\w+)\{.*split="5k/s".*\} (\S+)', line):
+                    gauges[match[1]] = float(match[2])
+        return gauges.get("levels", 0) > 0
 
     try:
         process = start(("generate", "levels=1k", "unit=1", "budget=5k"), tmp_path, address=str(machines.address))
@@ -292,9 +292,9 @@ def test_ray_exports_progress_to_prometheus(tmp_path: Path) -> None:
         process.communicate(timeout=patience(COMMAND_SECONDS))
     finally:
         machines.shutdown()
-    assert told.keys() == {"levels", "solved", "env_steps"}
-    assert 0 <= told["solved"] <= told["levels"] <= committed
-    assert told["env_steps"] > 0
+    assert gauges.keys() == {"levels", "solved", "env_steps"}
+    assert 0 <= gauges["solved"] <= gauges["levels"] <= committed
+    assert gauges["env_steps"] > 0
 
 
 @pytest.mark.campaign
@@ -303,8 +303,8 @@ def test_crew_replaces_a_stalled_worker(tmp_path: Path) -> None:
     alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long
     command = ["generate", f"levels={LEVELS}", "unit=1", "budget=1M", "workers=1", *alone]
     process = start([str(LEVELS), str(patience(STALLED)), *command], tmp_path, module="tests.pipeline.fragile")
-    split, at_work = tmp_path / "data/1M/s", "ray::Fragile.work"
-    working = lambda: [pid for pid in descendants(process.pid) if title(pid).startswith(at_work)]
+    split, busy = tmp_path / "data/1M/s", "ray::Fragile.work"
+    working = lambda: [pid for pid in descendants(process.pid) if title(pid).startswith(busy)]
     worker, *_ = until(lambda: fragment_paths(split) and working(), process)
     os.kill(worker, signal.SIGSTOP)
     _, err = process.communicate(timeout=patience(COMMAND_SECONDS))
@@ -340,6 +340,6 @@ def test_lost_machines_and_a_restarted_driver_change_no_bit(tmp_path: Path) -> N
 
 
 def works_on(machine: Any) -> bool:
-    """Whether a worker has units on this node of Ray."""
+    """Whether a worker on this node of Ray has units."""
     raylets = {info[0].process.pid for kind, info in machine.all_processes.items() if kind == "raylet"}
     return any(title(pid).startswith("ray::WorkerActor.work") for raylet in raylets for pid in descendants(raylet))

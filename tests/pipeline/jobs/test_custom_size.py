@@ -1,4 +1,4 @@
-"""A dataset of a size without a letter, and of a preset: every command works on it. And sheets of sampled levels."""
+"""A dataset of a custom size and a preset distribution, on which every command works; and sheets of sampled levels."""
 
 import shlex
 from pathlib import Path
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.campaign
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a real, tiny split of this size: levels 5 to 8, of which a long search leaves 8 unsolved too."""
+    """Return a folder with a tiny real split of this size: levels 5 to 8; even a long search does not solve level 8."""
     folder = tmp_path_factory.mktemp("custom")
     words = [f"size={SIZE}", "distribution=free", "first_level=5", "levels=4", "budget=5k", "executor=inline"]
     done = here(["generate", *words], folder)
@@ -40,9 +40,9 @@ def test_manifest_names_size_and_distribution(made: Path, capsys: pytest.Capture
     assert [row["size"] for row in rows] == [SIZE] * 4
     assert rows[0]["command"] == f"levelproof generate size={SIZE} budget=5k distribution=free first_level=5 levels=1"
     inspect(made / SPLIT, RowQuery(limit=0), False)
-    name, mark = survey(made / SPLIT)["distribution"].values()
+    name, digest = survey(made / SPLIT)["distribution"].values()
     assert name == "free"
-    assert f"free ({mark})" in capsys.readouterr().out
+    assert f"free ({digest})" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("size", ["4-2-0-1", "6-0-1-1", "5-2-1-0"])

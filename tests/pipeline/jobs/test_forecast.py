@@ -1,4 +1,4 @@
-"""A forecast holds: of many jobs, of what becomes of their levels, and of the files that sealing makes."""
+"""Forecasts: the coverage of their intervals, how they scale, and the number of files after sealing."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""`levelproof import`: trajectories that the reference wrote become a split on which every command works."""
+"""`levelproof import`: the reference's trajectories become a split on which every command works."""
 
 import json
 import shlex
@@ -26,7 +26,7 @@ NAMES = [*(f"first#{i}" for i in range(ROWS // 2)), *(f"second#{i}" for i in ran
 
 @pytest.fixture(scope="module")
 def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a copy of the golden trajectories of size s, `theirs`, and the split that was made of it."""
+    """Return a folder with the golden trajectories of size s (`theirs`) and the split imported from them."""
     folder = tmp_path_factory.mktemp("imported")
     shutil.copytree(GOLDEN / "s", folder / "theirs")
     done = here(["import", "theirs", "-o", "data/1M/s"], folder)
@@ -39,7 +39,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(once: Path, tmp_path: Path) -> Path:
-    """A copy; its rows name the trajectories of the first."""
+    """Return a copy of `once`; its rows name the original's trajectories."""
     return Path(shutil.copytree(once, tmp_path / "copy"))
 
 
@@ -88,7 +88,7 @@ def test_verify_checks_every_imported_level(once: Path, folder: Path) -> None:
     shutil.rmtree(once / "theirs.gone", ignore_errors=True)
     (once / "theirs").rename(once / "theirs.gone")
     try:
-        (wrong,) = examine(once / "data/1M/s").wrong  # the unsolved one's world is nowhere else
+        (wrong,) = examine(once / "data/1M/s").wrong  # the unsolved level's world is stored nowhere else
     finally:
         (once / "theirs.gone").rename(once / "theirs")
     assert "cannot be made again" in wrong
@@ -168,7 +168,7 @@ def test_import_continues_after_a_stop(once: Path, tmp_path: Path, monkeypatch: 
 
 
 def test_import_reports_and_skips_invalid_records(once: Path, tmp_path: Path) -> None:
-    """An array of all, uncompressed and with an axis more, of which the reference reads that as well."""
+    """The array is uncompressed and has an additional axis; the reference reads such arrays as well."""
     made = trajectories_in(once / "theirs")
     plain = np.dtype([(name, made.dtype[name].base, made.dtype[name].shape[1:]) for name in made.dtype.names or ()])
     made = made.view(plain).copy()
@@ -208,7 +208,7 @@ def test_import_requires_a_split_named_by_budget_and_size(once: Path, tmp_path: 
 
 @pytest.mark.campaign
 def test_import_reads_folders_that_the_reference_wrote(reference: Path, tmp_path: Path) -> None:
-    """Most of what reaches the goal there does so here. Of other sizes, golden folders are read."""
+    """Most episodes that reach the goal there do so here; golden folders cover other sizes."""
     solved, others = 24, 4
     file = oracle.sampled_levels(reference, "s")
     words = [tmp_path / "s", file, "--size", "s", "--levels", 128, "--solved", solved, "--others", others]

@@ -1,4 +1,4 @@
-"""Level files instead of random levels: a split for each size, and every command works on it without the sampler."""
+"""Level files instead of random levels: one split per size, on which every command works without the sampler."""
 
 import json
 import shlex
@@ -35,7 +35,7 @@ IDS = TRIVIAL, UNSOLVABLE = 1, 16  # of size s: the first gets a shard, the seco
 
 
 def still() -> Level:
-    """Of another size, and nothing acts in it: next to no program is compiled for that size."""
+    """Return a level of another size in which nothing acts, so that few programs are compiled for that size."""
     level = switchback()
     level.model.thruster_active[...] = False
     return level
@@ -50,13 +50,13 @@ def write(folder: Path, level_id: int, name: str, rules: TaskParams | None = Non
 
 
 def rows_of(split: Path) -> dict[str, dict]:
-    """By the names of their files."""
+    """Return the rows by the names of their files."""
     return {Path(row["file"]).name: row for row in read_manifest(split).table.to_pylist()}
 
 
 @pytest.fixture(scope="module")
 def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with level files below `mine`, of two sizes, and the splits that the command made of them."""
+    """Return a folder with level files of two sizes below `mine`, and the splits that `generate` made of them."""
     folder = tmp_path_factory.mktemp("files")
     write(folder / "mine", TRIVIAL, "a.json")
     write(folder / "mine", TRIVIAL, "deeper/copy.json")
@@ -77,7 +77,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(once: Path, tmp_path: Path) -> Path:
-    """A copy; the files that rows name are those of the first."""
+    """Return a copy of `once`; its rows name the original's files."""
     return Path(shutil.copytree(once, tmp_path / "files"))
 
 
@@ -90,7 +90,7 @@ def test_rows_have_the_file_and_an_id_from_the_content(once: Path) -> None:
         assert row["level_id"] == level_id_for(row["content_hash"])
         assert Path(row["file"]).is_absolute()
     ids = [row["level_id"] for row in rows.values()]
-    assert ids != list(IDS), "the id that the sampler knows is not in the file"
+    assert ids != list(IDS), "files do not contain the sampler's ids"
     assert len(read_manifest(once / "data/5k/s").fragments) == 1, "ids far apart share a unit"
 
 
@@ -129,7 +129,7 @@ def test_verify_checks_every_level_against_its_file(once: Path, folder: Path) ->
 
 
 def test_repair_reads_lost_levels_from_their_files(folder: Path) -> None:
-    """A shard that is gone, and then the fragment, whose rows alone know where the files are."""
+    """A missing shard is restored; a damaged fragment is not, because only its rows name the files."""
     split = folder / "data/5k/s"
     before, (shard,) = lasting(split), (split / "shards").iterdir()
     shutil.rmtree(shard)

@@ -1,4 +1,4 @@
-"""Scalars of a run are what its events tell, in files that others read; what they refuse ends no run."""
+"""Logging of a run's scalars: their values, files that the libraries read, and errors that never end the run."""
 
 import struct
 import sys
@@ -31,7 +31,7 @@ STATE = {
 
 
 def tensorboard_file(folder: Path) -> Iterator[tuple[str, int, float]]:
-    """Name, step and value of each scalar: length, checksum, event, checksum, as TensorFlow has its records."""
+    """Yield name, step and value of each scalar from TensorFlow's records: length, checksum, event, checksum."""
     from tensorboardX.proto.event_pb2 import Event
 
     (path,) = folder.glob("*/events.out.tfevents.*")
@@ -71,8 +71,8 @@ def test_logged_writes_to_the_working_folder_if_the_split_is_in_a_store(
         log([BEGAN, STATE])
     (sentence,) = said
     assert sentence.startswith("Scalars for tensorboard: log/128k/s/")
-    told = {name: value for name, _, value in tensorboard_file(tmp_path / "log/128k/s")}
-    assert told == pytest.approx(scalars(BEGAN, STATE))
+    logged_values = {name: value for name, _, value in tensorboard_file(tmp_path / "log/128k/s")}
+    assert logged_values == pytest.approx(scalars(BEGAN, STATE))
 
 
 @pytest.mark.parametrize("refuses", ["from the first", "later", "at the end"])
@@ -121,8 +121,8 @@ def generated(words: Sequence[str], folder: Path) -> str:
 
 
 @pytest.mark.campaign
-def test_those_who_plot_them_read_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run for Weights & Biases, without network, and the same command with more levels for TensorBoard."""
+def test_tensorboard_and_wandb_read_the_scalars(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Log a run to offline Weights & Biases, then the same command with more levels to TensorBoard."""
     wandb = pytest.importorskip("wandb")
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     monkeypatch.setenv("WANDB_MODE", "offline")

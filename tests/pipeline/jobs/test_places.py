@@ -1,4 +1,4 @@
-"""How many workers a machine gets, and of what: as its cores, GPUs and memory allow. Some on real Ray."""
+"""Number of workers that a machine gets by its cores, GPUs and memory. One test runs real Ray."""
 
 import os
 import subprocess
@@ -18,7 +18,7 @@ from tests.pipeline.command import COMMAND_SECONDS, ROOT
 
 NEED = 2 * GB
 
-# A machine with a GPU that an actor holds, and memory for one worker on its two cores
+# A machine with two cores, memory for one worker, and a GPU that an actor holds
 HELD = """
 import ray
 from levelproof.configs.compose import compose_job
@@ -46,8 +46,8 @@ assert gpu == "Workers use CPU cores, not GPUs: after 1 s of waiting, others sti
 assert memory.endswith("has 2.0 GB of memory free, and a worker of this size needs 1.5 GB: it runs 1 of 2 workers.")
 cluster.GPU_PATIENCE = 600.0
 ray.kill(holder)
-assert cluster._why_no_gpu() == NO_GPU  # it is free, and none that JAX can use
-ray.get(Holder.remote().there.remote(), timeout=600.0)  # nor does the probe keep it
+assert cluster._why_no_gpu() == NO_GPU  # it is free, but JAX cannot use it
+ray.get(Holder.remote().there.remote(), timeout=600.0)  # the probe has released it
 """
 
 

@@ -1,4 +1,4 @@
-"""`levelproof plan`, on a job so small that its sample is all of it."""
+"""`levelproof plan`, on a job so small that the sample is the whole job."""
 
 import json
 from pathlib import Path

@@ -1,5 +1,5 @@
-"""Jobs that are stopped or killed while experts train: the same command ends with the same bits, and trains only what
-was not kept."""
+"""Jobs that are stopped or killed while experts train: the same command ends with the same bits, and repeats only the
+training that was not saved."""
 
 import re
 import signal
@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.campaign, pytest.mark.slow]
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    """And its env steps."""
+    """Return the split of an undisturbed run, and its env steps."""
     folder = tmp_path_factory.mktemp("undisturbed")
     done = here(["generate", *SETTINGS, "executor=inline"], folder)
     assert done.returncode == 0, done.stderr
@@ -52,7 +52,7 @@ def test_same_command_resumes_unfinished_experts(
     begin = time.monotonic()
     process.send_signal(number)
     _, err = process.communicate(timeout=patience(60))
-    # the command's own clock ends it after LAST s, however slow the machine is: only its exit may take longer there
+    # The command's own timer ends it after LAST s on any machine; only its exit may take longer on a slow one
     assert time.monotonic() - begin < LAST + patience(2)
     assert process.returncode == (-9 if number == signal.SIGKILL else 130), err
     kept = load_paused(split, range(LEVELS), compose_job(SETTINGS))

@@ -1,4 +1,4 @@
-"""What people see while they wait."""
+"""Progress of a job: the counts, the estimates, and how they are shown."""
 
 import io
 
@@ -37,7 +37,7 @@ def test_tally_discards_the_progress_of_a_failed_attempt() -> None:
 
 
 def board_at(now: Tally, time: list[float]) -> tuple[Board, io.StringIO]:
-    """A board that tells a line at every refresh, with a clock of its own."""
+    """Return a board that prints to a string, and whose clock reads `time[0]`."""
     text = io.StringIO()
     return Board(now, Console(file=text), clock=lambda: time[0]), text
 
@@ -65,7 +65,7 @@ def test_board_pace_excludes_levels_of_earlier_runs() -> None:
 
 
 def test_board_keeps_its_pace_during_a_pause() -> None:
-    """An evaluation may take longer than the pace is averaged over."""
+    """An evaluation may take longer than the averaging period of the pace."""
     now, time = tally(), [0.0]
     board, text = board_at(now, time)
     for steps in (100, 200):

@@ -1,4 +1,4 @@
-"""The budget ladder on real splits: levels of a manifest again, from the start or where their experts were."""
+"""`regenerate` on real splits: a manifest's levels at a larger budget, from the start or from saved experts."""
 
 import shutil
 from pathlib import Path
@@ -24,7 +24,7 @@ SETTINGS = ["levels=12", "stop.rule=solved", "executor=inline"]  # so that some 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With data/8k/s, made with `keep_experts=true` by a worker that has several units at once, and sealed."""
+    """Return a folder with data/8k/s, made with `keep_experts=true` by a worker with several units, then sealed."""
     folder = tmp_path_factory.mktemp("ladder")
     done = here(["generate", *SETTINGS, "budget=8k", "keep_experts=true", "unit=2"], folder)
     assert done.returncode == 0, done.stderr
@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows_of(split: Path) -> list[dict]:
-    """What lasts of a manifest."""
+    """Return the reproducible part of a manifest, as strings."""
     return [{name: str(value) for name, value in row.items()} for row in lasting(split)]
 
 

@@ -1,4 +1,4 @@
-"""What is damaged or missing is made again bit for bit, and what is sound is not touched."""
+"""`verify --repair` regenerates what is damaged or missing bit for bit, and leaves sound files untouched."""
 
 import random
 import shutil
@@ -45,7 +45,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sealed(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first two units in one fragment."""
+    """Return a copy of `whole` with its first two units sealed into one fragment."""
     split = tmp_path_factory.mktemp("sealed") / "s"
     shutil.copytree(whole, split)
     last = fragment_paths(split)[-1]
@@ -57,7 +57,7 @@ def sealed(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def witness(sealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same in actions and key frames."""
+    """Return a copy of `sealed` with records stored at density "witness"."""
     split = tmp_path_factory.mktemp("witness") / "s"
     shutil.copytree(sealed, split)
     seal_split(split, 2, Console(quiet=True), "witness")
@@ -70,7 +70,7 @@ def copied(tmp_path: Path) -> Callable[[Path], Path]:
 
 
 def content(split: Path) -> tuple[str, dict[int, dict[str, np.ndarray]]]:
-    """What lasts of the rows, and the fields of every witness."""
+    """Return the reproducible part of the rows, and the fields of every witness."""
     rows = read_manifest(split).table.to_pylist()
     fields = {row["level_id"]: Shard(split / row["shard"]).read([row["row"]]) for row in rows if row["shard"]}
     kept = [bool(row["experts"]) for row in rows]
@@ -78,7 +78,7 @@ def content(split: Path) -> tuple[str, dict[int, dict[str, np.ndarray]]]:
 
 
 def assert_as_before(split: Path, before: Path, deleted: bool = False) -> None:
-    """Data of a fragment that somebody deleted stays, as always."""
+    """Check that the split equals `before`; if a fragment was `deleted`, its data files may stay."""
     (rows, fields), (rows_before, fields_before) = content(split), content(before)
     assert rows == rows_before
     assert fields.keys() == fields_before.keys()
@@ -98,29 +98,29 @@ def repaired(split: Path) -> str:
 
 
 def untouched(split: Path, fragment: Path) -> set[tuple[Path, int, int]]:
-    """Files that this fragment commits, as the file system knows them."""
+    """Return the files that this fragment commits, with their inodes and times."""
     files = [fragment, *(file for file, levels in files_of(split).items() if levels & files_of(split)[fragment])]
     return {(file, file.stat().st_ino, file.stat().st_mtime_ns) for file in files}
 
 
 def data_files(split: Path) -> set[tuple[Path, int]]:
-    """All but the note and the writer's lock, in which a repair writes its name."""
+    """Return all files with their times, without those that any repair writes: the note and the writer's lock."""
     files = (file for file in split.rglob("*") if file.name not in (JOB, WRITER_LOCK) and file.is_file())
     return {(file, file.stat().st_mtime_ns) for file in files}
 
 
 def test_repair_restores_a_shard_a_fragment_and_the_note_at_once(whole: Path, copied: Callable[[Path], Path]) -> None:
-    """A chunk of a shard, a fragment that cannot be read, and the note; the third unit stays as it is."""
-    split, chance = copied(whole), random.Random(0)
+    """A chunk of a shard is damaged, a fragment is unreadable, and the note is missing; the third unit is sound."""
+    split, rng = copied(whole), random.Random(0)
     first, second, third = fragment_paths(split)
     kept = untouched(split, third)
     shard = next(path for path in (split / "shards").iterdir() if path.name.startswith(first.stem))
-    flip(shard / "dyn32/c/0/0/0", chance)
+    flip(shard / "dyn32/c/0/0/0", rng)
     second.write_bytes(b"PAR1")
     (split / JOB).unlink()
-    told = repaired(split)
-    assert str(second) in told
-    assert str(shard) in told
+    output = repaired(split)
+    assert str(second) in output
+    assert str(shard) in output
     assert untouched(split, third) == kept
     assert_as_before(split, whole)
     assert "nothing" not in repaired(split)
@@ -128,7 +128,7 @@ def test_repair_restores_a_shard_a_fragment_and_the_note_at_once(whole: Path, co
 
 @pytest.mark.campaign
 def test_repair_runs_on_ray_workers(whole: Path, copied: Callable[[Path], Path]) -> None:
-    """Two on Ray, in processes that have not started JAX when they are forked."""
+    """Two workers, forked from a process that has not started JAX."""
     split = copied(whole)
     for path in fragment_paths(split)[:2]:
         path.write_bytes(b"PAR1")
@@ -143,8 +143,8 @@ def test_repair_runs_on_ray_workers(whole: Path, copied: Callable[[Path], Path])
 def test_repair_restores_each_kind_of_file(
     kind: str, whole: Path, copied: Callable[[Path], Path], request: pytest.FixtureRequest
 ) -> None:
-    """One after another: a flip in every file of the first fragment's data, and in it; then each of them gone."""
-    split, chance = copied(request.getfixturevalue(kind)), random.Random(3)
+    """Flip bits in the first fragment and in each kind of its data files, then delete them; repair after each kind."""
+    split, rng = copied(request.getfixturevalue(kind)), random.Random(3)
     for kinds in ("zarr.json", "c", "npz", "parquet", "json", "gone"):
         last = fragment_paths(split)[-1]
         kept = untouched(split, last)
@@ -156,14 +156,14 @@ def test_repair_restores_each_kind_of_file(
             if kinds == "gone":
                 file.unlink()
             else:
-                flip(file, chance)
+                flip(file, rng)
         repaired(split)
         assert untouched(split, last) == kept
         assert_as_before(split, whole, deleted=kinds == "gone")
 
 
 class Killed(BaseException):
-    """The process dies here."""
+    """Simulates the death of the process."""
 
 
 @pytest.mark.campaign
@@ -171,8 +171,8 @@ class Killed(BaseException):
 def test_repair_continues_after_a_kill_at_any_step(
     kind: str, whole: Path, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before and after everything that it does to the disk."""
-    original, chance = request.getfixturevalue(kind), random.Random(4)
+    """Kill it before and after each step that writes to the disk."""
+    original, rng = request.getfixturevalue(kind), random.Random(4)
     steps = [(repairing, name) for name in ("note_job", "take_out", "taken", "generate")]
     steps += [(mend, name) for name in ("begin_fragment", "merge_shards", "disown", "write_fragment")]
     for number, (module, name) in enumerate(steps):
@@ -180,18 +180,18 @@ def test_repair_continues_after_a_kill_at_any_step(
             split = Path(shutil.copytree(original, tmp_path / f"{number}-{after}"))
             first = fragment_paths(split)[0]
             shards = [path for path in (split / "shards").iterdir() if path.name.startswith(first.stem)]
-            flip(shards[0] / "dyn32/c/0/0/0", chance)
+            flip(shards[0] / "dyn32/c/0/0/0", rng)
             fragment_paths(split)[-1].write_bytes(b"PAR1")
             done = getattr(module, name)
 
-            def die(*words: Any, done: Any = done, after: bool = after, **named: Any) -> None:
+            def die(*args: Any, done: Any = done, after: bool = after, **kwargs: Any) -> None:
                 if after:
-                    done(*words, **named)
+                    done(*args, **kwargs)
                 raise Killed
 
             with monkeypatch.context() as patched:
                 patched.setattr(module, name, die)
-                with suppress(Killed):  # where a damage takes this step
+                with suppress(Killed):  # some repairs skip this step
                     repaired(split)
             repaired(split)
             assert_as_before(split, whole)
@@ -199,7 +199,6 @@ def test_repair_continues_after_a_kill_at_any_step(
 
 @pytest.mark.campaign
 def test_repair_reports_and_keeps_levels_of_another_stack(copied: Callable[[Path], Path], whole: Path) -> None:
-    """Of another stack."""
     split = copied(whole)
     (path, *_) = fragment_paths(split)
     fragment, rows = read_fragment(path)

@@ -1,4 +1,4 @@
-"""Runs on real Ray workers, undisturbed and killed in every way: afterwards the split is that of one without Ray."""
+"""Runs on real Ray workers, undisturbed and killed in several ways, all end in the same split as a run without Ray."""
 
 import os
 import signal
@@ -19,26 +19,28 @@ from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, listeni
 from tests.pipeline.jobs.test_log import tensorboard_file
 from tests.pipeline.made import lasting
 
-LEVELS = 16  # enough that a run is still at work when it is killed after its first unit
+LEVELS = 16  # enough that a run is still active when it is killed after its first unit
 COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
-ALONE = "workers=1"  # where it does not matter how many: each has to start
+ALONE = "workers=1"  # for tests that need no more, because starting each takes time
 SPLIT = Path("data/5k/s")
-LOOPBACK = ("0100007F:", "00000000000000000000000001000000:", "0000000000000000FFFF00000100007F:")  # as Linux has it
+LOOPBACK = ("0100007F:", "00000000000000000000000001000000:", "0000000000000000FFFF00000100007F:")  # in /proc/net/tcp
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Without Ray; with scalars, which change no bit."""
+    """Return the split of a run without Ray; it logs scalars, which change no bit."""
     folder = tmp_path_factory.mktemp("undisturbed")
     done = here([*COMMAND, "executor=inline", "log=tensorboard"], folder)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     (run,) = runs_in(folder / SPLIT)
-    told = events_of(run)
-    assert [told[0]["event"], told[-1]["event"], told[-1]["how"]] == ["started", "ended", "done"]
-    assert sum(of["levels"] for of in told if of["event"] == "committed") == told[-1]["done"] == told[0]["levels"]
+    events = events_of(run)
+    began, *_, ended = events
+    assert [began["event"], ended["event"], ended["how"]] == ["started", "ended", "done"]
+    committed = sum(event["levels"] for event in events if event["event"] == "committed")
+    assert committed == ended["done"] == began["levels"]
     plotted = list(tensorboard_file(folder / SPLIT / "log"))
     assert plotted[0] == ("levels/committed", 0, 0.0)
     assert ("levels/committed", LEVELS, LEVELS) in plotted
@@ -47,7 +49,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def content(split: Path) -> tuple[str, dict[int, dict]]:
-    """What lasts of the rows, and the stored fields of every solved level."""
+    """Return the reproducible part of the rows, and the stored fields of every solved level."""
     manifest = read_manifest(split)
     rows = manifest.table.to_pylist()
     fields = {row["level_id"]: Shard(split / row["shard"]).read([row["row"]]) for row in rows if row["shard"]}
@@ -64,7 +66,7 @@ def assert_same_content(split: Path, other: Path) -> None:
 
 
 def workers(process: subprocess.Popen[str]) -> list[int]:
-    """Ray's workers that have units now."""
+    """Return the process ids of Ray's workers that have units now."""
     return sorted(pid for pid in descendants(process.pid) if title(pid).startswith("ray::WorkerActor.work"))
 
 
@@ -80,7 +82,7 @@ def test_undisturbed_run_commits_every_level(undisturbed: Path) -> None:
 
 
 @pytest.mark.campaign
-def test_with_a_worker_for_each_core_the_same_comes_out(undisturbed: Path, tmp_path: Path) -> None:
+def test_number_of_workers_changes_no_result(undisturbed: Path, tmp_path: Path) -> None:
     done = run(COMMAND, tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
@@ -101,7 +103,7 @@ def test_command_killed_by_sigkill_continues_to_the_same_bits(undisturbed: Path,
     family = {pid for pid in descendants(process.pid) if "Agent" not in title(pid)}
     process.kill()
     process.communicate()
-    assert_all_gone(family)  # but for two idle helpers of Ray, which try for a minute to report that it died
+    assert_all_gone(family)  # without Ray's two idle agents, which try for a minute to report the death
     assert 1 <= len(fragment_paths(tmp_path / SPLIT)) < LEVELS
     done = here([*COMMAND, "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
@@ -113,7 +115,7 @@ def test_command_killed_by_sigkill_continues_to_the_same_bits(undisturbed: Path,
 def test_run_with_a_killed_worker_stops_and_continues_to_the_same_bits(
     undisturbed: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
-    """Another worker takes what the dead one had, and is at work when the run is stopped. They listen on loopback."""
+    """Another worker takes over the dead one's units, and is busy when the run is stopped. All listen on loopback."""
     process = start([*COMMAND, ALONE], tmp_path, preexec_fn=heed_ctrl_c)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
     places = listening(descendants(process.pid))
@@ -130,7 +132,7 @@ def test_run_with_a_killed_worker_stops_and_continues_to_the_same_bits(
     took = time.monotonic() - begin
     assert process.returncode == 130, err
     assert "trying again" in err
-    assert "Stopped: " in err or took >= LAST  # the command's own clock ends it on a slow machine before it says so
+    assert "Stopped: " in err or took >= LAST  # on a slow machine the command's timer ends it before the message
     assert "Traceback" not in err
     assert_all_gone(family)
     done = here([*COMMAND, "executor=inline"], tmp_path)
@@ -140,7 +142,7 @@ def test_run_with_a_killed_worker_stops_and_continues_to_the_same_bits(
 
 
 def test_driver_does_not_start_jax(tmp_path: Path) -> None:
-    """On a GPU it would take the memory that the worker needs; and threads and cache are set before JAX starts."""
+    """JAX in the driver would take the workers' GPU memory; threads and cache must be set before JAX starts."""
     program = (
         "from levelproof.configs.compose import compose_job; compose_job([]); "
         "from levelproof.pipeline.jobs import cluster, generate"

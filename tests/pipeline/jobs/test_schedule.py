@@ -1,4 +1,4 @@
-"""What is left to do: everything wanted and not done, once; attempts and quarantine."""
+"""Planning of units, and the scheduler: every missing level is made once; attempts and quarantine."""
 
 import tracemalloc
 from collections.abc import Collection, Iterable, Sequence
@@ -42,7 +42,7 @@ def test_plan_units_cut_at_the_same_ids_for_any_first_level(count: int, unit: in
 
 @given(st.integers(1, 60), st.integers(1, 20), st.sets(st.integers(0, 59)))
 def test_plan_units_give_new_names_to_what_is_left(count: int, unit: int, committed: set[int]) -> None:
-    """A fragment holds the first and the last level of its name, so what is left never takes a name that is there."""
+    """A fragment contains the first and the last level of its name, so what is left never needs a committed name."""
     units = list(plan_units(range(count), set(), unit))
     kept = [work for i, work in enumerate(units) if i in committed]
     done = {level_id for work in kept for level_id in work.level_ids}
@@ -61,7 +61,7 @@ def finished(units: Iterable[WorkUnit], wants: int = 1000) -> Round:
 
 
 def drain(scheduler: Scheduler, workers: int, kills: Collection[int]) -> tuple[list[int], int]:
-    """Levels that got done, and how many workers died, where some levels kill the worker that has them."""
+    """Run workers, which die of the levels in `kills`; return the finished levels and the number of deaths."""
     done, deaths = [], 0
     while not scheduler.over:
         for worker in range(workers):
@@ -97,7 +97,7 @@ def test_scheduler_gives_failed_units_fewer_companions_each_time() -> None:
     scheduler = scheduler_of(100, 1, workers=1)
     scheduler.report(0, finished([]), 0.0)
     for attempt, most in enumerate(MAX_UNITS):
-        while True:  # those that have failed less come first, and none of them joins one that has failed more
+        while True:  # units with fewer failures come first, and never share a worker with those that have more
             units = scheduler.order(0, 0.0).units
             (attempts,) = {scheduler.attempts.get(unit, 0) for unit in units}
             if attempts == attempt:
@@ -113,7 +113,7 @@ def test_scheduler_gives_failed_units_fewer_companions_each_time() -> None:
 
 def test_scheduler_orders_units_while_a_worker_has_room() -> None:
     scheduler = scheduler_of(12, 4, workers=1)
-    (first,) = scheduler.order(0, 0.0).units  # however little room there is
+    (first,) = scheduler.order(0, 0.0).units  # a worker without units gets one, whatever its room
     assert not scheduler.order(0, 0.0).units
     scheduler.report(0, Round([], {first: (0, 0.0, 0)}, wants=2), 0.0)
     (second,) = scheduler.order(0, 0.0).units
@@ -121,7 +121,7 @@ def test_scheduler_orders_units_while_a_worker_has_room() -> None:
     assert not scheduler.order(0, 0.0).units
     assert [outcome.unit for outcome in scheduler.lost(0, "died")] == [second]
     scheduler.join(0, 0.0)
-    assert scheduler.order(0, 0.0).units  # the next worker in its place begins anew
+    assert scheduler.order(0, 0.0).units  # its replacement starts without units
 
 
 def test_scheduler_cuts_units_to_a_workers_share_towards_the_end() -> None:
@@ -141,16 +141,16 @@ def test_scheduler_moves_unstarted_levels_to_idle_workers() -> None:
     (unit,) = scheduler.order(0, 0.0).units
     scheduler.report(0, Round([], {unit: (0, 0.0, 0)}, wants=0, spare=24), 0.0)
     scheduler.share()
-    assert scheduler.order(0, 0.0).give == 0, "nobody has nothing"
+    assert scheduler.order(0, 0.0).give == 0, "no worker is idle"
     scheduler.join("idle", 0.0)
     assert scheduler.order("idle", 0.0).units == []
     scheduler.share()
     assert scheduler.order(0, 0.0).give == 12
     kept, back = unit.only(range(20)), unit.only(range(20, 32))
     scheduler.report(0, Round([], {}, wants=100, spare=12, cuts=[Cut(unit, kept, back)]), 0.0)
-    assert not scheduler.order(0, 0.0).units, "it is not for the one that gave it back"
+    assert not scheduler.order(0, 0.0).units, "the worker that gave levels back does not get them again"
     (part,) = scheduler.order("idle", 0.0).units
-    assert part.level_ids == (20, 21, 22, 23, 24, 25)  # a half; the other is for whoever is the first to want it
+    assert part.level_ids == (20, 21, 22, 23, 24, 25)  # half of them; the other half waits for the next request
     assert [*scheduler.workers[0].units] == [kept]
 
 
@@ -168,7 +168,7 @@ def test_scheduler_counts_no_failure_for_leaving_workers_and_lists_silent_ones()
 
 
 def test_scheduler_memory_does_not_grow_with_waiting_levels() -> None:
-    """A million levels, of which none is there before it is asked for."""
+    """Units of a million levels are created only when they are ordered."""
     tracemalloc.start()
     scheduler = Scheduler(plan_units(range(2**20), [], 32), 2**20, 32)
     before = tracemalloc.get_traced_memory()[0]
@@ -178,13 +178,13 @@ def test_scheduler_memory_does_not_grow_with_waiting_levels() -> None:
 
 
 def timed(units: Iterable[WorkUnit], each: float, wants: int = 0) -> Round:
-    """A report of units that are committed, whose levels took `each` s."""
+    """Return a round in which these units are committed, and each level took `each` seconds."""
     took = lambda unit: Summary(len(unit.level_ids), 0, EnvSteps(), Seconds(training=each * len(unit.level_ids)))
     return Round([UnitOutcome(unit, took(unit)) for unit in units], {}, wants)
 
 
 def run_through(scheduler: Scheduler, each: Sequence[float]) -> list[WorkUnit]:
-    """All units of a job, committed by one worker for each of these times that its levels take, s."""
+    """Commit all units of a job with one worker per entry of `each`, its seconds per level; return the units."""
     units: list[WorkUnit] = []
     for worker in range(len(each)):
         scheduler.join(worker, 0.0)
@@ -225,8 +225,8 @@ def test_timed_job_continues_with_units_of_other_sizes_after_a_kill() -> None:
 def test_timed_units_take_20_to_60_seconds_and_untimed_ones_keep_their_size() -> None:
     sizes = [len(unit.level_ids) for unit in run_through(schedule(range(8192), [], 8192, 32, timed=True), [0.5])]
     assert sizes[:3] == [32, 80, 80]
-    given = [len(unit.level_ids) for unit in run_through(schedule(range(8192), [], 8192, 64, timed=False), [0.5])]
-    assert given[:3] == [64, 64, 64]
+    untimed = [len(unit.level_ids) for unit in run_through(schedule(range(8192), [], 8192, 64, timed=False), [0.5])]
+    assert untimed[:3] == [64, 64, 64]
 
 
 def test_range_stays_a_range_in_every_timed_unit() -> None:

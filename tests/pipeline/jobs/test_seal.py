@@ -1,4 +1,4 @@
-"""Sealing beside a job: what is done is merged while units come, in what order ever, and trouble never ends the job."""
+"""Sealing during a job: committed units are merged while others come, in any order; errors never end the job."""
 
 import random
 from collections.abc import Callable, Collection
@@ -19,13 +19,13 @@ UNITS = [WorkUnit((level_id,)) for level_id in range(12)]
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With all of them committed."""
+    """Return a split with all UNITS committed."""
     return made_split(tmp_path_factory.mktemp("source"), [[Label.UNSOLVED], [Label.SOLVED]] * (len(UNITS) // 2))
 
 
 @pytest.fixture
 def split(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """With levels 0 and 1."""
+    """Return a split with levels 0 and 1."""
     monkeypatch.setattr(store, "ROWS", 3)
     for number in range(2):
         commit_copy(source, number, tmp_path)
@@ -34,7 +34,7 @@ def split(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 @pytest.fixture
 def make(source: Path, split: Path) -> Make:
-    """As a worker and a driver do."""
+    """Return a function that commits a unit as a worker does, and reports it to the sealer as the driver does."""
 
     def committed(sealer: Sealer, unit: WorkUnit, coming: Collection[WorkUnit]) -> None:
         commit_copy(source, unit.level_ids[0], split)
@@ -64,7 +64,7 @@ def test_sealer_waits_for_running_units_but_not_for_failed_ones(split: Path, mak
             make(sealer, unit, UNITS[2:3])
         sealer.advance(2)
         assert not any(fragment.sealed for fragment in read_manifest(split).fragments), "level 2 may come"
-        sealer.advance(None)  # it has failed
+        sealer.advance(None)  # level 2 has failed
         sealer.finish()
         assert [fragment.rows for fragment in read_manifest(split).fragments] == [3, 1, 1]
         make(sealer, UNITS[2], [])

@@ -1,4 +1,4 @@
-"""A work unit has as many levels as keep its worker busy for 20 to 60 seconds, within a share of the job."""
+"""Sizes of work units: as many levels as keep a worker busy for 20 to 60 seconds, within a share of the job."""
 
 import pytest
 from hypothesis import given
@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from levelproof.pipeline.jobs.sizing import MAX_FACTOR, STEP, UNITS_EACH, UnitSize, unit_levels
 
-MANY = 10**9  # levels, of which a share never limits a unit
+MANY = 10**9  # levels; so many that a worker's share never limits a unit
 
 
 @given(st.floats(1e-9, 1e5), st.integers(1, 10**8), st.integers(0, 20_000), st.sampled_from([4, 8, 16, 32]))
@@ -29,7 +29,7 @@ def test_untimed_unit_is_small_and_no_more_than_a_share() -> None:
 
 
 def sized(*units: tuple[int, float]) -> UnitSize:
-    """The size after units of so many levels, each of which took so many seconds."""
+    """Return the size after units, each with a number of levels and the seconds that each level took."""
     size = UnitSize(MANY, 32)
     for levels, each in units:
         size.note(levels, levels * each, 1.0)

@@ -1,4 +1,4 @@
-"""One work unit on real levels: the commit gate and the commit."""
+"""One work unit on real levels: the check of its witnesses, and its commit."""
 
 import dataclasses
 from pathlib import Path
@@ -72,7 +72,7 @@ def test_check_witnesses_rejects_records_of_other_levels(job: JobConfig, result:
 
 
 def test_check_witnesses_rejects_a_record_that_misses_the_goal(job: JobConfig, result: UnitResult) -> None:
-    """Doing nothing gives a faithful record; called solved, it is caught by the goal."""
+    """Idle actions give a record that replays; labelled solved, it fails because it misses the goal."""
     verdicts = [dataclasses.replace(verdict, label=Label.SOLVED) for verdict in result.verdicts]
     idle = replay(result.levels, np.zeros_like(result.record.action), job.task)
     with pytest.raises(Failure, match="does not reach the goal"):

@@ -1,4 +1,4 @@
-"""A worker's loop on real units: what it commits, what it reports, and whom a failure reaches."""
+"""A worker's loop on real units: what it commits, what it reports, and which units a failure affects."""
 
 import errno
 from dataclasses import replace
@@ -33,18 +33,18 @@ def job() -> JobConfig:
 
 
 def outcomes(worker: Worker, units: list[WorkUnit]) -> dict[WorkUnit, UnitOutcome]:
-    """Of these units, all given at once."""
-    found: dict[WorkUnit, UnitOutcome] = {}
+    """Order these units at once, work until all have ended, and return their outcomes."""
+    ended: dict[WorkUnit, UnitOutcome] = {}
     round = worker.work(Order(units), 0.1)
     while True:
-        found |= {outcome.unit: outcome for outcome in round.outcomes}
+        ended |= {outcome.unit: outcome for outcome in round.outcomes}
         if not round.totals:
-            return found
+            return ended
         round = worker.work(Order([]), 0.1)
 
 
 def failing(work: Any, error: Exception, unit: WorkUnit | None = None, after: int = 0) -> Any:
-    """The function `work`, which fails with this unit, or in every call after so many."""
+    """Wrap the function `work` so that it raises `error` for this unit, or in every call after the first `after`."""
     calls: list[int] = []
 
     def maybe(*args: Any) -> Any:
@@ -77,7 +77,7 @@ def test_worker_commits_a_row_for_every_level(tmp_path: Path, job: JobConfig) ->
         if row["shard"]:
             assert Shard(tmp_path / row["shard"]).level_ids[row["row"]] == row["level_id"]
     costs = [row["seconds"] for row in manifest.table.to_pylist()]
-    for stage in ("sampling", "training", "evaluation", "replay"):  # writing goes on until after the row was written
+    for stage in ("sampling", "training", "evaluation", "replay"):  # not writing, which ends after the row is written
         assert sum(getattr(summary.seconds, stage) for summary in summaries) == pytest.approx(
             sum(cost[stage] for cost in costs), rel=1e-4
         )
@@ -93,7 +93,6 @@ def test_worker_commits_a_row_for_every_level(tmp_path: Path, job: JobConfig) ->
 
 
 def test_unit_has_the_same_rows_and_bits_beside_others_and_alone(tmp_path: Path, job: JobConfig) -> None:
-    """Beside others and by itself."""
     for name, units in ("beside", UNITS), ("alone", UNITS[:1]):
         (tmp_path / name).mkdir()
         assert all(outcome.summary for outcome in outcomes(Worker(job, tmp_path / name), units).values())
