@@ -1,5 +1,5 @@
-"""`python -m tests.pipeline.faults [FIRST COUNT]`: runs schedules, and prints how many there are of which; with
-`--count`, only that."""
+"""`python -m tests.pipeline.faults [FIRST COUNT]`: run fault schedules, and print a table of their numbers; with
+`--count`, print only the table."""
 
 import argparse
 import os
@@ -15,11 +15,11 @@ from tests.pipeline.faults.schedules import schedule_of, table
 def run() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.pipeline.faults")
     parser.add_argument("first", type=int, nargs="?", default=0, help="seed of the first schedule")
-    parser.add_argument("count", type=int, nargs="?", default=520, help="schedules")
-    parser.add_argument("--count", action="store_true", dest="only", help="only count what they are")
-    asked = parser.parse_args()
-    schedules = [schedule_of(seed) for seed in range(asked.first, asked.first + asked.count)]
-    if asked.only:
+    parser.add_argument("count", type=int, nargs="?", default=520, help="number of schedules")
+    parser.add_argument("--count", action="store_true", dest="only", help="print only the table of schedules")
+    arguments = parser.parse_args()
+    schedules = [schedule_of(seed) for seed in range(arguments.first, arguments.first + arguments.count)]
+    if arguments.only:
         print(table(schedules))
         return 0
     from tests.pipeline.faults.campaign import Campaign

@@ -1,5 +1,5 @@
-"""Runs schedules: the command with what goes wrong in it, the same command again, and a look whether all is as if
-nothing had gone wrong."""
+"""Running fault schedules: the command with its fault, then the same command again, then a check that the files equal
+those of an undisturbed run."""
 
 import os
 import shutil
@@ -29,79 +29,79 @@ FULL, ORPHAN, SECOND = "a disk that is really full", "a kill of the driver, the 
 
 
 class Undisturbed(NamedTuple):
-    """An operation with which nothing goes wrong."""
+    """An operation's results and counts without a fault."""
 
-    tree: Tree  # afterwards
+    tree: Tree  # files afterwards
     rows: dict[str, Rows]
     counts: tuple[int, int]  # effects of the driver, of its worker
-    requests: int
-    before: int  # bytes
+    requests: int  # to the store
+    before: int  # bytes on the disk
     after: int
-    largest: int  # of a file
+    largest: int  # bytes of the largest file
 
 
 class World:
     """The folder or the bucket in which one schedule runs."""
 
     def __init__(self, top: Path, files: Path, operation: str, server: Server | None = None) -> None:
-        """`files` are what commands write, in a store that has this `server`; `top` is for all else."""
+        """Commands write to `files`, directly or through the store's `server`; `top` has all else."""
         self.top, self.files, self.operation, self.server = top, files, OPERATIONS[operation], server
         self._out = f"s3://bucket/{files.name}" if server else str(files)
         self.commands: list[Command] = []
         top.mkdir(parents=True)
 
     def start(self, words: tuple[str, ...] = (), happening: Happening = NOTHING, log: Path | None = None) -> Command:
-        said = [word.replace("OUT", self._out) for word in words or self.operation.words]
+        arguments = [word.replace("OUT", self._out) for word in words or self.operation.words]
         beside = self.operation.beside and not words
         self.commands.append(
-            Command(said, self.files, self.top / f"output {len(self.commands)}", happening, log, beside)
+            Command(arguments, self.files, self.top / f"output {len(self.commands)}", happening, log, beside)
         )
         return self.commands[-1]
 
     def whole(self, words: tuple[str, ...] = ()) -> Command:
-        """A command that has to end well."""
+        """Run a command that must succeed."""
         command = self.start(words)
-        assert command.wait() == 0, command.said()
+        assert command.wait() == 0, command.output()
         command.ended()
         return command
 
-    def told(self, command: Command) -> None:
-        """It was killed, or ended with one sentence, or did not mind."""
-        code, said = command.wait(), command.said()
-        assert code in ENDS, f"exit code {code}: {said}"
-        assert "Traceback" not in said, said
-        assert len([line for line in said.splitlines() if line.startswith("Error: ")]) == (code in (1, 2)), said
-        assert "--debug" not in said, said
+    def require_clean_end(self, command: Command) -> None:
+        """Check that a command was killed, succeeded, or failed with exactly one sentence."""
+        code, output = command.wait(), command.output()
+        assert code in ENDS, f"exit code {code}: {output}"
+        assert "Traceback" not in output, output
+        assert len([line for line in output.splitlines() if line.startswith("Error: ")]) == (code in (1, 2)), output
+        assert "--debug" not in output, output
 
 
 class Campaign:
-    """One schedule after another."""
+    """Runs schedules one after another."""
 
     def __init__(self, folder: Path, server: Server) -> None:
-        """In an empty folder, with a server of the store that is in its `s3`."""
+        """`folder` is empty; `server` serves the object store in its subfolder `s3`."""
         self._folder, self._server = folder, server
         self._before: dict[str, Path] = {}
         self._undisturbed: dict[tuple[str, str], Undisturbed] = {}
         (folder / "s3/bucket").mkdir(parents=True)
         for out in (folder / "world/data", "s3://bucket/world"):
-            compose.compose_job([*GENERATE[1:], f"out={out}"])  # once, before forks do it
+            compose.compose_job([*GENERATE[1:], f"out={out}"])  # fills the cache before the process forks
         self._mounts = _can_mount(folder / "probe")
 
     def run(self, schedule: Schedule) -> bool:
-        """Whether what should happen did.
+        """Run a schedule; return whether its fault happened before the command ended.
 
         Raises:
-            AssertionError: it has changed anything for good, or was not told in a sentence.
+            AssertionError: the fault changed the final files, or the command failed without one sentence.
         """
         whole = self.undisturbed(schedule.operation, schedule.place)
         with self._world(schedule, whole.after if schedule.fault == FULL else 0) as world:
             disturb = _in_its_store if world.server else _in_its_folder
             command = disturb(world, schedule, whole)
-            world.told(command)
+            world.require_clean_end(command)
             require_sound(world.files, whole.rows)
-            _again(world, command, int(schedule.again * whole.counts[DRIVER]))
-            there = content_of(world.files)
-            assert there == whole.tree, differences(there, whole.tree)
+            _repeat(world, command, int(schedule.again * whole.counts[DRIVER]))
+            content = content_of(world.files)
+            assert content == whole.tree, differences(content, whole.tree)
         return bool(command.shared[HAPPENED])
 
     def undisturbed(self, operation: str, place: str) -> Undisturbed:
@@ -122,8 +122,8 @@ class Campaign:
 
     @contextmanager
     def _world(self, schedule: Schedule, room: int = 0) -> Iterator[World]:
-        """What is there before a schedule; on a file system of its own if it is to have little `room`."""
-        top = self._folder / "world"  # always the same: notes tell commands
+        """Yield the world before a schedule; with `room`, bytes, its files are on a small file system of their own."""
+        top = self._folder / "world"  # always the same path, because notes contain commands
         stored = schedule.place == "store"
         files = self._folder / "s3/bucket/world" if stored else top / "data"
         world = World(top, files, schedule.operation, self._server if stored else None)
@@ -136,10 +136,10 @@ class Campaign:
                 for words in world.operation.before:
                     world.whole(words)
             else:
-                shutil.copytree(self._there_before(schedule.operation), files, dirs_exist_ok=True)
+                shutil.copytree(self._initial_files(schedule.operation), files, dirs_exist_ok=True)
             yield world
         finally:
-            _mend(self._server)
+            _restore(self._server)
             for command in world.commands:
                 command.end()
             if mounted:
@@ -148,8 +148,8 @@ class Campaign:
             if stored:
                 shutil.rmtree(files)
 
-    def _there_before(self, operation: str) -> Path:
-        """Made once."""
+    def _initial_files(self, operation: str) -> Path:
+        """Return the files that an operation starts from; made once."""
         if operation not in self._before:
             top = self._folder / f"before {len(self._before)}"
             world = World(top, top / "data", operation)
@@ -163,8 +163,8 @@ class Campaign:
 
 
 def _leave(world: World) -> None:
-    """What processes leave that die: between a shard and its fragment, between a sealed fragment and those that it was
-    made of, and while they write small files."""
+    """Leave the files of processes that died between a shard and its fragment, between a sealed fragment and the
+    deletion of those that it replaces, and while writing small files."""
     four = tuple("levels=4" if word.startswith("levels=") else word for word in (*GENERATE, "out=OUT"))
     split, saved = world.files / "128k/s", world.top / "saved"
     world.whole(four)
@@ -205,7 +205,7 @@ def _in_its_folder(world: World, schedule: Schedule, whole: Undisturbed) -> Comm
     while not command.over():
         if fault == SECOND and command.asks():
             second = world.start()
-            world.told(second)
+            world.require_clean_end(second)
             second.ended()
             command.control.send(b"!")
         elif fault == "slow writes":
@@ -252,40 +252,40 @@ def _in_its_store(world: World, schedule: Schedule, whole: Undisturbed) -> Comma
     while not command.over():
         if asked.is_set() and not answered.is_set():
             second = world.start()
-            world.told(second)
+            world.require_clean_end(second)
             second.ended()
             answered.set()
         time.sleep(0.002)
     if fault != ORPHAN:
         command.ended()
     if every:
-        assert command.wait() == 0, command.said()
-    _mend(server)
+        assert command.wait() == 0, command.output()
+    _restore(server)
     return command
 
 
-def _again(world: World, before: Command, at: int) -> None:
-    """The same command; a worker that has outlived its driver goes on in the middle of it."""
+def _repeat(world: World, before: Command, at: int) -> None:
+    """Run the same command again; a worker that has outlived its driver continues during effect `at`."""
     command = world.start((), Happening("go on", "driver", at))
     while not command.over():
         if command.asks():
             with suppress(OSError):
                 before.control.send(b"!")
         time.sleep(0.002)
-    assert command.wait() == 0, f"again: {command.said()}"
+    assert command.wait() == 0, f"the second run failed: {command.output()}"
     command.ended()
     before.ended()
     if world.operation.beside:
         world.whole(SEAL)
 
 
-def _mend(server: Server) -> None:
+def _restore(server: Server) -> None:
     server.meanwhile = lambda _: None
     server.spoil(0)
 
 
 def _size(folder: Path) -> int:
-    """Bytes on the disk."""
+    """Return the bytes that a folder's files take on the disk."""
     return sum(-(-path.stat().st_size // PAGE) * PAGE for path in folder.rglob("*") if path.is_file())
 
 

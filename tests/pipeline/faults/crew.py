@@ -1,6 +1,6 @@
-"""In place of Ray and of training: one worker, forked, that commits ready-made results of units by the real commit.
+"""A substitute for Ray and training: one forked worker that commits ready-made results of units by the real commit.
 
-What trains takes seconds a unit and writes nothing; all that writes is as it is.
+Training takes seconds per unit and writes nothing, so it is left out; all code that writes is the real one.
 """
 
 import os
@@ -27,12 +27,12 @@ from levelproof.pipeline.store.leases import serve, served
 from tests.pipeline.made import made_level, made_record, made_verdict
 
 WANTED = 2  # levels for which a worker has room
-waiting: list[Connection] = []  # ends of workers that wait for their job
+waiting: list[Connection] = []  # connections to workers that wait for their job
 
 
 @cache
 def result_of(level_ids: tuple[int, ...], experts: bool) -> UnitResult:
-    """Random bits, the same each time."""
+    """Return a result of random bits, the same each time."""
     number, seed = len(level_ids), level_ids[0]
     verdicts = [made_verdict(Label.UNSOLVED if i % 3 == 1 else Label.SOLVED) for i in level_ids]
     level, record = made_level("s", number, seed), made_record("s", number, seed)
@@ -42,7 +42,7 @@ def result_of(level_ids: tuple[int, ...], experts: bool) -> UnitResult:
 
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
-    """As an executor does: work until nothing is left to do; who dies is replaced."""
+    """Run all units as an executor does, and replace a worker that dies."""
     worker: Connection | None = None
     while not scheduler.over:
         if worker is None:
@@ -62,7 +62,7 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
 
 
 def fork_worker(begin: Callable[[], None]) -> None:
-    """One more that waits; it ends when its driver does. Forked before that has locks and connections."""
+    """Fork a worker that waits for a job and ends with its driver; call before the driver has locks or connections."""
     mine, theirs = Pipe()
     if os.fork():
         theirs.close()

@@ -1,5 +1,5 @@
-"""What a process does to the files below a folder: counted, and told before it is done. And a machine's death: what it
-had not flushed to the disk is lost, by chance."""
+"""Effects of a process on the files below a folder, counted and reported before they happen; and loss of power, which
+undoes a random part of what was not flushed to the disk."""
 
 import fcntl
 import os
@@ -19,34 +19,34 @@ KINDS = {
     "fcntl.flock": "lock",
     "open": "write",
 }
-WHOLE = "whole"  # ends a line of the log: a process that is killed may have written the beginning of one
-Tell = Callable[[int, str, str], None]  # of the number of an effect, its kind, and a path
+WHOLE = "whole"  # ends each line of the log, because a killed process may leave only the beginning of one
+Tell = Callable[[int, str, str], None]  # gets an effect's number, its kind, and a path
 
 
 class Effects:
-    """Of this process from now on; one a process, as no audit hook is ever removed."""
+    """Counts the effects of this process from now on; at most one per process, as audit hooks cannot be removed."""
 
     def __init__(self, below: Path, tell: Tell, log: Path | None = None) -> None:
-        """`tell` may raise the error that the disk gives; what it does itself is not counted."""
+        """`tell` may raise the disk's error; its own effects are not counted. A `log` records effects in order."""
         self.count, self._below, self._log = 0, str(below), log
         self._telling, self._lock = threading.local(), threading.Lock()
         self._fsync = os.fsync
         self.tell = tell
-        os.fsync = self._flushed
-        sys.addaudithook(self._hear)
+        os.fsync = self._flush
+        sys.addaudithook(self._audit)
 
-    def _hear(self, event: str, arguments: tuple) -> None:
+    def _audit(self, event: str, arguments: tuple) -> None:
         kind = KINDS.get(event)
         if not kind or (kind == "write" and not (arguments[2] or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)):
             return
         if kind == "lock" and arguments[1] == fcntl.LOCK_UN:
             return
-        # What is in a folder that goes as a whole goes by its name alone; a lock by its number
+        # Audit events give a bare name inside a folder that is deleted recursively, and a descriptor for a lock
         path = "" if kind == "lock" else os.fsdecode(arguments[0]) if not isinstance(arguments[0], int) else ""
         if self._below in path or (path and not path.startswith("/")) or kind == "lock":
             self._happen(kind, path, arguments)
 
-    def _flushed(self, descriptor: int) -> None:
+    def _flush(self, descriptor: int) -> None:
         path = os.readlink(f"/proc/self/fd/{descriptor}")
         if self._below in path:
             self._happen("fsync", path, ())
@@ -66,7 +66,7 @@ class Effects:
             self._telling.now = False
 
     def _note(self, number: int, kind: str, path: str, arguments: tuple) -> None:
-        """In a log that is there after this process."""
+        """Append an effect to the log, with a copy of a file that it will delete."""
         assert self._log
         there = os.fsdecode(arguments[1]) if kind == "rename" else path
         saved = ""
@@ -78,40 +78,43 @@ class Effects:
 
 
 class Change(NamedTuple):
-    """An effect that is not on the disk for good."""
+    """An effect that was not flushed to the disk."""
 
     kind: str  # write, create, rename, unlink
-    path: Path  # whose bytes, or whose name
+    path: Path  # the file whose bytes or name changed
     source: Path  # of a rename
-    saved: str  # what was there before
+    saved: str  # path of a copy of the file that was there before; empty: none
 
 
 def lose_power(log: Path, seed: int) -> None:
-    """Undo some of what was not flushed, the last first: written bytes, and what names folders have."""
+    """Undo a random half of the unflushed changes to bytes and names, the latest first."""
     loose: list[Change] = []
     for line in log.read_text().splitlines():
         if not line.endswith("\t" + WHOLE):
-            continue  # what it tells of was not done
+            continue  # the process died before this effect
         kind, path, there, saved, existed, _ = line.split("\t")
         at = Path(there)
         if kind == "fsync":
-            loose = [of for of in loose if (of.path if of.kind == "write" else of.path.parent) != at]
+            loose = [
+                change for change in loose if (change.path if change.kind == "write" else change.path.parent) != at
+            ]
         elif kind == "write":
             loose += [Change("write", at, at, "")] + ([] if existed == "True" else [Change("create", at, at, "")])
         elif kind == "rename":
-            loose = [of._replace(path=at) if of.path == Path(path) and of.kind == "write" else of for of in loose]
+            old = Path(path)
+            loose = [c._replace(path=at) if c.path == old and c.kind == "write" else c for c in loose]
             loose.append(Change("rename", at, Path(path), saved))
         elif kind == "unlink" and saved:
             loose.append(Change("unlink", at, at, saved))
     dice = random.Random(seed)
-    for of in reversed(loose):
-        if dice.random() < 0.5 or not of.path.parent.is_dir():
+    for kind, path, source, saved in reversed(loose):
+        if dice.random() < 0.5 or not path.parent.is_dir():
             continue
-        if of.kind == "write" and of.path.is_file():
-            os.truncate(of.path, dice.choice([0, of.path.stat().st_size // 2]))
-        elif of.kind == "create":
-            of.path.unlink(missing_ok=True)
-        elif of.kind == "rename" and of.path.exists() and not of.source.exists():
-            of.path.rename(of.source)
-        if of.kind in ("rename", "unlink") and of.saved and not of.path.exists():
-            shutil.copyfile(of.saved, of.path)
+        if kind == "write" and path.is_file():
+            os.truncate(path, dice.choice([0, path.stat().st_size // 2]))
+        elif kind == "create":
+            path.unlink(missing_ok=True)
+        elif kind == "rename" and path.exists() and not source.exists():
+            path.rename(source)
+        if kind in ("rename", "unlink") and saved and not path.exists():
+            shutil.copyfile(saved, path)

@@ -1,7 +1,7 @@
-"""The command `levelproof` in a forked process, with all that it forks, to which something may happen.
+"""The command `levelproof` in a forked process with its own forks, and the faults that hit them.
 
-Nothing here computes with JAX: a process that has started it cannot fork. So what trains is `crew`, and what the engine
-computes again when a density is changed is looked up in what was stored before.
+Nothing here computes with JAX, because a process that has started JAX cannot fork. So `crew` replaces training, and
+records that the engine would re-simulate for another density are looked up in the ready-made results.
 """
 
 import errno
@@ -33,30 +33,30 @@ from tests.pipeline.faults import crew
 from tests.pipeline.faults.effects import Effects, Tell
 from tests.pipeline.faults.schedules import LEVELS
 
-HANGS = 60.0  # s after which a command hangs
-HELD = 0.5  # s that a worker that has outlived its driver waits for the next command, at most
-SLOW, FOR = 0.02, 10  # s of each of so many effects
+HANGS = 60.0  # s after which a command is taken to hang
+HELD = 0.5  # maximum s for which a worker that has outlived its driver waits for the next command
+SLOW, FOR = 0.02, 10  # s that each slow write takes, and their number
 DAY = 86_400.0  # s
-BESIDE_ROWS = 4  # of a fragment that is sealed beside a job
+BESIDE_ROWS = 4  # rows of a fragment that is sealed during a job
 TORN = "a kill within a write"
-LEAST = 4096  # bytes of a file that may be written: those of what the command says
-SPARE, MORTAL = 2, 10  # workers, where one dies, and where all do
+MIN_LIMIT = 4096  # bytes; smallest limit on a file's size, so that the command's output fits
+SPARE, MORTAL = 2, 10  # number of workers if one dies, and if all do
 ERRORS = {"no space": errno.ENOSPC, "input/output error": errno.EIO, "read-only": errno.EROFS}
-DRIVER, WORKER, HAPPENED, DRIVER_PID, WORKER_PID = range(5)  # places in what processes share: counts of effects first
+DRIVER, WORKER, HAPPENED, DRIVER_PID, WORKER_PID = range(5)  # indices in shared memory; the first two count effects
 ROLES = {"driver": DRIVER, "worker": WORKER}
 
 
 class Happening(NamedTuple):
-    """What happens to a command, in one of its processes."""
+    """A fault in one of a command's processes."""
 
     fault: str = ""
     whose: str = "driver"
-    at: int = 0  # effect, or bytes of a file
-    when: Callable[[str, str], bool] | None = None  # of an effect's kind and path, instead
+    at: int = 0  # number of an effect, or bytes of a file
+    when: Callable[[str, str], bool] | None = None  # instead of `at`: condition on an effect's kind and path
 
 
 class Command:
-    """One run of the command, in a session of its own."""
+    """One run of the command, in its own session."""
 
     def __init__(
         self,
@@ -67,10 +67,10 @@ class Command:
         log: Path | None = None,
         beside: bool = False,
     ) -> None:
-        """What it says goes to `output`, and what it does to files `below`, if that is wanted, to a `log`."""
+        """Its standard streams go to `output`; a `log` records its effects on files `below`."""
         self.shared = memoryview(mmap.mmap(-1, 64)).cast("q")
         self.control, theirs = socket.socketpair()
-        reads, alive = os.pipe()  # closed when the last process that has it ends
+        reads, alive = os.pipe()  # the read end reports end of file when the last forked process ends
         self._alive: int | None = reads
         self._output, self._end = output, time.monotonic() + patience(HANGS)
         self._code: int | None = None
@@ -94,31 +94,31 @@ class Command:
             os._exit(code)
 
     def over(self) -> bool:
-        """Whether the process itself has ended; its worker may go on."""
+        """Whether the process itself has ended; its worker may still run."""
         if self._code is None:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             self._code = os.waitstatus_to_exitcode(status) if pid else None
             if time.monotonic() > self._end:
                 self.kill()
-                raise AssertionError(f"it hangs: {self.said()}")
+                raise AssertionError(f"the command hangs: {self.output()}")
         return self._code is not None
 
     def wait(self) -> int:
-        """Its exit code; negative: of a signal. Raises AssertionError where it hangs."""
+        """Wait for its end; return the exit code, negative for a signal. Raise AssertionError if it hangs."""
         while not self.over():
             time.sleep(0.002)
         assert self._code is not None
         return self._code
 
     def asks(self) -> bool:
-        """Whether a process of it has said that it is time."""
+        """Whether one of its processes has reached the awaited effect."""
         try:
             return bool(self.control.recv(1, socket.MSG_DONTWAIT))
         except OSError:
             return False
 
     def ended(self) -> None:
-        """Wait until all that it has forked have ended, too."""
+        """Wait until all its forked processes have ended, too."""
         while self._alive is not None:
             if select.select([self._alive], [], [], patience(HANGS))[0]:
                 os.close(self._alive)
@@ -126,20 +126,20 @@ class Command:
                 self.control.close()
             else:
                 self.kill()
-                raise AssertionError(f"a worker hangs: {self.said()}")
+                raise AssertionError(f"a worker hangs: {self.output()}")
 
     def kill(self) -> None:
         os.killpg(self.pid, signal.SIGKILL)
 
     def end(self) -> None:
-        """All that it has forked, if it is not over: what was to be seen was not."""
+        """Kill whatever still runs of it, after a failed check."""
         if self._alive is not None:
             with suppress(ProcessLookupError):
                 self.kill()
             self.wait()
             self.ended()
 
-    def said(self) -> str:
+    def output(self) -> str:
         return self._output.read_text()
 
 
@@ -154,11 +154,11 @@ def _redirect(output: Path) -> None:
 def _prepare(
     below: Path, happening: Happening, log: Path | None, beside: bool, control: socket.socket, shared: memoryview
 ) -> None:
-    """Make this process, forked a moment ago, the command's."""
+    """Set up this newly forked process as the command's, with its fault and its workers."""
     if beside:
         seal.ROWS = BESIDE_ROWS
     if happening.fault in (TORN, "files that grow too large"):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (max(happening.at, LEAST), resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (max(happening.at, MIN_LIMIT), resource.RLIM_INFINITY))
         kills = happening.fault == TORN
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL if kills else signal.SIG_IGN)
         shared[HAPPENED] = 1
@@ -183,7 +183,7 @@ def _counted(shared: memoryview, role: int, tell: Tell | None) -> Tell:
 
 
 def _tell(happening: Happening, control: socket.socket, shared: memoryview) -> Tell:
-    """What is to happen at an effect, in the process that is about to have it."""
+    """Return the function that causes the fault in the process that is about to have its effect."""
     fault, _, at, when = happening
     code = next((code for name, code in ERRORS.items() if name in fault), 0)
 
@@ -211,7 +211,7 @@ def _tell(happening: Happening, control: socket.socket, shared: memoryview) -> T
 
 
 def _ask(control: socket.socket, seconds: float) -> None:
-    """Say that it is time, and wait for an answer."""
+    """Report that the awaited effect is reached, and wait up to `seconds` for an answer."""
     control.send(b"!")
     if seconds:
         control.settimeout(seconds)
@@ -232,7 +232,7 @@ def _set_clock_back() -> None:
 
 
 def set_up() -> None:
-    """Make this process one whose forks are the command's: without JAX, and with all that they share already there."""
+    """Prepare this process for forking commands: replace what uses JAX, and import and cache what all forks need."""
     inline.run = crew.run
     unit.device = lambda: "cpu: none"
     compose.compose_job = cache_of(compose.compose_job)
@@ -262,16 +262,16 @@ def set_up() -> None:
 
 
 def cache_of(function: Callable) -> Callable:
-    """The same of a list of words, each asked once."""
+    """Cache a function of one list."""
     known = cache(function)
-    return lambda words: known(tuple(words))
+    return lambda values: known(tuple(values))
 
 
 def _looked_up(stored: Mapping[bytes, tuple[Mapping[str, np.ndarray], int]]) -> Callable[..., density.Restored]:
     def restored(arrays: Mapping[str, np.ndarray], wanted: Any, _: Any) -> density.Restored:
         action = arrays["record/action"]
-        of = [stored[action[..., i].tobytes()] for i in range(action.shape[-1])]
-        found = {field.name: np.stack([all[field.name][..., i] for all, i in of], -1) for field in wanted}
-        return density.Restored(found, np.full(len(of), -1))
+        sources = [stored[action[..., i].tobytes()] for i in range(action.shape[-1])]
+        fields = {field.name: np.stack([whole[field.name][..., i] for whole, i in sources], -1) for field in wanted}
+        return density.Restored(fields, np.full(len(sources), -1))
 
     return restored

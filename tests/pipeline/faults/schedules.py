@@ -1,4 +1,4 @@
-"""Schedules: a command, what goes wrong in it, and at which of its effects. A seed makes one."""
+"""Fault schedules, each made from a seed: a command, a fault, and the effect at which it happens."""
 
 import random
 from collections import Counter
@@ -12,12 +12,12 @@ REGENERATE = ("regenerate", "manifest=OUT/128k/s", "budget=256k", "executor=inli
 
 
 class Operation(NamedTuple):
-    """A command, and what is there before it; `OUT` stands for the folder or the store's URL."""
+    """A command and the state before it; `OUT` stands for the folder or the store's URL."""
 
     words: tuple[str, ...]
-    before: tuple[tuple[str, ...], ...] = ()  # commands
-    left: bool = False  # and what dead processes have left
-    beside: bool = False  # it seals while it works
+    before: tuple[tuple[str, ...], ...] = ()  # commands that run first
+    left: bool = False  # add what dead processes leave
+    beside: bool = False  # it seals during the job
     works: bool = True  # it has a worker
 
 
@@ -33,7 +33,7 @@ OPERATIONS = {
 }
 STORED = ("generate", "seal")  # operations that also run in an object store
 
-OF_PROCESSES = {  # what happens at an effect, each of a driver or of a worker
+OF_PROCESSES = {  # faults at an effect, and the processes that they may hit
     "a kill": ("driver", "worker"),
     "a kill of all": ("driver", "worker"),
     "loss of power": ("driver", "worker"),
@@ -50,7 +50,7 @@ OF_PROCESSES = {  # what happens at an effect, each of a driver or of a worker
     "slow writes": ("driver", "worker"),
     "a clock that goes back": ("driver",),
 }
-OF_STORES = {  # at a request
+OF_STORES = {  # faults at a request to the store
     "a kill": ("driver", "worker"),
     "a kill of all": ("all",),
     "a kill of the driver, the worker goes on": ("worker",),
@@ -63,15 +63,15 @@ OFTEN = {"a kill": 3, "a kill of all": 2, "loss of power": 3, "a kill of the dri
 
 
 class Schedule(NamedTuple):
-    """What is done, what goes wrong, in which process, and when."""
+    """An operation, its fault, the process that the fault hits, and when."""
 
     seed: int
     operation: str
     place: str  # folder, store
     fault: str
     whose: str  # driver, worker, all
-    when: float  # share of the effects of an undisturbed run before it
-    again: float  # the same of the run after it, in which a worker that has outlived its driver goes on
+    when: float  # share of an undisturbed run's effects before the fault
+    again: float  # share of the second run's effects before a worker that has outlived its driver continues
 
     def __str__(self) -> str:
         where = "" if self.place == "folder" else " in a store"
@@ -79,7 +79,7 @@ class Schedule(NamedTuple):
 
 
 def _cells() -> list[tuple[str, str, str, str]]:
-    """Everything that there is to choose from, what matters most several times, in an order without meaning."""
+    """Return all combinations, important ones several times, in a fixed random order."""
     cells = []
     for name, operation in OPERATIONS.items():
         for place, faults in (("folder", OF_PROCESSES), ("store", OF_STORES if name in STORED else {})):
@@ -100,7 +100,7 @@ def schedule_of(seed: int) -> Schedule:
 
 
 def table(schedules: Iterable[Schedule]) -> str:
-    """How many there are of each fault, by operation."""
+    """Return a Markdown table of the number of schedules by fault and operation."""
     schedules = list(schedules)
     columns = list(dict.fromkeys((name, place) for place in ("folder", "store") for name in OPERATIONS))
     columns = [of for of in columns if of[1] == "folder" or of[0] in STORED]

@@ -1,6 +1,6 @@
-"""Schedules of faults: afterwards, the same command ends in the same bytes as if nothing had gone wrong.
+"""Fault schedules: after any fault, the same command ends in the same bytes as an undisturbed run.
 
-They run in a process that has not started JAX, because it forks.
+They run in another process, which has not started JAX, because it forks.
 """
 
 import subprocess
