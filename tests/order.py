@@ -1,4 +1,4 @@
-"""Pytest plugin: in which order tests run, which of them share a process, until when they begin, which did not run."""
+"""Pytest plugin: orders tests, groups those that share a process, limits their time, and lists those not run."""
 
 import time
 from collections import Counter
@@ -94,10 +94,10 @@ def pytest_testnodedown(node: Any) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Say how many tests did not run and why, and name those that the time did not suffice for."""
+    """Report how many tests did not run and why, and name those that the time limit excluded."""
     reports = terminalreporter.stats.get("skipped", [])
     reason_of = {report.nodeid: report.longrepr[-1].removeprefix("Skipped: ") for report in reports}
-    left_out, asked = config.stash.get(DESELECTED, 0), config.getoption("markexpr")
+    deselected, marks = config.stash.get(DESELECTED, 0), config.getoption("markexpr")
     terminalreporter.section("not run")
     terminalreporter.line(f"{len(reason_of)} skipped")
     for reason, count in Counter(reason_of.values()).most_common():
@@ -105,7 +105,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
         if reason.startswith(NOT_REACHED):
             for line in lines_of(nodeid for nodeid, why in reason_of.items() if why == reason):
                 terminalreporter.line(f"    {line}")
-    terminalreporter.line(f"{left_out} not asked for (-m '{asked}'); `pytest -m campaign` runs the campaigns")
+    terminalreporter.line(f"{deselected} deselected (-m '{marks}'); `pytest -m campaign` runs the campaigns")
 
 
 def lines_of(nodeids: Iterable[str]) -> list[str]:

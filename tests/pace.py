@@ -34,8 +34,8 @@ def slowness() -> float:
 
     The process that starts the tests measures it once; its children inherit the result (see `share`).
     """
-    told = os.environ.get(SLOWNESS)
-    return min(max(float(told) if told else measured(), 1.0), MAX_SLOWNESS)
+    setting = os.environ.get(SLOWNESS)
+    return min(max(float(setting) if setting else measured(), 1.0), MAX_SLOWNESS)
 
 
 def share() -> None:

@@ -1,4 +1,4 @@
-"""The arrows of import, and other promises about the source that docs/design.md makes."""
+"""The directions of imports, and other promises of docs/design.md about the source."""
 
 import ast
 import re
@@ -24,7 +24,7 @@ EXPERTS = (
     "experts.networks",
 )
 PIPELINE_BELOW = ("configs", *EXPERTS, *BELOW)
-# A room and the others that it may import: a folder with what lies below it, or one file
+# Each room, a folder with its subfolders or one file, and the other rooms that it may import
 MAY_IMPORT = {
     "physics.codegen": (),
     "physics": ("physics.codegen",),
@@ -65,11 +65,11 @@ MAY_IMPORT = {
         "pipeline",
         "configs",
     ),
-    "levelproof": (),  # opens every room
+    "levelproof": (),  # re-exports from every room
 }
 RAY_IN = {"pipeline/jobs/cluster.py"}
 HYDRA_IN = {"configs/compose.py"}
-LONGEST = 400  # lines of a file
+MAX_LINES = 400  # of a file
 FOLDERS = {*PRODUCT, *OUTSIDE, "manifests", "docs", ".ci", ".github"}
 
 
@@ -85,7 +85,7 @@ def name_of(path: Path) -> str:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Every module that a file imports, wherever in it, a name of a package as if it were a module."""
+    """Yield every module that a file imports anywhere; each name imported from a package counts as a module."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -127,7 +127,7 @@ def test_imports_run_downwards(path: Path) -> None:
     assert inner
     assert not libraries(path) & set(ROOMS), "import levelproof.<room>"
     assert not libraries(path) & set(OUTSIDE)
-    if inner == "levelproof":  # the door opens every room
+    if inner == "levelproof":  # re-exports from every room
         return
     wrong = {outer for outer in map(room, imported(path)) if outer and not allowed(inner, outer)}
     assert not wrong
@@ -141,7 +141,7 @@ def test_wheel_and_type_checker_cover_the_product_only() -> None:
         assert (ROOT / "levelproof" / name).samefile(ROOT / name)
 
 
-@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="this is no clone")
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="needs a git clone")
 def test_repository_has_no_unknown_folder() -> None:
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
     assert {path.partition("/")[0] for path in listed.splitlines() if "/" in path} == FOLDERS
@@ -159,14 +159,14 @@ def test_library_is_imported_only_at_its_edge(library: str, allowed: set[str]) -
 
 
 def test_levelproof_package_has_no_logic() -> None:
-    """Names and where they live; what a module needs to import them late; the command."""
+    """It contains only names and their modules, their late import, and the command."""
     assert [path.name for path in python_files("levelproof")] == ["__init__.py", "__main__.py"]
     tree = ast.parse((ROOT / "levelproof/__init__.py").read_text())
     names = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
     assert names <= {"__getattr__", "__dir__"}
     rest = [node for node in tree.body if not isinstance(node, ast.FunctionDef | ast.Import | ast.ImportFrom)]
     for node in rest:
-        if isinstance(node, ast.If):  # imports for type checkers; the refusal of a checkout without links
+        if isinstance(node, ast.If):  # imports for type checkers; the error in a checkout without links
             assert all(isinstance(line, ast.ImportFrom | ast.Raise) for line in node.body + node.orelse)
         elif ast.unparse(node) != "__all__ = list(HOME)":  # the docstring, and literal lists of names
             assert isinstance(node, ast.Expr | ast.Assign)
@@ -174,7 +174,7 @@ def test_levelproof_package_has_no_logic() -> None:
 
 
 def test_class_names_are_unique() -> None:
-    """One word for one thing: a reader who meets a name knows which file it is from."""
+    """So a class name tells its file."""
     homes = defaultdict(list)
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text())):
@@ -187,6 +187,6 @@ def test_class_names_are_unique() -> None:
 @pytest.mark.parametrize("path", SOURCES, ids=name_of)
 def test_files_are_short_finished_and_documented(path: Path) -> None:
     text = path.read_text()
-    assert len(text.splitlines()) <= LONGEST
+    assert len(text.splitlines()) <= MAX_LINES
     assert not re.search(r"\b(TODO|FIXME|XXX)\b", text)
-    assert ast.get_docstring(ast.parse(text)), "a module opens by saying what it is"
+    assert ast.get_docstring(ast.parse(text)), "a module starts with a docstring"

@@ -1,4 +1,4 @@
-"""How campaigns share a limited time: their order follows a seed, and the summary names those that were not reached."""
+"""Campaigns within a time limit: their order follows a seed, and the summary names those that were not reached."""
 
 import os
 import re

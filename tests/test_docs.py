@@ -1,4 +1,4 @@
-"""Every Python block of the README and the docs runs as it stands, and imports of ours the one door."""
+"""Every Python block of the README and the docs runs unchanged, and imports only the package `levelproof` of ours."""
 
 import ast
 import json
@@ -32,7 +32,7 @@ NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where a reader is who has typed the commands: the README's split, and levels of it as files."""
+    """Return a folder as the README's commands leave it: its split, and levels of it as files."""
     folder = tmp_path_factory.mktemp("reader")
     split = played_split(folder / "data")
     assert split == folder / "data/128k/s"
@@ -77,5 +77,5 @@ def test_docs_build_without_a_broken_link(tmp_path: Path) -> None:
     assert all(f'id="levelproof.{name}"' in page for name in levelproof.__all__ if name != "__version__")
     assert (tmp_path / "example/main.js").read_text() == (SITE / "main.js").read_text()  # a link, in docs/
     assert (tmp_path / "favicon.svg").is_file()
-    asked = {link for html in tmp_path.rglob("*.html") for link in re.findall(r'src="(https?:[^"]+)', html.read_text())}
-    assert not asked, "the site asks other hosts for something"
+    links = {link for html in tmp_path.rglob("*.html") for link in re.findall(r'src="(https?:[^"]+)', html.read_text())}
+    assert not links, "the site loads files from other hosts"

@@ -1,5 +1,4 @@
-"""The scripts of docs/examples: their commands are accepted, and they do what they are for, with stand-ins for what
-only a cluster has."""
+"""The scripts of docs/examples: their commands are valid, and they work with stand-ins for a cluster's programs."""
 
 import os
 import re
@@ -20,7 +19,7 @@ VALUES = {"$size": "s"}
 
 
 def commands(path: Path) -> list[list[str]]:
-    """The words of every command `levelproof generate`."""
+    """Return the arguments of every command `levelproof generate`."""
     lines = re.findall(r"levelproof generate (.*?)(?: &)?$", path.read_text(), re.MULTILINE)
     return [[re.sub(r"\$\w+", lambda name: VALUES[name[0]], word) for word in shlex.split(line)] for line in lines]
 
@@ -52,7 +51,8 @@ def test_kubernetes_example_is_a_ray_job() -> None:
 
 @pytest.fixture
 def stand_ins(tmp_path: Path) -> dict[str, str]:
-    """An environment where every program that runs says so, and `levelproof` ends as `codes` tells, or on SIGTERM."""
+    """Return an environment whose programs log their calls, and whose `levelproof` exits with the next code in the file
+    `codes`, or on SIGTERM."""
     program = '#!/bin/bash\necho "${0##*/} $*" >> log\n'
     ends = (
         "trap 'echo stopped >> log; exit 130' TERM\n"

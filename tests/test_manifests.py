@@ -1,4 +1,4 @@
-"""The committed reference manifest can be made again."""
+"""The committed reference manifest is reproducible."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ IDS = np.array([row["level_id"] for row in ROWS])
 
 def test_manifest_describes_the_default_dataset() -> None:
     assert IDS.tolist() == list(range(64))
-    assert {row["config_hash"] for row in ROWS} == {compose_job([]).hash}, "make it again: manifests/README.md"
+    assert {row["config_hash"] for row in ROWS} == {compose_job([]).hash}, "regenerate it: manifests/README.md"
     assert {row["label"] for row in ROWS} == {"solved", "unsolved", "trivial", "unsolvable"}
 
 
@@ -41,7 +41,7 @@ def test_sampler_reproduces_the_initial_worlds() -> None:
 
 
 def test_example_in_the_docs_is_the_manifests_gallery() -> None:
-    """Its pages are the program's own, its data are of these rows."""
+    """Its pages link to the program's own, and its data match these rows."""
     links = {path.name: path.resolve() for path in EXAMPLE.iterdir() if path.is_symlink()}
     assert links == {path.name: path.resolve() for path in SITE.iterdir()}
     assert {path.name for path in EXAMPLE.iterdir()} == {*links, "palette.css", "data"}
@@ -54,7 +54,7 @@ def test_example_in_the_docs_is_the_manifests_gallery() -> None:
 
 @pytest.mark.slow
 def test_three_levels_keep_their_labels() -> None:
-    """Two that were solved early and one where the goal was never reached: no change of last bits decides these."""
+    """Two were solved early and one never reached the goal, so differences in last bits do not change their labels."""
     by_expert = [row for row in ROWS if row["label"] == "solved" and row["steps_to_first_success"] is not None]
     early = sorted(by_expert, key=lambda row: row["steps_to_first_success"])[1:3]
     never = next(r for r in ROWS if r["label"] == "unsolved" and r["steps_to_first_success"] is None)

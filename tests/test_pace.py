@@ -19,8 +19,8 @@ WAITS = ("wait", "settimeout", "wait_for_timeout")  # methods whose first argume
 
 
 def test_patience_grows_with_the_slowness_and_never_shrinks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for told, seconds in (("3", 30.0), ("1", 10.0), ("0.2", 10.0), ("1000", 10.0 * pace.MAX_SLOWNESS)):
-        monkeypatch.setenv(pace.SLOWNESS, told)
+    for slowness, seconds in (("3", 30.0), ("1", 10.0), ("0.2", 10.0), ("1000", 10.0 * pace.MAX_SLOWNESS)):
+        monkeypatch.setenv(pace.SLOWNESS, slowness)
         assert patience(10) == seconds
 
 
@@ -30,7 +30,7 @@ def test_wait_until_fails_when_its_patience_ends(monkeypatch: pytest.MonkeyPatch
     with pytest.raises(AssertionError, match="within 1 s: a sign"):
         wait_until(lambda: False, 0.25, "a sign")
     assert time.monotonic() - begin >= 1
-    wait_until(lambda: time.monotonic() - begin > 1.5, 0.25)  # which takes longer than on a fast machine
+    wait_until(lambda: time.monotonic() - begin > 1.5, 0.25)  # longer than 0.25 s, within 4 times as much
 
 
 def test_commands_that_tests_start_inherit_the_slowness(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The command `levelproof`: as people run it, in a process of its own, or in this one, which has compiled already."""
+"""Running the command `levelproof`: in its own process as users do, or in this one, which has compiled already."""
 
 import contextlib
 import io
@@ -15,7 +15,7 @@ from levelproof.pipeline.cli.main import main
 from tests.pace import patience, wait_until
 
 ROOT = Path(__file__).parents[2]
-COMMAND_SECONDS = 600  # limit of a whole command; workers are niced, so any other load makes them wait
+COMMAND_SECONDS = 600  # limit of a whole command; workers are niced, so they wait for any other load
 TINY = ("levels=4", "unit=1", "budget=5k")  # four real units with two updates each
 
 T = TypeVar("T")
@@ -24,9 +24,14 @@ T = TypeVar("T")
 def start(
     arguments: Sequence[str], cwd: Path, address: str = "", module: str = "levelproof", **options: Any
 ) -> subprocess.Popen[str]:
-    """Start it in a process group of its own, so that Ctrl-C can be sent as a terminal sends it: to the whole group.
+    """Start the command in its own process group, so that Ctrl-C can be sent to the whole group, as a terminal does.
 
-    With an `address`, on the Ray cluster that is there; `module` is the program, if not the command itself.
+    Args:
+        arguments: of the command.
+        cwd: working folder.
+        address: RAY_ADDRESS; empty: unset.
+        module: program to run instead of the command.
+        options: further arguments of `Popen`.
     """
     environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "200"}
     environment.pop("RAY_ADDRESS", None)
@@ -50,7 +55,7 @@ def run(arguments: Sequence[str], cwd: Path, **options: Any) -> subprocess.Compl
 
 
 def here(arguments: Sequence[str], cwd: Path) -> subprocess.CompletedProcess[str]:
-    """The same in this process: for tests of what it does and says, not of how it starts and ends."""
+    """Run the command in this process, for tests of what it does and prints, not of how it starts and ends."""
     out, err = io.StringIO(), io.StringIO()
     with (
         contextlib.chdir(cwd),
@@ -63,7 +68,7 @@ def here(arguments: Sequence[str], cwd: Path) -> subprocess.CompletedProcess[str
 
 
 def heed_ctrl_c() -> None:
-    """As a command in a terminal's foreground: a shell's background jobs, and what they start, ignore SIGINT."""
+    """Handle SIGINT as a command in a terminal's foreground; a shell's background jobs and their children ignore it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -79,7 +84,7 @@ def until(condition: Callable[[], T], process: subprocess.Popen[str]) -> T:
 
 
 def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
-    """It ended with this exit code and one sentence that has these words, without a traceback."""
+    """Check that a command ended with this exit code and one sentence that contains `words`, without a traceback."""
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("Error: ")]
@@ -89,7 +94,7 @@ def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: st
 
 
 def descendants(process: int) -> set[int]:
-    """All processes below this one; Ray's are in sessions of their own, but its children all the same."""
+    """Return all processes below this one; Ray's have sessions of their own, but are its children."""
     parents = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and (state := status(int(entry.name))):
@@ -102,7 +107,7 @@ def descendants(process: int) -> set[int]:
 
 
 def status(pid: int) -> list[str] | None:
-    """State, parent, ... of a process; None when it is gone."""
+    """Return state, parent, ... of a process; None if it has ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

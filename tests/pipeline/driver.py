@@ -1,4 +1,4 @@
-"""A job without training: `python -m tests.pipeline.driver OUT` commits units of random bits, as `generate` does."""
+"""A job without training: `python -m tests.pipeline.driver OUT` commits units of random bits as `generate` does."""
 
 import sys
 from collections.abc import Callable
@@ -22,7 +22,7 @@ SPLIT = Path("128k/s")  # below OUT
 
 
 def drive(out: str, say: Callable[[str], None] = print) -> None:
-    """Commit what is missing."""
+    """Commit the missing units."""
     job = job_of(out)
     with writing(job, say) as (split, manifest):
         note_job(split, job, ["levelproof", "generate"], [(0, LEVELS - 1)])
@@ -37,23 +37,23 @@ def job_of(out: str) -> JobConfig:
 
 @cache
 def result_of(level_ids: tuple[int, ...]) -> UnitResult:
-    """Random bits, the same each time."""
+    """Return a result of random bits, the same each time."""
     return made_result([*level_ids], [[Label.SOLVED, Label.UNSOLVED][i % 2] for i in level_ids])
 
 
 def commit_made(split: Path, unit: WorkUnit) -> None:
-    """As the worker does that has this unit."""
+    """Commit a unit as its worker does."""
     commit(job_of("data"), split, unit, result_of(tuple(unit.level_ids)))
 
 
 def require_same_content(split: Path, other: Path) -> Manifest:
-    """Every row, but for where its witness is, and every field of every witness."""
+    """Check that rows, except where their witnesses are stored, and all fields of witnesses are equal."""
     manifests = require_manifest(split), read_manifest(other)
     rows, others = (manifest.table.to_pylist() for manifest in manifests)
-    for row, of in zip(rows, others, strict=True):
-        assert row | {"shard": bool(row["shard"]), "row": 0} == of | {"shard": bool(of["shard"]), "row": 0}
+    for row, twin in zip(rows, others, strict=True):
+        assert row | {"shard": bool(row["shard"]), "row": 0} == twin | {"shard": bool(twin["shard"]), "row": 0}
         if row["shard"]:
-            one, two = (Shard(at / it["shard"]).read([it["row"]]) for at, it in ((split, row), (other, of)))
+            one, two = (Shard(at / r["shard"]).read([r["row"]]) for at, r in ((split, row), (other, twin)))
             assert all(same_bits(one[name], two[name]).all() for name in two)
     return manifests[0]
 

@@ -1,6 +1,6 @@
 """The command `levelproof` with workers that die of a level: `python -m tests.pipeline.fragile LEVEL SECONDS ...`.
 
-Of level -1 they die before they have started. After so many seconds without a word they are given up.
+If LEVEL is -1, they die before they have started. After SECONDS without a report they are given up.
 """
 
 import os
@@ -15,7 +15,7 @@ from levelproof.pipeline.jobs.schedule import Order, Round
 
 
 class Fragile(cluster.WorkerActor):
-    """A worker as it is, but for one level that kills its process, as a fault in native code does."""
+    """A real worker, except that one level kills its process, as a fault in native code does."""
 
     deadly = int(sys.argv[1])
 
@@ -26,7 +26,7 @@ class Fragile(cluster.WorkerActor):
 
     def work(self, order: Order, seconds: float) -> Round:
         if any(self.deadly in unit.level_ids for unit in order.units):
-            os._exit(1)  # and with it die the units that it has from earlier rounds
+            os._exit(1)  # also takes its units from earlier rounds
         return super().work(order, seconds)
 
 

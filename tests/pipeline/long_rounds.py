@@ -1,6 +1,6 @@
-"""The command `levelproof` with rounds that last hours, as if it had very many workers, and as much time to stop.
+"""The command `levelproof` with rounds of hours, as with very many workers: `python -m tests.pipeline.long_rounds ...`.
 
-Run it as `python -m tests.pipeline.long_rounds ...`.
+It also has hours to stop.
 """
 
 import sys

@@ -1,7 +1,4 @@
-"""Levels, records and unit results filled with random bits: what the files must bring back, whatever it means.
-
-And a real split without training.
-"""
+"""Levels, records and results of random bits, which files must restore exactly; and real splits without training."""
 
 import dataclasses
 import shutil
@@ -42,9 +39,9 @@ SPENT = EnvSteps()
 
 
 def made(kind: type, size: Size, count: int, rng: np.random.Generator, *, time: bool = False) -> Any:
-    """An instance of a dataclass of arrays for `count` levels, by the shapes in its annotations.
+    """Return an instance of a dataclass of arrays for `count` levels, with the shapes in its annotations.
 
-    Floats have any bits: NaN, infinities, -0.0 and denormals included. Integers are at most 255.
+    Floats have random bits, including NaN, infinities, -0.0 and denormals. Integers are at most 255.
     """
     counts = {"body": size.bodies, "polygon": size.polygons, "circle": size.circles, "joint": size.joints}
     counts |= {"thruster": size.thrusters, "vertex": MAX_VERTICES, "contact": pairs_of(size).contacts}
@@ -78,15 +75,15 @@ def made_record(size: str = "s", count: int = 3, seed: int = 0) -> Record:
 
 
 def made_fields(size: str = "s", count: int = 3, seed: int = 0) -> dict[str, np.ndarray]:
-    """What a shard holds of them."""
+    """Return a shard's fields of random levels and records."""
     return arrays_of(made_level(size, count, seed), "level/") | arrays_of(made_record(size, count, seed), "record/")
 
 
 def _possible(tree: T, size: str, path: str) -> T:
-    """The same with integers that a size can have."""
-    most = highest(SIZES[size])
+    """Limit integers to those that are valid for a size."""
+    maxima = highest(SIZES[size])
     arrays = arrays_of(tree, path)
-    arrays |= {name: np.minimum(x, most[name]).astype(x.dtype) for name, x in arrays.items() if name in most}
+    arrays |= {name: np.minimum(x, maxima[name]).astype(x.dtype) for name, x in arrays.items() if name in maxima}
     return tree_of(type(tree), arrays, path)
 
 
@@ -113,7 +110,7 @@ def made_verdict(label: Label = Label.SOLVED, **changes: Any) -> Verdict:
 
 
 def made_result(level_ids: list[int], labels: list[Label], size: str = "s") -> UnitResult:
-    """Random bits, not a solution: for what writes and reads, not for what replays."""
+    """Return a result of random bits, which can be written and read but does not replay."""
     count = len(level_ids)
     verdicts = [made_verdict(label) for label in labels]
     return UnitResult(np.array(level_ids), made_level(size, count), made_record(size, count), verdicts, SPENT)
@@ -124,8 +121,10 @@ def made_job(out: str = "data", *overrides: str) -> JobConfig:
 
 
 def played_split(folder: Path, held: int = 16) -> Path:
-    """A real split in `folder`: levels of size s under random actions, each held for so many steps; what reaches the
-    goal is `solved`."""
+    """Make a real split in `folder`: levels of size s under random actions, each held for `held` env steps.
+
+    Levels whose episode reaches the goal are labelled solved.
+    """
     job = made_job(str(folder), "size=s", f"levels={PLAYED}")
     ids = np.arange(PLAYED, dtype=np.int32)
     levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
@@ -148,9 +147,9 @@ def played_split(folder: Path, held: int = 16) -> Path:
 
 
 def honest_split(folder: Path, unit: int, units: int, *, experts: bool = False) -> Path:
-    """A split without training in which everything is true: random actions solve what they solve.
+    """Make a split without training whose rows are true: levels are solved if random actions solve them.
 
-    With `experts` each unit keeps some, of which nothing but their file is real.
+    With `experts`, each unit stores some, whose files are real but whose content is not.
     """
     job, ids = made_job(str(folder), "size=s"), np.arange(unit * units)
     levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
@@ -167,25 +166,25 @@ def honest_split(folder: Path, unit: int, units: int, *, experts: bool = False) 
     path.mkdir(parents=True)
     note_job(path, job, ["levelproof", "generate"], [(0, len(ids) - 1)])
     for lanes in ids.reshape(units, unit):
-        told = [
+        unit_verdicts = [
             dataclasses.replace(verdicts[i], steps_to_goal=int(steps[i]) if verdicts[i].label in WITNESSED else None)
             for i in lanes
         ]
         weights: Any = {"weights": np.arange(4.0)}
         kept = {int(i): KeptExpert(weights, [0.5]) for i in lanes if experts}
-        result = UnitResult(lanes, take(levels, lanes), take(record, lanes), told, SPENT, kept)
+        result = UnitResult(lanes, take(levels, lanes), take(record, lanes), unit_verdicts, SPENT, kept)
         commit(job, path, WorkUnit(tuple(lanes.tolist())), result)
     return path
 
 
 def lasting(split: Path) -> list[dict[str, Any]]:
-    """What two runs of a job agree in: every row, without what tells of its run, and whether there is data."""
+    """Return the reproducible part of the rows: no columns about the run, and only whether there is data."""
     rows = read_manifest(split).table.to_pylist()
     return [{k: v for k, v in row.items() if k not in OF_THE_RUN} | {"data": bool(row["shard"])} for row in rows]
 
 
 def made_split(folder: Path, units: Sequence[Sequence[Label]], *words: str) -> Path:
-    """A split of units with these labels, level ids one after another; random bits in every level and record."""
+    """Make a split of units with these labels and consecutive level ids; levels and records are random bits."""
     job = made_job(str(folder), "size=s", *words)
     path, first = split_path(job.out, job.budget, job.size), 0
     path.mkdir(parents=True)
@@ -198,7 +197,7 @@ def made_split(folder: Path, units: Sequence[Sequence[Label]], *words: str) -> P
 
 
 def commit_copy(source: Path, number: int, split: Path) -> None:
-    """Commit to `split` a unit that another one of the same configuration has, by its number there."""
+    """Commit to `split` the unit with index `number` in `source`, a split of the same configuration."""
     fragment = fragment_paths(source)[number]
     for folder in ("manifest", "shards"):
         (split / folder).mkdir(parents=True, exist_ok=True)

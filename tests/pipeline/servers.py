@@ -1,4 +1,4 @@
-"""Servers on loopback that splits are read from, and what can go wrong between them and a reader."""
+"""Servers on loopback that splits are read from and written to, and their failures."""
 
 import hashlib
 import hmac
@@ -26,10 +26,10 @@ from tests.pace import patience, wait_until
 
 HOST = "127.0.0.1"
 ANSWER_SECONDS = 60  # limit of a server's start and of its answers
-# What Microsoft's emulator has one account for, the same everywhere: docs of Azurite, "default storage account"
+# The public account of Microsoft's emulator: docs of Azurite, "default storage account"
 AZURE_NAME, AZURE_VERSION = "devstoreaccount1", "2021-08-06"
 AZURE_KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr/KBHBeksoGMGw=="
-PAGE = 10  # keys of a page of S3's lists
+PAGE = 10  # keys per page of S3's lists
 SLOW = 1.0  # s
 
 
@@ -42,16 +42,16 @@ class Answer(NamedTuple):
     body: bytes
 
 
-Answers = Callable[[str, str, dict[str, str], bytes], Answer]  # of a method, a path, the request's headers and body
+Answers = Callable[[str, str, dict[str, str], bytes], Answer]  # gets a method, a path, the request's headers and body
 
 
 class Server:
-    """Answers requests by a function, writes them down, and may spoil every so many of them."""
+    """Answers requests by a function, logs them, and spoils every n-th answer if asked to."""
 
     def __init__(self, answers: Answers) -> None:
         self.log: list[str] = []  # "GET /path bytes=0-99"
         self.count, self.every, self.spoiled = 0, 0, "busy"
-        self.meanwhile: Callable[[int], object] = lambda _: None  # is told the number of each request
+        self.meanwhile: Callable[[int], object] = lambda _: None  # gets the number of each request
         server = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -65,7 +65,7 @@ class Server:
                 headers = {name.lower(): x for name, x in self.headers.items()}
                 length = int(headers.get("content-length", 0))
                 body = self.rfile.read(length)
-                if len(body) < length:  # who asked died in the middle of it
+                if len(body) < length:  # the client died while sending it
                     self.close_connection = True
                     return
                 if spoiled == "busy":
@@ -74,7 +74,7 @@ class Server:
                 if spoiled == "slow":
                     time.sleep(patience(SLOW))
                 given = answers(self.command, self.path, headers, body) if spoiled != "gone" else None
-                if given is None or spoiled == "lost":  # the connection, before or after it was done
+                if given is None or spoiled == "lost":  # drop the connection, before or after executing the request
                     self.close_connection = True
                     return
                 self.give(given, cut_off=spoiled == "cut")
@@ -92,11 +92,11 @@ class Server:
             do_GET = do_HEAD = do_PUT = do_DELETE = do_POST = answer  # noqa: N815
 
             def handle(self) -> None:
-                with suppress(ConnectionError):  # who asked is gone
+                with suppress(ConnectionError):  # the client has ended
                     super().handle()
 
             def log_message(self, *_: object) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-                """Not on the terminal."""
+                """Keep the terminal quiet."""
 
         self._server = ThreadingHTTPServer((HOST, 0), Handler)
         self._server.daemon_threads = True
@@ -104,8 +104,13 @@ class Server:
         Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
 
     def spoil(self, every: int, how: str = "busy") -> None:
-        """Of every so many requests: "busy"; cut answers off ("cut"); be "slow"; do it and lose the connection
-        ("lost"); or be "gone"."""
+        """Spoil every n-th request.
+
+        Args:
+            every: n; 0: spoil none.
+            how: "busy": answer 503; "cut": send half the answer; "slow": answer late; "lost": execute the request, then
+                drop the connection; "gone": drop the connection at once.
+        """
         self.every, self.spoiled = every, how
 
     def close(self) -> None:
@@ -123,26 +128,26 @@ def serving(answers: Answers) -> Iterator[Server]:
 
 
 def files_of(folder: Path) -> Answers:
-    """A web server that gives the files below a folder, or parts of them."""
+    """Serve the files below a folder, or ranges of their bytes, as a web server."""
 
     def answers(_: str, path: str, headers: dict[str, str], body: bytes = b"") -> Answer:
         file = folder / unquote(urlsplit(path).path.lstrip("/"))
         if not file.is_file():
             return Answer(404, {}, b"")
         data = file.read_bytes()
-        told = {"ETag": f'"{tag_of(file)}"', "Last-Modified": formatdate(file.stat().st_mtime, usegmt=True)}
-        told["x-goog-generation"] = str(file.stat().st_mtime_ns)
-        if asked := re.fullmatch(r"bytes=(\d+)-(\d+)", headers.get("range", "")):
-            first, last = int(asked[1]), min(int(asked[2]), len(data) - 1)
-            told["Content-Range"] = f"bytes {first}-{last}/{len(data)}"
-            return Answer(206, told, data[first : last + 1])
-        return Answer(200, told, data)
+        about = {"ETag": f'"{tag_of(file)}"', "Last-Modified": formatdate(file.stat().st_mtime, usegmt=True)}
+        about["x-goog-generation"] = str(file.stat().st_mtime_ns)
+        if match := re.fullmatch(r"bytes=(\d+)-(\d+)", headers.get("range", "")):
+            first, last = int(match[1]), min(int(match[2]), len(data) - 1)
+            about["Content-Range"] = f"bytes {first}-{last}/{len(data)}"
+            return Answer(206, about, data[first : last + 1])
+        return Answer(200, about, data)
 
     return answers
 
 
 def bucket_of(folder: Path) -> Answers:
-    """As much of S3 as levelproof asks for: the folder's entries are buckets, and keys are listed in pages."""
+    """Serve the part of S3 that levelproof uses: the folder's entries are buckets, and keys are listed in pages."""
     files, one_at_a_time = files_of(folder), Lock()
 
     def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
@@ -186,16 +191,16 @@ def _contents(bucket: Path, keys: Iterable[str]) -> str:
 
 
 def _changed(method: str, file: Path, headers: dict[str, str], body: bytes, new: Path) -> Answer:
-    """PUT with its conditions, DELETE of one key, and POST of keys to delete."""
+    """Execute PUT with its preconditions, DELETE of one key, or POST of keys to delete."""
     if method == "POST":
         keys = [key.decode() for key in re.findall(rb"<Key>(.*?)</Key>", body)]
         for key in keys:
             (file / key).unlink(missing_ok=True)
-        told = "".join(f"<Deleted><Key>{key}</Key></Deleted>" for key in keys)
-        return Answer(200, {}, f"<DeleteResult>{told}</DeleteResult>".encode())
+        deleted = "".join(f"<Deleted><Key>{key}</Key></Deleted>" for key in keys)
+        return Answer(200, {}, f"<DeleteResult>{deleted}</DeleteResult>".encode())
     if method == "DELETE":
         if not file.exists() and "x-amz-content-sha256" not in headers:
-            return Answer(404, {}, b"<Error><Code>NoSuchKey</Code></Error>")  # Google's, where Amazon's says 204
+            return Answer(404, {}, b"<Error><Code>NoSuchKey</Code></Error>")  # as Google's; Amazon's answers 204
         file.unlink(missing_ok=True)
         return Answer(204, {}, b"")
     wanted, generation = headers.get("if-match", "").strip('"'), headers.get("x-goog-if-generation-match")  # Google's
@@ -216,7 +221,7 @@ def tag_of(file: Path) -> str:
 
 
 def hub_of(folder: Path, dataset: str, token: str, page: int) -> Answers:
-    """The hub's two endpoints for the files of a dataset: lists in pages, and redirects to where files are."""
+    """Serve the hub's two endpoints for a dataset's files: lists in pages, and redirects to the files."""
     resolved, listed = f"/datasets/{dataset}/resolve/main/", f"/api/datasets/{dataset}/tree/main/"
     files = files_of(folder)
 
@@ -248,7 +253,7 @@ def hub_of(folder: Path, dataset: str, token: str, page: int) -> Answers:
 
 
 def before(host: str, port: int) -> Answers:
-    """A server that asks another one."""
+    """Forward requests to another server."""
 
     def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
         connection = HTTPConnection(host, port, timeout=patience(ANSWER_SECONDS))
@@ -265,7 +270,7 @@ def before(host: str, port: int) -> Answers:
 
 @contextmanager
 def s3_process() -> Iterator[tuple[str, int]]:
-    """A process that serves S3, moto's, with a bucket named `bucket`; where it listens."""
+    """Start moto's S3 server with a bucket named `bucket`; yield its host and port."""
     port = _free_port()
     words = [sys.executable, "-m", "moto.server", "-H", HOST, "-p", str(port)]
     with _listening(words, port, AWS_ACCESS_KEY_ID="moto", AWS_SECRET_ACCESS_KEY="moto"):
@@ -278,7 +283,7 @@ def s3_process() -> Iterator[tuple[str, int]]:
 
 @contextmanager
 def azure_process(azurite: str, folder: Path) -> Iterator[tuple[str, int]]:
-    """A process that serves Azure's blobs, Microsoft's emulator, with a container named `bucket`; where it listens."""
+    """Start Microsoft's emulator of Azure's blobs with a container named `bucket`; yield its host and port."""
     port = _free_port()
     words = [azurite, "--location", str(folder), "--blobHost", HOST, "--blobPort", str(port), "--disableTelemetry"]
     with _listening(words, port):

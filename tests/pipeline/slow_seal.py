@@ -1,7 +1,7 @@
-"""A job without training whose seal hangs in the disk: `python -m tests.pipeline.slow_seal OUT SECONDS BESIDE`.
+"""A job without training whose seal hangs in a disk call: `python -m tests.pipeline.slow_seal OUT SECONDS BESIDE`.
 
-The process ends SECONDS after it is asked to, at the latest. The seal begins beside the workers if BESIDE is 1, which
-then go on until they are asked to stop, and after them if it is 0.
+The process ends at most SECONDS after it is asked to. If BESIDE is 1, the seal begins while workers run, and they run
+until they are asked to stop; if it is 0, the seal begins after them.
 """
 
 import sys
@@ -23,7 +23,7 @@ from levelproof.pipeline.stopping import Stop
 from levelproof.pipeline.store import merge, seal
 from tests.pipeline.driver import LEVELS, UNIT, commit_made, job_of
 
-HUNG = "the seal hangs"  # what the process prints then
+HUNG = "the seal hangs"  # printed when it does
 
 
 def hang(_: Path) -> None:
@@ -32,7 +32,7 @@ def hang(_: Path) -> None:
 
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
-    """Commit units as workers do, one after another."""
+    """Commit units one after another, as workers do."""
     with stop.heeded():
         scheduler.join(run, time.monotonic())
         while not scheduler.over:

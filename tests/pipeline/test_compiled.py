@@ -1,4 +1,4 @@
-"""A compiled program that was half-written is compiled once more, and then kept."""
+"""Half-written compiled programs are deleted, recompiled once, and then kept."""
 
 import os
 import time
@@ -12,7 +12,7 @@ from levelproof.pipeline import runtime
 runtime.MIN_COMPILE_SECONDS = 0
 runtime.prepare_jax()
 import warnings
-warnings.simplefilter("error")  # JAX warns of what it cannot read
+warnings.simplefilter("error")  # JAX warns of programs that it cannot read
 import jax
 jax.jit(lambda x: x @ x + 1)(jax.numpy.ones((8, 8)))
 """
@@ -39,15 +39,15 @@ def test_truncated_program_is_recompiled_without_a_warning(tmp_path: Path) -> No
 
 
 def test_remove_damaged_reads_programs_that_changed_since_the_last_check(tmp_path: Path) -> None:
-    program, looked = tmp_path / "jit_f-0-cache", tmp_path / LAST_CHECK
+    program, last_check = tmp_path / "jit_f-0-cache", tmp_path / LAST_CHECK
     program.write_bytes(b"damaged")
     remove_damaged(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [LAST_CHECK]
     program.write_bytes(b"damaged")
     os.utime(program, (0, 0))  # a copy that keeps the time of its original
     later = time.time() + 60
-    os.utime(looked, (later, later))
+    os.utime(last_check, (later, later))
     remove_damaged(tmp_path)
-    assert program.exists()  # it is as it was at the last look
+    assert program.exists()  # unchanged since the last check
     remove_damaged(tmp_path)
     assert not program.exists()

@@ -1,4 +1,4 @@
-"""Commands whose reader leaves: they finish their work, and the exit code says what came of it. Real pipes."""
+"""Commands whose reader leaves: they finish their work, and their exit code reports the result. Real pipes."""
 
 import os
 import subprocess
@@ -20,7 +20,7 @@ from tests.pipeline.made import made_split
 
 @pytest.fixture
 def unread() -> Iterator[int]:
-    """The end to write to of a pipe whose reader has left."""
+    """Yield the write end of a pipe whose reader has left."""
     reader, writer = os.pipe()
     os.close(reader)
     yield writer
@@ -29,12 +29,12 @@ def unread() -> Iterator[int]:
 
 @pytest.fixture
 def split(tmp_path: Path) -> Path:
-    """Random bits, so `verify` finds much to report."""
+    """Return a split of random bits, in which `verify` finds much to report."""
     return made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]])
 
 
 def levelproof(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[str]:
-    """Each print is a write of its own, as a report is that does not fit into the buffer."""
+    """Run the command unbuffered: each print is a write, as for a report larger than the buffer."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     command = [sys.executable, "-m", "levelproof", *arguments]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | streams
@@ -69,7 +69,7 @@ def test_full_disk_below_stdout_is_an_error(split: Path) -> None:
 
 
 def test_watch_ends_when_its_reader_leaves(split: Path, unread: int) -> None:
-    """Although the run that it watches goes on."""
+    """It ends although the run that it watches continues."""
     workers = {"a machine": {"count": 2, "silent": 1.5}}
     numbers = dict.fromkeys(("levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined"), 1)
     tell(new_run(split), [{"time": time.time(), "event": "progress", "workers": workers, **numbers}])

@@ -1,4 +1,4 @@
-"""What others can write to is refused in one sentence: compiled programs are executed, experts go on."""
+"""Files that other users can write to are rejected: compiled programs are executed, and experts are resumed."""
 
 import os
 from pathlib import Path
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="the system ha
 
 
 def test_own_folder_is_created_for_its_user_alone(tmp_path: Path) -> None:
-    before = os.umask(0o002)  # as many systems have it
+    before = os.umask(0o002)  # the default of many systems
     try:
         made = own_folder(tmp_path / "deeper/cache", "delete it")
     finally:
@@ -44,7 +44,7 @@ def test_prepare_jax_rejects_programs_that_others_can_write_to(tmp_path: Path, m
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     (tmp_path / "jax").mkdir()
     (tmp_path / "jax").chmod(0o777)
-    monkeypatch.setattr(runtime, "remove_damaged", lambda _: pytest.fail("it is looked into"))
+    monkeypatch.setattr(runtime, "remove_damaged", lambda _: pytest.fail("the folder was read"))
     with pytest.raises(UserError, match=r"Other users can write to .*/jax"):
         prepare_jax()
 
@@ -52,13 +52,13 @@ def test_prepare_jax_rejects_programs_that_others_can_write_to(tmp_path: Path, m
 def test_cache_folder_rejects_another_users_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     cache_folder()
-    about = tmp_path.stat().st_uid
-    monkeypatch.setattr(os, "getuid", lambda: about + 1)
-    if about:
+    owner = tmp_path.stat().st_uid
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    if owner:
         with pytest.raises(UserError, match="belongs to another user"):
             cache_folder()
     else:
-        cache_folder()  # an administrator's: who is one may write anywhere
+        cache_folder()  # root's folders are accepted, because root can write anywhere
 
 
 def test_experts_that_others_can_write_to_are_rejected(tmp_path: Path) -> None:

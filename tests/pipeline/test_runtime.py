@@ -1,4 +1,4 @@
-"""How JAX computes in a worker: one thread, no deadlock, compiled code kept."""
+"""JAX in a worker: one thread, no deadlock, cached programs."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ from levelproof.pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder,
 from tests.pace import patience
 from tests.pipeline.command import ROOT
 
-# Orthogonal weights of several layers for several experts: batched QR factorisations side by side in one program
+# Orthogonal weights of several layers for several experts: batched QR factorisations in one program
 FACTORISE = """
 from levelproof.pipeline.runtime import prepare_jax
 prepare_jax()
@@ -46,12 +46,12 @@ def test_batched_factorisations_do_not_deadlock(tmp_path: Path) -> None:
     python(FACTORISE, tmp_path)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_xla_computes_on_one_thread(tmp_path: Path) -> None:
     assert int(python(COUNT, tmp_path)) <= 1
 
 
-@pytest.mark.skipif(sys.platform != "linux" or len(own_cores()) < 2, reason="looks at /proc; needs a second core")
+@pytest.mark.skipif(sys.platform != "linux" or len(own_cores()) < 2, reason="reads /proc; needs a second core")
 def test_own_core_pins_no_worker_if_cores_are_left_over(tmp_path: Path) -> None:
     program = (
         "from levelproof.pipeline.runtime import own_core, prepare_jax; prepare_jax(own_core(1)); "
@@ -92,16 +92,16 @@ def test_own_cores_respect_a_containers_quota(monkeypatch: pytest.MonkeyPatch, q
     monkeypatch.setattr(runtime, "_allowed_cores", lambda: list(range(64)))
     monkeypatch.setattr(runtime, "cpu_count", lambda: quota)
     assert len(own_cores()) == quota
-    pinned = quota == 64  # under a quota, neighbours of other containers would be on the same cores
+    pinned = quota == 64  # under a quota, other containers would use the same cores
     assert (runtime.own_core(64) is not None) == pinned
     assert runtime.own_core(63) is None
     while runtime.CLAIMS:
         runtime.CLAIMS.pop().close()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="no other system can")
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's CPU affinity")
 def test_own_core_gives_each_worker_another_core(tmp_path: Path) -> None:
-    """Of a mask that leaves some out; what a worker had is free when it has died."""
+    """The affinity mask omits some cores; a worker's core is free again when it has died."""
     program = (
         "import sys; from levelproof.pipeline import runtime; runtime._allowed_cores = lambda: [5, 7]; "
         "runtime.cpu_count = lambda: 64; print(runtime.own_core(2), flush=True); sys.stdin.read()"
@@ -114,8 +114,8 @@ def test_own_core_gives_each_worker_another_core(tmp_path: Path) -> None:
         text=True,
     )
     with start() as one, start() as two, start() as three:
-        told = sorted(each.stdout.readline().strip() for each in (one, two, three) if each.stdout)
-        assert told == ["5", "7", "None"]
+        cores = sorted(each.stdout.readline().strip() for each in (one, two, three) if each.stdout)
+        assert cores == ["5", "7", "None"]
         one.kill()
         two.kill()
         three.kill()

@@ -1,4 +1,4 @@
-"""SIGTERM and Ctrl-C end a command in time, whatever it does then. Real signals."""
+"""SIGTERM and Ctrl-C end a command in time, whatever it is doing. Real signals."""
 
 import os
 import re
@@ -15,7 +15,7 @@ from tests.pipeline.slow_seal import HUNG
 BOTH = (signal.SIGTERM, signal.SIGINT)
 
 
-def asked(number: signal.Signals) -> None:
+def send(number: signal.Signals) -> None:
     os.kill(os.getpid(), number)
 
 
@@ -36,42 +36,42 @@ def test_sigterm_ends_a_job_whose_seal_hangs(tmp_path: Path, beside: str) -> Non
 def test_signal_raises_keyboard_interrupt_outside_a_heeded_block(number: signal.Signals) -> None:
     before = [signal.getsignal(each) for each in BOTH]
     with pytest.raises(KeyboardInterrupt), stoppable() as stop:
-        asked(number)
+        send(number)
     assert stop.asked.is_set()
     assert [signal.getsignal(each) for each in BOTH] == before
     stop.clock.join(patience(COMMAND_SECONDS))
-    assert not stop.clock.is_alive(), "it would end this process"
+    assert not stop.clock.is_alive(), "the timer would end this process"
 
 
 @pytest.mark.parametrize("number", BOTH)
 def test_first_signal_only_sets_asked_in_a_heeded_block(number: signal.Signals) -> None:
     heeded = False
     with pytest.raises(KeyboardInterrupt), stoppable() as stop:  # noqa: PT012
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as Ray sets a handler of its own
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray, too, sets its own handler
         with stop.heeded():
-            asked(number)
+            send(number)
             assert stop.asked.is_set()
             assert 0 < stop.grace <= GRACE
             heeded = True
-        pytest.fail("it goes on as if nobody had asked")
+        pytest.fail("the block's end did not raise KeyboardInterrupt")
     assert heeded
 
 
 def test_second_signal_interrupts_a_heeded_block() -> None:
     with pytest.raises(KeyboardInterrupt), stoppable() as stop, stop.heeded():  # noqa: PT012
-        asked(signal.SIGTERM)
-        asked(signal.SIGINT)
-        pytest.fail("the second was ignored")
+        send(signal.SIGTERM)
+        send(signal.SIGINT)
+        pytest.fail("the second signal was ignored")
 
 
 @pytest.mark.slow
 def test_driver_cancels_rounds_to_stop(tmp_path: Path) -> None:
-    """A worker hears of nothing else before the end of its round."""
+    """Otherwise a worker would learn of the stop only at the end of its round."""
     alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long
     command = ["generate", "levels=8", "unit=1", "budget=100M", "workers=1", *alone]
     process = start(command, tmp_path, module="tests.pipeline.long_rounds")
-    at_work = "ray::WorkerActor.work"
-    until(lambda: any(title(pid).startswith(at_work) for pid in descendants(process.pid)), process)
+    busy = "ray::WorkerActor.work"
+    until(lambda: any(title(pid).startswith(busy) for pid in descendants(process.pid)), process)
     process.terminate()
     try:
         _, err = process.communicate(timeout=patience(COMMAND_SECONDS / 4))
