@@ -106,7 +106,7 @@ def test_set_role_fix_and_bodies_at() -> None:
         (lambda: move(empty(), FIRST, 1, 1), "no body 4"),
         (lambda: add_joint(empty(), 1, 1), "two bodies"),
         (lambda: add_thruster(empty(), 1, 1, 0), "on one"),
-        (lambda: resize(joined(), FIRST, 100), "reaches"),
+        (lambda: resize(joined(), FIRST, 100), "would reach"),
         (lambda: move(joined(), FIRST, 100, 1), "outside"),
         (lambda: add_body(add_body(add_body(empty(), "rectangle", 1, 1), "triangle", 1, 1), "triangle", 1, 1), "room"),
     ],
