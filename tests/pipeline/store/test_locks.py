@@ -110,7 +110,7 @@ def test_writing_refuses_a_file_system_without_locks(
 
     monkeypatch.setattr(fcntl, "flock", without)
     with (
-        pytest.raises(UserError, match=r"refuses locks \(No locks available\): choose a folder .* out=NAME"),
+        pytest.raises(UserError, match=r"does not support locks \(No locks available\): choose a folder .* out=NAME"),
         writing(made_job(str(tmp_path / "data")), print),
     ):
         pytest.fail("something would have trained")

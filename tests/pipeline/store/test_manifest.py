@@ -163,7 +163,7 @@ def test_read_manifest_refuses_another_version(tmp_path: Path, job: JobConfig) -
     table = pq.read_table(path)
     metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"9"}
     pq.write_table(table.replace_schema_metadata(metadata), path)
-    with pytest.raises(Failure, match="has manifest version 9, this program reads 7"):
+    with pytest.raises(Failure, match="has manifest version 9, but this program reads 7"):
         read_manifest(tmp_path)
 
 

@@ -138,5 +138,5 @@ def test_read_detects_a_missing_file(shard: Path, file: str) -> None:
 def test_shard_refuses_another_version(shard: Path) -> None:
     attributes = shard / "zarr.json"
     attributes.write_text(attributes.read_text().replace('"version": 2', '"version": 3'))
-    with pytest.raises(Failure, match="has version 3, this program reads 2"):
+    with pytest.raises(Failure, match="has version 3, but this program reads 2"):
         Shard(shard)
