@@ -145,5 +145,5 @@ def test_writing_refuses_linked_folders(tmp_path: Path, job: JobConfig, name: st
     assert mine.is_dir()
     (split / name).unlink()
     (split / name).touch()
-    with pytest.raises(UserError, match=rf"{name} is no folder"), writing(job, print):
+    with pytest.raises(UserError, match=rf"{name} is not a folder"), writing(job, print):
         pass
