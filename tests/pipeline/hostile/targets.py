@@ -24,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numcodecs import blosc  # pyright: ignore[reportAttributeAccessIssue]
 
-from levelproof.configs.compose import _parsed, compose_job
+from levelproof.configs.compose import _parse, compose_job
 from levelproof.configs.convert import plain, typed
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count
@@ -468,7 +468,7 @@ def overrides(folder: Path) -> Target:
                 job = compose_job([mutate_word(setting, random)])
                 assert typed(JobConfig, plain(job)) == job
             case 1 | 2 | 3 | 4:
-                _parsed(mutate_word(setting, random)).value()
+                _parse(mutate_word(setting, random)).value()
             case 5 | 6 | 7:
                 assert parse_count(mutate_word("11.5M", random), "levels") > 0
             case 8 | 9:
