@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from levelproof.experts.witness.witness import steps_to_goal
-from levelproof.pipeline.cli.gallery import MOST
+from levelproof.pipeline.cli.gallery import MAX_LEVELS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look.gallery import gallery as module
 from levelproof.pipeline.look.gallery.columns import FLAGS, NOTHING, NUMBERS
@@ -32,7 +32,7 @@ def manifest(split: Path) -> Manifest:
 @pytest.fixture(scope="module")
 def site(split: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("site") / "gallery"
-    gallery(split, out, None, MOST)
+    gallery(split, out, None, MAX_LEVELS)
     return out
 
 
@@ -150,7 +150,7 @@ def test_gallery_shows_a_sample_of_matching_levels(
     assert first.startswith(f"{tmp_path / 'some' / 'index.html'}: 3 of 50 levels, spread evenly over their ids, of ")
     assert second.endswith(f"-m webbrowser {tmp_path / 'some' / 'index.html'}")
     with pytest.raises(UserError, match=r"No level of .* matches"):
-        gallery(split, tmp_path / "none", "level_id < 0", MOST)
+        gallery(split, tmp_path / "none", "level_id < 0", MAX_LEVELS)
 
 
 def test_gallery_replaces_only_galleries(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,7 +173,7 @@ def test_gallery_replaces_only_galleries(split: Path, tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(module, "world_of", fail)
     with pytest.raises(Failure):
-        gallery(split, out, None, MOST)
+        gallery(split, out, None, MAX_LEVELS)
     assert data(out, "about")["levels"] == 2  # unchanged
     assert [path.name for path in tmp_path.iterdir()] == ["gallery"]
 
@@ -187,7 +187,7 @@ def test_gallery_reads_levels_block_by_block(
     monkeypatch.setattr(
         module, "read_rows", lambda at, table, fields: read.append(table.num_rows) or rows(at, table, fields)
     )
-    gallery(split, tmp_path / "gallery", None, MOST)
+    gallery(split, tmp_path / "gallery", None, MAX_LEVELS)
     assert BLOCK == 64
     assert max(read) <= 7
     assert sum(read) == manifest.table["shard"].is_valid().to_numpy().sum()
