@@ -1,1 +1,1 @@
-"""What measures: this program by itself and beside the reference. Not installed; `python -m benchmarks --help`."""
+"""Benchmarks of this program, alone and beside the reference; not installed. See `python -m benchmarks --help`."""

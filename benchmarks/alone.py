@@ -1,4 +1,4 @@
-"""Levels labelled without a worker: what it does with a unit, in one call, or with one unit after another."""
+"""Labelling without a worker: one unit in a call, or many units side by side."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TypeVar
@@ -13,7 +13,7 @@ from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 
-Tell = Callable[[int, float, int], None]  # totals so far: env steps, levels (parts count), solved levels
+Report = Callable[[int, float, int], None]  # totals so far: env steps, levels (fractions count), solved levels
 Name = TypeVar("Name")
 
 
@@ -23,36 +23,36 @@ def label(
     budget: int,
     procedure: Procedure,
     rules: TaskParams = DEFAULT_RULES,
-    tell: Tell = lambda *_: None,
+    report: Report = lambda *_: None,
     begun: Mapping[int, KeptExpert] = NOTHING_BEGUN,
 ) -> UnitResult:
-    """Label levels; `budget` are env steps that each expert may use, `tell` is called after each rollout.
+    """Label levels with `budget` env steps for each expert; `report` is called after each pool step.
 
     Raises:
-        ValueError: the budget is none that experts can use.
+        ValueError: experts cannot use this budget.
     """
     pool = Pool(budget, procedure, rules)
     run = TrainingRun(pool, levels, level_ids, begun)
     while not pool.step():
         run.submit_searched()
-        tell(*run.totals())
+        report(*run.totals())
     result = run.finish()
     solved = sum(verdict.label is Label.SOLVED for verdict in result.verdicts)
-    tell(result.spent.shown, len(result.verdicts), solved)
+    report(result.spent.shown, len(result.verdicts), solved)
     return result
 
 
 def side_by_side(
     pool: Pool,
     units: Iterable[tuple[Name, Level, np.ndarray]],
-    tell: Callable[[Mapping[Name, TrainingRun]], None] = lambda _: None,
+    report: Callable[[Mapping[Name, TrainingRun]], None] = lambda _: None,
 ) -> Iterator[tuple[Name, UnitResult]]:
-    """Label units, each when the pool wants levels; what came of each, as it is done.
+    """Label units, adding one whenever the pool wants levels; yield each result when it is ready.
 
     Args:
         pool: where their experts train.
-        units: of each a name, its levels and their ids.
-        tell: called after each step with all that is under way.
+        units: name, levels and their ids of each unit.
+        report: called after each step with the runs in progress.
     """
     runs: dict[Name, TrainingRun] = {}
     waiting = iter(units)
@@ -68,6 +68,6 @@ def side_by_side(
         finished = pool.step()
         for run in runs.values():
             run.submit_searched()
-        tell(runs)
+        report(runs)
         for name in [name for name, run in runs.items() if run.submission in finished]:
             yield name, runs.pop(name).finish()

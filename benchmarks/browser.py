@@ -1,4 +1,4 @@
-"""A browser without a window: Chromium as the machine has it, driven by Playwright, which brings none of its own."""
+"""A headless browser: the machine's own Chromium, driven by Playwright."""
 
 import os
 import shutil
@@ -11,27 +11,27 @@ from levelproof.pipeline.errors import Failure
 if TYPE_CHECKING:
     from playwright.sync_api import Browser  # pyright: ignore[reportMissingImports]
 
-VARIABLE = "LEVELPROOF_CHROMIUM"  # a Chromium, if it is not on the path
+VARIABLE = "LEVELPROOF_CHROMIUM"  # the Chromium to use, if it is not on the path
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-WORDS = ("--no-sandbox", "--enable-precise-memory-info")  # containers let nobody make a sandbox
+ARGUMENTS = ("--no-sandbox", "--enable-precise-memory-info")  # containers forbid sandboxes
 
 
 @contextmanager
 def browser() -> "Iterator[Browser]":
-    """Chromium, while it is needed.
+    """Run Chromium in the `with` block.
 
     Raises:
-        Failure: there is none, or no Playwright.
+        Failure: Chromium or Playwright is missing.
     """
     program = os.environ.get(VARIABLE) or next(filter(None, map(shutil.which, NAMES)), None)
     if not program:
-        raise Failure(f"there is no Chromium: install Debian's package chromium, or name a program in {VARIABLE}.")
+        raise Failure(f"Chromium is missing: install Debian's package chromium, or name a program in {VARIABLE}.")
     try:
         from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise Failure("there is no Playwright: pip install playwright.") from None
+        raise Failure("Playwright is missing: pip install playwright.") from None
     with sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=program, args=list(WORDS))
+        opened = driver.chromium.launch(executable_path=program, args=list(ARGUMENTS))
         try:
             yield opened
         finally:

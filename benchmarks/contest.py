@@ -1,4 +1,4 @@
-"""Contestants: groups of processes that get ready one group after another and then run in turns."""
+"""Contestants of a race: groups of processes that compile one group at a time and then run in turns."""
 
 import json
 import statistics
@@ -9,14 +9,14 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from typing import IO
 
-from benchmarks.oracle import tell
+from benchmarks.oracle import log
 from benchmarks.reference.serve import MARK
 from levelproof.pipeline.errors import Failure
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A contestant: what to start. All its processes run at the same time."""
+    """A contestant, as the commands to start; all its processes run concurrently."""
 
     name: str
     commands: Sequence[Sequence[str]]
@@ -26,7 +26,7 @@ class Entry:
 
 @dataclass
 class Score:
-    """What a contestant did."""
+    """Measurements of a contestant."""
 
     entry: Entry
     compile_seconds: float = 0.0
@@ -42,7 +42,7 @@ class Score:
 
 
 def compete(entries: Sequence[Entry], repeats: int) -> list[Score]:
-    """Start every contestant, then let each run once, `repeats` times in turns.
+    """Start every contestant, then let them run in turns, `repeats` times each.
 
     Raises:
         Failure: a process ends early.
@@ -54,38 +54,38 @@ def compete(entries: Sequence[Entry], repeats: int) -> list[Score]:
 
         teams = [[make(entry, command) for command in entry.commands] for entry in entries]
         scores = []
-        for entry, team in zip(entries, teams, strict=True):  # compiles undisturbed
-            tell(f"{entry.name}: compiling ...")
+        for entry, team in zip(entries, teams, strict=True):  # one at a time, so that nothing disturbs compiling
+            log(f"{entry.name}: compiling ...")
             for process in team:
-                process.wake()
+                process.start()
             ready = [process.answer() for process in team]
             scores.append(Score(entry, max(facts["compile_seconds"] for facts in ready)))
         for _ in range(repeats):
             for score, team in zip(scores, teams, strict=True):
                 _run_once(score, team)
-                tell(f"{score.entry.name}: {score.rates[-1]:,.0f} env steps/s")
+                log(f"{score.entry.name}: {score.rates[-1]:,.0f} env steps/s")
     return scores
 
 
 @dataclass
 class Process:
-    """A process that speaks the protocol of `serve`; it ends with `stack`."""
+    """A process that speaks the protocol of reference/serve.py; killed when `stack` closes."""
 
     command: Sequence[str]
     environment: Mapping[str, str]
     stack: ExitStack
     errors: IO[str]
 
-    def wake(self) -> None:
+    def start(self) -> None:
         pipe = subprocess.PIPE
         self.running = subprocess.Popen(
             self.command, stdin=pipe, stdout=pipe, stderr=self.errors, env=dict(self.environment), text=True
         )
         self.stack.callback(_end, self.running)
 
-    def go(self, request: str = "") -> None:
+    def send(self, request: str = "") -> None:
         assert self.running.stdin is not None
-        with suppress(BrokenPipeError):  # it died: `answer` says so
+        with suppress(BrokenPipeError):  # the process died: `answer` raises
             self.running.stdin.write(f"{request}\n")
             self.running.stdin.flush()
 
@@ -97,13 +97,13 @@ class Process:
         self.errors.seek(0)
         reason = (self.errors.read().strip().splitlines() or ["no message"])[-1]
         raise Failure(
-            f"A process of the bench ended early ({reason}): run it alone to see more: {' '.join(self.command)}"
+            f"A process of the benchmark ended early ({reason}): run it alone to see more: {' '.join(self.command)}"
         )
 
 
 def _run_once(score: Score, team: Sequence[Process]) -> None:
     for process in team:
-        process.go()
+        process.send()
     answers = [process.answer() for process in team]
     score.rates.append(score.entry.steps / max(facts["seconds"] for facts in answers))
     score.goals += sum(facts["goal"] for facts in answers)

@@ -1,4 +1,4 @@
-"""How much faster one process steps on several cores, which JAX sees as devices: env steps/s of `levelproof.Lanes`."""
+"""Speedup of one process on several cores, which JAX sees as devices: env steps/s of `levelproof.Lanes`."""
 
 import argparse
 import os
@@ -20,7 +20,7 @@ from levelproof.levelgen.task.environment import make
 from levelproof.levelgen.task.lanes import Lanes
 from levelproof.pipeline.runtime import own_cores
 
-EACH = 512  # lanes on a core
+LANES_PER_CORE = 512
 REPEATS = 30
 
 
@@ -29,43 +29,43 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=REPEATS, help=f"of which the best counts (default: {REPEATS})")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     count = len(own_cores())
     flags = os.environ.get("XLA_FLAGS", ""), f"--xla_force_host_platform_device_count={count}"
     os.environ["XLA_FLAGS"] = " ".join(flags).strip()
-    results = [measured(size, count, given.repeats) for size in given.size]
-    rows = [[of["size"], f"{of['one']:,.0f}", f"{of['all']:,.0f}", f"{of['all'] / of['one']:.2f}"] for of in results]
+    results = [measured(size, count, args.repeats) for size in args.size]
+    rows = [[result["size"], f"{result['one']:,.0f}", f"{result['all']:,.0f}", f"{result['all'] / result['one']:.2f}"] for result in results]
     table = Table(("size", "one core", f"{count} cores", "times"), rows, "Env steps/s of one process")
     return Report("All cores from one process", results, [table])
 
 
 def measured(size: str, count: int, repeats: int) -> dict[str, Any]:
-    """Env steps/s on one core and on all, the best of the repeats in turns."""
+    """Measure env steps/s on one core and on all, in turns; keep the best repeat of each."""
     env, params = make(sample_levels(np.arange(LEVELS), size))
     programs = {cores: _program(Lanes(env), params, cores) for cores in (1, count)}
     best = dict.fromkeys(programs, np.inf)
     for _ in range(repeats):
-        for cores, (compiled, given) in programs.items():
+        for cores, (compiled, inputs) in programs.items():
             begin = time.perf_counter()
-            jax.block_until_ready(compiled(*given))
+            jax.block_until_ready(compiled(*inputs))
             best[cores] = min(best[cores], time.perf_counter() - begin)
-    rates = {cores: STEPS * EACH * cores / seconds for cores, seconds in best.items()}
+    rates = {cores: STEPS * LANES_PER_CORE * cores / seconds for cores, seconds in best.items()}
     return {"size": size, "cores": count, "unit": "env steps/s", "one": rates[1], "all": rates[count]}
 
 
 def _program(lanes: Lanes, params: Any, cores: int) -> tuple[Any, tuple]:
-    """A rollout with its lanes divided among cores, compiled, and what it takes."""
-    total = EACH * cores
+    """Compile a rollout whose lanes are divided among cores; return it with its inputs."""
+    total = LANES_PER_CORE * cores
     table = jax.jit(lanes.table)(params)
     _, state, played = jax.jit(lanes.reset)(table, jnp.arange(total) % LEVELS)
     coming = jax.random.randint(jax.random.key(0), (STEPS, total), 0, LEVELS)
     mesh = jax.make_mesh((cores,), ("core",), axis_types=(AxisType.Auto,), devices=jax.devices()[:cores])
     lanes_last = partial(jax.tree.map, lambda x: PartitionSpec(*[None] * (x.ndim - 1), "core"))
     everywhere = jax.tree.map(lambda _: PartitionSpec(), table)
-    given = table, played, state, jnp.asarray(sticky_actions(STEPS, total)), coming
-    specs = everywhere, *map(lanes_last, given[1:])
-    rollout = lambda *given: lanes_rollout(lanes, *given)[0]
-    out = lanes_last(jax.eval_shape(rollout, *given))
+    inputs = table, played, state, jnp.asarray(sticky_actions(STEPS, total)), coming
+    specs = everywhere, *map(lanes_last, inputs[1:])
+    rollout = lambda *inputs: lanes_rollout(lanes, *inputs)[0]
+    out = lanes_last(jax.eval_shape(rollout, *inputs))
     divided = jax.shard_map(rollout, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False)
-    placed = jax.tree.map(lambda x, spec: jax.device_put(x, jax.sharding.NamedSharding(mesh, spec)), given, specs)
+    placed = jax.tree.map(lambda x, spec: jax.device_put(x, jax.sharding.NamedSharding(mesh, spec)), inputs, specs)
     return jax.jit(divided).lower(*placed).compile(), placed

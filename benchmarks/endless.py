@@ -1,4 +1,4 @@
-"""Experts that train without end and without evaluations: what the benchmarks of training time."""
+"""Experts that train without end or evaluations, for the benchmarks that time training."""
 
 import numpy as np
 
@@ -12,20 +12,20 @@ from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 
-UPDATES = 10**6  # more than a benchmark waits for
+UPDATES = 10**6  # more than any benchmark runs
 
 
 def endless_queue(levels: Level, config: ExpertConfig) -> LevelQueue:
-    """All of these levels, with as many places."""
+    """Return a queue filled to capacity with exactly these levels."""
     queue = empty_queue(levels, levels.role.shape[-1], config)
     for first in range(0, queue.capacity, GROUP):
-        some = np.arange(first, min(first + GROUP, queue.capacity))
-        queue = enter(queue, some.tolist(), take(levels, some), some, no_success(len(some)), config, UPDATES)
+        positions = np.arange(first, min(first + GROUP, queue.capacity))
+        queue = enter(queue, positions.tolist(), take(levels, positions), positions, no_success(len(positions)), config, UPDATES)
     return queue
 
 
-def go_on(
+def update_slots(
     slots: Slots, queue: LevelQueue, config: ExpertConfig, rules: TaskParams = DEFAULT_RULES
 ) -> tuple[Slots, Report]:
-    """An update in every slot (`slots` are used up)."""
+    """Advance every slot by an update; donates `slots`."""
     return advance(slots, queue, config, rules_of(StopConfig(rule=Rule.BUDGET), config), rules)

@@ -1,4 +1,4 @@
-"""Env steps a second of both programs in training one expert per level, with the reference's hyperparameters."""
+"""Env steps/s of both programs when training one expert per level with the reference's hyperparameters."""
 
 import argparse
 
@@ -19,18 +19,18 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--updates", type=int, default=4, help="updates of a run (default: 4)")
 
 
-def run(given: argparse.Namespace) -> Report:
-    race.check(given, ("repeats", *COUNTS))
-    python, settings = oracle.oracle_python(), {name: getattr(given, name) for name in COUNTS}
-    shape = [word for name in COUNTS[1:] for word in (f"--{name}", settings[name])]
-    steps = given.levels * given.environments * given.horizon * given.updates
+def run(args: argparse.Namespace) -> Report:
+    race.check(args, ("repeats", *COUNTS))
+    python, settings = oracle.oracle_python(), {name: getattr(args, name) for name in COUNTS}
+    shape = [argument for name in COUNTS[1:] for argument in (f"--{name}", settings[name])]
+    steps = args.levels * args.environments * args.horizon * args.updates
 
     def entries(size: str) -> list[Entry]:
-        levels = given.level_file or oracle.sampled_levels(python, size)
+        levels = args.level_file or oracle.sampled_levels(python, size)
 
-        def words(share: race.Share) -> list[object]:
+        def arguments(share: race.Share) -> list[object]:
             return ["--levels", levels, *shape, "--first", share.first, "--count", share.count]
 
-        return race.contestants("experts", given.levels, steps, words, lambda share: [*words(share), "--size", size])
+        return race.contestants("experts", args.levels, steps, arguments, lambda share: [*arguments(share), "--size", size])
 
-    return race.run("Training, beside the reference", given, entries, settings)
+    return race.run("Training, beside the reference", args, entries, settings)

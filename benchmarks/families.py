@@ -1,4 +1,4 @@
-"""The presets of the distribution: a sheet of each, and how many of their levels need no expert."""
+"""Presets of the distribution: a sheet of each, and the share of their levels that need no expert."""
 
 import argparse
 from pathlib import Path
@@ -21,34 +21,34 @@ KINDS = ("trivial", "fails", "unsolvable")
 
 
 def shares(distribution: Distribution, size: str, count: int) -> dict[str, float]:
-    """Of levels that are trivial, that doing nothing fails, and that are proved unsolvable."""
+    """Return the shares of levels that are trivial, that doing nothing fails, and that are proved unsolvable."""
     facts = facts_of(sample_levels(np.arange(count), SIZES[size], distribution), DEFAULT_RULES)
-    found = facts.reaches, facts.fails, facts.proof != Proof.NONE
-    return {name: float(x.mean()) for name, x in zip(KINDS, found, strict=True)}
+    flags = facts.reaches, facts.fails, facts.proof != Proof.NONE
+    return {name: float(x.mean()) for name, x in zip(KINDS, flags, strict=True)}
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--levels", type=int, default=2_000, help="levels a size and preset (default: 2,000)")
-    parser.add_argument("--sheets", type=Path, help="folder for the sheets, levels-NAME.png")
+    parser.add_argument("--levels", type=int, default=2_000, help="levels per size and preset (default: 2,000)")
+    parser.add_argument("--sheets", type=Path, help="folder to write a sheet levels-NAME.png of each preset to")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     prepare_jax()
     results = []
     for name, distribution in distributions().items():
-        if given.sheets:
+        if args.sheets:
             job = compose_job([f"size={SHEET_SIZE}", f"distribution={name}", f"levels={LEVELS}"])
-            write_png(sheet_of(job), given.sheets / f"levels-{name}.png")
-        of_sizes = {size: shares(distribution, size, given.levels) for size in SIZES}
-        results.append({"distribution": name, "levels": given.levels, "shares": of_sizes})
+            write_png(sheet_of(job), args.sheets / f"levels-{name}.png")
+        of_sizes = {size: shares(distribution, size, args.levels) for size in SIZES}
+        results.append({"distribution": name, "levels": args.levels, "shares": of_sizes})
     rows = [
-        [f"`{of['distribution']}`", *(f"{x:.1%}" for shares in of["shares"].values() for x in shares.values())]
-        for of in results
+        [f"`{result['distribution']}`", *(f"{x:.1%}" for shares in result["shares"].values() for x in shares.values())]
+        for result in results
     ]
     head = [f"{size}: {what}" for size in SIZES for what in KINDS]
     return Report(
         title="Levels that need no expert, by distribution",
         results=results,
         tables=[Table(("distribution", *head), rows)],
-        notes=[f"Shares of {given.levels:,} levels a size and distribution."],
+        notes=[f"Shares of {args.levels:,} levels a size and distribution."],
     )

@@ -1,8 +1,8 @@
-"""Are our random levels the reference's? Statistic by statistic, from as many levels of each.
+"""Whether our random levels are distributed as the reference's, statistic by statistic, from equally many of each.
 
 Statistics with many values are compared by the two-sample test of Kolmogorov and Smirnov, the others by a chi-square
-test of counts; p is corrected for the number of statistics of a size (Holm). Doing nothing is played on our engine for
-both, so that only the levels can differ. Fails where a statistic differs.
+test of counts; p is corrected for the number of statistics of a size (Holm). Idle episodes of both are played on our
+engine, so that only the levels can differ. The benchmark fails if a statistic differs.
 """
 
 import argparse
@@ -28,19 +28,19 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.runtime import prepare_jax
 
 SIGNIFICANT = 1e-3
-COUNTED = 40  # statistics with at most so many different values are compared by their counts
-RARE = 10  # values seen less often, in both samples together, are counted as one
-Samples = dict[str, Shaped[np.ndarray, " value"]]  # by statistic: of a level, body, joint or thruster each
-CODES = ("role", "roles", "kinds", "place", "binding")  # last words of statistics whose numbers are names
+COUNTED = 40  # statistics with at most this many distinct values are compared by counts
+RARE = 10  # values rarer than this, in both samples together, are pooled
+Samples = dict[str, Shaped[np.ndarray, " value"]]  # by statistic: one value per level, body, joint or thruster
+CODES = ("role", "roles", "kinds", "place", "binding")  # last words of statistics whose values are codes
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One statistic of one size."""
+    """One statistic of one size, compared."""
 
     ours: str
     theirs: str
-    p: float | None  # None: one and the same value in every level of both
+    p: float | None  # None: all values of both samples are equal
     corrected: float | None
 
 
@@ -56,13 +56,13 @@ class SizeReport:
 
 
 def reference_levels(size: str, count: int, seed: int) -> Level:
-    """Levels of the reference's sampler, from the cache folder if they are there."""
+    """Load levels of the reference's sampler from the cache folder; sample them on first use."""
     with np.load(oracle.sampled_levels(oracle.oracle_python(), size, count, seed)) as file:
         return level_from_kinetix({name: file[name] for name in file.files})
 
 
 def samples(level: Level) -> Samples:
-    """Every statistic's values."""
+    """Compute the values of every statistic."""
     lanes = level.role.shape[-1]
     zeros = np.zeros(lanes, np.int32), np.zeros(lanes, np.float32)
     facts = jax.device_get(facts_of(level, DEFAULT_RULES))
@@ -74,7 +74,7 @@ def samples(level: Level) -> Samples:
 
 
 def p_value(ours: Shaped[np.ndarray, " value"], theirs: Shaped[np.ndarray, " value"]) -> float | None:
-    """Of the hypothesis that both samples have one distribution; None where both hold one and the same value."""
+    """Test the hypothesis that both samples share a distribution; None if all values are equal."""
     ours, theirs = (np.asarray(x, np.float32) for x in (ours, theirs))
     values = np.unique(np.concatenate([ours, theirs]))
     if len(values) <= 1:
@@ -88,23 +88,23 @@ def p_value(ours: Shaped[np.ndarray, " value"], theirs: Shaped[np.ndarray, " val
     if table.shape[1] == 1:
         return 1.0
     if not table.sum(1).all():
-        return 0.0  # one side never has what the other has
+        return 0.0  # one sample is empty, the other is not
     return float(stats.chi2_contingency(table).pvalue)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def compare(ours: Samples, theirs: Samples) -> dict[str, Compared]:
-    """Statistic by statistic; what neither side ever has is left out."""
+    """Compare statistic by statistic; leave out those that neither side has values of."""
     names = [name for name in theirs if len(ours[name]) or len(theirs[name])]
     p = {name: p_value(ours[name], theirs[name]) for name in names}
     varied = [name for name in names if p[name] is not None]
     corrected = dict(zip(varied, holm([p[name] or 0.0 for name in varied]), strict=True))
     return {
-        name: Compared(told(name, ours[name]), told(name, theirs[name]), p[name], corrected.get(name)) for name in names
+        name: Compared(summarise(name, ours[name]), summarise(name, theirs[name]), p[name], corrected.get(name)) for name in names
     }
 
 
-def told(name: str, values: Shaped[np.ndarray, " value"]) -> str:
-    """A sample in a word: its mean, the share of True, or the most frequent name and its share."""
+def summarise(name: str, values: Shaped[np.ndarray, " value"]) -> str:
+    """Summarise a sample: its mean, its share of True, or its most frequent code with the share."""
     if not len(values):
         return "none"
     if name.split()[-1] in CODES:
@@ -120,16 +120,16 @@ def measured(size: str, count: int, seed: int) -> SizeReport:
 
 
 def summary(reports: Sequence[SizeReport]) -> Table:
-    """What it comes to, a column a size."""
+    """Summarise the comparison in a column per size."""
     tested = [[c for c in r.statistics.values() if c.p is not None and c.corrected is not None] for r in reports]
     rows: dict[str, list[Any]] = {
         "levels of each": [f"{r.levels:,}" for r in reports],
         "statistics": [len(r.statistics) for r in reports],
         "of them the same number in every level": [
-            len(r.statistics) - len(of) for r, of in zip(reports, tested, strict=True)
+            len(r.statistics) - len(varied) for r, varied in zip(reports, tested, strict=True)
         ],
-        "smallest p": [smallest(c.p for c in of) for of in tested],
-        "smallest corrected p": [smallest(c.corrected for c in of) for of in tested],
+        "smallest p": [smallest(c.p for c in varied) for varied in tested],
+        "smallest corrected p": [smallest(c.corrected for c in varied) for varied in tested],
         f"differ (corrected p < {SIGNIFICANT:g})": [len(r.differ) for r in reports],
     }
     return Table(("", *(r.size for r in reports)), [[name, *map(str, cells)] for name, cells in rows.items()])
@@ -140,13 +140,13 @@ def smallest(p: Iterable[float | None]) -> str:
 
 
 def table(reports: Sequence[SizeReport]) -> Table:
-    """Every statistic: ours, the reference's and p of each size, and the verdict."""
+    """List every statistic: ours, the reference's and p of each size, and the verdict."""
     rows = []
     for name in dict.fromkeys(name for r in reports for name in r.statistics):
         cells = [cell for r in reports for cell in _cells(r.statistics.get(name))]
         off = [r.size for r in reports if name in r.differ]
         rows.append([name, *cells, f"differs: {', '.join(off)}" if off else "same"])
-    head = [word for r in reports for word in (f"{r.size}: ours", "reference", "p")]
+    head = [title for r in reports for title in (f"{r.size}: ours", "reference", "p")]
     return Table(("statistic", *head, "verdict"), rows)
 
 
@@ -156,13 +156,13 @@ def _cells(c: Compared | None) -> tuple[str, str, str]:
 
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
-    parser.add_argument("--levels", type=int, default=20_000, help="of each sampler (default: 20,000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the reference's sampler (default: 0)")
+    parser.add_argument("--levels", type=int, default=20_000, help="levels from each sampler (default: 20,000)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the reference's sampler (default: 0)")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     prepare_jax()
-    reports = [measured(size, given.levels, given.seed) for size in given.size]
+    reports = [measured(size, args.levels, args.seed) for size in args.size]
     off = [f"{name} of {r.size}" for r in reports for name in r.differ]
     return Report(
         title="Random levels, ours and the reference's",
@@ -175,7 +175,7 @@ def run(given: argparse.Namespace) -> Report:
             "No p: every level of both has the same value."
         ],
         reference=oracle.versions(oracle.oracle_python()),
-        fault=f"Other than the reference's: {', '.join(off)}." if off else "",
+        fault=f"Statistics that differ from the reference's: {', '.join(off)}." if off else "",
     )
 
 

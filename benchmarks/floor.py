@@ -1,8 +1,8 @@
-"""What a physics step costs, stage by stage, and how far it is from its arithmetic.
+"""Cost of a physics step, stage by stage, against the floor of its arithmetic.
 
 Times: the machine code of the first 1, 2, ... stages (physics/engine.py) over sampled levels in mid-episode, one core;
-a stage costs what it adds. Work: the same blocks through an interpreter of the kernel's jaxpr that counts vector
-operations, loads and stores of rows. Floor: vector operations at VECTORS_PER_CYCLE, and at CLOCK, the core's own.
+a stage costs what it adds. Work: an interpreter of the kernel's jaxpr runs the same blocks and counts vector operations,
+loads and stores of rows. Floor: vector operations at VECTORS_PER_CYCLE and the core's measured clock.
 """
 
 import argparse
@@ -34,11 +34,11 @@ LEVELS, COUNTED = 1024, 64  # lanes timed, lanes counted
 STEPS = 32  # env steps under random actions before the measurement
 VECTORS_PER_CYCLE = 2  # 512-bit arithmetic of this generation of cores
 REPEATS = 40
-CUTS = (*((stage,) for stage in STAGES[:-2]), STAGES[-2:])  # the last is too short to be told from the one before it
+CUTS = (*((stage,) for stage in STAGES[:-2]), STAGES[-2:])  # the last stage is too short to time by itself
 
 
 def worlds(size: str) -> Inputs:
-    """Levels some way into their episodes, and controls."""
+    """Sample levels, play them into mid-episode, and return their states with controls."""
     level = sample_levels(np.arange(LEVELS), SIZES[size])
     choices = jnp.array(CHOICES)[:, None]
 
@@ -53,7 +53,7 @@ def worlds(size: str) -> Inputs:
 
 
 def seconds(given: Inputs, stages: tuple) -> float:
-    """Of one block of lanes."""
+    """Time the stages on one block of lanes, s; the best of REPEATS."""
     compiled = jax.jit(lambda given: as_machine_code(given, DEFAULT_PARAMS, False, stages))
     jax.block_until_ready(compiled(given))
     best = np.inf
@@ -65,7 +65,7 @@ def seconds(given: Inputs, stages: tuple) -> float:
 
 
 def count(given: Inputs, stages: tuple) -> Counter:
-    """Vector operations, loads and stores of one block of lanes, on average."""
+    """Count vector operations, loads and stores of one block of lanes, on average."""
     size, total = given.model.size, Counter()
 
     def kernel(given, table, after, scratch):
@@ -76,8 +76,8 @@ def count(given: Inputs, stages: tuple) -> Counter:
     table = table_of(size, True)
     scratch = jax.tree.map(lambda buffer: np.zeros(buffer.array().shape, buffer.dtype), buffers_of(Scratch, size))
     for first in range(0, COUNTED, LANES):
-        mine = jax.tree.map(lambda x, at=first: np.array(x[..., at : at + LANES]), given)
-        handed = mine, table, jax.tree.map(np.zeros_like, mine.before), scratch
+        block_inputs = jax.tree.map(lambda x, at=first: np.array(x[..., at : at + LANES]), given)
+        handed = block_inputs, table, jax.tree.map(np.zeros_like, block_inputs.before), scratch
         closed = jax.make_jaxpr(kernel)(*handed)
         interpret(closed.jaxpr, [np.array(x) for x in (*closed.consts, *jax.tree.leaves(handed))], total)
     return Counter({what: n * LANES // COUNTED for what, n in total.items()})
@@ -88,7 +88,7 @@ def rows(shape: tuple[int, ...]) -> int:
 
 
 def interpret(jaxpr: core.Jaxpr, arguments: list, total: Counter) -> list:
-    """Interpret a kernel, references being NumPy arrays, and count."""
+    """Interpret a kernel whose references are NumPy arrays; add its work to `total`."""
     known = dict(zip(jaxpr.invars, arguments, strict=True))
     read = lambda x: x.val if isinstance(x, core.Literal) else known[x]
     for equation in jaxpr.eqns:
@@ -128,7 +128,7 @@ def one(equation, operands: list, total: Counter) -> list:
 
 
 def access(name: str, params: dict, operands: list, total: Counter) -> list:
-    """Read or write some rows of a reference."""
+    """Read or write rows of a reference; add them to `total`."""
     written = name != "get"
     transforms = jax.tree.unflatten(params["tree"], operands[1 + written :])
     index = tuple(
@@ -144,22 +144,22 @@ def access(name: str, params: dict, operands: list, total: Counter) -> list:
 
 
 def clock() -> float:
-    """The core's cycles a second, from a chain of dependent integer additions."""
+    """Measure the core's clock, Hz, with a chain of dependent integer operations."""
     from llvmlite import binding, ir
 
-    module, word = ir.Module(), ir.IntType(64)
-    function = ir.Function(module, ir.FunctionType(word, [word]), "chain")
+    module, integer = ir.Module(), ir.IntType(64)
+    function = ir.Function(module, ir.FunctionType(integer, [integer]), "chain")
     b = ir.IRBuilder(function.append_basic_block())
     start, body, done = b.block, b.append_basic_block(), b.append_basic_block()
     b.branch(body)
     b.position_at_end(body)
-    i, x = b.phi(word), b.phi(word)
-    i.add_incoming(word(0), start)
-    x.add_incoming(word(1), start)
+    i, x = b.phi(integer), b.phi(integer)
+    i.add_incoming(integer(0), start)
+    x.add_incoming(integer(1), start)
     y = x
     for _ in range(16):
-        y = b.xor(b.add(y, i), word(0x5DEECE66D))  # two cycles, one after the other
-    after = b.add(i, word(1))
+        y = b.xor(b.add(y, i), integer(0x5DEECE66D))  # two dependent operations of one cycle each
+    after = b.add(i, integer(1))
     i.add_incoming(after, body)
     x.add_incoming(y, body)
     b.cbranch(b.icmp_unsigned("<", after, function.args[0]), body, done)
@@ -184,39 +184,39 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
     cycles = clock()
-    results = [measured(size, cycles) for size in given.size]
+    results = [measured(size, cycles) for size in args.size]
     groups = list(results[0]["stages"])
     rows = []
-    for of in results:
-        took = [f"{of['stages'][name]['microseconds']:.2g}" for name in groups]
-        moved = of["loads"] + of["stores"]
-        work = f"{of['operations']:,}", f"{moved:,}", f"{of['floor']:.2f}", f"{of['microseconds'] / of['floor']:.1f}"
-        rows.append([of["size"], *took, f"{of['microseconds']:.2g}", *work])
+    for result in results:
+        took = [f"{result['stages'][name]['microseconds']:.2g}" for name in groups]
+        moved = result["loads"] + result["stores"]
+        work = f"{result['operations']:,}", f"{moved:,}", f"{result['floor']:.2f}", f"{result['microseconds'] / result['floor']:.1f}"
+        rows.append([result["size"], *took, f"{result['microseconds']:.2g}", *work])
     head = ("size", *groups, "all", "vector operations", "loads and stores", "floor", "times the floor")
     title = f"Microseconds of one core for a block of {LANES} lanes and one physics step"
     return Report(
         title="What a physics step costs",
         results=results,
         tables=[Table(head, rows, title)],
-        notes=[f"The core's clock: {cycles / 1e9:.2f} GHz. Floor: {VECTORS_PER_CYCLE} vector operations a cycle."],
+        notes=[f"The core's clock: {cycles / 1e9:.2f} GHz. Floor: {VECTORS_PER_CYCLE} vector operations per cycle."],
     )
 
 
 def measured(size: str, cycles: float) -> dict[str, Any]:
-    """Microseconds and work of each group of stages, and of all."""
+    """Measure microseconds and work of each group of stages, and of the whole step."""
     given, before, counted, stages = worlds(size), 0.0, Counter(), {}
     for group in CUTS:
         done = STAGES[: STAGES.index(group[-1]) + 1]
         now, work = seconds(given, done), count(given, done)
-        stages[", ".join(stage.__name__ for stage in group)] = told(now - before, work - counted, cycles)
+        stages[", ".join(stage.__name__ for stage in group)] = costs(now - before, work - counted, cycles)
         before, counted = now, work
-    return {"size": size, **told(before, counted, cycles), "clock": cycles, "stages": stages}
+    return {"size": size, **costs(before, counted, cycles), "clock": cycles, "stages": stages}
 
 
-def told(took: float, work: Counter, cycles: float) -> dict[str, float]:
+def costs(took: float, work: Counter, cycles: float) -> dict[str, float]:
     floor = work["operations"] / VECTORS_PER_CYCLE / cycles
     parts = {what: work[what] for what in ("operations", "loads", "stores")}
     return {"microseconds": took * 1e6, **parts, "floor": floor * 1e6}

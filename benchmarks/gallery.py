@@ -1,7 +1,7 @@
-"""How a gallery of many levels feels in a browser: how soon it shows, how smoothly it scrolls, what it keeps.
+"""Speed of a gallery of many levels in a browser: time to the first levels, smoothness of scrolling, memory.
 
-Chromium without a window and without a GPU, the site opened from the disk. The split is made for this: sampled levels,
-of which the first were played at random and some reach the goal.
+Headless Chromium without a GPU opens the site from disk. The split is synthetic: sampled levels, the first of which
+were played at random, so that some reach the goal.
 """
 
 import argparse
@@ -33,14 +33,14 @@ from levelproof.pipeline.look.gallery.gallery import gallery
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.layout import split_path
 
-UNIT = 1000  # levels that are made at once
-HELD = 16  # env steps that an action is held
+UNIT = 1000  # levels
+HELD = 16  # env steps between action changes
 SCROLLS = 5.0  # s
 PACE = 40  # px a frame
-FIRST, FRAMES, GROWS = 2.0, 50.0, 1.1  # the aims: s, frames/s, times the memory
+MAX_SECONDS, MIN_FRAMES, MAX_GROWTH = 2.0, 50.0, 1.1  # the targets: s, frames/s, factor
 JUMPS = 150
 VIEW = {"width": 1280, "height": 900}
-# Scrolls for some milliseconds; the milliseconds between its frames
+# Scroll for `length` ms; return the ms between frames
 SCROLLING = """async ([length, pace]) => {
     const gaps = [];
     let before = await new Promise(requestAnimationFrame);
@@ -53,14 +53,14 @@ SCROLLING = """async ([length, pace]) => {
     }
     return gaps;
 }"""
-# Jumps over the whole page and waits for what is drawn there
+# Jump along the whole page, waiting at each stop until it is drawn
 JUMPING = """async (jumps) => {
     for (let i = 0; i <= jumps; i++) {
         scrollTo(0, (document.body.scrollHeight - innerHeight) * i / jumps);
         for (let frame = 0; frame < 6; frame++) await new Promise(requestAnimationFrame);
     }
 }"""
-# Brushes a histogram as a pointer does, and sorts; milliseconds of each
+# Brush a histogram with a pointer, then sort; return the ms of the slowest brush move and of the sort
 CHOOSING = """async () => {
     const svg = document.querySelector(".histogram svg");
     const { left, top, width } = svg.getBoundingClientRect();
@@ -85,41 +85,41 @@ CHOOSING = """async () => {
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--levels", nargs="+", default=["10k", "100k"], help="of each gallery (default: 10k 100k)")
-    parser.add_argument("--size", default="s", help="of the levels (default: s)")
-    parser.add_argument("--folder", type=Path, help="keep the galleries in this folder, or use those that are there")
+    parser.add_argument("--levels", nargs="+", default=["10k", "100k"], help="levels of each gallery (default: 10k 100k)")
+    parser.add_argument("--size", default="s", help="size of the levels (default: s)")
+    parser.add_argument("--folder", type=Path, help="keep the galleries in this folder, or reuse those in it")
 
 
-def run(given: argparse.Namespace) -> Report:
-    folder = given.folder or Path(tempfile.mkdtemp(prefix="levelproof-"))
+def run(args: argparse.Namespace) -> Report:
+    folder = args.folder or Path(tempfile.mkdtemp(prefix="levelproof-"))
     try:
-        sites = {count: made_gallery(folder, given.size, parse_count(count, "levels")) for count in given.levels}
+        sites = {count: made_gallery(folder, args.size, parse_count(count, "levels")) for count in args.levels}
         with browser() as chromium:
             results = [{"levels": count, **measured(chromium, *site)} for count, site in sites.items()]
     finally:
-        if not given.folder:
+        if not args.folder:
             shutil.rmtree(folder)
-    slow = [of["levels"] for of in results if not fits(of)]
+    slow = [result["levels"] for result in results if not fits(result)]
     return Report(
         title="Galleries of many levels",
         results=results,
         tables=[
-            Table(("", *(f"{of['levels']} levels of {given.size}" for of in results)), [*rows(results)]),
+            Table(("", *(f"{result['levels']} levels of {args.size}" for result in results)), [*rows(results)]),
         ],
         notes=[
-            f"Chromium without a window or a GPU, {VIEW['width']} by {VIEW['height']} px, the site on the disk. "
-            "The first levels are drawn when all cells of the first screen are. It scrolls "
-            f"{PACE} px a frame for {SCROLLS:.0f} s, over levels that have to be loaded. Memory is JavaScript's after "
-            "a garbage collection: with all columns, after jumps over the whole page, and after as many again. "
-            f"The aim is {FIRST:.0f} s to the first levels, {FRAMES:.0f} frames/s, and memory that these last jumps "
-            f"let grow by less than {GROWS - 1:.0%}.",
+            f"Headless Chromium without a GPU, {VIEW['width']} by {VIEW['height']} px, the site on disk. "
+            "The first levels count as drawn when all cells of the first screen are. The page scrolls "
+            f"{PACE} px a frame for {SCROLLS:.0f} s, over levels that must be loaded. Memory is JavaScript's after "
+            "a garbage collection: with all columns, after jumps along the whole page, and after as many more. "
+            f"The target is {MAX_SECONDS:.0f} s to the first levels, {MIN_FRAMES:.0f} frames/s, and memory growth below "
+            f"{MAX_GROWTH - 1:.0%} in the second series of jumps.",
         ],
-        fault=f"{', '.join(slow)} levels: slower than the aim." if slow else "",
+        fault=f"{', '.join(slow)} levels miss the target." if slow else "",
     )
 
 
-def fits(of: Mapping[str, Any]) -> bool:
-    return of["first"] < FIRST and of["frames"] > FRAMES and of["memory_again"] < GROWS * of["memory_after"]
+def fits(result: Mapping[str, Any]) -> bool:
+    return result["first"] < MAX_SECONDS and result["frames"] > MIN_FRAMES and result["memory_again"] < MAX_GROWTH * result["memory_after"]
 
 
 def rows(results: list[dict[str, Any]]) -> list[list[str]]:
@@ -136,11 +136,11 @@ def rows(results: list[dict[str, Any]]) -> list[list[str]]:
         "memory after the whole page, MB": ("memory_after", "{:.1f}"),
         "memory after the whole page twice, MB": ("memory_again", "{:.1f}"),
     }
-    return [[words, *(form.format(of[name]) for of in results)] for words, (name, form) in lines.items()]
+    return [[title, *(form.format(result[name]) for result in results)] for title, (name, form) in lines.items()]
 
 
 def measured(chromium: Any, site: Path, written: float) -> dict[str, Any]:
-    """What a browser takes for one gallery."""
+    """Measure one gallery in a browser."""
     context = chromium.new_context(viewport=VIEW)
     page = context.new_page()
     page.goto((site / "index.html").as_uri())
@@ -166,14 +166,14 @@ def measured(chromium: Any, site: Path, written: float) -> dict[str, Any]:
 
 
 def _mark(page: Any, name: str) -> float:
-    """Seconds from the navigation to what the page notes."""
+    """Return the seconds from navigation to a mark that the page sets."""
     found = f"performance.getEntriesByName('{name}')"
     page.wait_for_function(f"{found}.length > 0")
     return page.evaluate(f"{found}[0].startTime") / 1000
 
 
 def _after_jumps(context: Any, page: Any) -> float:
-    """Memory after jumps over the whole page and back, MB."""
+    """Return the memory after jumps along the whole page and back, MB."""
     page.evaluate(JUMPING, JUMPS)
     page.evaluate("scrollTo(0, 0)")
     page.wait_for_timeout(500)
@@ -181,7 +181,7 @@ def _after_jumps(context: Any, page: Any) -> float:
 
 
 def _memory(context: Any, page: Any) -> float:
-    """Of JavaScript, MB."""
+    """Return JavaScript's memory after a garbage collection, MB."""
     session = context.new_cdp_session(page)
     session.send("HeapProfiler.collectGarbage")
     used = session.send("Runtime.getHeapUsage")["usedSize"] / 1e6
@@ -190,7 +190,7 @@ def _memory(context: Any, page: Any) -> float:
 
 
 def made_gallery(folder: Path, size: str, levels: int) -> tuple[Path, float]:
-    """A gallery of so many levels, and the core-seconds that it took to write, whenever that was."""
+    """Return a gallery of `levels` levels, written on first use, and the core-seconds that writing took."""
     site, took = folder / f"gallery-{size}-{levels}", folder / f"gallery-{size}-{levels}.txt"
     if not took.is_file():
         split = made_split(folder / str(levels), size, levels)
@@ -201,7 +201,7 @@ def made_gallery(folder: Path, size: str, levels: int) -> tuple[Path, float]:
 
 
 def made_split(folder: Path, size: str, levels: int) -> Path:
-    """A split of levels of which the first UNIT were played at random: what reaches the goal is solved."""
+    """Write a split whose first UNIT levels were played at random; those that reach the goal are solved."""
     prepare_jax()
     job, rng = compose_job([f"out={folder}", f"size={size}", f"levels={levels}"]), np.random.default_rng(0)
     split, count = split_path(job.out, job.budget, job.size), min(UNIT, levels)
@@ -221,6 +221,6 @@ def made_split(folder: Path, size: str, levels: int) -> Path:
             else Verdict(Label.UNSOLVED, "not played", False, success_rate=0.0, env_steps=int(spent))
             for i, spent in enumerate(rng.integers(0, 2**18, len(ids)))
         ]
-        here = take(record, np.arange(len(ids)))  # of levels without a witness nobody stores it
+        here = take(record, np.arange(len(ids)))  # commit stores only the records of levels with a witness
         commit(job, split, WorkUnit(tuple(ids.tolist())), UnitResult(ids, level, here, verdicts, EnvSteps()))
     return split

@@ -1,8 +1,8 @@
-"""The reference's 74 handmade levels, labelled one by one: the levels that everybody in the field knows.
+"""The reference's 74 handmade levels, which the field knows, labelled one by one.
 
-They are read from its installation and have the ids that `generate level_files=` gives them: the same results. Beside
-them stands the reference's PPO; what it makes of a level waits in the cache folder. The page has a picture of each
-solved level at the moment when its witness reaches the goal.
+They are read from the reference's installation and have the ids that `generate level_files=` gives them, so results are
+the same. The reference's PPO is measured beside them; the cache folder keeps its results. The page shows each solved
+level at the moment when its witness reaches the goal.
 """
 
 import argparse
@@ -37,11 +37,11 @@ from levelproof.pipeline.store.origins import Origin
 
 SIZES = ("s", "m", "l")
 KINDS = {"search": "search_steps", "training": "env_steps", "evaluation": "evaluation_steps"}
-PPO, PPO_BUDGET = VARIANTS["reference"].procedure, 1_000_000  # the reference's, and its env steps
-PPO_TOLD = {"PPO: first success": "steps_to_first_success", "PPO: steps to goal": "steps_to_goal"}
+PPO, PPO_BUDGET = VARIANTS["reference"].procedure, 1_000_000  # the reference's PPO, and its env steps
+PPO_COLUMNS = {"PPO: first success": "steps_to_first_success", "PPO: steps to goal": "steps_to_goal"}
 SIDE_BY_SIDE = 8  # levels on which the reference's PPO is trained together
 PLOT = "handmade.png"
-COLUMNS, PIXELS = 8, 130  # of the sheet; width of a picture
+COLUMNS, PIXELS = 8, 130  # columns of the sheet; width of a picture
 FALLS = (
     "level",
     "size",
@@ -50,7 +50,7 @@ FALLS = (
     "env steps until red",
     "covers x, m",
 )
-HEAD = ("level", "size", "label", "seconds", *KINDS, "witness", "steps to goal", *PPO_TOLD)
+HEAD = ("level", "size", "label", "seconds", *KINDS, "witness", "steps to goal", *PPO_COLUMNS)
 
 
 def register(parser: argparse.ArgumentParser) -> None:
@@ -59,28 +59,28 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--search",
         default="16M",
-        help="search.env_steps; patience half of it, variations a quarter (default: 16M, as the levels are few)",
+        help="search.env_steps; half of it is patience, a quarter variations (default: 16M, as there are few levels)",
     )
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
     python = oracle.oracle_python()
     folder = oracle.handmade_levels(python)
-    most = parse_count(given.search, "--search")
-    longer = {"env_steps": most, "patience": most // 2, "variations": most // 4}
-    words = [f"search.{name}={steps}" for name, steps in longer.items()]
-    job = compose_job([f"level_files={folder}", f"budget={given.budget}", *words])
+    env_steps = parse_count(args.search, "--search")
+    longer = {"env_steps": env_steps, "patience": env_steps // 2, "variations": env_steps // 4}
+    settings = [f"search.{name}={steps}" for name, steps in longer.items()]
+    job = compose_job([f"level_files={folder}", f"budget={args.budget}", *settings])
     listing = levels_below(folder, job)
     if listing.refused:
         raise UserError(listing.refused[0])
     results, solved = [], list[Image.Image]()
-    for size in given.size:
+    for size in args.size:
         by_ppo = ppo(listing.levels[size], cache_folder() / "handmade")
         rows_of_size, pictures = labelled(job, listing.levels[size])
-        results += [of | of_ppo for of, of_ppo in zip(rows_of_size, by_ppo, strict=True)]
+        results += [result | of_ppo for result, of_ppo in zip(rows_of_size, by_ppo, strict=True)]
         solved += pictures
-    rows = [[of["level"], of["size"], of["label"], *_cells(of)] for of in results]
+    rows = [[result["level"], result["size"], result["label"], *_cells(result)] for result in results]
     sizes = ("size", "levels", "with a witness", "PPO solves", "seconds", *KINDS)
     return Report(
         "The reference's handmade levels",
@@ -88,22 +88,21 @@ def run(given: argparse.Namespace) -> Report:
         [
             Table(HEAD, rows),
             Table(sizes, totals(results), "By size"),
-            Table(FALLS, falls(job, listing.levels, given.size), "Levels in which green can only fall onto red"),
+            Table(FALLS, falls(job, listing.levels, args.size), "Levels in which green can only fall onto red"),
         ],
         notes=[
             "Each level is labelled alone, on one core, by the default procedure, with up to "
-            f"`search.env_steps={given.search}`, half as much patience and a quarter as many variations; seconds are "
-            "without compiling. The slots beside its expert are empty, so a job that labels many levels takes fewer "
-            "seconds for each. The "
-            "columns named after them are env steps.",
+            f"`search.env_steps={args.search}`, half as much patience and a quarter as many variations; seconds "
+            "exclude compiling. The slots beside its expert are empty, so a job that labels many levels takes fewer "
+            "seconds for each. The columns after the seconds are env steps.",
             f"*PPO*: the reference's hyperparameters for {PPO.expert.updates_in(PPO_BUDGET):,} updates of "
             f"{PPO.expert.steps_per_update:,} env steps, on our engine: the variant `reference` of "
-            "[solved.md](solved.md), which has it beside the reference's own environment, where this would take some "
-            "eight hours of a core. It solves a level if its last evaluation has a witness; *first success* are env "
+            "[solved.md](solved.md), which also has it in the reference's own environment, where this would take some "
+            "eight core-hours. It solves a level if its last evaluation has a witness; *first success*: env "
             "steps of training until then.",
             "In the levels of the last table no actions reach the goal: green is a circle that its thrusters cannot "
-            "turn, they lift less than it weighs, and all it can cover before it lies on the red floor meets nothing "
-            "that is not red (`benchmarks/falls.py`). In `h12_platformer_1` and `h13_platformer_2` the thrusters lift "
+            "turn, they lift less than it weighs, and all that it can cover before it lies on the red floor meets only "
+            "red (`benchmarks/falls.py`). In `h12_platformer_1` and `h13_platformer_2` the thrusters lift "
             "half of the weight, too, and what green can reach before red is one side of a shelf, below its edge. In "
             "`hard_beam_balance`, `hard_cartpole_thrust` and `hard_cartpole_wheels` blue is more than a metre above "
             "what can reach it ([tried](../tried/labels.md)).",
@@ -115,9 +114,9 @@ def run(given: argparse.Namespace) -> Report:
 
 
 def labelled(job: JobConfig, origins: dict[int, Origin]) -> tuple[list[dict[str, Any]], list[Image.Image]]:
-    """What came of each level, and how long it took; and pictures of the solved ones.
+    """Label each level; return a row with its result and seconds, and pictures of the solved levels.
 
-    What compiles for one does not count: it is done twice.
+    A level that compiles something is labelled again, so that compiling is not timed.
     """
     results, pictures, compiled = [], [], set()
     for level_id, origin in origins.items():
@@ -134,17 +133,17 @@ def labelled(job: JobConfig, origins: dict[int, Origin]) -> tuple[list[dict[str,
         results.append(of_level)
         if verdict.steps_to_goal is not None:
             pictures.append(picture_of(result, verdict.steps_to_goal - 1, Path(origin.file).stem))
-        oracle.tell(f"{of_level['level']}: {of_level['label']}, {of_level['seconds']:.1f} s")
+        oracle.log(f"{of_level['level']}: {of_level['label']}, {of_level['seconds']:.1f} s")
     return results, pictures
 
 
 def falls(job: JobConfig, levels: Mapping[str, Mapping[int, Origin]], sizes: Sequence[str]) -> list[list[str]]:
-    """A row for each level whose green can only fall."""
+    """List each level whose green can only fall."""
     rows = []
     for origin in (origin for size in sizes for origin in levels[size].values()):
-        if what := fall(level_at(origin), job.task):
-            numbers = f"{what.weight:.2f}", f"{what.lift:.2f}", str(what.env_steps)
-            left, right = what.reach
+        if found_fall := fall(level_at(origin), job.task):
+            numbers = f"{found_fall.weight:.2f}", f"{found_fall.lift:.2f}", str(found_fall.env_steps)
+            left, right = found_fall.reach
             rows.append([Path(origin.file).stem, origin.size, *numbers, f"{left:.2f} to {right:.2f}"])
     return rows
 
@@ -154,36 +153,36 @@ def ppo(origins: Mapping[int, Origin], folder: Path) -> list[dict[str, Any]]:
     settings = hashlib.sha256(repr((PPO, PPO_BUDGET)).encode()).hexdigest()[:12]
     files = {level_id: folder / f"{level_id}-{settings}.json" for level_id in origins}
     known = {level_id: json.loads(file.read_text()) for level_id, file in files.items() if file.exists()}
-    left = np.array([level_id for level_id in origins if level_id not in known])
+    missing = np.array([level_id for level_id in origins if level_id not in known])
     folder.mkdir(parents=True, exist_ok=True)
-    for block in blocks(len(left), SIDE_BY_SIDE):
-        ids = left[np.unique(block)]
+    for block in blocks(len(missing), SIDE_BY_SIDE):
+        ids = missing[np.unique(block)]
         result = label(levels_at([origins[i] for i in ids.tolist()]), ids, PPO_BUDGET, PPO)
         for level_id, verdict in zip(ids.tolist(), result.verdicts, strict=True):
-            known[level_id] = told(verdict)
+            known[level_id] = ppo_results(verdict)
             files[level_id].write_text(json.dumps(known[level_id]))
-        oracle.tell(f"PPO: {len(known)} of {len(origins)} levels")
+        oracle.log(f"PPO: {len(known)} of {len(origins)} levels")
     return [known[level_id] for level_id in origins]
 
 
-def told(verdict: Verdict) -> dict[str, int | None]:
-    """Of the reference's PPO."""
-    return {name: getattr(verdict, field) for name, field in PPO_TOLD.items()}
+def ppo_results(verdict: Verdict) -> dict[str, int | None]:
+    """Extract PPO_COLUMNS from a verdict."""
+    return {name: getattr(verdict, field) for name, field in PPO_COLUMNS.items()}
 
 
 def picture_of(result: UnitResult, step: int, name: str) -> Image.Image:
-    """The one level before this env step of its record."""
+    """Draw the result's only level before this env step of its record."""
     state = jax.tree.map(lambda x: x[step], result.record.state)
     return draw(result.levels, state, caption=Caption(name), pixels=PIXELS)
 
 
 def write_sheet(pictures: Sequence[Image.Image], path: Path) -> None:
-    """In few colours: the file is a fraction of the size."""
+    """Write a sheet in few colours, which shrinks the file."""
     sheet(pictures, COLUMNS).quantize(64).save(path, optimize=True)
 
 
 def timed(job: JobConfig, level_id: int, origin: Origin) -> tuple[UnitResult, float]:
-    """What came of a level, and the seconds that it took."""
+    """Label a level; return the result and the seconds it took."""
     level, ids = level_at(origin), np.array([level_id])
     start = time.perf_counter()
     result = label(level, ids, job.env_steps, job.procedure, job.task)
@@ -191,21 +190,21 @@ def timed(job: JobConfig, level_id: int, origin: Origin) -> tuple[UnitResult, fl
 
 
 def totals(results: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """A row for each size."""
+    """Sum the results by size."""
     rows = []
-    for size in dict.fromkeys(of["size"] for of in results):
-        mine = [of for of in results if of["size"] == size]
-        with_witness = sum(of["label"] in WITNESSED for of in mine)
-        sums = [f"{sum(of[name] for of in mine):,}" for name in KINDS]
-        by_ppo = sum(of["PPO: steps to goal"] is not None for of in mine)
-        seconds = f"{sum(of['seconds'] for of in mine):.1f}"
-        rows.append([size, str(len(mine)), str(with_witness), str(by_ppo), seconds, *sums])
+    for size in dict.fromkeys(result["size"] for result in results):
+        same_size = [result for result in results if result["size"] == size]
+        witnessed = sum(result["label"] in WITNESSED for result in same_size)
+        sums = [f"{sum(result[name] for result in same_size):,}" for name in KINDS]
+        by_ppo = sum(result["PPO: steps to goal"] is not None for result in same_size)
+        seconds = f"{sum(result['seconds'] for result in same_size):.1f}"
+        rows.append([size, str(len(same_size)), str(witnessed), str(by_ppo), seconds, *sums])
     return rows
 
 
-def _cells(of: dict[str, Any]) -> list[str]:
-    last = ["-" if of[name] is None else _text(of[name]) for name in ("witness", "steps to goal", *PPO_TOLD)]
-    return [f"{of['seconds']:.1f}", *(f"{of[name]:,}" for name in KINDS), *last]
+def _cells(result: dict[str, Any]) -> list[str]:
+    last = ["-" if result[name] is None else _text(result[name]) for name in ("witness", "steps to goal", *PPO_COLUMNS)]
+    return [f"{result['seconds']:.1f}", *(f"{result[name]:,}" for name in KINDS), *last]
 
 
 def _text(value: str | int) -> str:

@@ -1,4 +1,4 @@
-"""Levels of a bench on our side: read from the reference's plain arrays."""
+"""Levels for our side of a benchmark, read from the reference's plain arrays."""
 
 import jax
 import numpy as np
@@ -8,7 +8,7 @@ from levelproof.levelgen.level import Level
 
 
 def load_levels(path: str, first: int, count: int) -> Level:
-    """Levels `first` to `first + count - 1` of a file, going round where it has fewer; numpy on the host."""
+    """Load levels `first` to `first + count - 1` of a file as numpy arrays; indices wrap around."""
     with np.load(path) as file:
         levels = level_from_kinetix({name: file[name] for name in file.files})
     index = (first + np.arange(count)) % levels.role.shape[-1]

@@ -1,7 +1,7 @@
-"""How long commands take to start on a sealed split of millions of levels, and how much memory they need.
+"""Start-up time and memory of commands on a sealed split of millions of levels.
 
-The split is made for this: rows of the committed reference manifest, drawn anew, with ids, hashes, signatures and
-commands of their own; shards with as many files as sealed ones have, of their size and without any content.
+The split is synthetic: resampled rows of the committed reference manifest with ids, hashes, signatures and commands of
+their own; shards with as many files as sealed ones, of the same size but empty.
 """
 
 import argparse
@@ -34,48 +34,48 @@ from levelproof.pipeline.store.merge import FILE_BYTES
 from levelproof.pipeline.store.seal import ROWS
 
 REFERENCE = Path(__file__).parent.parent / "manifests" / "128k-s.parquet"
-SECONDS, BYTES = 10, 2 * 2**30  # that each command should stay within
-ENTRIES, FILES = 10_000, 20_000  # of a folder, and in all
-TRAJECTORY = 12_500  # bytes of one, of size s
-ALIKE = 200  # one in so many levels looks like the next
-MORE = 2**17  # levels that `generate` is to add
+MAX_SECONDS, MAX_BYTES = 10, 2 * 2**30  # targets for each command
+MAX_ENTRIES, MAX_FILES = 10_000, 20_000  # targets for one folder, and for the whole split
+TRAJECTORY = 12_500  # bytes of one trajectory of size s
+ALIKE = 200  # every 200th level is a near duplicate of the next
+ADDED_LEVELS = 2**17  # levels that `generate` would add
 ARRAYS = ("dyn32", "dyn8", "act", "lvl32", "lvl8")
 CONDITION = "label = 'solved' AND steps_to_goal < 64"
 OPEN = f"import levelproof, sys; print(len(levelproof.open(sys.argv[1], where={CONDITION!r})))"
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--levels", default="6M", help="of the split (default: 6M)")
-    parser.add_argument("--repeats", type=int, default=1, help="of each command; the slowest counts (default: 1)")
-    parser.add_argument("--split", type=Path, help="keep the split in this folder, or use the one that is there")
+    parser.add_argument("--levels", default="6M", help="levels of the split (default: 6M)")
+    parser.add_argument("--repeats", type=int, default=1, help="runs of each command; the slowest counts (default: 1)")
+    parser.add_argument("--split", type=Path, help="keep the split in this folder, or reuse the one in it")
 
 
-def run(given: argparse.Namespace) -> Report:
-    levels = parse_count(given.levels, "levels")
-    folder = given.split or Path(tempfile.mkdtemp(prefix="levelproof-"))
+def run(args: argparse.Namespace) -> Report:
+    levels = parse_count(args.levels, "levels")
+    folder = args.split or Path(tempfile.mkdtemp(prefix="levelproof-"))
     try:
         split = split_path(str(folder), "128k", "s")
         if not split.exists():
             made_split(folder, levels)
-        results = [measured(name, words, given.repeats) for name, words in commands(folder, split, levels).items()]
-        files = [Path(at) / name for at, _, names in os.walk(split) for name in names]
+        results = [measured(name, arguments, args.repeats) for name, arguments in commands(folder, split, levels).items()]
+        files = [Path(path) / name for path, _, names in os.walk(split) for name in names]
         entries = max(Counter(path.parent for path in [*files, *split.rglob("*/")]).values())
     finally:
-        if not given.split:
+        if not args.split:
             shutil.rmtree(folder)
-    worst = [of["name"] for of in results if of["seconds"] > SECONDS or of["bytes"] > BYTES]
+    worst = [result["name"] for result in results if result["seconds"] > MAX_SECONDS or result["bytes"] > MAX_BYTES]
     head = ("command", "seconds", "core-seconds", "peak memory, MiB")
-    numbers = lambda of: (f"{of['seconds']:.1f}", f"{of['core_seconds']:.1f}", f"{of['bytes'] / 2**20:,.0f}")
+    numbers = lambda result: (f"{result['seconds']:.1f}", f"{result['core_seconds']:.1f}", f"{result['bytes'] / 2**20:,.0f}")
     return Report(
         title="Manifests of millions of levels",
         results=[*results, {"name": "layout", "files": len(files), "largest_folder": entries}],
-        tables=[Table(head, [(of["name"], *numbers(of)) for of in results])],
+        tables=[Table(head, [(result["name"], *numbers(result)) for result in results])],
         notes=[
-            f"Whole processes on a sealed split of {levels:,} levels with {MORE:,} more to come, the files in the "
-            f"system's cache. It has {len(files):,} files, and its largest folder {entries:,} entries. The aim is "
-            f"{SECONDS} s and {BYTES / 2**20:,.0f} MiB for each, {FILES:,} files, and {ENTRIES:,} entries.",
+            f"Whole processes on a sealed split of {levels:,} levels, with {ADDED_LEVELS:,} more to generate, its files in the "
+            f"page cache. It has {len(files):,} files, and its largest folder {entries:,} entries. The target is "
+            f"{MAX_SECONDS} s and {MAX_BYTES / 2**20:,.0f} MiB for each, {MAX_FILES:,} files, and {MAX_ENTRIES:,} entries.",
         ],
-        fault=f"{', '.join(worst)}: more than {SECONDS} s or {BYTES / 2**20:,.0f} MiB." if worst else "",
+        fault=f"{', '.join(worst)}: more than {MAX_SECONDS} s or {MAX_BYTES / 2**20:,.0f} MiB." if worst else "",
     )
 
 
@@ -85,32 +85,32 @@ def commands(folder: Path, split: Path, levels: int) -> dict[str, Sequence[str]]
         "levelproof inspect": ("-m", "levelproof", "inspect", str(split)),
         f'levelproof inspect --where "{CONDITION}"': ("-m", "levelproof", "inspect", str(split), "--where", CONDITION),
         "levelproof generate, until the first unit": (
-            "-m", "benchmarks.ours.start", f"out={folder}", "size=s", "budget=128k", f"levels={levels + MORE}",
+            "-m", "benchmarks.ours.start", f"out={folder}", "size=s", "budget=128k", f"levels={levels + ADDED_LEVELS}",
         ),
         f'levelproof.open(where="{CONDITION}")': ("-c", OPEN, str(split)),
     }  # fmt: skip
 
 
-def measured(name: str, words: Sequence[str], repeats: int) -> dict[str, Any]:
-    """Wall seconds, core-seconds and peak memory of a process, the worst of some."""
-    seconds, cores, most = [], [], []
+def measured(name: str, arguments: Sequence[str], repeats: int) -> dict[str, Any]:
+    """Run a process `repeats` times; return its worst wall seconds, core-seconds and peak memory."""
+    seconds, cores, memory = [], [], []
     for _ in range(repeats):
         start = time.perf_counter()
         process = subprocess.Popen(
-            [sys.executable, *words], env=dict(oracle.our_environment()), stdout=subprocess.DEVNULL
+            [sys.executable, *arguments], env=dict(oracle.our_environment()), stdout=subprocess.DEVNULL
         )
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         seconds.append(time.perf_counter() - start)
         cores.append(usage.ru_utime + usage.ru_stime)
-        most.append(usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024))
+        memory.append(usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024))
         if process.returncode:
             raise RuntimeError(f"{name} failed")
-    return {"name": name, "seconds": max(seconds), "core_seconds": max(cores), "bytes": max(most)}
+    return {"name": name, "seconds": max(seconds), "core_seconds": max(cores), "bytes": max(memory)}
 
 
 def made_split(folder: Path, levels: int) -> None:
-    """A sealed split of so many levels."""
+    """Write a sealed split of `levels` levels."""
     job = compose_job([f"out={folder}", "size=s", "budget=128k", f"levels={levels}"])
     split = split_path(job.out, job.budget, job.size)
     base, rng = pq.read_table(REFERENCE), np.random.default_rng(0)
@@ -126,7 +126,7 @@ def made_split(folder: Path, levels: int) -> None:
 
 
 def rows(base: pa.Table, ids: np.ndarray, shard: str, config_hash: str, rng: np.random.Generator) -> pa.Table:
-    """A row for each id: what came of a level is drawn from `base`, what is a level's own is new."""
+    """Make a row for each id: results are resampled from `base`, a level's own values are new."""
     table, count = base.take(rng.integers(0, base.num_rows, len(ids))), len(ids)
     solved = np.array(table.column("shard").is_valid())
     halves = [[f"n1:{secrets.token_hex(8)}" for _ in range(2)] for _ in ids]
@@ -146,13 +146,13 @@ def rows(base: pa.Table, ids: np.ndarray, shard: str, config_hash: str, rng: np.
         name: own.get(name, table.column(name) if name in table.column_names else None) for name in COLUMNS.names
     }
     made = pa.table(
-        {name: pa.chunked_array(of) if isinstance(of, pa.ChunkedArray) else of for name, of in columns.items()}
+        {name: pa.chunked_array(column) if isinstance(column, pa.ChunkedArray) else column for name, column in columns.items()}
     )
     return made.cast(COLUMNS)
 
 
 def hollow_shard(path: Path, trajectories: int) -> None:
-    """The files of a sealed shard, of their size, without content."""
+    """Write the files of a sealed shard, of the right size but empty."""
     files = max(1, trajectories * TRAJECTORY // FILE_BYTES)
     for name in ("zarr.json", *(f"{array}/zarr.json" for array in ARRAYS)):
         (path / name).parent.mkdir(parents=True, exist_ok=True)

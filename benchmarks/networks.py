@@ -1,7 +1,7 @@
-"""What networks cost: multiply-adds of one env step, and env steps/s of experts in training.
+"""Cost of the networks: multiply-adds of one env step, and env steps/s of training.
 
-The transformer is counted, not built: tokens are the floor, movable polygons, circles, joints and thrusters; policy
-and value function share none, as in the others.
+The transformer is counted, not built. Its tokens are the floor, movable polygons, circles, joints and thrusters; policy
+and value function share no layers, as in the other networks.
 """
 
 import argparse
@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.endless import endless_queue, go_on
+from benchmarks.endless import endless_queue, update_slots
 from benchmarks.report import Report, Table
 from levelproof.experts.config import ExpertConfig, Network
 from levelproof.experts.networks.entity import KINDS
@@ -23,29 +23,29 @@ from levelproof.levelgen.task.observe.flat import DYNAMIC_ROWS
 from levelproof.physics.types import FIXED_POLYGONS, Size
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 
-SLOTS, UPDATES, REPEATS = 4, 5, 9  # REPEATS in turns, so that medians compare
-LAYERS, MODEL = 2, 64  # of the transformer; heads change nothing here
+SLOTS, UPDATES, REPEATS = 4, 5, 9  # networks take turns, so that medians compare
+LAYERS, MODEL = 2, 64  # of the transformer; the number of heads does not change the count
 FEED_FORWARD = 4 * MODEL
 CONFIGS = {kind.value: ExpertConfig(network=kind, slots=SLOTS) for kind in Network}
 FLAT = CONFIGS["flat"]
-STEPS_OF_UPDATES = 3 * FLAT.epochs  # forward passes' worth per env step: a backward pass takes about two
+STEPS_OF_UPDATES = 3 * FLAT.epochs  # forward passes per env step: a backward pass costs about two more
 
 
 def multiply_adds(name: str, size: Size) -> int:
-    """Of one forward pass of one lane: policy and value function, what is folded once per level left out."""
+    """Count multiply-adds of one forward pass of one lane, without what is folded once per level."""
     moving = len(DYNAMIC_ROWS)
-    things = (size.polygons - FIXED_POLYGONS, size.circles, size.joints, size.thrusters)
-    moving_rows = sum(n * len(kind.moving_rows) for n, kind in zip(things, KINDS, strict=True))
+    entities = (size.polygons - FIXED_POLYGONS, size.circles, size.joints, size.thrusters)
+    moving_rows = sum(n * len(kind.moving_rows) for n, kind in zip(entities, KINDS, strict=True))
     if name == "transformer":
-        tokens = 1 + sum(things)
+        tokens = 1 + sum(entities)
         projections = 4 * MODEL * MODEL  # queries, keys, values, outputs
         layer = tokens * (projections + 2 * tokens * MODEL + 2 * MODEL * FEED_FORWARD)
         trunk = moving_rows * MODEL + LAYERS * layer
         last = MODEL
     elif name == "entity":
         config = CONFIGS[name]
-        sums = sum(things) * config.encoding
-        kinds = sum(n > 0 for n in (1, *things[1:]))
+        sums = sum(entities) * config.encoding
+        kinds = sum(n > 0 for n in (1, *entities[1:]))
         trunk = moving_rows * config.encoding + sums + kinds * config.encoding * config.width
         trunk, last = trunk + (config.depth - 2) * config.width**2, config.width
     else:
@@ -57,14 +57,14 @@ def multiply_adds(name: str, size: Size) -> int:
 
 
 def ready(size: Size, config: ExpertConfig):
-    """A function that trains on for some updates, after a first one."""
+    """Train UPDATES updates; return a function that trains as many more."""
     queue = endless_queue(jax.device_get(sample_levels(np.arange(SLOTS), size)), config)
     slots = empty_slots(SLOTS, queue, config)
 
     def train() -> None:
         nonlocal slots
         for _ in range(UPDATES):
-            slots, _ = go_on(slots, queue, config)
+            slots, _ = update_slots(slots, queue, config)
         jax.block_until_ready(slots)
 
     train()
@@ -72,7 +72,7 @@ def ready(size: Size, config: ExpertConfig):
 
 
 def rates(size: Size) -> dict[str, float]:
-    """Env steps/s of training in one core, medians, in turns."""
+    """Measure env steps/s of training on one core, in turns; return medians."""
     contestants = {name: ready(size, config) for name, config in CONFIGS.items()}
     seconds = {name: [] for name in contestants}
     for _ in range(REPEATS):
@@ -84,23 +84,23 @@ def rates(size: Size) -> dict[str, float]:
 
 
 def register(_: argparse.ArgumentParser) -> None:
-    """No words of its own."""
+    """Add nothing: the benchmark has no arguments of its own."""
 
 
 def run(_: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
     results = [result(name, size) for name, size in SIZES.items()]
     names = ("flat", "entity", "transformer")
-    counts = [[*(f"{of['multiply_adds'][n]:,}" for n in names), f"{of['with_updates']:,}"] for of in results]
-    speeds = [[f"{rate:,.0f}" for rate in of["env_steps_per_second"].values()] for of in results]
-    sizes = [of["size"] for of in results]
-    rows = lambda cells: [[size, *of] for size, of in zip(sizes, cells, strict=True)]
+    counts = [[*(f"{result['multiply_adds'][n]:,}" for n in names), f"{result['with_updates']:,}"] for result in results]
+    speeds = [[f"{rate:,.0f}" for rate in result["env_steps_per_second"].values()] for result in results]
+    sizes = [result["size"] for result in results]
+    rows = lambda cells: [[size, *result] for size, result in zip(sizes, cells, strict=True)]
     return Report(
         title="Networks",
         results=results,
         tables=[
             Table(("size", *names, "transformer with its updates"), rows(counts), "Multiply-adds of one env step"),
-            Table(("size", *CONFIGS), rows(speeds), "Env steps per second of a core, training"),
+            Table(("size", *CONFIGS), rows(speeds), "Env steps/s of a core, training"),
         ],
         notes=["The transformer is counted, not built."],
     )

@@ -20,8 +20,8 @@ from levelproof.pipeline.store.layout import split_path
 
 PLOT = "night.svg"
 COLOURS = {"driver": "#0072b2", "workers": "#d55e00", "ray": "#777777"}  # Okabe and Ito
-EVERY = 10.0  # s between samples
-MOST = 2000  # samples; of more, every other one is kept
+INTERVAL = 10.0  # s between samples
+MAX_SAMPLES = 2000  # samples; of more, every other one is kept
 
 
 def register(parser: argparse.ArgumentParser) -> None:
@@ -30,45 +30,45 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", default="s")
     parser.add_argument("--budget", default="64k")
     parser.add_argument("--out", type=Path, help="where the split stays (default: it does not)")
-    parser.add_argument("--every", type=float, default=EVERY, metavar="SECONDS", help="between samples of memory")
+    parser.add_argument("--every", type=float, default=INTERVAL, metavar="SECONDS", help="between samples of memory")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory() as folder:
-        out = str(given.out or folder)
-        split = split_path(out, given.budget, given.size)
-        words = [f"size={given.size}", f"levels={given.levels}", f"budget={given.budget}", f"out={out}"]
+        out = str(args.out or folder)
+        split = split_path(out, args.budget, args.size)
+        arguments = [f"size={args.size}", f"levels={args.levels}", f"budget={args.budget}", f"out={out}"]
         samples: list[dict[str, Any]] = []
         steps = {
-            "generate": _timed(["generate", *words, *given.settings], samples, given.every, split),
-            "seal": _timed(["seal", str(split)], samples, given.every, split),
-            "verify": _timed(["verify", str(split)], samples, given.every, split),
+            "generate": _timed(["generate", *arguments, *args.settings], samples, args.every, split),
+            "seal": _timed(["seal", str(split)], samples, args.every, split),
+            "verify": _timed(["verify", str(split)], samples, args.every, split),
         }
         workers = max(sample["worker_count"] for sample in samples)
-        found = measured(split, max(workers, 1), steps["generate"])
+        totals = measured(split, max(workers, 1), steps["generate"])
         status = json.loads(_levelproof("status", str(split), "--json"))
-    while len(samples) > MOST:
+    while len(samples) > MAX_SAMPLES:
         samples = samples[::2]
-    memory = {of: max(sample[of] for sample in samples) for of in COLOURS}
-    late = [sample for sample in samples if sample["step"] == "generate"]
-    half = late[len(late) // 2 :]
+    memory = {kind: max(sample[kind] for sample in samples) for kind in COLOURS}
+    generating = [sample for sample in samples if sample["step"] == "generate"]
+    half = generating[len(generating) // 2 :]
     table = {
         "levels": f"{status['done']:,}",
         "workers": str(workers),
         **{f"{step}, s": f"{seconds:,.0f}" for step, seconds in steps.items()},
-        "solved": f"{found['solved']:,}",
-        "core-seconds a solved level": f"{found['seconds_per_solved']:.3g}" if found["solved"] else "-",
-        "bytes, sealed": f"{found['bytes']:,}",
-        "files, sealed": f"{found['files']:,}",
+        "solved": f"{totals['solved']:,}",
+        "core-seconds a solved level": f"{totals['seconds_per_solved']:.3g}" if totals["solved"] else "-",
+        "bytes, sealed": f"{totals['bytes']:,}",
+        "files, sealed": f"{totals['files']:,}",
         "most fragments meanwhile": f"{max(sample['fragments'] for sample in samples):,}",
-        **{f"most memory of {of}, MB": f"{value / 2**20:,.0f}" for of, value in memory.items()},
+        **{f"most memory of {kind}, MB": f"{value / 2**20:,.0f}" for kind, value in memory.items()},
         "driver's memory, second half of generate, MB": " to ".join(
             f"{value / 2**20:,.0f}" for value in (half[0]["driver"], half[-1]["driver"])
         ),
     }
     return Report(
-        title=f"{given.levels} levels of size {given.size} at {given.budget}",
-        results=[{**steps, **found, "memory": memory, "samples": samples}],
+        title=f"{args.levels} levels of size {args.size} at {args.budget}",
+        results=[{**steps, **totals, "memory": memory, "samples": samples}],
         tables=[Table(("", ""), list(table.items()))],
         notes=[
             "`levelproof generate`, `seal` and `verify`, one after another. Memory is what processes have in RAM, each "
@@ -79,35 +79,35 @@ def run(given: argparse.Namespace) -> Report:
     )
 
 
-def _timed(words: Sequence[str], samples: list[dict[str, Any]], every: float, split: Path) -> float:
+def _timed(arguments: Sequence[str], samples: list[dict[str, Any]], every: float, split: Path) -> float:
     """Seconds that a command takes; meanwhile its processes are looked at again and again."""
-    oracle.tell(f"levelproof {' '.join(words)}")
-    begun = time.time()
-    command = [sys.executable, "-m", "levelproof", *words]
+    oracle.log(f"levelproof {' '.join(arguments)}")
+    start = time.time()
+    command = [sys.executable, "-m", "levelproof", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=dict(oracle.our_environment()))
     over = threading.Event()
 
-    def look() -> None:
+    def sample() -> None:
         while not over.is_set():
-            samples.append({"time": time.time(), "step": words[0], **memory_of(process.pid), **parts_of(split)})
+            samples.append({"time": time.time(), "step": arguments[0], **memory_of(process.pid), **parts_of(split)})
             over.wait(every)
 
-    looking = threading.Thread(target=look)
-    looking.start()
+    thread = threading.Thread(target=sample)
+    thread.start()
     try:
         code = process.wait()
     finally:
         process.terminate()
         over.set()
-        looking.join()
+        thread.join()
     if code:
-        raise Failure(f"`levelproof {' '.join(words)}` ended with exit code {code}: it has said why above.")
-    return time.time() - begun
+        raise Failure(f"`levelproof {' '.join(arguments)}` ended with exit code {code}: it has said why above.")
+    return time.time() - start
 
 
 def memory_of(driver: int) -> dict[str, int]:
     """Bytes in RAM of a command, of its workers and of all else below it; pages that are shared in parts."""
-    found = {"driver": _memory(driver), "workers": 0, "ray": 0, "worker_count": 0}
+    totals = {"driver": _memory(driver), "workers": 0, "ray": 0, "worker_count": 0}
     for pid in _below(driver):
         title = _read(pid, "cmdline").replace("\0", " ")
         is_worker = title.startswith("ray::WorkerActor")
@@ -160,8 +160,8 @@ def draw(samples: Sequence[Mapping[str, Any]], file: Path) -> None:
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout="constrained")
     minutes = [(sample["time"] - samples[0]["time"]) / 60 for sample in samples]
-    for of, colour in COLOURS.items():
-        left.plot(minutes, [sample[of] / 2**30 for sample in samples], color=colour, label=of)
+    for kind, colour in COLOURS.items():
+        left.plot(minutes, [sample[kind] / 2**30 for sample in samples], color=colour, label=kind)
     left.set(xlabel="minutes", ylabel="memory, GB", ylim=0)
     right.plot(minutes, [sample["fragments"] for sample in samples], color="#009e73", label="fragments")
     right.plot(minutes, [sample["shards"] for sample in samples], color="#777777", label="shards")

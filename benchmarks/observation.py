@@ -72,9 +72,9 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=REPEATS, help=f"of which the best counts (default: {REPEATS})")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
-    results = [measured(size, given.lanes, given.repeats) for size in given.size]
+    results = [measured(size, args.lanes, args.repeats) for size in args.size]
     rows = [[of["size"], *(f"{of[way]:,.0f}" for way in WAYS), *_shares(of)] for of in results]
     header = ("size", *WAYS, "observation slower by", "Lanes", "vmap")
     table = Table(header, rows, "Env steps/s of one core; Lanes and vmap also as a share of `with`")

@@ -51,7 +51,7 @@ def sampled_levels(python: Path, size: str, count: int = LEVELS, seed: int = SEE
     path = cache_folder() / "bench" / f"levels-{size}-{count}-{seed}.npz"
     with alone(cache_folder() / "bench.lock"):
         if not path.is_file():
-            tell(f"Sampling {count} levels of size {size} with the reference (once, one to three minutes) ...")
+            log(f"Sampling {count} levels of size {size} with the reference (once, one to three minutes) ...")
             path.parent.mkdir(parents=True, exist_ok=True)
             unfinished = path.with_name(f"unfinished-{path.name}")
             words = [unfinished, "--size", size, "--count", count, "--seed", seed]
@@ -98,13 +98,13 @@ def our_environment() -> Mapping[str, str]:
     return dict(os.environ) | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
 
 
-def tell(text: str) -> None:
+def log(text: str) -> None:
     """To the person who waits; standard output is for results."""
     print(text, file=sys.stderr, flush=True)
 
 
 def _make(folder: Path) -> None:
-    tell(f"Making the reference's environment in {folder} (once, about two minutes) ...")
+    log(f"Making the reference's environment in {folder} (once, about two minutes) ...")
     shutil.rmtree(folder, ignore_errors=True)
     _run([sys.executable, "-m", "venv", folder], "make an environment for the reference", environment())
     pip = [folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]

@@ -20,27 +20,27 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference-block", type=int, help="the same for the reference (default: all of a process)")
 
 
-def run(given: argparse.Namespace) -> Report:
-    race.check(given, ("repeats", "lanes", "steps", "block", "reference_block"))
-    python, their_block = oracle.oracle_python(), given.reference_block or given.lanes
-    settings = {"lanes": given.lanes, "steps": given.steps, "block": given.block}
+def run(args: argparse.Namespace) -> Report:
+    race.check(args, ("repeats", "lanes", "steps", "block", "reference_block"))
+    python, their_block = oracle.oracle_python(), args.reference_block or args.lanes
+    settings = {"lanes": args.lanes, "steps": args.steps, "block": args.block}
     settings |= {"reference_block": their_block, "stickiness": STICKINESS}
     with tempfile.TemporaryDirectory() as folder:
         actions = Path(folder) / "actions.npy"
-        np.save(actions, sticky_actions(given.steps, given.lanes))
+        np.save(actions, sticky_actions(args.steps, args.lanes))
 
         def entries(size: str) -> list[Entry]:
-            levels = given.level_file or oracle.sampled_levels(python, size)
+            levels = args.level_file or oracle.sampled_levels(python, size)
 
             def words(share: race.Share) -> list[object]:
                 return ["--levels", levels, "--actions", actions, "--first", share.first, "--lanes", share.count]
 
             return race.contestants(
                 "physics",
-                given.lanes,
-                given.lanes * given.steps,
-                lambda share: [*words(share), "--block", given.block],
+                args.lanes,
+                args.lanes * args.steps,
+                lambda share: [*words(share), "--block", args.block],
                 lambda share: [*words(share), "--block", their_block, "--size", size],
             )
 
-        return race.run("Physics, beside the reference", given, entries, settings)
+        return race.run("Physics, beside the reference", args, entries, settings)

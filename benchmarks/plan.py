@@ -28,11 +28,11 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("settings", nargs="*", default=words, help=f"of the job (default: {' '.join(words)})")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory() as out:
-        planned = json.loads(_levelproof("plan", *given.settings, "--json"))
+        planned = json.loads(_levelproof("plan", *args.settings, "--json"))
         begun = time.monotonic()
-        _levelproof("generate", *given.settings, f"out={out}")
+        _levelproof("generate", *args.settings, f"out={out}")
         wall = time.monotonic() - begun
         (split,) = (path.parent for path in Path(out).glob("*/*/manifest"))
         _levelproof("seal", str(split))
@@ -45,7 +45,7 @@ def run(given: argparse.Namespace) -> Report:
         results=results,
         tables=[Table(head, [row(of) for of in results])],
         notes=[
-            f"`levelproof plan {' '.join(given.settings)}` made {planned['sample']['levels']} of the levels in "
+            f"`levelproof plan {' '.join(args.settings)}` made {planned['sample']['levels']} of the levels in "
             f"{planned['sample']['wall']:.0f} s, compiling included, on {planned['sample']['workers']} workers; then "
             f"`levelproof generate` made all {planned['levels']:,} with {planned['workers']} workers, with the same "
             "compiled programs. *interval*: of nine cases in ten. *bytes* and *files* are those of the sealed split."
@@ -84,7 +84,7 @@ def row(of: Mapping[str, Any]) -> Sequence[str]:
 
 
 def _levelproof(*words: str) -> str:
-    oracle.tell(f"levelproof {' '.join(words)}")
+    oracle.log(f"levelproof {' '.join(words)}")
     command, environment = [sys.executable, "-m", "levelproof", *words], dict(oracle.our_environment())
     done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True, env=environment)
     if done.returncode:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from benchmarks.alone import label
-from benchmarks.oracle import tell
+from benchmarks.oracle import log
 from benchmarks.report import Report, Table
 from levelproof.configs.compose import compose_job
 from levelproof.experts.labels import BY_EXPERT, Label
@@ -44,9 +44,9 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first", type=int, default=FIRST, help=f"level id (default: {FIRST:,})")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     prepare_jax()
-    found = {size: lengths(size, given.first, given.levels or LEVELS[size]) for size in given.size}
+    found = {size: lengths(size, args.first, args.levels or LEVELS[size]) for size in args.size}
     budgets = [f"{budget:,}" for budget in POLISH]
     return Report(
         title="Polished witnesses",
@@ -68,7 +68,7 @@ def run(given: argparse.Namespace) -> Report:
             ),
         ],
         notes=[
-            f"Levels from id {given.first:,} on, experts of {BUDGET:,} env steps; counted are levels that the default "
+            f"Levels from id {args.first:,} on, experts of {BUDGET:,} env steps; counted are levels that the default "
             "procedure solves and on which `procedure=masters` has a witness of its expert's own. *Polished*: the "
             "default's witnesses after so many env steps of `search.polish` each, the shortest whatever its "
             "portability.",
@@ -89,7 +89,7 @@ def lengths(size: str, first: int, count: int) -> Lengths:
         for i, (one, other) in enumerate(zip(default.verdicts, masters.verdicts, strict=True))
         if one.label is Label.SOLVED and other.witness in BY_EXPERT
     ]
-    tell(f"{size}: {len(both)} of {count} levels count.")
+    log(f"{size}: {len(both)} of {count} levels count.")
     witnesses, at = [witness_of(default, i) for i in both], np.array(both, int)
     polished = [steps_of(polish(take(levels, at), ids[at], witnesses, env_steps)) for env_steps in POLISH]
     return Lengths(steps_of(witnesses), np.array(polished), steps_of([witness_of(masters, i) for i in both]))

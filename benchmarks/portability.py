@@ -79,7 +79,7 @@ def measured(python: Path, size: str, count: int, first: int) -> Played:
     pool = Pool(BUDGET, Procedure(), DEFAULT_RULES)
     ids = np.arange(first, first + count, dtype=np.int32)
     found = [of for start in range(0, count, UNIT) for of in solved(pool, ids[start : start + UNIT], size)]
-    oracle.tell(f"{size}: {len(found)} of {count} levels are solved.")
+    oracle.log(f"{size}: {len(found)} of {count} levels are solved.")
     levels = jax.tree.map(lambda *x: np.concatenate(x, -1), *(of.level for of in found))
     level_ids = np.array([of.level_id for of in found], np.int32)
     kinds = list(zip(*(of.witnesses for of in found), strict=True))
@@ -151,22 +151,22 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first", type=int, default=FIRST, help=f"level id (default: {FIRST:,})")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     prepare_jax()
     python = oracle.oracle_python()
-    counts = np.broadcast_to(given.levels, len(given.size)).tolist()
+    counts = np.broadcast_to(args.levels, len(args.size)).tolist()
     results = [
-        result(size, count, measured(python, size, count, given.first))
-        for size, count in zip(given.size, counts, strict=True)
+        result(size, count, measured(python, size, count, args.first))
+        for size, count in zip(args.size, counts, strict=True)
     ]
-    tried = " and ".join(f"{count:,} of {size}" for size, count in zip(given.size, counts, strict=True))
+    tried = " and ".join(f"{count:,} of {size}" for size, count in zip(args.size, counts, strict=True))
     head = ("size", "witnesses", "which", "reach the goal", "95% interval", "portability", "survive all", "of those")
     return Report(
         title="Witnesses in the reference",
         results=results,
         tables=[Table(head, [row for of in results for row in rows(of)])],
         notes=[
-            f"{tried}, from id {given.first:,} on, experts of {BUDGET:,} env steps, the default procedure. Solved "
+            f"{tried}, from id {args.first:,} on, experts of {BUDGET:,} env steps, the default procedure. Solved "
             "levels, exported as level files and played in the reference by its own loader and "
             "environment: how many witnesses end their first episode in the goal. *chosen*: the candidate that "
             "survives most replays from starts moved by a rounding error, or what a search around it finds; *first*: "

@@ -55,17 +55,17 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--level-file", type=Path, help="levels as the reference's arrays (default: it samples some)")
 
 
-def check(given: argparse.Namespace, counts: Sequence[str]) -> None:
+def check(args: argparse.Namespace, counts: Sequence[str]) -> None:
     """Refuse counts below one and a file that is not there.
 
     Raises:
         UserError: one is.
     """
     for name in counts:
-        if (value := getattr(given, name)) is not None and value < 1:
+        if (value := getattr(args, name)) is not None and value < 1:
             raise UserError(f"--{name.replace('_', '-')} is {value}: it has to be at least 1.")
-    if given.level_file is not None and not given.level_file.is_file():
-        raise UserError(f"There is no file {given.level_file}: give levels as .npz, or leave --level-file out.")
+    if args.level_file is not None and not args.level_file.is_file():
+        raise UserError(f"There is no file {args.level_file}: give levels as .npz, or leave --level-file out.")
 
 
 def shares(count: int, cores: Sequence[int]) -> list[Share]:
@@ -102,10 +102,10 @@ def contestants(
 
 
 def run(
-    title: str, given: argparse.Namespace, entries: Callable[[str], list[Entry]], settings: Mapping[str, Any]
+    title: str, args: argparse.Namespace, entries: Callable[[str], list[Entry]], settings: Mapping[str, Any]
 ) -> Report:
     """A race for each size, one after another."""
-    results = [summary(size, settings, compete(entries(size), given.repeats)) for size in given.size]
+    results = [summary(size, settings, compete(entries(size), args.repeats)) for size in args.size]
     wild = ", ".join(result.size for result in results if not result.finite)
     return Report(
         title=title,

@@ -37,9 +37,9 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement (default: 4)")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     python = oracle.oracle_python()
-    results = [measured(python, size, given.seconds) for size in given.size]
+    results = [measured(python, size, args.seconds) for size in args.size]
     return Report(
         title="Reading trajectories",
         results=results,
@@ -83,7 +83,7 @@ def made(size: str) -> dict[str, Path]:
     source = home / "generated" / BUDGET / size
     with oracle.alone(cache_folder() / "bench.lock"):
         if not source.is_dir():
-            oracle.tell(f"Labelling {LEVELS[size]} levels of size {size} to read (once, one to five minutes) ...")
+            oracle.log(f"Labelling {LEVELS[size]} levels of size {size} to read (once, one to five minutes) ...")
             _levelproof(
                 "generate", f"size={size}", f"levels={LEVELS[size]}", f"budget={BUDGET}", f"out={source.parents[1]}"
             )

@@ -23,11 +23,11 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tests", action="store_true", help="the second command, too")
 
 
-def run(given: argparse.Namespace) -> Report:
-    commands = [INSTALL, GENERATE, GENERATE, *((INSTALL_DEV, TEST) if given.tests else ())]
+def run(args: argparse.Namespace) -> Report:
+    commands = [INSTALL, GENERATE, GENERATE, *((INSTALL_DEV, TEST) if args.tests else ())]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        environment = _fresh(folder, given.python)
+        environment = _fresh(folder, args.python)
         results = [_timed(command, folder / "clone", environment) for command in commands]
     return Report(
         title="The README's commands",

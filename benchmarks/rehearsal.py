@@ -221,15 +221,15 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=10_000, metavar="N", help="cores; GPUs are a tenth of them")
 
 
-def run(given: argparse.Namespace) -> Report:
-    found, levels = _measured(given), parse_count(given.levels, "levels")
-    seconds = found * (given.mean / found.mean()) if given.mean else found
-    scaled = ", scaled to that average" if given.mean else ""
-    gpus = max(1, given.workers // 10)
+def run(args: argparse.Namespace) -> Report:
+    found, levels = _measured(args), parse_count(args.levels, "levels")
+    seconds = found * (args.mean / found.mean()) if args.mean else found
+    scaled = ", scaled to that average" if args.mean else ""
+    gpus = max(1, args.workers // 10)
     scenes = [
-        Scene(f"{given.workers:,} cores", levels, given.workers, 64),
-        Scene(f"{given.workers:,} cores, levels 16 times as long", levels, given.workers, 64, stretch=16.0),
-        Scene("the same, machines that live an hour", levels, given.workers, 64, stretch=16.0, lifetime=3600.0),
+        Scene(f"{args.workers:,} cores", levels, args.workers, 64),
+        Scene(f"{args.workers:,} cores, levels 16 times as long", levels, args.workers, 64, stretch=16.0),
+        Scene("the same, machines that live an hour", levels, args.workers, 64, stretch=16.0, lifetime=3600.0),
         Scene(f"{gpus:,} GPUs of 20 cores each", levels, gpus, 8, speed=20.0, stretch=16.0),
     ]
     results = [rehearsed(scene, seconds) for scene in scenes]
@@ -270,12 +270,12 @@ def run(given: argparse.Namespace) -> Report:
     )
 
 
-def _measured(given: argparse.Namespace) -> Float[np.ndarray, " level"]:
-    if not given.split:
-        return measure(compose_job([*given.settings, "levels=4k"]), Console(stderr=True)).busy
-    _, busy, _ = costs_of(given.split)
+def _measured(args: argparse.Namespace) -> Float[np.ndarray, " level"]:
+    if not args.split:
+        return measure(compose_job([*args.settings, "levels=4k"]), Console(stderr=True)).busy
+    _, busy, _ = costs_of(args.split)
     if not np.isfinite(busy).all():
-        raise UserError(f"Rows of {given.split} do not tell seconds: give a split that this version made.")
+        raise UserError(f"Rows of {args.split} do not tell seconds: give a split that this version made.")
     return busy
 
 

@@ -19,11 +19,11 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--levels", type=int, default=LEVELS, help=f"of a timed call (default: {LEVELS:,})")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     python = oracle.oracle_python()
     results = []
-    for size in given.size:
-        words = ["--size", size, "--levels", given.levels]
+    for size in args.size:
+        words = ["--size", size, "--levels", args.levels]
         ours = json.loads(oracle.run_ours("sampler", words))
         theirs = json.loads(oracle.run_script(python, "sampler", words, "sample levels with the reference"))
         results.append(result(size, ours, theirs))
@@ -32,7 +32,7 @@ def run(given: argparse.Namespace) -> Report:
         title="Samplers",
         results=results,
         tables=[Table(head, [row(of) for of in results])],
-        notes=[f"{given.levels:,} levels of ours in blocks of 256; the reference in batches of 512, two of m and l."],
+        notes=[f"{args.levels:,} levels of ours in blocks of 256; the reference in batches of 512, two of m and l."],
         reference=oracle.versions(python),
     )
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Int
 from scipy.stats import chi2
 
-from benchmarks.oracle import tell
+from benchmarks.oracle import log
 from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
 from levelproof.configs.numbers import parse_count
@@ -49,18 +49,18 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env-steps", nargs="+", default=["100M"], help="of a search, of each size (default: 100M)")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
-    wanted = np.broadcast_to([parse_count(x, "--env-steps") for x in given.env_steps], len(given.size)).tolist()
-    most = dict(zip(given.size, wanted, strict=True))
+    wanted = np.broadcast_to([parse_count(x, "--env-steps") for x in args.env_steps], len(args.size)).tolist()
+    most = dict(zip(args.size, wanted, strict=True))
     kept = cache_folder() / "search"
-    found = {size: searched(size, given.first, given.levels or LEVELS[size], n, kept) for size, n in most.items()}
+    found = {size: searched(size, args.first, args.levels or LEVELS[size], n, kept) for size, n in most.items()}
     return Report(
         title="How much a longer search would find",
         results=[result(size, of, most[size]) for size, of in found.items()],
         tables=[curve(found, most), more(found, most)],
         notes=[
-            f"Levels from id {given.first:,} on that are neither trivial nor proved unsolvable; the default search "
+            f"Levels from id {args.first:,} on that are neither trivial nor proved unsolvable; the default search "
             "without an early end, no experts; every success is replayed. *In the next, at most*: the 95% upper bound "
             "of what another doubling of the steps would find, if finds are rare and independent (Poisson) and it "
             "finds no more than the last one did.",
@@ -94,7 +94,7 @@ def searched(size: str, first: int, count: int, env_steps: int, kept: Path) -> I
             for i, row in zip(at, advanced(take(levels, at), ids[at], [rows[i] for i in at], most), strict=True):
                 rows[i] = row
                 write(folder, int(ids[i]), row)
-        tell(f"{size}: {sum(int(row.length[0]) == 0 for row in rows if row)} levels unsolved within {most:,}.")
+        log(f"{size}: {sum(int(row.length[0]) == 0 for row in rows if row)} levels unsolved within {most:,}.")
     return steps_to_success(levels, [row for row in rows if row], env_steps)
 
 

@@ -49,8 +49,8 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("split", type=Path, nargs="*", help=f"splits (default: made, experts alone, {BUDGET} each)")
 
 
-def run(given: argparse.Namespace) -> Report:
-    with _splits(given.split) as splits:  # on all cores
+def run(args: argparse.Namespace) -> Report:
+    with _splits(args.split) as splits:  # on all cores
         prepare_jax(own_cores()[0])
         results = [result for split in splits for result in measured(split)]
     head = (
@@ -86,7 +86,7 @@ def _splits(given: Sequence[Path]) -> Iterator[Sequence[Path]]:
     with tempfile.TemporaryDirectory() as out:
         for size, levels in LEVELS.items():
             words = ("generate", f"size={size}", f"levels={levels}", f"budget={BUDGET}", f"out={out}", *ALONE)
-            oracle.tell(f"levelproof {' '.join(words)}")
+            oracle.log(f"levelproof {' '.join(words)}")
             command = [sys.executable, "-m", "levelproof", *words]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=dict(oracle.our_environment()))
         yield [Path(out) / BUDGET / size for size in SIZES]
@@ -102,7 +102,7 @@ def measured(split: Path) -> Iterator[dict[str, Any]]:
     encoding = open_shard(split, rows["shard"][0].as_py(), size).encoding
     arrays, full = read_rows(split, rows), None
     for density in get_args(Density):
-        oracle.tell(f"{size}: {density}, {len(ids)} trajectories")
+        oracle.log(f"{size}: {density}, {len(ids)} trajectories")
         with tempfile.TemporaryDirectory() as folder:
             found = _stored(Path(folder), ids, arrays, replace(encoding, density=density))
         full = full or found["bytes_per_transition"]

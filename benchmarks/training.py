@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.endless import endless_queue, go_on
+from benchmarks.endless import endless_queue, update_slots
 from benchmarks.report import Report, Table
 from levelproof.experts.config import ExpertConfig
 from levelproof.experts.policy import network_of
@@ -36,12 +36,12 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
     config, parts = ExpertConfig(), ("rollout", "update", "both")
     experts = slot_count(config)
     results = []
-    for size in given.size:
+    for size in args.size:
         levels = jax.device_get(sample_levels(jnp.arange(experts), SIZES[size]))
         rates = [experts * config.steps_per_update / seconds(call) for call in calls(levels, config)]
         results.append({"size": size, "unit": "env steps/s of one core", **dict(zip(parts, rates, strict=True))})
@@ -54,7 +54,7 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
     """A rollout, an update, and both: functions without arguments, one after another."""
     count = levels.role.shape[-1]
     queue = endless_queue(levels, config)
-    slots, _ = go_on(empty_slots(count, queue, config), queue, config)
+    slots, _ = update_slots(empty_slots(count, queue, config), queue, config)
     experts, levels = slots.slot.training.train_state, jax.tree.map(jnp.asarray, levels)
     experts = jax.tree.map(jnp.copy, experts)  # `advance` uses its slots up
     lanes, network = config.environments * count, network_of(levels.size, config)
@@ -81,7 +81,7 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
 
     def both() -> Any:
         nonlocal slots
-        slots, report = go_on(slots, queue, config)
+        slots, report = update_slots(slots, queue, config)
         return report
 
     yield both

@@ -57,16 +57,16 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=2, help="pairs of runs; default: 2, 0: the scheduler alone")
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     simulated = [simulate(units) for units in UNITS]
-    words = [f"size={given.size}", f"budget={given.budget}", f"levels={given.levels}", "first_level=1000000"]
-    pairs = [tuple(given.levels / seconds_of(words, workers) for workers in (1, 2)) for _ in range(given.repeats)]
+    words = [f"size={args.size}", f"budget={args.budget}", f"levels={args.levels}", "first_level=1000000"]
+    pairs = [tuple(args.levels / seconds_of(words, workers) for workers in (1, 2)) for _ in range(args.repeats)]
     ratios = [two / one for one, two in pairs]
-    shared = [tuple(beside(words, processes) for processes in (1, 2)) for _ in range(2 * given.repeats)]
+    shared = [tuple(beside(words, processes) for processes in (1, 2)) for _ in range(2 * args.repeats)]
     most = [2 * one / two for one, two in shared]
     results = [{"workers": WORKERS, **of} for of in simulated]
-    results += [{"size": given.size, "budget": given.budget, "one": one, "two": two} for one, two in pairs]
-    results += [{"size": given.size, "budget": given.budget, "alone": one, "beside": two} for one, two in shared]
+    results += [{"size": args.size, "budget": args.budget, "one": one, "two": two} for one, two in pairs]
+    results += [{"size": args.size, "budget": args.budget, "alone": one, "beside": two} for one, two in shared]
     rows = [[f"{one:.2f}", f"{two:.2f}", f"{two / one:.2f}"] for one, two in pairs]
     apart = [[f"{one:.1f}", f"{two:.1f}", f"{of:.2f}"] for (one, two), of in zip(shared, most, strict=True)]
     of_driver = [
@@ -82,8 +82,8 @@ def run(given: argparse.Namespace) -> Report:
         title="One worker, two workers, a thousand",
         results=results,
         tables=[
-            Table(("levels/s, one worker", "two workers", "ratio"), rows, f"A job of {given.levels} levels of size "
-                  f"{given.size}, {given.budget} env steps each, on two cores"),
+            Table(("levels/s, one worker", "two workers", "ratio"), rows, f"A job of {args.levels} levels of size "
+                  f"{args.size}, {args.budget} env steps each, on two cores"),
             Table(("s, one process", "each of two at once", "two for one"), apart, f"{BESIDE} units of the job in "
                   "processes that share nothing but the machine"),
             Table(

@@ -18,12 +18,12 @@ def main() -> None:
     parser.add_argument("--horizon", type=int, required=True)
     parser.add_argument("--updates", type=int, required=True)
     parser.add_argument("--core", type=int)
-    given = parser.parse_args()
-    prepare_jax(given.core)
+    args = parser.parse_args()
+    prepare_jax(args.core)
 
     import jax
 
-    from benchmarks.endless import endless_queue, go_on
+    from benchmarks.endless import endless_queue, update_slots
     from benchmarks.levels import load_levels
     from benchmarks.solved.variants import REFERENCE
     from levelproof.experts.pool.pool import slot_count
@@ -33,11 +33,11 @@ def main() -> None:
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
     no_evaluation = {"attempts": 1, "sticky_attempts": 0, "moved_attempts": 0}
-    config = replace(REFERENCE.expert, environments=given.environments, horizon=given.horizon, **no_evaluation)
+    config = replace(REFERENCE.expert, environments=args.environments, horizon=args.horizon, **no_evaluation)
     rules = TaskParams(dense_reward_scale=config.dense_reward_scale)
-    levels = load_levels(given.levels, given.first, given.count)
-    slots = min(slot_count(config), given.count)
-    batches = [np.minimum(np.arange(i, i + slots), given.count - 1) for i in range(0, given.count, slots)]
+    levels = load_levels(args.levels, args.first, args.count)
+    slots = min(slot_count(config), args.count)
+    batches = [np.minimum(np.arange(i, i + slots), args.count - 1) for i in range(0, args.count, slots)]
 
     def train(updates: int, batches: list[np.ndarray]) -> list[tuple[Training, float]]:
         """Fresh experts, a batch of them after another: what they have become, and their goals."""
@@ -52,7 +52,7 @@ def main() -> None:
     def train_batch(queue: LevelQueue, updates: int) -> tuple[Training, float]:
         now, goals, ended = empty_slots(slots, queue, config), 0.0, np.zeros(slots)
         for _ in range(updates):
-            now, seen = go_on(now, queue, config, rules)
+            now, seen = update_slots(now, queue, config, rules)
             before, ended = ended, np.asarray(now.slot.training.progress.episodes)
             goals += float((np.nan_to_num(np.asarray(seen.share)) * (ended - before)).sum())
         return now.slot.training, goals
@@ -61,7 +61,7 @@ def main() -> None:
     warm, _ = timed(lambda: train(1, batches[:1]))
 
     def run() -> dict:
-        seconds, out = timed(lambda: train(given.updates, batches))
+        seconds, out = timed(lambda: train(args.updates, batches))
         finite = all(
             np.isfinite(np.asarray(x)).all() for training, _ in out for x in jax.tree.leaves(training.train_state)
         )

@@ -16,8 +16,8 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, required=True, help="lanes of this process")
     parser.add_argument("--block", type=int, required=True, help="lanes stepped together")
     parser.add_argument("--core", type=int)
-    given = parser.parse_args()
-    prepare_jax(given.core)
+    args = parser.parse_args()
+    prepare_jax(args.core)
 
     import jax
 
@@ -34,11 +34,11 @@ def main() -> None:
         now, totals = jax.lax.scan(act, now, actions)
         return now, jax.tree.map(lambda x: x.sum(), totals)
 
-    levels = load_levels(given.levels, given.first, given.lanes)
-    actions = np.load(given.actions)[:, :, given.first : given.first + given.lanes]
-    size = min(given.block, given.lanes)
+    levels = load_levels(args.levels, args.first, args.lanes)
+    actions = np.load(args.actions)[:, :, args.first : args.first + args.lanes]
+    size = min(args.block, args.lanes)
     # the last block is filled up with its last lane, so that one program serves all
-    cut = [np.minimum(np.arange(i, i + size), given.lanes - 1) for i in range(0, given.lanes, size)]
+    cut = [np.minimum(np.arange(i, i + size), args.lanes - 1) for i in range(0, args.lanes, size)]
     blocks = [jax.tree.map(lambda x, at=at: jax.numpy.asarray(x[..., at]), (levels, actions)) for at in cut]
     worlds = [task.reset(level) for level, _ in blocks]
     first_level, first_actions = blocks[0]

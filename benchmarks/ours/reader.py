@@ -16,17 +16,17 @@ def main() -> None:
     parser.add_argument("split")
     parser.add_argument("--batch", type=int, required=True)
     parser.add_argument("--seconds", type=float, required=True)
-    given = parser.parse_args()
+    args = parser.parse_args()
     start = time.perf_counter()
-    data = levelproof.open(given.split)
-    batches = data.batches(given.batch, seed=0, fields=["record", "level"], observation=None, epochs=None)
+    data = levelproof.open(args.split)
+    batches = data.batches(args.batch, seed=0, fields=["record", "level"], observation=None, epochs=None)
     following = lambda: next(batches)
     following()
     first = time.perf_counter() - start
     for _ in range(WARM):
         following()
     arrays = lambda batch: [x for x in jax.tree.leaves(batch) if isinstance(x, np.ndarray)]
-    print(json.dumps({"first": first} | rates(following, arrays, given.batch, given.seconds)))
+    print(json.dumps({"first": first} | rates(following, arrays, args.batch, args.seconds)))
 
 
 if __name__ == "__main__":

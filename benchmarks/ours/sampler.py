@@ -17,11 +17,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--size", required=True)
     parser.add_argument("--levels", type=int, required=True)
-    given = parser.parse_args()
-    sample = lambda count: jax.block_until_ready(sample_levels(np.arange(count), SIZES[given.size]))
+    args = parser.parse_args()
+    sample = lambda count: jax.block_until_ready(sample_levels(np.arange(count), SIZES[args.size]))
     first, _ = timed(lambda: sample(FIRST))
-    seconds, _ = timed(lambda: sample(given.levels))
-    print(json.dumps({"first": first, "rate": given.levels / seconds}))
+    seconds, _ = timed(lambda: sample(args.levels))
+    print(json.dumps({"first": first, "rate": args.levels / seconds}))
 
 
 if __name__ == "__main__":

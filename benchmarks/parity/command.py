@@ -40,10 +40,10 @@ def size(text: str) -> str:
     return text
 
 
-def run(given: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> Report:
     """Both engines in turns, this one in this process."""
-    race.check(given, ("states", "episodes"))
-    if given.level_file is not None and len(given.size) > 1:
+    race.check(args, ("states", "episodes"))
+    if args.level_file is not None and len(args.size) > 1:
         raise UserError("--level-file has levels of one size: give that one as --size.")
     prepare_jax()
     from benchmarks.parity.campaign import campaign  # compiles functions as it is imported
@@ -52,7 +52,7 @@ def run(given: argparse.Namespace) -> Report:
     python = oracle.oracle_python()
     board = Board(Console(stderr=True))
     with board.shown():
-        of = (given.states, given.episodes, board, given.level_file, given.keep)
-        sizes = [campaign(python, size, *of) for size in given.size]
-    settings = {"states": given.states, "episodes": given.episodes, "stickiness": STICKINESS}
+        of = (args.states, args.episodes, board, args.level_file, args.keep)
+        sizes = [campaign(python, size, *of) for size in args.size]
+    settings = {"states": args.states, "episodes": args.episodes, "stickiness": STICKINESS}
     return report_of(sizes, settings, oracle.versions(python))

@@ -153,12 +153,12 @@ class Reference:
 
     def _answer(self, request: dict[str, Any], fields: dict[str, np.ndarray], out: Path) -> dict:
         if not self.awake:
-            self.process.wake()
+            self.process.start()
             self.process.answer()
             self.awake = True
         worlds = self.folder / "in.npz"
         np.savez(worlds, **fields)  # pyright: ignore[reportArgumentType]
-        self.process.go(json.dumps(request | {"worlds": str(worlds), "out": str(out)}))
+        self.process.send(json.dumps(request | {"worlds": str(worlds), "out": str(out)}))
         return self.process.answer()
 
     @staticmethod

@@ -37,18 +37,18 @@ def main() -> None:
     parser.add_argument("folder")
     parser.add_argument("--batch", type=int, required=True)
     parser.add_argument("--seconds", type=float, required=True)
-    given = parser.parse_args()
+    args = parser.parse_args()
 
     import jax
     from kinetix.data import TrajectoryDatasetManager
 
     start = time.perf_counter()
-    manager = TrajectoryDatasetManager(given.folder, given.batch, seed=0)
+    manager = TrajectoryDatasetManager(args.folder, args.batch, seed=0)
     manager.load_next_batch()
     first = time.perf_counter() - start
     for _ in range(WARM):
         manager.load_next_batch()
-    print(json.dumps({"first": first} | rates(manager.load_next_batch, jax.tree.leaves, given.batch, given.seconds)))
+    print(json.dumps({"first": first} | rates(manager.load_next_batch, jax.tree.leaves, args.batch, args.seconds)))
 
 
 if __name__ == "__main__":

@@ -21,15 +21,15 @@ def main() -> None:
     parser.add_argument("--horizon", type=int, required=True)
     parser.add_argument("--updates", type=int, required=True)
     parser.add_argument("--core", type=int)
-    given = parser.parse_args()
-    stay_on(given.core)
+    args = parser.parse_args()
+    stay_on(args.core)
 
     import jax
     from ppo import Trainer
 
-    levels = load_levels(given.levels, given.size, given.first, given.count)
-    trainer = Trainer.of(given.size, given.environments, given.horizon)
-    keys = jax.random.split(jax.random.PRNGKey(given.first), given.count)
+    levels = load_levels(args.levels, args.size, args.first, args.count)
+    trainer = Trainer.of(args.size, args.environments, args.horizon)
+    keys = jax.random.split(jax.random.PRNGKey(args.first), args.count)
 
     def compile_both():
         first = jax.jit(jax.vmap(trainer.start)).lower(keys, levels).compile()
@@ -40,7 +40,7 @@ def main() -> None:
 
     def train():
         learner, ends = first(keys, levels), []
-        for _ in range(given.updates):
+        for _ in range(args.updates):
             learner, seen = compiled(learner, levels)
             ends.append(seen)
         return jax.block_until_ready((learner, ends))

@@ -27,16 +27,16 @@ def main() -> None:
     parser.add_argument("--size", required=True)
     parser.add_argument("--cache", required=True, help="folder for compiled code")
     parser.add_argument("--core", type=int)
-    given = parser.parse_args()
-    stay_on(given.core)
+    args = parser.parse_args()
+    stay_on(args.core)
 
     import jax
     from kinetix.environment import EnvParams
     from kinetix.environment.env import make_kinetix_env
     from kinetix.environment.spaces import ActionType, ObservationType
 
-    jax.config.update("jax_compilation_cache_dir", given.cache)
-    params, static = EnvParams(dense_reward_scale=0.0), static_of(given.size)
+    jax.config.update("jax_compilation_cache_dir", args.cache)
+    params, static = EnvParams(dense_reward_scale=0.0), static_of(args.size)
     env = make_kinetix_env(ActionType.MULTI_DISCRETE, ObservationType.SYMBOLIC_FLAT, None, params, static)
 
     def act_one(state, level, action):
@@ -51,7 +51,7 @@ def main() -> None:
     def worlds(request):
         with np.load(request["worlds"]) as file:
             actions, lanes = file["actions"], len(file["gravity"])
-        return load_levels(request["worlds"], given.size, 0, lanes), np.moveaxis(actions, -2, -1)
+        return load_levels(request["worlds"], args.size, 0, lanes), np.moveaxis(actions, -2, -1)
 
     def play(request):
         """Writes `reward`, `done` (step, lane), and if asked to `record` what evolves before each action."""
@@ -73,7 +73,7 @@ def main() -> None:
         np.savez(request["out"], control=np.asarray(control), **part(after, EVOLVING + GEOMETRY))  # pyright: ignore[reportArgumentType]
         return {}
 
-    does = {"handmade": lambda request: handmade(given.size, request["out"]), "play": play, "step": one_step}
+    does = {"handmade": lambda request: handmade(args.size, request["out"]), "play": play, "step": one_step}
     answer({}, lambda request: does[request["do"]](request))
 
 

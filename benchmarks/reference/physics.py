@@ -21,8 +21,8 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, required=True, help="lanes of this process")
     parser.add_argument("--block", type=int, required=True, help="lanes stepped together")
     parser.add_argument("--core", type=int)
-    given = parser.parse_args()
-    stay_on(given.core)
+    args = parser.parse_args()
+    stay_on(args.core)
 
     import jax
     import jax.numpy as jnp
@@ -30,13 +30,13 @@ def main() -> None:
     from kinetix.environment.env import make_kinetix_env
     from kinetix.environment.spaces import ActionType, ObservationType
 
-    params, static = EnvParams(), static_env_params_from_size(given.size)
+    params, static = EnvParams(), static_env_params_from_size(args.size)
     env = make_kinetix_env(ActionType.MULTI_DISCRETE, ObservationType.SYMBOLIC_FLAT, None, params, static)
-    block = min(given.block, given.lanes)
-    cut = [np.minimum(np.arange(i, i + block), given.lanes - 1) for i in range(0, given.lanes, block)]
-    worlds = load_levels(given.levels, given.size, given.first, given.lanes)
+    block = min(args.block, args.lanes)
+    cut = [np.minimum(np.arange(i, i + block), args.lanes - 1) for i in range(0, args.lanes, block)]
+    worlds = load_levels(args.levels, args.size, args.first, args.lanes)
     levels = [jax.tree.map(lambda x, at=at: x[at], worlds) for at in cut]
-    given_actions = np.moveaxis(np.load(given.actions), 1, 2)[:, given.first : given.first + given.lanes]
+    given_actions = np.moveaxis(np.load(args.actions), 1, 2)[:, args.first : args.first + args.lanes]
     actions = [jnp.asarray(given_actions[:, at]) for at in cut]
     keys = jax.random.split(jax.random.PRNGKey(0), block)
     step = jax.vmap(env.step, in_axes=(0, 0, 0, None, 0))

@@ -25,15 +25,15 @@ def main():
     parser.add_argument("--size", required=True)
     parser.add_argument("--rows", type=int, required=True)
     parser.add_argument("--steps", type=int, nargs="+", required=True)
-    given = parser.parse_args()
-    batch = TrajectoryDatasetManager(given.folder, batch_size=given.rows).load_next_batch()
-    render = jax.jit(make_render_pixels(EnvParams(), static_env_params_from_size(given.size)))
-    shown = jax.tree.map(lambda x: jnp.asarray(x[:, np.array(given.steps)]), batch.env_state)
+    args = parser.parse_args()
+    batch = TrajectoryDatasetManager(args.folder, batch_size=args.rows).load_next_batch()
+    render = jax.jit(make_render_pixels(EnvParams(), static_env_params_from_size(args.size)))
+    shown = jax.tree.map(lambda x: jnp.asarray(x[:, np.array(args.steps)]), batch.env_state)
     at = lambda i, t: jax.tree.map(lambda x: x[i, t], shown)
-    frames = np.array([[render(at(i, t)) for t in range(len(given.steps))] for i in range(given.rows)])
+    frames = np.array([[render(at(i, t)) for t in range(len(args.steps))] for i in range(args.rows)])
     fields = {f"env_state/{name}": values for name, values in flatten(batch.env_state).items()}
     others = {"action": batch.action, "action_mask": batch.action_mask, "done": batch.done, "mask": batch.mask}
-    np.savez(given.out, **{"frame": frames, **others, **fields})  # pyright: ignore[reportArgumentType]
+    np.savez(args.out, **{"frame": frames, **others, **fields})  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":

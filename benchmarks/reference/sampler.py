@@ -14,13 +14,13 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--size", required=True)
     parser.add_argument("--levels", type=int, required=True)
-    given = parser.parse_args()
+    args = parser.parse_args()
 
     import jax
 
-    sample, keys = sampler(given.size), keys_of(0, given.levels)
+    sample, keys = sampler(args.size), keys_of(0, args.levels)
     first, _ = timed(lambda: jax.block_until_ready(sample(keys[0])))
-    keys = keys if given.size == "s" else keys[:FEW]
+    keys = keys if args.size == "s" else keys[:FEW]
     seconds, _ = timed(lambda: [jax.block_until_ready(sample(some)) for some in keys])
     print(json.dumps({"first": first, "rate": len(keys) * BATCH / seconds}))
 

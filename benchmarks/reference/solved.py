@@ -26,27 +26,27 @@ def main() -> None:
     parser.add_argument("--steps", type=int, required=True, help="env steps of an attempt")
     parser.add_argument("--cache", required=True, help="folder for compiled code")
     parser.add_argument("--core", type=int)
-    given = parser.parse_args()
-    stay_on(given.core)
+    args = parser.parse_args()
+    stay_on(args.core)
 
     import jax
 
-    jax.config.update("jax_compilation_cache_dir", given.cache)
-    answer({}, Batch(given).answer)
+    jax.config.update("jax_compilation_cache_dir", args.cache)
+    answer({}, Batch(args).answer)
 
 
 class Batch:
     """Levels and their experts, side by side."""
 
-    def __init__(self, given: argparse.Namespace) -> None:
+    def __init__(self, args: argparse.Namespace) -> None:
         import jax
         from ppo import Trainer
 
         def evaluate(learner, level, key):
-            return trainer.evaluate(learner, level, key, given.attempts, given.steps)
+            return trainer.evaluate(learner, level, key, args.attempts, args.steps)
 
-        trainer = Trainer.of(given.size, given.environments, given.horizon)
-        self.given, self.compiled = given, False
+        trainer = Trainer.of(args.size, args.environments, args.horizon)
+        self.args, self.compiled = args, False
         self.start_all, self.update_all, self.evaluate_all = (
             jax.jit(jax.vmap(program)) for program in (trainer.start, trainer.update, evaluate)
         )
@@ -74,8 +74,8 @@ class Batch:
         with np.load(path) as file:
             ids = file["level_id"]
         self.count = len(ids)
-        self.levels = load_levels(path, self.given.size, 0, self.given.width)
-        seeds = np.resize(ids, self.given.width).astype(np.uint32)
+        self.levels = load_levels(path, self.args.size, 0, self.args.width)
+        seeds = np.resize(ids, self.args.width).astype(np.uint32)
         keys = jax.vmap(lambda seed: jax.random.split(jax.random.PRNGKey(seed)))(seeds)
         self.of_evaluation = keys[:, 1]
         self.learner, self.seen = self.start_all(keys[:, 0], self.levels), []

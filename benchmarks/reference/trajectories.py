@@ -61,17 +61,17 @@ def main():
     parser.add_argument("--size", required=True)
     for name in ("levels", "solved", "others"):
         parser.add_argument(f"--{name}", type=int, required=True)
-    given = parser.parse_args()
-    levels = load_levels(given.levels_file, given.size, 0, given.levels)
-    actions = np.moveaxis(sticky_actions(STEPS, given.levels), 1, 2)  # (time, level, 6)
-    states, done, goal = play(given.size, levels, jnp.asarray(actions))
+    args = parser.parse_args()
+    levels = load_levels(args.levels_file, args.size, 0, args.levels)
+    actions = np.moveaxis(sticky_actions(STEPS, args.levels), 1, 2)  # (time, level, 6)
+    states, done, goal = play(args.size, levels, jnp.asarray(actions))
     good = done.any(1) & (goal | ~done).all(1)
-    kept = np.concatenate([np.flatnonzero(good)[: given.solved], np.flatnonzero(~good)[: given.others]])
-    assert len(kept) == given.solved + given.others, f"{good.sum()} levels of {given.levels} are solved"
+    kept = np.concatenate([np.flatnonzero(good)[: args.solved], np.flatnonzero(~good)[: args.others]])
+    assert len(kept) == args.solved + args.others, f"{good.sum()} levels of {args.levels} are solved"
     made = trajectories(
-        given.size, jax.tree.map(lambda x: x[kept], states), np.moveaxis(actions, 1, 0)[kept], done[kept]
+        args.size, jax.tree.map(lambda x: x[kept], states), np.moveaxis(actions, 1, 0)[kept], done[kept]
     )
-    group, half = zarr.open_group(given.out, mode="w"), len(kept) // 2
+    group, half = zarr.open_group(args.out, mode="w"), len(kept) // 2
     write: Any = group.array  # of zarr 2, which the reference has
     write("first", made[:half], chunks=(4, STEPS))
     write("second", made[half:], chunks=(2, 100), compressor=Blosc("zstd", 9, shuffle=0))

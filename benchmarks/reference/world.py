@@ -104,9 +104,9 @@ def main() -> None:
     parser.add_argument("--size", required=True)
     parser.add_argument("--count", type=int, required=True)
     parser.add_argument("--seed", type=int, required=True)
-    given = parser.parse_args()
-    fields = sample_levels(given.size, given.count, given.seed)
-    np.savez_compressed(given.out, **fields)  # pyright: ignore[reportArgumentType]
+    args = parser.parse_args()
+    fields = sample_levels(args.size, args.count, args.seed)
+    np.savez_compressed(args.out, **fields)  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":

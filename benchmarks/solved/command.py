@@ -37,43 +37,43 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--results", type=Path, default=FILE, help="file (default: benchmarks/results/solved.parquet)")
 
 
-def run(given: argparse.Namespace) -> Report:
-    trained = train(given) if given.variant else None
-    results = read(given.results)
+def run(args: argparse.Namespace) -> Report:
+    trained = train(given) if args.variant else None
+    results = read(args.results)
     named = {each.header.name: each for each in results}
-    if missing := [name for name in given.groups if name not in named]:
-        raise UserError(f"There are no results of {', '.join(missing)} in {given.results}: train them, with --variant.")
-    if given.groups:
-        results = [named[name] for name in given.groups]
+    if missing := [name for name in args.groups if name not in named]:
+        raise UserError(f"There are no results of {', '.join(missing)} in {args.results}: train them, with --variant.")
+    if args.groups:
+        results = [named[name] for name in args.groups]
     elif trained:
         results = [each for each in results if (each.header.size, each.header.budget) == (trained.size, trained.budget)]
     if not results:
-        raise UserError(f"There are no results in {given.results}: train some, with --variant.")
-    return report_of(results, whole=not (given.groups or trained))
+        raise UserError(f"There are no results in {args.results}: train some, with --variant.")
+    return report_of(results, whole=not (args.groups or trained))
 
 
-def train(given: argparse.Namespace) -> Header:
+def train(args: argparse.Namespace) -> Header:
     """What is not known of the variant yet.
 
     Raises:
         UserError: a number or the size will not do, or there are results under other settings.
     """
-    budget, levels = parse_count(given.budget, "--budget"), parse_count(given.levels, "--levels")
-    variant = VARIANTS[given.variant]
+    budget, levels = parse_count(args.budget, "--budget"), parse_count(args.levels, "--levels")
+    variant = VARIANTS[args.variant]
     try:
         check_budget(budget, variant.procedure.expert, variant.procedure.stop)
     except ValueError as error:
         raise UserError(f"--{error}.") from None
-    if given.first < 0:
-        raise UserError(f"--first is {given.first}: level ids are 0 and above.")
+    if args.first < 0:
+        raise UserError(f"--first is {args.first}: level ids are 0 and above.")
     try:
-        size_of(given.size)
+        size_of(args.size)
     except ValueError as error:
         raise UserError(f"--{error}.") from None
-    header = Header(given.variant, given.size, budget, plain(variant.procedure))
+    header = Header(args.variant, args.size, budget, plain(variant.procedure))
     worker = original.work if variant.original else measure.work
-    wanted = range(given.first, given.first + levels)
-    measure.measure(header, variant, wanted, given.jobs, worker, given.again, given.results)
+    wanted = range(args.first, args.first + levels)
+    measure.measure(header, variant, wanted, args.jobs, worker, args.again, args.results)
     return header
 
 

@@ -56,7 +56,7 @@ class Reference:
     folder: Path
 
     def ask(self, **request: str) -> dict[str, Any]:
-        self.process.go(json.dumps(request))
+        self.process.send(json.dumps(request))
         return self.process.answer()
 
 
@@ -73,7 +73,7 @@ def started(python: Path, core: int, header: Header, config: ExpertConfig) -> It
     command = [str(word) for word in (python, oracle.SCRIPTS / "solved.py", *words)]
     with ExitStack() as stack, tempfile.TemporaryFile("w+") as errors, tempfile.TemporaryDirectory() as folder:
         process = Process(command, oracle.environment(), stack, errors)
-        process.wake()
+        process.start()
         process.answer()
         yield Reference(process, Path(folder))
 

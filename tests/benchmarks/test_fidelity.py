@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from benchmarks.fidelity import SizeReport, compare, p_value, summary, table, told
+from benchmarks.fidelity import SizeReport, compare, p_value, summary, table, summarise
 from benchmarks.statistics import holm
 
 RNG = np.random.default_rng(0)
@@ -64,9 +64,9 @@ def test_compare_finds_the_one_that_differs() -> None:
 
 
 def test_told() -> None:
-    assert told("thruster power", np.array([1.0, 2.0])) == "1.5"
-    assert told("joint fixed", np.array([True, False, False, False])) == "25.00%"
-    assert told("joint fixed", np.array([])) == "none"
+    assert summarise("thruster power", np.array([1.0, 2.0])) == "1.5"
+    assert summarise("joint fixed", np.array([True, False, False, False])) == "25.00%"
+    assert summarise("joint fixed", np.array([])) == "none"
 
 
 def test_tables() -> None:

@@ -76,7 +76,7 @@ def test_a_page_is_written_whole(tmp_path, monkeypatch, capsys) -> None:
         REPORT, plots={"physics.svg": lambda path: path.write_text("<svg/>")}, fault="It is off."
     )
     for _ in range(2):
-        command.tell(drawn, RUN, given)
+        command.show(drawn, RUN, given)
     assert (tmp_path / "results" / "physics.md").read_text() == as_page(drawn, RUN)
     assert (tmp_path / "results" / "physics.svg").read_text() == "<svg/>"
     shown = capsys.readouterr()
