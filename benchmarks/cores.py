@@ -26,7 +26,9 @@ REPEATS = 30
 
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=["s"], help="default: s")
-    parser.add_argument("--repeats", type=int, default=REPEATS, help=f"of which the best counts (default: {REPEATS})")
+    parser.add_argument(
+        "--repeats", type=int, default=REPEATS, help=f"timed runs; the best counts (default: {REPEATS})"
+    )
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -34,7 +36,10 @@ def run(args: argparse.Namespace) -> Report:
     flags = os.environ.get("XLA_FLAGS", ""), f"--xla_force_host_platform_device_count={count}"
     os.environ["XLA_FLAGS"] = " ".join(flags).strip()
     results = [measured(size, count, args.repeats) for size in args.size]
-    rows = [[result["size"], f"{result['one']:,.0f}", f"{result['all']:,.0f}", f"{result['all'] / result['one']:.2f}"] for result in results]
+    rows = [
+        [result["size"], f"{result['one']:,.0f}", f"{result['all']:,.0f}", f"{result['all'] / result['one']:.2f}"]
+        for result in results
+    ]
     table = Table(("size", "one core", f"{count} cores", "times"), rows, "Env steps/s of one process")
     return Report("All cores from one process", results, [table])
 

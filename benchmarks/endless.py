@@ -20,7 +20,9 @@ def endless_queue(levels: Level, config: ExpertConfig) -> LevelQueue:
     queue = empty_queue(levels, levels.role.shape[-1], config)
     for first in range(0, queue.capacity, GROUP):
         positions = np.arange(first, min(first + GROUP, queue.capacity))
-        queue = enter(queue, positions.tolist(), take(levels, positions), positions, no_success(len(positions)), config, UPDATES)
+        queue = enter(
+            queue, positions.tolist(), take(levels, positions), positions, no_success(len(positions)), config, UPDATES
+        )
     return queue
 
 

@@ -31,6 +31,8 @@ def run(args: argparse.Namespace) -> Report:
         def arguments(share: race.Share) -> list[object]:
             return ["--levels", levels, *shape, "--first", share.first, "--count", share.count]
 
-        return race.contestants("experts", args.levels, steps, arguments, lambda share: [*arguments(share), "--size", size])
+        return race.contestants(
+            "experts", args.levels, steps, arguments, lambda share: [*arguments(share), "--size", size]
+        )
 
     return race.run("Training, beside the reference", args, entries, settings)

@@ -99,7 +99,8 @@ def compare(ours: Samples, theirs: Samples) -> dict[str, Compared]:
     varied = [name for name in names if p[name] is not None]
     corrected = dict(zip(varied, holm([p[name] or 0.0 for name in varied]), strict=True))
     return {
-        name: Compared(summarise(name, ours[name]), summarise(name, theirs[name]), p[name], corrected.get(name)) for name in names
+        name: Compared(summarise(name, ours[name]), summarise(name, theirs[name]), p[name], corrected.get(name))
+        for name in names
     }
 
 

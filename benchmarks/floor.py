@@ -1,8 +1,8 @@
 """Cost of a physics step, stage by stage, against the floor of its arithmetic.
 
 Times: the machine code of the first 1, 2, ... stages (physics/engine.py) over sampled levels in mid-episode, one core;
-a stage costs what it adds. Work: an interpreter of the kernel's jaxpr runs the same blocks and counts vector operations,
-loads and stores of rows. Floor: vector operations at VECTORS_PER_CYCLE and the core's measured clock.
+a stage costs what it adds. Work: an interpreter of the kernel's jaxpr runs the same blocks and counts vector
+operations, loads and stores of rows. Floor: vector operations at VECTORS_PER_CYCLE and the core's measured clock.
 """
 
 import argparse
@@ -52,31 +52,31 @@ def worlds(size: str) -> Inputs:
     return Inputs(level.model, now.state, *controls(level, actions[-1]))
 
 
-def seconds(given: Inputs, stages: tuple) -> float:
+def seconds(inputs: Inputs, stages: tuple) -> float:
     """Time the stages on one block of lanes, s; the best of REPEATS."""
-    compiled = jax.jit(lambda given: as_machine_code(given, DEFAULT_PARAMS, False, stages))
-    jax.block_until_ready(compiled(given))
+    compiled = jax.jit(lambda inputs: as_machine_code(inputs, DEFAULT_PARAMS, False, stages))
+    jax.block_until_ready(compiled(inputs))
     best = np.inf
     for _ in range(REPEATS):
         start = time.perf_counter()
-        jax.block_until_ready(compiled(given))
+        jax.block_until_ready(compiled(inputs))
         best = min(best, time.perf_counter() - start)
     return best / (LEVELS / LANES)
 
 
-def count(given: Inputs, stages: tuple) -> Counter:
+def count(inputs: Inputs, stages: tuple) -> Counter:
     """Count vector operations, loads and stores of one block of lanes, on average."""
-    size, total = given.model.size, Counter()
+    size, total = inputs.model.size, Counter()
 
-    def kernel(given, table, after, scratch):
-        table, given, after, scratch = jax.tree.map(jax.new_ref, (table, given, after, scratch))
-        block = Block(table, given, after, None, scratch)
+    def kernel(inputs, table, after, scratch):
+        table, inputs, after, scratch = jax.tree.map(jax.new_ref, (table, inputs, after, scratch))
+        block = Block(table, inputs, after, None, scratch)
         step_block(block, DEFAULT_PARAMS, stages)
 
     table = table_of(size, True)
     scratch = jax.tree.map(lambda buffer: np.zeros(buffer.array().shape, buffer.dtype), buffers_of(Scratch, size))
     for first in range(0, COUNTED, LANES):
-        block_inputs = jax.tree.map(lambda x, at=first: np.array(x[..., at : at + LANES]), given)
+        block_inputs = jax.tree.map(lambda x, at=first: np.array(x[..., at : at + LANES]), inputs)
         handed = block_inputs, table, jax.tree.map(np.zeros_like, block_inputs.before), scratch
         closed = jax.make_jaxpr(kernel)(*handed)
         interpret(closed.jaxpr, [np.array(x) for x in (*closed.consts, *jax.tree.leaves(handed))], total)
@@ -193,7 +193,12 @@ def run(args: argparse.Namespace) -> Report:
     for result in results:
         took = [f"{result['stages'][name]['microseconds']:.2g}" for name in groups]
         moved = result["loads"] + result["stores"]
-        work = f"{result['operations']:,}", f"{moved:,}", f"{result['floor']:.2f}", f"{result['microseconds'] / result['floor']:.1f}"
+        work = (
+            f"{result['operations']:,}",
+            f"{moved:,}",
+            f"{result['floor']:.2f}",
+            f"{result['microseconds'] / result['floor']:.1f}",
+        )
         rows.append([result["size"], *took, f"{result['microseconds']:.2g}", *work])
     head = ("size", *groups, "all", "vector operations", "loads and stores", "floor", "times the floor")
     title = f"Microseconds of one core for a block of {LANES} lanes and one physics step"
@@ -207,10 +212,10 @@ def run(args: argparse.Namespace) -> Report:
 
 def measured(size: str, cycles: float) -> dict[str, Any]:
     """Measure microseconds and work of each group of stages, and of the whole step."""
-    given, before, counted, stages = worlds(size), 0.0, Counter(), {}
+    inputs, before, counted, stages = worlds(size), 0.0, Counter(), {}
     for group in CUTS:
         done = STAGES[: STAGES.index(group[-1]) + 1]
-        now, work = seconds(given, done), count(given, done)
+        now, work = seconds(inputs, done), count(inputs, done)
         stages[", ".join(stage.__name__ for stage in group)] = costs(now - before, work - counted, cycles)
         before, counted = now, work
     return {"size": size, **costs(before, counted, cycles), "clock": cycles, "stages": stages}

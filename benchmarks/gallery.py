@@ -85,7 +85,9 @@ CHOOSING = """async () => {
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--levels", nargs="+", default=["10k", "100k"], help="levels of each gallery (default: 10k 100k)")
+    parser.add_argument(
+        "--levels", nargs="+", default=["10k", "100k"], help="levels of each gallery (default: 10k 100k)"
+    )
     parser.add_argument("--size", default="s", help="size of the levels (default: s)")
     parser.add_argument("--folder", type=Path, help="keep the galleries in this folder, or reuse those in it")
 
@@ -111,15 +113,19 @@ def run(args: argparse.Namespace) -> Report:
             "The first levels count as drawn when all cells of the first screen are. The page scrolls "
             f"{PACE} px a frame for {SCROLLS:.0f} s, over levels that must be loaded. Memory is JavaScript's after "
             "a garbage collection: with all columns, after jumps along the whole page, and after as many more. "
-            f"The target is {MAX_SECONDS:.0f} s to the first levels, {MIN_FRAMES:.0f} frames/s, and memory growth below "
-            f"{MAX_GROWTH - 1:.0%} in the second series of jumps.",
+            f"The target is {MAX_SECONDS:.0f} s to the first levels, {MIN_FRAMES:.0f} frames/s, and memory growth "
+            f"below {MAX_GROWTH - 1:.0%} in the second series of jumps.",
         ],
         fault=f"{', '.join(slow)} levels miss the target." if slow else "",
     )
 
 
 def fits(result: Mapping[str, Any]) -> bool:
-    return result["first"] < MAX_SECONDS and result["frames"] > MIN_FRAMES and result["memory_again"] < MAX_GROWTH * result["memory_after"]
+    return (
+        result["first"] < MAX_SECONDS
+        and result["frames"] > MIN_FRAMES
+        and result["memory_again"] < MAX_GROWTH * result["memory_after"]
+    )
 
 
 def rows(results: list[dict[str, Any]]) -> list[list[str]]:

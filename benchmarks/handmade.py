@@ -149,7 +149,7 @@ def falls(job: JobConfig, levels: Mapping[str, Mapping[int, Origin]], sizes: Seq
 
 
 def ppo(origins: Mapping[int, Origin], folder: Path) -> list[dict[str, Any]]:
-    """What the reference's PPO makes of each level, as PPO_TOLD. What is known waits in the folder."""
+    """Train the reference's PPO on each level; return PPO_COLUMNS. The folder keeps results for later runs."""
     settings = hashlib.sha256(repr((PPO, PPO_BUDGET)).encode()).hexdigest()[:12]
     files = {level_id: folder / f"{level_id}-{settings}.json" for level_id in origins}
     known = {level_id: json.loads(file.read_text()) for level_id, file in files.items() if file.exists()}

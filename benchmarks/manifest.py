@@ -57,7 +57,9 @@ def run(args: argparse.Namespace) -> Report:
         split = split_path(str(folder), "128k", "s")
         if not split.exists():
             made_split(folder, levels)
-        results = [measured(name, arguments, args.repeats) for name, arguments in commands(folder, split, levels).items()]
+        results = [
+            measured(name, arguments, args.repeats) for name, arguments in commands(folder, split, levels).items()
+        ]
         files = [Path(path) / name for path, _, names in os.walk(split) for name in names]
         entries = max(Counter(path.parent for path in [*files, *split.rglob("*/")]).values())
     finally:
@@ -65,15 +67,20 @@ def run(args: argparse.Namespace) -> Report:
             shutil.rmtree(folder)
     worst = [result["name"] for result in results if result["seconds"] > MAX_SECONDS or result["bytes"] > MAX_BYTES]
     head = ("command", "seconds", "core-seconds", "peak memory, MiB")
-    numbers = lambda result: (f"{result['seconds']:.1f}", f"{result['core_seconds']:.1f}", f"{result['bytes'] / 2**20:,.0f}")
+    numbers = lambda result: (
+        f"{result['seconds']:.1f}",
+        f"{result['core_seconds']:.1f}",
+        f"{result['bytes'] / 2**20:,.0f}",
+    )
     return Report(
         title="Manifests of millions of levels",
         results=[*results, {"name": "layout", "files": len(files), "largest_folder": entries}],
         tables=[Table(head, [(result["name"], *numbers(result)) for result in results])],
         notes=[
-            f"Whole processes on a sealed split of {levels:,} levels, with {ADDED_LEVELS:,} more to generate, its files in the "
-            f"page cache. It has {len(files):,} files, and its largest folder {entries:,} entries. The target is "
-            f"{MAX_SECONDS} s and {MAX_BYTES / 2**20:,.0f} MiB for each, {MAX_FILES:,} files, and {MAX_ENTRIES:,} entries.",
+            f"Whole processes on a sealed split of {levels:,} levels, with {ADDED_LEVELS:,} more to generate, its "
+            f"files in the page cache. It has {len(files):,} files, and its largest folder {entries:,} entries. The "
+            f"target is {MAX_SECONDS} s and {MAX_BYTES / 2**20:,.0f} MiB for each, {MAX_FILES:,} files, and "
+            f"{MAX_ENTRIES:,} entries.",
         ],
         fault=f"{', '.join(worst)}: more than {MAX_SECONDS} s or {MAX_BYTES / 2**20:,.0f} MiB." if worst else "",
     )
@@ -146,7 +153,10 @@ def rows(base: pa.Table, ids: np.ndarray, shard: str, config_hash: str, rng: np.
         name: own.get(name, table.column(name) if name in table.column_names else None) for name in COLUMNS.names
     }
     made = pa.table(
-        {name: pa.chunked_array(column) if isinstance(column, pa.ChunkedArray) else column for name, column in columns.items()}
+        {
+            name: pa.chunked_array(column) if isinstance(column, pa.ChunkedArray) else column
+            for name, column in columns.items()
+        }
     )
     return made.cast(COLUMNS)
 

@@ -91,7 +91,9 @@ def run(_: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
     results = [result(name, size) for name, size in SIZES.items()]
     names = ("flat", "entity", "transformer")
-    counts = [[*(f"{result['multiply_adds'][n]:,}" for n in names), f"{result['with_updates']:,}"] for result in results]
+    counts = [
+        [*(f"{result['multiply_adds'][n]:,}" for n in names), f"{result['with_updates']:,}"] for result in results
+    ]
     speeds = [[f"{rate:,.0f}" for rate in result["env_steps_per_second"].values()] for result in results]
     sizes = [result["size"] for result in results]
     rows = lambda cells: [[size, *result] for size, result in zip(sizes, cells, strict=True)]

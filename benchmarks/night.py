@@ -1,4 +1,4 @@
-"""A long run for real: made, sealed and verified, with the memory of its processes and its files over time."""
+"""A long real run, generated, sealed and verified, with its memory and files over time."""
 
 import argparse
 import json
@@ -21,15 +21,15 @@ from levelproof.pipeline.store.layout import split_path
 PLOT = "night.svg"
 COLOURS = {"driver": "#0072b2", "workers": "#d55e00", "ray": "#777777"}  # Okabe and Ito
 INTERVAL = 10.0  # s between samples
-MAX_SAMPLES = 2000  # samples; of more, every other one is kept
+MAX_SAMPLES = 2000  # above, every other sample is dropped
 
 
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("settings", nargs="*", help="more settings of generate")
-    parser.add_argument("--levels", default="100k", help="how many (default: 100k)")
+    parser.add_argument("--levels", default="100k", help="number of levels (default: 100k)")
     parser.add_argument("--size", default="s")
     parser.add_argument("--budget", default="64k")
-    parser.add_argument("--out", type=Path, help="where the split stays (default: it does not)")
+    parser.add_argument("--out", type=Path, help="folder to keep the split in (default: it is deleted)")
     parser.add_argument("--every", type=float, default=INTERVAL, metavar="SECONDS", help="between samples of memory")
 
 
@@ -60,8 +60,8 @@ def run(args: argparse.Namespace) -> Report:
         "core-seconds a solved level": f"{totals['seconds_per_solved']:.3g}" if totals["solved"] else "-",
         "bytes, sealed": f"{totals['bytes']:,}",
         "files, sealed": f"{totals['files']:,}",
-        "most fragments meanwhile": f"{max(sample['fragments'] for sample in samples):,}",
-        **{f"most memory of {kind}, MB": f"{value / 2**20:,.0f}" for kind, value in memory.items()},
+        "maximum fragments": f"{max(sample['fragments'] for sample in samples):,}",
+        **{f"maximum memory of {kind}, MB": f"{value / 2**20:,.0f}" for kind, value in memory.items()},
         "driver's memory, second half of generate, MB": " to ".join(
             f"{value / 2**20:,.0f}" for value in (half[0]["driver"], half[-1]["driver"])
         ),
@@ -71,8 +71,8 @@ def run(args: argparse.Namespace) -> Report:
         results=[{**steps, **totals, "memory": memory, "samples": samples}],
         tables=[Table(("", ""), list(table.items()))],
         notes=[
-            "`levelproof generate`, `seal` and `verify`, one after another. Memory is what processes have in RAM, each "
-            "page shared by several counted once: of the command itself, of its workers, and of Ray's own processes.",
+            "`levelproof generate`, `seal` and `verify`, one after another. Memory is the RAM of processes, with "
+            "shared pages counted once: of the command itself, of its workers, and of Ray's own processes.",
             f"![Memory, files and levels over time]({PLOT})",
         ],
         plots={PLOT: lambda path: draw(samples, path)},
@@ -80,19 +80,19 @@ def run(args: argparse.Namespace) -> Report:
 
 
 def _timed(arguments: Sequence[str], samples: list[dict[str, Any]], every: float, split: Path) -> float:
-    """Seconds that a command takes; meanwhile its processes are looked at again and again."""
+    """Run a command, sampling its processes at intervals; return its seconds."""
     oracle.log(f"levelproof {' '.join(arguments)}")
     start = time.time()
     command = [sys.executable, "-m", "levelproof", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=dict(oracle.our_environment()))
     over = threading.Event()
 
-    def sample() -> None:
+    def watch() -> None:
         while not over.is_set():
             samples.append({"time": time.time(), "step": arguments[0], **memory_of(process.pid), **parts_of(split)})
             over.wait(every)
 
-    thread = threading.Thread(target=sample)
+    thread = threading.Thread(target=watch)
     thread.start()
     try:
         code = process.wait()
@@ -101,23 +101,23 @@ def _timed(arguments: Sequence[str], samples: list[dict[str, Any]], every: float
         over.set()
         thread.join()
     if code:
-        raise Failure(f"`levelproof {' '.join(arguments)}` ended with exit code {code}: it has said why above.")
+        raise Failure(f"`levelproof {' '.join(arguments)}` ended with exit code {code}: see its message above.")
     return time.time() - start
 
 
 def memory_of(driver: int) -> dict[str, int]:
-    """Bytes in RAM of a command, of its workers and of all else below it; pages that are shared in parts."""
-    totals = {"driver": _memory(driver), "workers": 0, "ray": 0, "worker_count": 0}
+    """Return the RAM of a command, of its workers and of its other descendants, bytes; shared pages are divided."""
+    memory = {"driver": _memory(driver), "workers": 0, "ray": 0, "worker_count": 0}
     for pid in _below(driver):
         title = _read(pid, "cmdline").replace("\0", " ")
         is_worker = title.startswith("ray::WorkerActor")
-        found["workers" if is_worker else "ray"] += _memory(pid)
-        found["worker_count"] += is_worker
-    return found
+        memory["workers" if is_worker else "ray"] += _memory(pid)
+        memory["worker_count"] += is_worker
+    return memory
 
 
 def _below(pid: int) -> list[int]:
-    """All processes that a process has started, and those that these have."""
+    """List all descendants of a process."""
     tasks = Path(f"/proc/{pid}/task").glob("*")
     children = [int(child) for task in tasks for child in _read_path(task / "children").split()]
     return [below for child in children for below in (child, *_below(child))]
@@ -135,13 +135,13 @@ def _read(pid: int, name: str) -> str:
 
 
 def _read_path(path: Path) -> str:
-    with suppress(OSError):  # it has ended
+    with suppress(OSError):  # the process has ended
         return path.read_text(errors="replace")
     return ""
 
 
 def parts_of(split: Path) -> dict[str, int]:
-    """How many fragments and shards a split has."""
+    """Count a split's fragments and shards."""
     return {"fragments": len([*split.glob("manifest/[!.]*")]), "shards": len([*split.glob("shards/*")])}
 
 

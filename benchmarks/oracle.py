@@ -1,4 +1,4 @@
-"""The reference's own environment: Kinetix 3.0.2, made on first use in the user's cache folder."""
+"""The reference's own Python environment: Kinetix 3.0.2, made on first use in the user's cache folder."""
 
 import fcntl
 import os
@@ -12,24 +12,24 @@ from pathlib import Path
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.runtime import cache_folder
 
-PYTHON_VARIABLE = "LEVELPROOF_ORACLE_PYTHON"  # a Python that has the reference already
+PYTHON_VARIABLE = "LEVELPROOF_ORACLE_PYTHON"  # names a Python that already has the reference
 REQUIREMENTS = ("kinetix-env==3.0.2", "jax2d==1.0.1", "jax[cpu]==0.9.0")
-LEVELS = 1024  # sampled per size and kept; more lanes go round
+LEVELS = 1024  # sampled and cached per size; more lanes reuse them in order
 SEED = 0
 ROOT = Path(__file__).parent.parent
 SCRIPTS = Path(__file__).parent / "reference"
 
 
 def oracle_python() -> Path:
-    """The Python that runs the reference, made if need be (about two minutes, a gigabyte).
+    """Return the Python that runs the reference, made on first use (about two minutes, a gigabyte).
 
     Raises:
         UserError: LEVELPROOF_ORACLE_PYTHON names no program.
-        Failure: it cannot be made.
+        Failure: the environment cannot be made.
     """
     if chosen := os.environ.get(PYTHON_VARIABLE):
         if shutil.which(chosen) is None:
-            raise UserError(f"{PYTHON_VARIABLE} is {chosen}, which is no program: unset it, or name a Python.")
+            raise UserError(f"{PYTHON_VARIABLE} is {chosen}, which is not a program: unset it, or name a Python.")
         return Path(chosen)
     folder = cache_folder() / "reference"
     python, ready = folder / "bin" / "python", folder / "ready"
@@ -41,65 +41,65 @@ def oracle_python() -> Path:
 
 
 def handmade_levels(python: Path) -> Path:
-    """The folder of the reference's handmade levels, in its installation."""
+    """Return the folder of handmade levels in the reference's installation."""
     code = "from importlib.util import find_spec; print(*find_spec('kinetix').submodule_search_locations)"
     return Path(_run([python, "-c", code], "find the reference's handmade levels", environment()).strip()) / "levels"
 
 
 def sampled_levels(python: Path, size: str, count: int = LEVELS, seed: int = SEED) -> Path:
-    """A file of levels that the reference sampled, made on first use (minutes: it compiles slowly)."""
+    """Return a file of levels that the reference sampled, made on first use (minutes: it compiles slowly)."""
     path = cache_folder() / "bench" / f"levels-{size}-{count}-{seed}.npz"
     with alone(cache_folder() / "bench.lock"):
         if not path.is_file():
             log(f"Sampling {count} levels of size {size} with the reference (once, one to three minutes) ...")
             path.parent.mkdir(parents=True, exist_ok=True)
             unfinished = path.with_name(f"unfinished-{path.name}")
-            words = [unfinished, "--size", size, "--count", count, "--seed", seed]
-            run_script(python, "world", words, "sample levels with the reference")
+            arguments = [unfinished, "--size", size, "--count", count, "--seed", seed]
+            run_script(python, "world", arguments, "sample levels with the reference")
             unfinished.replace(path)
     return path
 
 
-def run_script(python: Path, script: str, words: Sequence[object], what: str) -> str:
-    """What a script of benchmarks/reference prints in the reference's interpreter.
+def run_script(python: Path, script: str, arguments: Sequence[object], task: str) -> str:
+    """Run a script of benchmarks/reference in the reference's interpreter; return what it prints.
 
     Raises:
-        Failure: it fails; `what` says at what.
+        Failure: the script fails; `task` completes "Cannot ..." in the message.
     """
-    return _run([python, SCRIPTS / f"{script}.py", *words], what, environment())
+    return _run([python, SCRIPTS / f"{script}.py", *arguments], task, environment())
 
 
-def run_ours(script: str, words: Sequence[object]) -> str:
-    """What a script of benchmarks/ours prints, in a process of its own.
+def run_ours(script: str, arguments: Sequence[object]) -> str:
+    """Run a script of benchmarks/ours in its own process; return what it prints.
 
     Raises:
-        Failure: it fails.
+        Failure: the script fails.
     """
-    return _run([sys.executable, "-m", f"benchmarks.ours.{script}", *words], f"run our {script}", our_environment())
+    return _run([sys.executable, "-m", f"benchmarks.ours.{script}", *arguments], f"run our {script}", our_environment())
 
 
 def versions(python: Path) -> dict[str, str]:
-    """Versions of the reference and of what it runs on."""
+    """Return the versions of the reference and of its dependencies."""
     names = ("kinetix-env", "jax2d", "jax", "jaxlib")
     code = f"from importlib.metadata import version; print(*(version(name) for name in {names!r}))"
-    told = _run([python, "-c", code], "ask the reference for its version", environment()).split()
-    return dict(zip(names, told, strict=True))
+    printed = _run([python, "-c", code], "ask the reference for its version", environment()).split()
+    return dict(zip(names, printed, strict=True))
 
 
 def environment() -> Mapping[str, str]:
-    """Of the reference's processes: nothing of ours, no compiled code kept."""
+    """Return environment variables for the reference's processes: none of ours, no compilation cache."""
     ours = ("PYTHONPATH", "PYTHONHOME", "JAX_COMPILATION_CACHE_DIR", "XLA_FLAGS")
     return {name: value for name, value in os.environ.items() if name not in ours} | {"JAX_PLATFORMS": "cpu"}
 
 
 def our_environment() -> Mapping[str, str]:
-    """Of our processes: they find the packages wherever they were imported from."""
+    """Return environment variables for our processes: they import the same packages as this one."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     return dict(os.environ) | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
 
 
 def log(text: str) -> None:
-    """To the person who waits; standard output is for results."""
+    """Print progress to standard error; standard output is for results."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -112,18 +112,18 @@ def _make(folder: Path) -> None:
     _run([*pip, *REQUIREMENTS], f"install {REQUIREMENTS[0]}", environment(), hint)
 
 
-def _run(command: Sequence[object], what: str, environment: Mapping[str, str], hint: str = "") -> str:
-    words = [str(word) for word in command]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+def _run(command: Sequence[object], task: str, environment: Mapping[str, str], hint: str = "") -> str:
+    arguments = [str(argument) for argument in command]
+    done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise Failure(f"Cannot {what} ({reason})" + (f": {hint}." if hint else "."))
+        raise Failure(f"Cannot {task} ({reason})" + (f": {hint}." if hint else "."))
     return done.stdout
 
 
 @contextmanager
 def alone(path: Path) -> Iterator[None]:
-    """One process at a time; the others wait."""
+    """Hold the lock file in the `with` block, so that one process at a time runs it."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("a")

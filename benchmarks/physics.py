@@ -1,4 +1,4 @@
-"""Env steps a second of both engines: the engine and the task's rules, without observations."""
+"""Env steps/s of both engines with the task's rules, without observations."""
 
 import argparse
 import tempfile
@@ -16,8 +16,10 @@ def register(parser: argparse.ArgumentParser) -> None:
     race.register(parser)
     parser.add_argument("--lanes", type=int, default=1024, help="worlds stepped side by side (default: 1024)")
     parser.add_argument("--steps", type=int, default=64, help="env steps of a run in each lane (default: 64)")
-    parser.add_argument("--block", type=int, default=128, help="lanes our engine is given at a time (default: 128)")
-    parser.add_argument("--reference-block", type=int, help="the same for the reference (default: all of a process)")
+    parser.add_argument("--block", type=int, default=128, help="lanes per call of our engine (default: 128)")
+    parser.add_argument(
+        "--reference-block", type=int, help="lanes per call of the reference (default: all of a process)"
+    )
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -32,15 +34,15 @@ def run(args: argparse.Namespace) -> Report:
         def entries(size: str) -> list[Entry]:
             levels = args.level_file or oracle.sampled_levels(python, size)
 
-            def words(share: race.Share) -> list[object]:
+            def arguments(share: race.Share) -> list[object]:
                 return ["--levels", levels, "--actions", actions, "--first", share.first, "--lanes", share.count]
 
             return race.contestants(
                 "physics",
                 args.lanes,
                 args.lanes * args.steps,
-                lambda share: [*words(share), "--block", args.block],
-                lambda share: [*words(share), "--block", their_block, "--size", size],
+                lambda share: [*arguments(share), "--block", args.block],
+                lambda share: [*arguments(share), "--block", their_block, "--size", size],
             )
 
         return race.run("Physics, beside the reference", args, entries, settings)

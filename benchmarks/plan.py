@@ -1,4 +1,4 @@
-"""What `levelproof plan` says of a job, and what the job then takes, sealed, on the same cores."""
+"""The forecast of `levelproof plan` against the job itself, sealed, on the same cores."""
 
 import argparse
 import json
@@ -19,43 +19,45 @@ from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.shard import stored_bytes
 from levelproof.pipeline.words import number
 
-TARGET = 0.15  # by which wall time may be off
+TARGET = 0.15  # relative error of the wall time
 SIZE, LEVELS, BUDGET = "s", "4k", "64k"
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    words = [f"size={SIZE}", f"levels={LEVELS}", f"budget={BUDGET}"]
-    parser.add_argument("settings", nargs="*", default=words, help=f"of the job (default: {' '.join(words)})")
+    arguments = [f"size={SIZE}", f"levels={LEVELS}", f"budget={BUDGET}"]
+    parser.add_argument(
+        "settings", nargs="*", default=arguments, help=f"settings of the job (default: {' '.join(arguments)})"
+    )
 
 
 def run(args: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory() as out:
         planned = json.loads(_levelproof("plan", *args.settings, "--json"))
-        begun = time.monotonic()
+        start = time.monotonic()
         _levelproof("generate", *args.settings, f"out={out}")
-        wall = time.monotonic() - begun
+        wall = time.monotonic() - start
         (split,) = (path.parent for path in Path(out).glob("*/*/manifest"))
         _levelproof("seal", str(split))
-        found = {"wall": wall, **measured(split, planned["workers"], wall)}
-    results = [compared(name, planned, found[name]) for name in found]
+        measurements = {"wall": wall, **measured(split, planned["workers"], wall)}
+    results = [compared(name, planned, measurements[name]) for name in measurements]
     head = ("", "forecast", "interval", "measured", "forecast / measured")
     off = abs(results[0]["ratio"] - 1)
     return Report(
         title="A forecast against its run",
         results=results,
-        tables=[Table(head, [row(of) for of in results])],
+        tables=[Table(head, [row(result) for result in results])],
         notes=[
             f"`levelproof plan {' '.join(args.settings)}` made {planned['sample']['levels']} of the levels in "
             f"{planned['sample']['wall']:.0f} s, compiling included, on {planned['sample']['workers']} workers; then "
             f"`levelproof generate` made all {planned['levels']:,} with {planned['workers']} workers, with the same "
-            "compiled programs. *interval*: of nine cases in ten. *bytes* and *files* are those of the sealed split."
+            "compiled programs. *interval*: holds nine cases in ten. *bytes* and *files* are those of the sealed split."
         ],
-        fault=f"The wall time is {off:.0%} off, and the target is {TARGET:.0%}." if off > TARGET else "",
+        fault=f"The wall time is {off:.0%} off; the target is {TARGET:.0%}." if off > TARGET else "",
     )
 
 
 def measured(split: Path, workers: int, wall: float) -> dict[str, Any]:
-    """The same numbers of a split that was made in `wall` s and sealed."""
+    """Measure what `plan` forecasts on a split that was generated in `wall` s and sealed."""
     table = read_manifest(split, READ).table
     labels, cost = table.column("label").to_pylist(), cost_of(table)
     assert cost is not None
@@ -76,17 +78,19 @@ def compared(name: str, planned: Mapping[str, Any], value: float) -> dict[str, A
     return {"what": name, **guess, "measured": value, "ratio": guess["expected"] / value}
 
 
-def row(of: Mapping[str, Any]) -> Sequence[str]:
+def row(result: Mapping[str, Any]) -> Sequence[str]:
     names = {"wall": "wall time, s", "hours": "core- or GPU-hours", "seconds_per_solved": "seconds a solved level"}
-    interval = f"{number(of['low'])} to {number(of['high'])}" if of["low"] < of["high"] else "-"
-    name = names.get(str(of["what"]), str(of["what"]))
-    return [name, number(of["expected"]), interval, number(of["measured"]), f"{of['ratio']:.2f}"]
+    interval = f"{number(result['low'])} to {number(result['high'])}" if result["low"] < result["high"] else "-"
+    name = names.get(str(result["what"]), str(result["what"]))
+    return [name, number(result["expected"]), interval, number(result["measured"]), f"{result['ratio']:.2f}"]
 
 
-def _levelproof(*words: str) -> str:
-    oracle.log(f"levelproof {' '.join(words)}")
-    command, environment = [sys.executable, "-m", "levelproof", *words], dict(oracle.our_environment())
+def _levelproof(*arguments: str) -> str:
+    oracle.log(f"levelproof {' '.join(arguments)}")
+    command, environment = [sys.executable, "-m", "levelproof", *arguments], dict(oracle.our_environment())
     done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True, env=environment)
     if done.returncode:
-        raise Failure(f"`levelproof {' '.join(words)}` ended with exit code {done.returncode}: it has said why above.")
+        raise Failure(
+            f"`levelproof {' '.join(arguments)}` ended with exit code {done.returncode}: see its message above."
+        )
     return done.stdout

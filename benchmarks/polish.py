@@ -1,4 +1,4 @@
-"""What polish gives: steps to the goal of witnesses before and after, and of experts that master their levels."""
+"""Steps to the goal of witnesses before and after polishing, and of experts that master their levels."""
 
 import argparse
 from collections.abc import Sequence
@@ -26,12 +26,12 @@ from levelproof.pipeline.runtime import prepare_jax
 FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
 LEVELS = {"s": 64, "m": 64, "l": 32}
 BUDGET = 256_000  # env steps of an expert
-POLISH = (16_384, 65_536, 262_144)  # env steps of a witness
+POLISH = (16_384, 65_536, 262_144)  # env steps per witness
 
 
 @dataclass(frozen=True)
 class Lengths:
-    """Env steps to the goal, of levels that both procedures solve, the masters by an expert's own witness."""
+    """Env steps to the goal on levels that both procedures solve, the masters by an expert's own witness."""
 
     default: Int[np.ndarray, " level"]
     polished: Int[np.ndarray, "budget level"]
@@ -41,28 +41,31 @@ class Lengths:
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
     parser.add_argument("--levels", type=int, help="ids of each size (default: 64 of s and m, 32 of l)")
-    parser.add_argument("--first", type=int, default=FIRST, help=f"level id (default: {FIRST:,})")
+    parser.add_argument("--first", type=int, default=FIRST, help=f"first level id (default: {FIRST:,})")
 
 
 def run(args: argparse.Namespace) -> Report:
     prepare_jax()
-    found = {size: lengths(size, args.first, args.levels or LEVELS[size]) for size in args.size}
+    lengths_by_size = {size: lengths(size, args.first, args.levels or LEVELS[size]) for size in args.size}
     budgets = [f"{budget:,}" for budget in POLISH]
     return Report(
         title="Polished witnesses",
-        results=[{"size": size} | summary(of) for size, of in found.items()],
+        results=[{"size": size} | summary(lengths) for size, lengths in lengths_by_size.items()],
         tables=[
             Table(
                 ("size", "levels", "default", *(f"polished, {budget}" for budget in budgets), "masters"),
-                [[size, str(len(of.default)), *(f"{x:.1f}" for x in means(of))] for size, of in found.items()],
+                [
+                    [size, str(len(lengths.default)), *(f"{x:.1f}" for x in means(lengths))]
+                    for size, lengths in lengths_by_size.items()
+                ],
                 "Mean steps to the goal",
             ),
             Table(
                 ("size", "longer than polished, mean", "median", "as short or shorter"),
                 [
                     [size, f"{excess.mean():.0%}", f"{np.median(excess):.0%}", f"{(excess <= 0).mean():.0%}"]
-                    for size, of in found.items()
-                    for excess in [masters_excess(of)]
+                    for size, lengths in lengths_by_size.items()
+                    for excess in [masters_excess(lengths)]
                 ],
                 f"Masters, against witnesses polished for {budgets[-1]} env steps",
             ),
@@ -70,14 +73,14 @@ def run(args: argparse.Namespace) -> Report:
         notes=[
             f"Levels from id {args.first:,} on, experts of {BUDGET:,} env steps; counted are levels that the default "
             "procedure solves and on which `procedure=masters` has a witness of its expert's own. *Polished*: the "
-            "default's witnesses after so many env steps of `search.polish` each, the shortest whatever its "
+            "default's witnesses after this many env steps of `search.polish` each, the shortest whatever its "
             "portability.",
         ],
     )
 
 
 def lengths(size: str, first: int, count: int) -> Lengths:
-    """Of so many levels of a size."""
+    """Measure `count` levels of a size from id `first` on."""
     ids = np.arange(first, first + count, dtype=np.int32)
     levels = jax.tree.map(np.asarray, sample_levels(ids, SIZES[size]))
     default, masters = (
@@ -90,13 +93,13 @@ def lengths(size: str, first: int, count: int) -> Lengths:
         if one.label is Label.SOLVED and other.witness in BY_EXPERT
     ]
     log(f"{size}: {len(both)} of {count} levels count.")
-    witnesses, at = [witness_of(default, i) for i in both], np.array(both, int)
-    polished = [steps_of(polish(take(levels, at), ids[at], witnesses, env_steps)) for env_steps in POLISH]
+    witnesses, indices = [witness_of(default, i) for i in both], np.array(both, int)
+    polished = [steps_of(polish(take(levels, indices), ids[indices], witnesses, env_steps)) for env_steps in POLISH]
     return Lengths(steps_of(witnesses), np.array(polished), steps_of([witness_of(masters, i) for i in both]))
 
 
 def polish(levels: Level, level_ids: Int[np.ndarray, " level"], witnesses: Sequence[Witness], env_steps: int) -> list:
-    """The shortest of each level."""
+    """Polish witnesses; return the shortest of each level, whatever its portability."""
     procedure = Procedure()
     only = replace(
         procedure, search=replace(procedure.search, polish=env_steps), expert=replace(procedure.expert, replays=0)
@@ -115,22 +118,22 @@ def steps_of(witnesses: Sequence[Witness]) -> Int[np.ndarray, " level"]:
     return np.array([witness.steps for witness in witnesses], int)
 
 
-def means(of: Lengths) -> list[float]:
-    return [float(x.mean()) for x in (of.default, *of.polished, of.masters)]
+def means(lengths: Lengths) -> list[float]:
+    return [float(x.mean()) for x in (lengths.default, *lengths.polished, lengths.masters)]
 
 
-def masters_excess(of: Lengths) -> Float[np.ndarray, " level"]:
-    """By which share masters take longer than the most polished witness."""
-    return of.masters / of.polished[-1] - 1
+def masters_excess(lengths: Lengths) -> Float[np.ndarray, " level"]:
+    """Return the excess of masters' steps over the most polished witness, as a share."""
+    return lengths.masters / lengths.polished[-1] - 1
 
 
-def summary(of: Lengths) -> dict:
-    """Of one size, as JSON has it."""
-    default, *polished, masters = means(of)
+def summary(lengths: Lengths) -> dict:
+    """Summarise one size as a JSON document."""
+    default, *polished, masters = means(lengths)
     return {
-        "levels": len(of.default),
+        "levels": len(lengths.default),
         "default": default,
         "polished": dict(zip(map(str, POLISH), polished, strict=True)),
         "masters": masters,
-        "masters_excess": float(masters_excess(of).mean()),
+        "masters_excess": float(masters_excess(lengths).mean()),
     }

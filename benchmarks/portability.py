@@ -1,7 +1,7 @@
-"""How many witnesses reach the goal in the reference: exported levels, its own loader and environment.
+"""Share of witnesses that reach the goal in the reference: exported levels, its own loader and environment.
 
-Levels are labelled by the default procedure. Of each solved one the chosen witness is played, and the one that it
-would have if none were replayed from moved starts.
+The default procedure labels levels. Of each solved level two witnesses are played: the chosen one, and the one chosen
+without replays from perturbed starts.
 """
 
 import argparse
@@ -35,14 +35,14 @@ from levelproof.pipeline.runtime import prepare_jax
 BUDGET = 64_000  # env steps of an expert
 FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
 UNIT = 64  # levels at a time
-KINDS = ("chosen", "first")  # the most portable candidate, and the first that there is
+KINDS = ("chosen", "first")  # the most portable candidate, and the first candidate
 
 
 class Played(NamedTuple):
-    """A size's solved levels; what there is of both kinds has them in this order."""
+    """Results on a size's solved levels; the first axis is KINDS."""
 
     portability: Float[np.ndarray, "2 level"]
-    reached: Bool[np.ndarray, "2 level"]  # the goal, in the reference
+    reached: Bool[np.ndarray, "2 level"]  # whether the goal was reached in the reference
 
 
 class Solved(NamedTuple):
@@ -54,7 +54,7 @@ class Solved(NamedTuple):
 
 
 def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Iterator[Solved]:
-    """Of these levels those that are solved."""
+    """Label levels; yield the solved ones."""
     levels = jax.tree.map(np.asarray, sample_levels(level_ids, SIZES[size]))
     run = TrainingRun(pool, levels, level_ids)
     while not pool.step():
@@ -62,7 +62,7 @@ def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Itera
     result, submission = run.finish(), run.submission
     assert submission is not None
     once = replace(pool.config, replays=0)
-    for at, i in enumerate(run.left.tolist()):
+    for position, i in enumerate(run.left.tolist()):
         verdict = result.verdicts[i]
         if verdict.label is Label.SOLVED:
             assert verdict.witness is not None
@@ -70,35 +70,39 @@ def solved(pool: Pool, level_ids: Int[np.ndarray, " level"], size: str) -> Itera
             chosen = Witness(
                 np.asarray(result.record.action)[..., i], verdict.witness, verdict.steps_to_goal, verdict.portability
             )
-            first = candidates_of(submission.evaluations[at], submission.found.source[at], once)[0]
+            first = candidates_of(submission.evaluations[position], submission.found.source[position], once)[0]
             yield Solved(take(levels, np.array([i])), int(level_ids[i]), (chosen, first))
 
 
 def measured(python: Path, size: str, count: int, first: int) -> Played:
-    """How portable the witnesses of so many levels of a size are."""
+    """Measure the witnesses of `count` levels of a size."""
     pool = Pool(BUDGET, Procedure(), DEFAULT_RULES)
     ids = np.arange(first, first + count, dtype=np.int32)
-    found = [of for start in range(0, count, UNIT) for of in solved(pool, ids[start : start + UNIT], size)]
-    oracle.log(f"{size}: {len(found)} of {count} levels are solved.")
-    levels = jax.tree.map(lambda *x: np.concatenate(x, -1), *(of.level for of in found))
-    level_ids = np.array([of.level_id for of in found], np.int32)
-    kinds = list(zip(*(of.witnesses for of in found), strict=True))
+    solved_levels = [
+        solved_level
+        for start in range(0, count, UNIT)
+        for solved_level in solved(pool, ids[start : start + UNIT], size)
+    ]
+    oracle.log(f"{size}: {len(solved_levels)} of {count} levels are solved.")
+    levels = jax.tree.map(lambda *x: np.concatenate(x, -1), *(solved_level.level for solved_level in solved_levels))
+    level_ids = np.array([solved_level.level_id for solved_level in solved_levels], np.int32)
+    kinds = list(zip(*(solved_level.witnesses for solved_level in solved_levels), strict=True))
     shares = [survival(levels, level_ids, kind, ExpertConfig().replays, DEFAULT_RULES) for kind in kinds]
-    return Played(np.array(shares), in_reference(python, [of.level for of in found], kinds))
+    return Played(np.array(shares), in_reference(python, [solved_level.level for solved_level in solved_levels], kinds))
 
 
 def in_reference(python: Path, levels: list[Level], kinds: list[tuple[Witness, ...]]) -> Bool[np.ndarray, "kind level"]:
-    """Whether witnesses of several kinds reach the goal there. One that is of two kinds is played once."""
-    plays, at = dict[tuple[int, bytes], int](), np.zeros((len(kinds), len(levels)), int)
+    """Return whether witnesses of several kinds reach the goal in the reference; play equal ones once."""
+    plays, index = dict[tuple[int, bytes], int](), np.zeros((len(kinds), len(levels)), int)
     for kind, witnesses in enumerate(kinds):
         for i, witness in enumerate(witnesses):
-            at[kind, i] = plays.setdefault((i, np.asarray(witness.action, np.int32).tobytes()), len(plays))
+            index[kind, i] = plays.setdefault((i, np.asarray(witness.action, np.int32).tobytes()), len(plays))
     action = [np.frombuffer(action, np.int32).reshape(RECORD_STEPS, -1) for _, action in plays]
-    return played(python, [levels[i] for i, _ in plays], np.stack(action, 1))[at]
+    return played(python, [levels[i] for i, _ in plays], np.stack(action, 1))[index]
 
 
 def played(python: Path, levels: list[Level], action: Int[np.ndarray, "256 level 6"]) -> Bool[np.ndarray, " level"]:
-    """Whether the first episode of each level ends in the goal there."""
+    """Return whether each level's first episode ends in the goal in the reference."""
     with tempfile.TemporaryDirectory() as name:
         folder, actions, out = Path(name) / "levels", Path(name) / "actions.npz", Path(name) / "out.npz"
         folder.mkdir()
@@ -111,7 +115,7 @@ def played(python: Path, levels: list[Level], action: Int[np.ndarray, "256 level
 
 
 def result(size: str, levels: int, played: Played) -> dict:
-    """Of one size, as JSON has it."""
+    """Summarise one size as a JSON document."""
     kinds = {}
     for kind, portability, reached in zip(KINDS, *played, strict=True):
         survived_all = reached[portability == 1]
@@ -125,21 +129,21 @@ def result(size: str, levels: int, played: Played) -> dict:
     return {"size": size, "levels": levels, "witnesses": played.reached.shape[1], **kinds}
 
 
-def share(of: Bool[np.ndarray, " level"]) -> float:
-    return float(of.mean()) if len(of) else float("nan")
+def share(reached: Bool[np.ndarray, " level"]) -> float:
+    return float(reached.mean()) if len(reached) else float("nan")
 
 
-def rows(of: Mapping) -> list[list[str]]:
+def rows(result: Mapping) -> list[list[str]]:
     return [
         [
-            of["size"],
-            f"{of['witnesses']:,}",
+            result["size"],
+            f"{result['witnesses']:,}",
             kind,
-            f"{of[kind]['reach_the_goal']:.1%}",
-            " to ".join(f"{x:.1%}" for x in of[kind]["interval"]),
-            f"{of[kind]['portability']:.3f}",
-            f"{of[kind]['survive_all']:.1%}",
-            f"{of[kind]['reach_the_goal_of_those']:.1%}",
+            f"{result[kind]['reach_the_goal']:.1%}",
+            " to ".join(f"{x:.1%}" for x in result[kind]["interval"]),
+            f"{result[kind]['portability']:.3f}",
+            f"{result[kind]['survive_all']:.1%}",
+            f"{result[kind]['reach_the_goal_of_those']:.1%}",
         ]
         for kind in KINDS
     ]
@@ -147,8 +151,8 @@ def rows(of: Mapping) -> list[list[str]]:
 
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
-    parser.add_argument("--levels", type=int, nargs="+", default=[1024], help="of each size (default: 1,024)")
-    parser.add_argument("--first", type=int, default=FIRST, help=f"level id (default: {FIRST:,})")
+    parser.add_argument("--levels", type=int, nargs="+", default=[1024], help="levels of each size (default: 1,024)")
+    parser.add_argument("--first", type=int, default=FIRST, help=f"first level id (default: {FIRST:,})")
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -164,15 +168,15 @@ def run(args: argparse.Namespace) -> Report:
     return Report(
         title="Witnesses in the reference",
         results=results,
-        tables=[Table(head, [row for of in results for row in rows(of)])],
+        tables=[Table(head, [row for result in results for row in rows(result)])],
         notes=[
             f"{tried}, from id {args.first:,} on, experts of {BUDGET:,} env steps, the default procedure. Solved "
             "levels, exported as level files and played in the reference by its own loader and "
-            "environment: how many witnesses end their first episode in the goal. *chosen*: the candidate that "
-            "survives most replays from starts moved by a rounding error, or what a search around it finds; *first*: "
-            "with `expert.replays=0`. "
-            "*portability*: the mean share of these replays that reach the goal; *survive all*: the witnesses that do "
-            "in every one, and how many *of those* reach the goal in the reference."
+            "environment: the share of witnesses that end their first episode in the goal. *chosen*: the candidate "
+            "that survives most replays from starts perturbed by a rounding error, or what a search around it finds; "
+            "*first*: with `expert.replays=0`. *portability*: the mean share of these replays that reach the goal; "
+            "*survive all*: the share of witnesses that reach it in every replay, and the share *of those* that reach "
+            "it in the reference."
         ],
         reference=oracle.versions(python),
     )

@@ -1,4 +1,4 @@
-"""Both sides on the same levels, in turns: who runs where, and what their rates come to."""
+"""A race of both sides on the same levels, in turns: the division among cores, and the summary of rates."""
 
 import argparse
 import sys
@@ -21,7 +21,7 @@ OURS, PINNED, FREE = "ours", "reference, process per core", "reference, one proc
 
 @dataclass(frozen=True)
 class Share:
-    """What one process gets of the lanes or levels."""
+    """The lanes or levels of one process."""
 
     core: int | None  # None: all cores
     first: int
@@ -30,7 +30,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Result:
-    """Rates are medians of env steps a second of the whole machine; the reference's is its best way to run."""
+    """Result of a race; rates are medians of env steps/s of the whole machine, the reference's by its faster way."""
 
     size: str
     unit: str
@@ -42,34 +42,34 @@ class Result:
     spread: dict[str, list[float]]  # smallest and largest run of each
     runs: dict[str, list[float]]
     compile_seconds: dict[str, float]  # of each contestant, slowest process, nothing cached
-    compile_ratio: float  # ours / the reference's lesser
-    goal_share: dict[str, float | None]  # of the episodes that ended: a check that both play the same game
+    compile_ratio: float  # ours / the faster compiling way of the reference
+    goal_share: dict[str, float | None]  # of finished episodes: checks that both sides play the same game
     finite: bool  # no NaN or infinity anywhere
     settings: dict[str, Any]
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    """Words of every race."""
+    """Add the arguments of every race."""
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=["s"], help="of the levels (default: s)")
     parser.add_argument("--repeats", type=int, default=5, help="timed runs of each side; medians count (default: 5)")
     parser.add_argument("--level-file", type=Path, help="levels as the reference's arrays (default: it samples some)")
 
 
 def check(args: argparse.Namespace, counts: Sequence[str]) -> None:
-    """Refuse counts below one and a file that is not there.
+    """Check that counts are positive and that the level file exists.
 
     Raises:
-        UserError: one is.
+        UserError: a check fails.
     """
     for name in counts:
         if (value := getattr(args, name)) is not None and value < 1:
-            raise UserError(f"--{name.replace('_', '-')} is {value}: it has to be at least 1.")
+            raise UserError(f"--{name.replace('_', '-')} is {value}, but must be at least 1.")
     if args.level_file is not None and not args.level_file.is_file():
-        raise UserError(f"There is no file {args.level_file}: give levels as .npz, or leave --level-file out.")
+        raise UserError(f"The file {args.level_file} does not exist: give levels as .npz, or leave --level-file out.")
 
 
 def shares(count: int, cores: Sequence[int]) -> list[Share]:
-    """As even as can be; cores without work are left out."""
+    """Split `count` items evenly over cores; omit cores that get none."""
     cuts = np.linspace(0, count, min(len(cores), count) + 1).round().astype(int).tolist()
     return [Share(core, a, b - a) for core, a, b in zip(cores, cuts, cuts[1:], strict=False)]
 
@@ -77,20 +77,22 @@ def shares(count: int, cores: Sequence[int]) -> list[Share]:
 def contestants(
     script: str, count: int, steps: int, ours: Callable[[Share], list[object]], theirs: Callable[[Share], list[object]]
 ) -> list[Entry]:
-    """Ours; the reference with a process per core, and with one that has all cores.
+    """Make the entries: ours, the reference with a process per core, and the reference with one process on all cores.
 
     Args:
-        script: of benchmarks/ours and of benchmarks/reference.
-        count: lanes or levels, which the processes share.
+        script: file name in benchmarks/ours and in benchmarks/reference.
+        count: lanes or levels to divide among processes.
         steps: env steps of all processes in a run.
-        ours: words of a process of ours with its share.
-        theirs: the same for the reference.
+        ours: arguments of our process for its share.
+        theirs: arguments of the reference's process for its share.
     """
     cores, python = own_cores(), oracle.oracle_python()
     shared, whole = shares(count, cores), [Share(None, 0, count)]
 
-    def entry(name: str, start: Sequence[object], words: Callable[[Share], list[object]], split: list[Share]) -> Entry:
-        commands = [[str(x) for x in (*start, *words(of), *_on(of.core))] for of in split]
+    def entry(
+        name: str, start: Sequence[object], arguments: Callable[[Share], list[object]], split: list[Share]
+    ) -> Entry:
+        commands = [[str(x) for x in (*start, *arguments(share), *_on(share.core))] for share in split]
         return Entry(name, commands, oracle.our_environment() if name == OURS else oracle.environment(), steps)
 
     start = [python, oracle.SCRIPTS / f"{script}.py"]
@@ -104,21 +106,21 @@ def contestants(
 def run(
     title: str, args: argparse.Namespace, entries: Callable[[str], list[Entry]], settings: Mapping[str, Any]
 ) -> Report:
-    """A race for each size, one after another."""
+    """Run a race for each size."""
     results = [summary(size, settings, compete(entries(size), args.repeats)) for size in args.size]
-    wild = ", ".join(result.size for result in results if not result.finite)
+    diverged = ", ".join(result.size for result in results if not result.finite)
     return Report(
         title=title,
         results=[asdict(result) for result in results],
         tables=[rates(results), details(results)],
         notes=[", ".join(f"{name} {value}" for name, value in settings.items())],
         reference=oracle.versions(oracle.oracle_python()),
-        fault=f"A state or a weight of size {wild} is not finite: do not trust these numbers." if wild else "",
+        fault=f"A state or a weight of size {diverged} is not finite: do not trust these numbers." if diverged else "",
     )
 
 
 def summary(size: str, settings: Mapping[str, Any], scores: Sequence[Score]) -> Result:
-    """The first of `scores` is ours, the others are ways to run the reference."""
+    """Summarise a race; the first of `scores` is ours, the others are ways to run the reference."""
     ours, *others = scores
     best = max(others, key=lambda score: score.rate)
     named = {score.entry.name: score for score in scores}
@@ -142,24 +144,26 @@ def summary(size: str, settings: Mapping[str, Any], scores: Sequence[Score]) -> 
 
 
 def rates(results: Sequence[Result]) -> Table:
-    """A row a size: ours, and each way of the reference with its ratio."""
+    """Make a row per size: our rate, and each way of the reference with its ratio."""
     ways = list(results[0].ways)[1:]
-    head = ["size", "ours, env steps/s", *(word for way in ways for word in (way, "ratio"))]
+    head = ["size", "ours, env steps/s", *(title for way in ways for title in (way, "ratio"))]
     rows = []
-    for of in results:
-        theirs = [cell for way in ways for cell in (f"{of.ways[way]:,.0f}", f"{of.ours / of.ways[way]:.3g}")]
-        rows.append([of.size, f"{of.ours:,.0f}", *theirs])
+    for result in results:
+        theirs = [
+            cell for way in ways for cell in (f"{result.ways[way]:,.0f}", f"{result.ours / result.ways[way]:.3g}")
+        ]
+        rows.append([result.size, f"{result.ours:,.0f}", *theirs])
     return Table(head, rows)
 
 
 def details(results: Sequence[Result]) -> Table:
-    """A row a size and contestant."""
+    """Make a row per size and contestant."""
     rows = []
-    for of in results:
-        for way, (low, high) in of.spread.items():
-            goals = of.goal_share[way]
-            seconds, share = f"{of.compile_seconds[way]:.1f}", "-" if goals is None else f"{goals:.1%}"
-            rows.append([of.size, way, f"{low:,.0f} to {high:,.0f}", seconds, share])
+    for result in results:
+        for way, (low, high) in result.spread.items():
+            goals = result.goal_share[way]
+            seconds, share = f"{result.compile_seconds[way]:.1f}", "-" if goals is None else f"{goals:.1%}"
+            rows.append([result.size, way, f"{low:,.0f} to {high:,.0f}", seconds, share])
     return Table(("size", "side", "runs, env steps/s", "compile, s", "episodes that reach the goal"), rows)
 
 

@@ -1,7 +1,8 @@
-"""Trajectories a second of both readers on the same trajectories: random batches, every field, both cores for each.
+"""Trajectories/s of both readers on the same trajectories: random batches, every field, two cores each.
 
-Ours reads a sealed split, of all its fields (`full`) and of little more than actions (`witness`, simulated again); the
-reference reads what `levelproof export --format kinetix` makes of it. Both read from the page cache.
+Our reader gets a sealed split, once with every field stored (`full`), once with little more than actions (`witness`,
+which it simulates again); the reference gets that split from `levelproof export --format kinetix`. Both read from the
+page cache.
 """
 
 import argparse
@@ -22,19 +23,19 @@ from levelproof.pipeline.store.shard import stored_bytes
 
 BATCH = 64
 BUDGET = "64k"
-LEVELS = {"s": 512, "m": 192, "l": 128}  # that are tried; two thirds get a witness
+LEVELS = {"s": 512, "m": 192, "l": 128}  # labelled; about two thirds get a witness
 DENSITIES = ("full", "witness")
 TABLES = {
     "rate": "Trajectories/s",
     "copied": "Trajectories/s, with every array copied as well",
-    "core_rate": "Trajectories a second of a core",
+    "core_rate": "Trajectories/s of a core",
 }
-TARGETS = {"s": 6, "m": 5, "l": 3}  # times the reference's
+TARGETS = {"s": 6, "m": 5, "l": 3}  # multiples of the reference's rate
 
 
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
-    parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement (default: 4)")
+    parser.add_argument("--seconds", type=float, default=4.0, help="seconds of each measurement (default: 4)")
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -45,9 +46,9 @@ def run(args: argparse.Namespace) -> Report:
         results=results,
         tables=[table(results, what, title) for what, title in TABLES.items()],
         notes=[
-            f"Random batches of {BATCH} whole trajectories with every field, after {WARM} to warm up; the reference's "
-            "are runs of neighbours in a random order, ours are drawn one by one. Both give arrays (batch, time, ...) "
-            "that are views of what they decoded; for the second table all of them are copied.",
+            f"Random batches of {BATCH} whole trajectories with every field, after {WARM} to warm up; the reference "
+            "draws runs of neighbours, our reader draws trajectories one by one. Both return arrays (batch, time, ...) "
+            "that are views of what they decoded; the second table includes a copy of every array.",
             f"Targets are {', '.join(f'{times}x for {size}' for size, times in TARGETS.items())}.",
         ],
         reference=oracle.versions(python),
@@ -55,30 +56,35 @@ def run(args: argparse.Namespace) -> Report:
 
 
 def measured(python: Path, size: str, seconds: float) -> dict[str, Any]:
-    """Rates of both on one split."""
-    folders = made(size)
-    words = ["--batch", BATCH, "--seconds", seconds]
-    ours = {of: json.loads(oracle.run_ours("reader", [folders[of], *words])) for of in DENSITIES}
+    """Measure both readers on one split."""
+    folders = folders_of(size)
+    arguments = ["--batch", BATCH, "--seconds", seconds]
+    ours = {density: json.loads(oracle.run_ours("reader", [folders[density], *arguments])) for density in DENSITIES}
     theirs = json.loads(
-        oracle.run_script(python, "batches", [folders["kinetix"], *words], "read trajectories with the reference")
+        oracle.run_script(python, "batches", [folders["kinetix"], *arguments], "read trajectories with the reference")
     )
-    stored = {of: sum(map(stored_bytes, (folders[of] / "shards").iterdir())) for of in DENSITIES}
+    stored = {density: sum(map(stored_bytes, (folders[density] / "shards").iterdir())) for density in DENSITIES}
     return {"size": size, "unit": "trajectories/s", "ours": ours, "reference": theirs, "bytes": stored}
 
 
 def table(results: list[dict[str, Any]], what: str, title: str) -> Table:
     rows = []
-    for of in results:
-        theirs = of["reference"][what]
-        cells = [f"{of['ours'][density][what]:,.0f}" for density in DENSITIES]
-        ratios = [f"{of['ours'][density][what] / theirs:.1f}x" for density in DENSITIES]
-        rows.append([of["size"], *cells, f"{theirs:,.0f}", *ratios])
-    head = ("size", *(f"ours, {density}" for density in DENSITIES), "reference", *(f"{of}, times" for of in DENSITIES))
+    for result in results:
+        theirs = result["reference"][what]
+        cells = [f"{result['ours'][density][what]:,.0f}" for density in DENSITIES]
+        ratios = [f"{result['ours'][density][what] / theirs:.1f}x" for density in DENSITIES]
+        rows.append([result["size"], *cells, f"{theirs:,.0f}", *ratios])
+    head = (
+        "size",
+        *(f"ours, {density}" for density in DENSITIES),
+        "reference",
+        *(f"{density}, times" for density in DENSITIES),
+    )
     return Table(head, rows, title)
 
 
-def made(size: str) -> dict[str, Path]:
-    """Folders with the same trajectories: a split of each density, and the reference's; made on first use."""
+def folders_of(size: str) -> dict[str, Path]:
+    """Return folders with the same trajectories, made on first use: a split of each density, and the export."""
     home = cache_folder() / "bench" / "reader"
     source = home / "generated" / BUDGET / size
     with oracle.alone(cache_folder() / "bench.lock"):
@@ -87,7 +93,7 @@ def made(size: str) -> dict[str, Path]:
             _levelproof(
                 "generate", f"size={size}", f"levels={LEVELS[size]}", f"budget={BUDGET}", f"out={source.parents[1]}"
             )
-        folders = {of: home / of / size for of in (*DENSITIES, "kinetix")}
+        folders = {name: home / name / size for name in (*DENSITIES, "kinetix")}
         for density in DENSITIES:
             if not folders[density].is_dir():
                 unfinished = folders[density].with_name(f"unfinished-{size}")

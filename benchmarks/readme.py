@@ -1,4 +1,4 @@
-"""The README's two commands as a stranger types them: a fresh clone, a fresh environment, nothing compiled before."""
+"""The README's commands as a newcomer types them: a fresh clone, a fresh environment, nothing compiled yet."""
 
 import argparse
 import os
@@ -19,8 +19,10 @@ INSTALL_DEV, TEST = 'pip install -e ".[dev]"', "pytest"
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--python", default=sys.executable, help="that makes the environment (default: this one)")
-    parser.add_argument("--tests", action="store_true", help="the second command, too")
+    parser.add_argument(
+        "--python", default=sys.executable, help="Python that makes the environment (default: this one)"
+    )
+    parser.add_argument("--tests", action="store_true", help="run the tests, too")
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -32,13 +34,15 @@ def run(args: argparse.Namespace) -> Report:
     return Report(
         title="The README's commands",
         results=results,
-        tables=[Table(("command", "wall time", "it said"), [_row(result) for result in results])],
-        notes=["In order, in a fresh clone and a fresh environment; packages come from the index, programs compile."],
+        tables=[Table(("command", "wall time", "output"), [_row(result) for result in results])],
+        notes=[
+            "In order, in a fresh clone and a fresh environment: packages come from the index, and programs compile."
+        ],
     )
 
 
 def _fresh(folder: Path, python: str) -> dict[str, str]:
-    """A clone of what is committed, and the environment variables of a new virtual environment with an empty cache."""
+    """Clone the commit and make a virtual environment with an empty cache; return its environment variables."""
     subprocess.run(["git", "clone", "--quiet", ROOT, folder / "clone"], check=True)
     subprocess.run([python, "-m", "venv", folder / "environment"], check=True)
     ours = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "LEVELPROOF", "RAY"))}
@@ -47,10 +51,10 @@ def _fresh(folder: Path, python: str) -> dict[str, str]:
 
 
 def _timed(command: str, folder: Path, environment: dict[str, str]) -> dict[str, Any]:
-    """A command's wall time, s, and the line that sums it up.
+    """Run a command; return its wall time, s, and the line that sums it up.
 
     Raises:
-        Failure: it fails.
+        Failure: the command fails.
     """
     start = time.perf_counter()
     done = subprocess.run(command, cwd=folder, env=environment, shell=True, capture_output=True, text=True, check=False)

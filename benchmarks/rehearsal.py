@@ -1,8 +1,8 @@
-"""A job of millions of levels on thousands of workers, rehearsed: the scheduler is the real one, the clock is not.
+"""A rehearsal of a job of millions of levels on thousands of workers: the real scheduler under a simulated clock.
 
-Levels take as long as levels of a real run did. Machines die without a word or are taken away with notice, and come
-back; workers crash; some are slow. The driver hears one report at a time, and a worker waits until it is heard. What is
-counted: levels, work that was lost, reports, requests to the store, what the driver computes and keeps in memory.
+Levels take as long as levels of a real run did. Machines die, or are taken away with notice, and are replaced; workers
+crash; some are slow. The driver handles one report at a time, and a worker waits for its turn. Counted are levels, lost
+work, reports, requests to the store, and the driver's time and memory.
 """
 
 import argparse
@@ -28,51 +28,51 @@ from levelproof.pipeline.jobs.plan import costs_of, measure
 from levelproof.pipeline.jobs.schedule import Round, Scheduler, schedule, until_report
 from levelproof.pipeline.jobs.sizing import MAX_FACTOR
 
-UNTIMED, SLOTS = 32, 4  # levels of a unit that nobody has timed, experts side by side: of size s on a core
-HEARING = 1e-3  # s of the driver for a report beside the scheduler's: Ray's call and its answer; assumed
-PUTS = 3500  # a second to one prefix of S3, as its documentation says
-REQUESTS = 13  # to write for a unit of density full: a shard of 11 files, its mark, its fragment
-LOOK = 1.0  # s between two looks at workers that have nothing
-AWAY = 300.0  # s after which another machine takes the place of one that is gone
+UNTIMED, SLOTS = 32, 4  # levels of the first units, before any are timed; slots of size s on a core
+HEARING = 1e-3  # s of the driver per report besides the scheduler's, for Ray's call and answer; assumed
+PUTS = 3500  # requests/s to one prefix of S3, from its documentation
+REQUESTS = 13  # per unit of density full: a shard of 11 files, its mark, its fragment
+POLL = 1.0  # s between offers to idle workers
+REPLACEMENT = 300.0  # s until another machine replaces one that is gone
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is rehearsed."""
+    """Settings of a rehearsal."""
 
     name: str
     levels: int
     workers: int
-    a_machine: int  # workers
-    speed: float = 1.0  # of a worker, against the core of the sample
-    stretch: float = 1.0  # of what a level takes
-    lifetime: float = 24 * 3600.0  # s of a machine on average, until it is taken away with notice
-    failures: float = 30 * 24 * 3600.0  # s of a machine on average, until it dies without
-    crashes: float = 7 * 24 * 3600.0  # s of a worker on average, until its process dies
-    slow: float = 0.01  # share of workers
-    slower: float = 5.0  # times
+    a_machine: int  # workers per machine
+    speed: float = 1.0  # of a worker, relative to the core that the sample was timed on
+    stretch: float = 1.0  # factor on the seconds of every level
+    lifetime: float = 24 * 3600.0  # s, mean life of a machine until it is taken away with notice
+    failures: float = 30 * 24 * 3600.0  # s, mean life of a machine until it dies without notice
+    crashes: float = 7 * 24 * 3600.0  # s, mean life of a worker until its process dies
+    slow: float = 0.01  # share of workers that are slow
+    slower: float = 5.0  # factor by which they are slower
     unit: int | None = None  # levels per work unit; None: by the rule of `generate`
 
 
 @dataclass
 class Counts:
-    """What came of it."""
+    """Totals of a rehearsal."""
 
     seconds: float = 0.0  # by the simulated clock
     levels: int = 0
-    there: float = 0.0  # s of workers, from when they join to when they go
-    useful: float = 0.0  # s of workers, on what was committed
-    lost: float = 0.0  # s of workers, on what was not
+    there: float = 0.0  # s of workers, from joining to leaving
+    useful: float = 0.0  # s of workers, on committed levels
+    lost: float = 0.0  # s of workers, on levels that were not committed
     reports: int = 0
     commits: int = 0
     scheduling: float = 0.0  # s of this process, in the scheduler
     hearing: float = 0.0  # s of the simulated driver
     quarantined: int = 0
-    gone: int = 0  # machines
+    gone: int = 0  # machines taken away or dead
 
 
 class Rehearsal:
-    """One scene, event after event."""
+    """Event loop of one scene."""
 
     def __init__(self, scene: Scene, seconds: Float[np.ndarray, " level"], seed: int = 0) -> None:
         self.scene, self.counts = scene, Counts()
@@ -83,29 +83,29 @@ class Rehearsal:
         self._machines: dict[int, list[SimulatedWorker]] = {}
         for machine in range(-(-scene.workers // scene.a_machine)):
             self._at(self._rng.uniform(0, 60), "join", machine)
-        self._at(LOOK, "look", None)
+        self._at(POLL, "look", None)
 
     def run(self) -> Counts:
         handle = {"join": self._join, "report": self._report, "look": self._look, "crash": self._crash}
         while not (self._machines and self._scheduler.over):
-            self.counts.seconds, _, kind, what = heappop(self._events)
+            self.counts.seconds, _, kind, payload = heappop(self._events)
             if kind in ("preempted", "dies"):
-                self._goes(*what, notice=kind == "preempted")
+                self._goes(*payload, notice=kind == "preempted")
             else:
-                handle[kind](what)
+                handle[kind](payload)
         left = (worker for workers in self._machines.values() for worker in workers)
         self.counts.there += sum(self.counts.seconds - worker.joined for worker in left)
         self.counts.quarantined = len(self._scheduler.quarantined)
         return self.counts
 
-    def _at(self, when: float, kind: str, what: Any) -> None:
-        heappush(self._events, (when, next(self._number), kind, what))
+    def _at(self, when: float, kind: str, payload: Any) -> None:
+        heappush(self._events, (when, next(self._number), kind, payload))
 
-    def _scheduled(self, work: Any, *words: Any) -> Any:
-        """A call of the scheduler, by this machine's clock."""
-        begun = time.perf_counter()
-        answer = work(*words)
-        self.counts.scheduling += time.perf_counter() - begun
+    def _scheduled(self, work: Any, *arguments: Any) -> Any:
+        """Call the scheduler; add the time it takes on this machine."""
+        start = time.perf_counter()
+        answer = work(*arguments)
+        self.counts.scheduling += time.perf_counter() - start
         return answer
 
     def _join(self, machine: int) -> None:
@@ -123,7 +123,7 @@ class Rehearsal:
         self._at(now + self._rng.exponential(scene.failures), "dies", (machine, workers))
 
     def _order(self, worker: SimulatedWorker) -> None:
-        """The driver tells a worker what to do, when it comes to it."""
+        """Send a worker its order, as soon as the driver is free."""
         now = max(self._driver_free, self.counts.seconds) + HEARING
         order = self._scheduled(self._scheduler.order, worker, now)
         if not self._scheduler.workers[worker].units:
@@ -135,8 +135,8 @@ class Rehearsal:
         seconds = until_report(order, len(self._scheduler.workers))
         self._at(worker.begin(order, now, seconds, self._work), "report", (worker, worker.until))
 
-    def _report(self, what: tuple[SimulatedWorker, float]) -> None:
-        worker, until = what
+    def _report(self, payload: tuple[SimulatedWorker, float]) -> None:
+        worker, until = payload
         if worker.alive and worker.until == until:
             self._heard(worker, *worker.report(self.counts.seconds))
             self._order(worker)
@@ -145,21 +145,21 @@ class Rehearsal:
         self.counts.reports += 1
         self.counts.useful += useful
         self.counts.commits += len(round.outcomes)
-        self.counts.levels += sum(len(of.unit.level_ids) for of in round.outcomes)
+        self.counts.levels += sum(len(outcome.unit.level_ids) for outcome in round.outcomes)
         self._scheduled(self._scheduler.report, worker, round, self.counts.seconds)
 
     def _look(self, _: None) -> None:
-        """Workers that have nothing are offered what there is by now."""
+        """Share out levels, and order idle workers to take them."""
         if self._idle:
             self._scheduled(self._scheduler.share)
             for worker in [*self._idle]:
                 if not self._scheduler.waiting:
                     break
                 self._order(worker)
-        self._at(self.counts.seconds + LOOK, "look", None)
+        self._at(self.counts.seconds + POLL, "look", None)
 
     def _crash(self, worker: SimulatedWorker) -> None:
-        """The process dies; another takes its place, and its units count as failed."""
+        """Kill a process: its units count as failed, and another process replaces it."""
         if not worker.alive:
             return
         self._remove(worker)
@@ -172,7 +172,7 @@ class Rehearsal:
         self._order(other)
 
     def _goes(self, machine: int, workers: list[SimulatedWorker], notice: bool) -> None:
-        """A machine is taken away, or dies; another comes."""
+        """Remove a machine, with notice or dead, and schedule its replacement."""
         if self._machines.get(machine) is not workers:
             return
         self.counts.gone += 1
@@ -183,7 +183,7 @@ class Rehearsal:
             self._remove(worker)
             self._scheduled(self._scheduler.leave, worker)
         del self._machines[machine]
-        self._at(self.counts.seconds + AWAY, "join", machine)
+        self._at(self.counts.seconds + REPLACEMENT, "join", machine)
 
     def _remove(self, worker: SimulatedWorker) -> None:
         worker.alive = False
@@ -195,35 +195,35 @@ class Rehearsal:
 
 
 def scheduler_of(scene: Scene) -> Scheduler:
-    """The scheduler of `generate`, with all levels of a scene to do."""
+    """Return the scheduler of `generate` with all levels of a scene planned."""
     return schedule(range(scene.levels), (), scene.levels, scene.unit or UNTIMED, scene.unit is None)
 
 
 def state_bytes(scene: Scene) -> int:
-    """Memory that the driver's plan and scheduler take until every worker is busy, at most."""
+    """Return the peak memory of the driver's plan and scheduler until every worker is busy, bytes."""
     tracemalloc.start()
     scheduler = scheduler_of(scene)
     for worker in range(scene.workers):
         scheduler.join(worker, 0.0)
         scheduler.order(worker, 0.0)
-    most = tracemalloc.get_traced_memory()[1]
+    peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    return most
+    return peak
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("settings", nargs="*", default=["size=s", "budget=64k"], help="of the levels that are measured")
-    parser.add_argument("--split", type=Path, help="a split whose rows tell seconds (default: some levels are made)")
+    parser.add_argument("settings", nargs="*", default=["size=s", "budget=64k"], help="settings of the levels to time")
+    parser.add_argument("--split", type=Path, help="a split whose rows have seconds (default: time new levels)")
+    parser.add_argument("--mean", type=float, metavar="S", help="mean seconds of a level (default: as measured)")
+    parser.add_argument("--levels", default="11.5M", help="levels of the rehearsed job (default: 11.5M)")
     parser.add_argument(
-        "--mean", type=float, metavar="S", help="s that a level takes on average (default: as measured)"
+        "--workers", type=int, default=10_000, metavar="N", help="cores (default: 10000); a tenth as many GPUs"
     )
-    parser.add_argument("--levels", default="11.5M", help="of the rehearsed job (default: 11.5M)")
-    parser.add_argument("--workers", type=int, default=10_000, metavar="N", help="cores; GPUs are a tenth of them")
 
 
 def run(args: argparse.Namespace) -> Report:
-    found, levels = _measured(args), parse_count(args.levels, "levels")
-    seconds = found * (args.mean / found.mean()) if args.mean else found
+    busy, levels = _measured(args), parse_count(args.levels, "levels")
+    seconds = busy * (args.mean / busy.mean()) if args.mean else busy
     scaled = ", scaled to that average" if args.mean else ""
     gpus = max(1, args.workers // 10)
     scenes = [
@@ -233,7 +233,7 @@ def run(args: argparse.Namespace) -> Report:
         Scene(f"{gpus:,} GPUs of 20 cores each", levels, gpus, 8, speed=20.0, stretch=16.0),
     ]
     results = [rehearsed(scene, seconds) for scene in scenes]
-    most = state_bytes(scenes[0])
+    peak = state_bytes(scenes[0])
     head = (
         "",
         "hours",
@@ -250,22 +250,23 @@ def run(args: argparse.Namespace) -> Report:
     )
     return Report(
         title="A rehearsal at scale",
-        results=[*results, {"state_bytes": most}],
-        tables=[Table(head, [row(of) for of in results])],
+        results=[*results, {"state_bytes": peak}],
+        tables=[Table(head, [row(result) for result in results])],
         notes=[
             f"{levels:,} levels, by the scheduler of `generate` under a simulated clock, in units of its default size: "
-            f"20 to 60 s of a worker, at most {MAX_FACTOR * UNTIMED} levels and a quarter of a worker's share; a "
-            f"level takes what one of {len(seconds):,} measured ones did, {seconds.mean():.3g} core-seconds on average"
-            f"{scaled}. Machines of 64 cores or 8 GPUs are taken away with notice after a day, or as said, and die "
-            f"without after 30 days, on average, and another comes {AWAY / 60:.0f} minutes later; processes crash once "
-            "a week; 1% of workers are five times slower. That a GPU is worth 20 cores is assumed, not measured.",
-            "*levels a unit*: on average. *busy*: share of the workers' time, from when they join to when they go, "
-            "that went into what was committed; *lost*: into what was not. "
-            "*scheduler*: microseconds of this machine for each report; *driver*: share of its time, with "
+            f"20 to 60 s of a worker, at most {MOST * UNTIMED} levels and a quarter of a worker's share; a "
+            f"level takes the time of one of {len(seconds):,} measured levels, {seconds.mean():.3g} core-seconds on "
+            f"average{scaled}. On average, a machine of 64 cores or 8 GPUs is taken away with notice after a day, or as "
+            f"named, and dies without notice after 30 days; another replaces it {REPLACEMENT / 60:.0f} minutes "
+            "later. Processes crash once a week; 1% of workers are five times slower. That a GPU equals 20 "
+            "cores is assumed, not measured.",
+            "*levels a unit*: on average. *busy*: share of the workers' time, from joining to leaving, that went into "
+            "committed levels; *lost*: share of their work that did not. "
+            "*scheduler*: microseconds of this machine per report; *driver*: share of its time, with "
             f"{HEARING * 1e3:.0f} ms for Ray's part of a report, which is assumed. *writes/s*: requests to an object "
-            f"store, {REQUESTS} a unit; S3 promises {PUTS:,} a second to a prefix. *first*: the most loaded of store, "
-            "driver and workers, and its load; above 100% it does not keep up, and the job takes longer than shown.",
-            f"The plan and the scheduler take {most / 2**20:.0f} MB of the driver's memory with all workers busy.",
+            f"store, {REQUESTS} per unit; S3 promises {PUTS:,} a second per prefix. *first*: the most loaded of store, "
+            "driver and workers, and its load; above 100% it cannot keep up, and the job takes longer than shown.",
+            f"The plan and the scheduler take {peak / 2**20:.0f} MB of the driver's memory with all workers busy.",
         ],
     )
 
@@ -275,31 +276,31 @@ def _measured(args: argparse.Namespace) -> Float[np.ndarray, " level"]:
         return measure(compose_job([*args.settings, "levels=4k"]), Console(stderr=True)).busy
     _, busy, _ = costs_of(args.split)
     if not np.isfinite(busy).all():
-        raise UserError(f"Rows of {args.split} do not tell seconds: give a split that this version made.")
+        raise UserError(f"Rows of {args.split} have no seconds: give a split that this version made.")
     return busy
 
 
 def rehearsed(scene: Scene, seconds: Float[np.ndarray, " level"]) -> dict[str, Any]:
-    """A scene in numbers."""
-    of = Rehearsal(scene, seconds).run()
-    writes = of.commits * REQUESTS / of.seconds
+    """Run a scene; return its results as a JSON document."""
+    counts = Rehearsal(scene, seconds).run()
+    writes = counts.commits * REQUESTS / counts.seconds
     loads = {
-        "driver": (of.hearing + of.scheduling) / of.seconds,
+        "driver": (counts.hearing + counts.scheduling) / counts.seconds,
         "store": writes / PUTS,
-        "workers": of.useful / (of.there * scene.speed),
+        "workers": counts.useful / (counts.there * scene.speed),
     }
     return {
         "scene": scene.name,
-        "hours": of.seconds / 3600,
-        "levels": of.levels,
-        "levels_per_second": of.levels / of.seconds,
-        "levels_per_unit": of.levels / of.commits,
+        "hours": counts.seconds / 3600,
+        "levels": counts.levels,
+        "levels_per_second": counts.levels / counts.seconds,
+        "levels_per_unit": counts.levels / counts.commits,
         "busy": loads["workers"],
-        "lost": of.lost / (of.useful + of.lost),
-        "machines_gone": of.gone,
-        "quarantined": of.quarantined,
-        "reports_per_second": of.reports / of.seconds,
-        "scheduler_us": of.scheduling / max(of.reports, 1) * 1e6,
+        "lost": counts.lost / (counts.useful + counts.lost),
+        "machines_gone": counts.gone,
+        "quarantined": counts.quarantined,
+        "reports_per_second": counts.reports / counts.seconds,
+        "scheduler_us": counts.scheduling / max(counts.reports, 1) * 1e6,
         "driver": loads["driver"],
         "writes_per_second": writes,
         "first": (first := max(loads, key=lambda name: loads[name])),
@@ -307,18 +308,18 @@ def rehearsed(scene: Scene, seconds: Float[np.ndarray, " level"]) -> dict[str, A
     }
 
 
-def row(of: Mapping[str, Any]) -> Sequence[str]:
+def row(result: Mapping[str, Any]) -> Sequence[str]:
     return [
-        of["scene"],
-        f"{of['hours']:.2f}",
-        f"{of['levels_per_second']:,.0f}",
-        f"{of['levels_per_unit']:,.0f}",
-        f"{of['busy']:.0%}",
-        f"{of['lost']:.2%}",
-        f"{of['machines_gone']:,}",
-        f"{of['reports_per_second']:,.0f}",
-        f"{of['scheduler_us']:.0f} µs",
-        f"{of['driver']:.0%}",
-        f"{of['writes_per_second']:,.0f}",
-        f"{of['first']}, {of['load']:.0%}",
+        result["scene"],
+        f"{result['hours']:.2f}",
+        f"{result['levels_per_second']:,.0f}",
+        f"{result['levels_per_unit']:,.0f}",
+        f"{result['busy']:.0%}",
+        f"{result['lost']:.2%}",
+        f"{result['machines_gone']:,}",
+        f"{result['reports_per_second']:,.0f}",
+        f"{result['scheduler_us']:.0f} µs",
+        f"{result['driver']:.0%}",
+        f"{result['writes_per_second']:,.0f}",
+        f"{result['first']}, {result['load']:.0%}",
     ]

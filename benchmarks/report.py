@@ -1,4 +1,4 @@
-"""What a benchmark found, and the one way to show it: as text, as JSON, and as its page in docs/results."""
+"""A benchmark's report, shown as text, as JSON, and as its page in docs/results."""
 
 import json
 import math
@@ -13,12 +13,12 @@ from levelproof.pipeline.runtime import own_cores
 from levelproof.pipeline.store.provenance import device, versions
 
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
-DIGITS = 5  # of a number in JSON
+DIGITS = 5  # significant digits of a number in JSON
 
 
 @dataclass(frozen=True)
 class Table:
-    """Cells as people read them."""
+    """A table of formatted cells."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -32,21 +32,23 @@ class Table:
 
 @dataclass(frozen=True)
 class Report:
-    """What a benchmark found."""
+    """Results of a benchmark."""
 
     title: str  # of its page
-    results: Sequence[Mapping[str, Any]]  # a JSON document each; beside the reference: `ours`, `reference`, `ratio`
+    results: Sequence[Mapping[str, Any]]  # JSON documents; those of races have `ours`, `reference`, `ratio`
     tables: Sequence[Table]
     notes: Sequence[str] = ()  # sentences below the tables
-    plots: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)  # file name: draws it
-    reference: Mapping[str, str] = field(default_factory=dict)  # versions of the reference, where it took part
-    fault: str = ""  # what makes the command fail
-    made: str = ""  # when and where, if that is not now and here
+    plots: Mapping[str, Callable[[Path], None]] = field(
+        default_factory=dict
+    )  # by file name: function that draws the plot
+    reference: Mapping[str, str] = field(default_factory=dict)  # versions of the reference, if it took part
+    fault: str = ""  # makes the command fail
+    made: str = ""  # when and where it was measured, if not now and here
 
 
 @dataclass(frozen=True)
 class Run:
-    """When and where a benchmark ran, and on what."""
+    """Command, time, machine and versions of a benchmark run."""
 
     benchmark: str
     command: str
@@ -55,10 +57,10 @@ class Run:
     versions: Mapping[str, Mapping[str, Any]]
 
     @staticmethod
-    def now(benchmark: str, words: Sequence[str], report: Report) -> "Run":
+    def now(benchmark: str, arguments: Sequence[str], report: Report) -> "Run":
         return Run(
             benchmark=benchmark,
-            command=" ".join(("python -m benchmarks", *words)),
+            command=" ".join(("python -m benchmarks", *arguments)),
             date=datetime.now(UTC).isoformat(timespec="seconds"),
             machine={"device": device(), "cores": len(own_cores()), "system": platform.platform()},
             versions={"ours": versions(), **({"reference": report.reference} if report.reference else {})},
@@ -66,34 +68,36 @@ class Run:
 
     @property
     def made(self) -> str:
-        """In a sentence."""
+        """Sentence on when and where."""
         machine = "{device}, {cores} cores, {system}".format_map(self.machine)
-        sides = [f"{side}: {', '.join(f'{name} {x}' for name, x in of.items())}" for side, of in self.versions.items()]
+        sides = [
+            f"{side}: {', '.join(f'{name} {x}' for name, x in stack.items())}" for side, stack in self.versions.items()
+        ]
         return f"{self.date}, on {machine}; {'; '.join(sides)}"
 
 
 def as_text(report: Report, run: Run) -> str:
-    """For a terminal."""
+    """Format a report for a terminal."""
     tables = [table.markdown() for table in report.tables]
     return "\n\n".join((*tables, *report.notes, report.made or f"{run.made}."))
 
 
 def as_page(report: Report, run: Run) -> str:
-    """For docs/results; its benchmark writes it whole, and nobody else."""
+    """Format a report as a page of docs/results, which only its benchmark writes."""
     tables = [table.markdown() for table in report.tables]
     made = f"Written by `{run.command}`. Measured: {report.made or run.made}."
     return "\n\n".join((f"# {report.title}", made, *tables, *report.notes)) + "\n"
 
 
 def as_json(report: Report, run: Run) -> str:
-    """A document for each result, one after another."""
+    """Format a report as one JSON document per result."""
     about = {"date": run.date, "machine": run.machine, "versions": run.versions}
     documents = [{"bench": run.benchmark, **result, **about} for result in report.results]
     return "\n".join(json.dumps(rounded(document), indent=2, allow_nan=False) for document in documents)
 
 
 def rounded(value: Any) -> Any:
-    """As JSON has it: few digits; null where there is no number, infinity as a word."""
+    """Round floats for JSON: NaN becomes null, infinity a string."""
     if isinstance(value, Mapping):
         return {name: rounded(item) for name, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,6 +1,6 @@
-"""Levels a second of our sampler and of the reference's, and the seconds of their first calls, compile included.
+"""Levels/s of our sampler and of the reference's, and the seconds of their first calls, compiling included.
 
-No cache of compiled code; one process each, one after the other, each with all cores and threads as its user has them.
+One process each, in turn, on all cores with default threads and without a compilation cache.
 """
 
 import argparse
@@ -16,23 +16,23 @@ LEVELS = 4096
 
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
-    parser.add_argument("--levels", type=int, default=LEVELS, help=f"of a timed call (default: {LEVELS:,})")
+    parser.add_argument("--levels", type=int, default=LEVELS, help=f"levels of a timed call (default: {LEVELS:,})")
 
 
 def run(args: argparse.Namespace) -> Report:
     python = oracle.oracle_python()
     results = []
     for size in args.size:
-        words = ["--size", size, "--levels", args.levels]
-        ours = json.loads(oracle.run_ours("sampler", words))
-        theirs = json.loads(oracle.run_script(python, "sampler", words, "sample levels with the reference"))
+        arguments = ["--size", size, "--levels", args.levels]
+        ours = json.loads(oracle.run_ours("sampler", arguments))
+        theirs = json.loads(oracle.run_script(python, "sampler", arguments, "sample levels with the reference"))
         results.append(result(size, ours, theirs))
     head = ("size", "first call, s", "reference", "levels/s", "reference", "ratio")
     return Report(
         title="Samplers",
         results=results,
-        tables=[Table(head, [row(of) for of in results])],
-        notes=[f"{args.levels:,} levels of ours in blocks of 256; the reference in batches of 512, two of m and l."],
+        tables=[Table(head, [row(result) for result in results])],
+        notes=[f"{args.levels:,} levels of ours in blocks of 256; the reference in batches of 512, two for m and l."],
         reference=oracle.versions(python),
     )
 
@@ -48,7 +48,7 @@ def result(size: str, ours: Mapping[str, float], theirs: Mapping[str, float]) ->
     }
 
 
-def row(of: Mapping) -> list[str]:
-    first = of["first_call_seconds"]
-    rates = f"{of['ours']:,.0f}", f"{of['reference']:,.0f}", f"{of['ratio']:.1f}"
-    return [of["size"], f"{first['ours']:.1f}", f"{first['reference']:.0f}", *rates]
+def row(result: Mapping) -> list[str]:
+    first = result["first_call_seconds"]
+    rates = f"{result['ours']:,.0f}", f"{result['reference']:,.0f}", f"{result['ratio']:.1f}"
+    return [result["size"], f"{first['ours']:.1f}", f"{first['reference']:.0f}", *rates]

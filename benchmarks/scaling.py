@@ -1,9 +1,8 @@
-"""Env steps a second against what touches, and against the number of bodies.
+"""Env steps/s against active contacts, and against the number of bodies.
 
-One core, blocks of lanes as a job has them. Left: levels of s, m, l in mid-episode, sorted by their active contacts
-and shared out into groups; each group is stepped by itself, under sticky random actions.
-Right: custom sizes of 8 to 32 bodies, sampled levels; the dashed line is what a cost that grows with all pairs,
-touching or not, would leave of the first point.
+One core, in blocks of lanes as in a job. Left: levels of s, m and l in mid-episode, sorted by their active contacts and
+divided into groups; each group is stepped by itself, under sticky random actions. Right: sampled levels of custom sizes
+of 8 to 32 bodies; the dashed line extrapolates the first point as if cost grew with all pairs, touching or not.
 """
 
 import argparse
@@ -41,7 +40,7 @@ def take(tree, lanes):
 
 @jax.jit
 def play(level: Level, now: task.TaskState, actions: jax.Array):
-    """Some env steps; contacts after each."""
+    """Take env steps; return the active contacts after each."""
 
     def act(now, action):
         now, _ = task.step(level, now, action)
@@ -51,14 +50,14 @@ def play(level: Level, now: task.TaskState, actions: jax.Array):
 
 
 def in_blocks(level: Level, now: task.TaskState, actions: Int[np.ndarray, "step 6 lane"]) -> tuple[task.TaskState, Any]:
-    """All lanes, LANES at a time."""
+    """Play all lanes, LANES at a time."""
     cuts = [np.arange(i, i + LANES) for i in range(0, now.timestep.size, LANES)]
     parts = [play(take(level, cut), take(now, cut), actions[..., cut]) for cut in cuts]
     return jax.tree.map(lambda *xs: np.concatenate(xs, -1), *parts)
 
 
 def rate(level: Level, now: task.TaskState) -> tuple[float, float]:
-    """Env steps a second of one core, and active contacts of a lane, on average."""
+    """Measure env steps/s of one core, and the mean active contacts of a lane."""
     actions = jnp.asarray(sticky_actions(STEPS, LANES, 1))
     contacts = jax.block_until_ready(play(level, now, actions))[1]
     best = np.inf
@@ -70,7 +69,7 @@ def rate(level: Level, now: task.TaskState) -> tuple[float, float]:
 
 
 def by_contacts(size: str) -> list[tuple[float, float]]:
-    """(active contacts, env steps a second) of groups of levels."""
+    """Measure (active contacts, env steps/s) of groups of levels."""
     level = sample_levels(np.arange(LEVELS), SIZES[size])
     now, contacts = in_blocks(level, task.reset(level), sticky_actions(SETTLING, LEVELS))
     order = np.argsort(contacts[-1], kind="stable")
@@ -85,7 +84,7 @@ def by_contacts(size: str) -> list[tuple[float, float]]:
 
 
 def by_bodies(bodies: int) -> tuple[float, float, int]:
-    """Env steps a second, active contacts, and contacts of all pairs, of a custom size."""
+    """Measure env steps/s, active contacts, and contacts of all pairs, of a custom size."""
     movable = bodies - FIXED_POLYGONS
     circles = movable // 3
     size = Size(bodies - circles, circles, joints=max(1, movable // 3), thrusters=2)
@@ -95,7 +94,7 @@ def by_bodies(bodies: int) -> tuple[float, float, int]:
 
 
 def register(_: argparse.ArgumentParser) -> None:
-    """No words of its own."""
+    """Add nothing: the benchmark has no arguments of its own."""
 
 
 def run(_: argparse.Namespace) -> Report:
@@ -120,10 +119,10 @@ def run(_: argparse.Namespace) -> Report:
         title="Env steps/s against contacts and bodies",
         results=results,
         tables=[
-            Table(("size", "active contacts", "env steps/s"), left, "Levels in groups by what touches in them"),
+            Table(("size", "active contacts", "env steps/s"), left, "Levels in groups by active contacts"),
             Table(("bodies", "active contacts", "contacts of all pairs", "env steps/s"), right, "Custom sizes"),
         ],
-        notes=[f"![Env steps a second against active contacts, and against bodies]({PLOT})"],
+        notes=[f"![Env steps/s against active contacts, and against bodies]({PLOT})"],
         plots={PLOT: lambda path: draw(touching, grown, path)},
     )
 

@@ -1,4 +1,4 @@
-"""Workers under a simulated clock, as `benchmarks.rehearsal` has them: what they are ordered, do and report."""
+"""Workers under a simulated clock, for `benchmarks.rehearsal`: their orders, work and reports."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ from levelproof.pipeline.jobs.schedule import Cut, Order, Round, Summary, UnitOu
 
 
 class Work:
-    """What levels take: always the same for a level, whoever makes it."""
+    """Seconds of every level: the same on whichever worker."""
 
     def __init__(self, seconds: Float[np.ndarray, " level"]) -> None:
         drawn = np.random.default_rng(0).choice(seconds, 2**20)
@@ -22,27 +22,27 @@ class Work:
         if isinstance(ids, range):
             first, end = ids[0] % period, ids[-1] % period + 1
             return float(self._sums[end] - self._sums[first] + (self._sums[-1] if end <= first else 0.0))
-        at = np.array(ids) % period
-        return float((self._sums[at + 1] - self._sums[at]).sum())
+        indices = np.array(ids) % period
+        return float((self._sums[indices + 1] - self._sums[indices]).sum())
 
 
 @dataclass(eq=False)
 class SimulatedWorker:
-    """Does its units one after another; as the real one, it reports when one ends, or when it is time."""
+    """Works through its units in order; like the real worker, reports when one ends or when time is up."""
 
     machine: int
     speed: float
     slots: int
-    joined: float  # when
+    joined: float  # time
     units: deque[tuple[WorkUnit, float]] = field(default_factory=deque)
-    into: float = 0.0  # s of work on the first of them
-    since: float = 0.0  # when it began with what it does
-    until: float = 0.0  # when it reports
+    into: float = 0.0  # s of work done on the first unit
+    since: float = 0.0  # time when its current stretch of work began
+    until: float = 0.0  # time of its next report
     cuts: list[Cut] = field(default_factory=list)
     alive: bool = True
 
     def begin(self, order: Order, now: float, seconds: float, work: Work) -> float:
-        """Take what is ordered; when it will report."""
+        """Accept an order; return the time of the next report."""
         self.into = self.into if self.units else 0.0
         self._give(order.give, work)
         self.units.extend((unit, work.of(unit)) for unit in order.units)
@@ -52,12 +52,12 @@ class SimulatedWorker:
 
     @property
     def decided(self) -> int:
-        """Levels of its first unit."""
+        """Number of decided levels in its first unit."""
         unit, seconds = self.units[0] if self.units else (None, 0.0)
         return min(int(self.into / seconds * len(unit.level_ids)), len(unit.level_ids)) if unit and seconds else 0
 
     def report(self, now: float) -> tuple[Round, float]:
-        """What it has done by now, and how much work it was."""
+        """Report what is done by now, with the s of work in it."""
         self.into += (now - self.since) * self.speed if self.units else 0.0
         self.since = now
         outcomes, useful = [], 0.0
@@ -71,7 +71,7 @@ class SimulatedWorker:
         return Round(outcomes, {}, max(0, self.slots - waiting), waiting, cuts), useful
 
     def leave(self, now: float) -> tuple[Round, float]:
-        """As far as it has come: levels that are decided are committed, the others given back."""
+        """Commit decided levels and return the others; report as `report` does."""
         round, useful = self.report(now)
         done = self.decided
         for unit, seconds in self.units:
@@ -85,16 +85,16 @@ class SimulatedWorker:
         return Round(round.outcomes, {}, 0, cuts=round.cuts, leaves=True), useful
 
     def _give(self, levels: int, work: Work) -> None:
-        """Levels that have not begun, of the latest units first."""
-        left = levels
+        """Return levels that have not begun, from the last units first."""
+        missing = levels
         for i in range(len(self.units) - 1, -1, -1):
             unit = self.units[i][0]
-            some = min(left, len(unit.level_ids) - (0 if i else self.decided + self.slots))
-            if some <= 0:
+            count = min(missing, len(unit.level_ids) - (0 if i else self.decided + self.slots))
+            if count <= 0:
                 return
-            kept, back = (unit.only(part) for part in (unit.level_ids[:-some], unit.level_ids[-some:]))
+            kept, back = (unit.only(part) for part in (unit.level_ids[:-count], unit.level_ids[-count:]))
             self.cuts.append(Cut(unit, kept, back))
-            left -= some
+            missing -= count
             if kept:
                 self.units[i] = kept, work.of(kept)
             else:
@@ -102,5 +102,5 @@ class SimulatedWorker:
 
 
 def committed(unit: WorkUnit, seconds: float) -> UnitOutcome:
-    """The outcome of a unit that took its worker so long."""
+    """Return the outcome of a unit that took its worker `seconds`."""
     return UnitOutcome(unit, Summary(len(unit.level_ids), 0, EnvSteps(), Seconds(training=seconds)))

@@ -1,4 +1,4 @@
-"""Intervals and tests that benchmarks state, by scipy and statsmodels."""
+"""Confidence intervals and tests for benchmarks, from scipy and statsmodels."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from statsmodels.stats.multitest import multipletests
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """A 95% interval of a share (Wilson 1927)."""
+    """Return the 95% interval of a share (Wilson 1927)."""
     if not trials:
         return 0.0, 1.0
     low, high = binomtest(successes, trials).proportion_ci(method="wilson")
@@ -16,11 +16,14 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 
 def mcnemar(only_one: int, only_other: int) -> float:
-    """Exact two-sided p of levels that only one of two variants solved (McNemar 1947): a fair coin decides each."""
+    """Return the exact two-sided p for levels that only one of two variants solved (McNemar 1947).
+
+    Under the null hypothesis a fair coin decides which variant solves each.
+    """
     flips = only_one + only_other
     return float(binomtest(only_one, flips).pvalue) if flips else 1.0
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Corrected p, in the given order: below a bound where Holm's procedure rejects at that bound."""
+    """Return corrected p in the given order; Holm's procedure rejects where they are below its level."""
     return np.asarray(multipletests(p, method="holm")[1]).tolist() if p else []

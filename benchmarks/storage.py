@@ -1,7 +1,7 @@
-"""What a transition takes on the disk in each density, and how fast trajectories are written and read, on one core.
+"""Bytes of a stored transition in each density, and trajectories/s written and read on one core.
 
-All trajectories of a split are put into one shard of each density. `resume` and `witness` are written with the check
-that everything comes back, and read through the engine where it has to compute.
+All trajectories of a split go into one shard of each density. Writing `resume` and `witness` includes the check that
+every bit is restored; reading them includes the engine's steps.
 """
 
 import argparse
@@ -32,25 +32,27 @@ from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.schema import Encoding
 from levelproof.pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
 
-PUBLISHED = {"s": 80, "m": 111, "l": 306}  # bytes per transition, Kinetix's 1M splits
-BATCH = 64  # random trajectories that are read at once
+PUBLISHED = {"s": 80, "m": 111, "l": 306}  # bytes per transition of Kinetix's 1M splits
+BATCH = 64  # random trajectories per read
 FIELDS: Mapping[str, Sequence[str] | None] = {
     "every field": None,
     "positions": ("record/state/position", "record/state/rotation"),
     "actions": ("record/action", "record/done"),
 }
-SECONDS = 0.7  # of the core's time for each measurement, at least
-# Of splits that are made for this: what experts find alone plays for longer than what a search finds
+SECONDS = 0.7  # minimum CPU time of a measurement
+# Splits made for the benchmark: witnesses of experts alone are longer than those of a search
 BUDGET, LEVELS = "256k", {"s": 512, "m": 256, "l": 128}
 ALONE = ("procedure=published", "stop.rule=solved")
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("split", type=Path, nargs="*", help=f"splits (default: made, experts alone, {BUDGET} each)")
+    parser.add_argument(
+        "split", type=Path, nargs="*", help=f"splits (default: new ones by experts alone, {BUDGET} env steps each)"
+    )
 
 
 def run(args: argparse.Namespace) -> Report:
-    with _splits(args.split) as splits:  # on all cores
+    with _splits(args.split) as splits:  # generated on all cores
         prepare_jax(own_cores()[0])
         results = [result for split in splits for result in measured(split)]
     head = (
@@ -61,39 +63,39 @@ def run(args: argparse.Namespace) -> Report:
         "of full",
         "published",
         "written/s",
-        *(f"{of}/s" for of in FIELDS),
+        *(f"{result}/s" for result in FIELDS),
     )
     return Report(
         title="Storage",
         results=results,
-        tables=[Table(head, [row(of) for of in results])],
+        tables=[Table(head, [row(result) for result in results])],
         notes=[
-            "All trajectories of the splits, trivial ones among them. *bytes* per transition, of all files of one "
-            "shard; *published*: of the reference's 1M splits. *written/s* and the columns after it: trajectories a "
-            "second of a core's time, written all at once, and read in random batches of "
-            f"{BATCH} to arrays of {', '.join(FIELDS)}; the files are in the system's cache, and programs are compiled "
-            "before. Key frames of `witness` every 32 steps. Load of the machine meanwhile, with this: "
-            f"{os.getloadavg()[1]:.1f}; what others do slows this down.",
+            "All trajectories of the splits, trivial levels included. *bytes* per transition, over all files of one "
+            "shard; *published*: of the reference's 1M splits. *written/s* and the columns after it: trajectories per "
+            "second of CPU time, written all at once, and read in random batches of "
+            f"{BATCH} to arrays of {', '.join(FIELDS)}; files are in the page cache, and programs are already "
+            "compiled. Key frames of `witness` every 32 steps. The load average was "
+            f"{os.getloadavg()[1]:.1f}, this benchmark included; other load slows it down.",
         ],
     )
 
 
 @contextmanager
-def _splits(given: Sequence[Path]) -> Iterator[Sequence[Path]]:
-    if given:
-        yield given
+def _splits(splits: Sequence[Path]) -> Iterator[Sequence[Path]]:
+    if splits:
+        yield splits
         return
     with tempfile.TemporaryDirectory() as out:
         for size, levels in LEVELS.items():
-            words = ("generate", f"size={size}", f"levels={levels}", f"budget={BUDGET}", f"out={out}", *ALONE)
-            oracle.log(f"levelproof {' '.join(words)}")
-            command = [sys.executable, "-m", "levelproof", *words]
+            arguments = ("generate", f"size={size}", f"levels={levels}", f"budget={BUDGET}", f"out={out}", *ALONE)
+            oracle.log(f"levelproof {' '.join(arguments)}")
+            command = [sys.executable, "-m", "levelproof", *arguments]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=dict(oracle.our_environment()))
         yield [Path(out) / BUDGET / size for size in SIZES]
 
 
 def measured(split: Path) -> Iterator[dict[str, Any]]:
-    """What each density takes for the trajectories of a split, those of trivial levels among them."""
+    """Measure each density on the trajectories of a split, trivial levels included."""
     rows = require_manifest(split, COLUMNS).table
     rows = rows.filter(pc.is_valid(rows["shard"]))  # pyright: ignore[reportAttributeAccessIssue]
     if not rows.num_rows:
@@ -104,16 +106,16 @@ def measured(split: Path) -> Iterator[dict[str, Any]]:
     for density in get_args(Density):
         oracle.log(f"{size}: {density}, {len(ids)} trajectories")
         with tempfile.TemporaryDirectory() as folder:
-            found = _stored(Path(folder), ids, arrays, replace(encoding, density=density))
-        full = full or found["bytes_per_transition"]
+            measurements = _stored(Path(folder), ids, arrays, replace(encoding, density=density))
+        full = full or measurements["bytes_per_transition"]
         about = {"size": size, "trajectories": len(ids), "density": density, "published": PUBLISHED.get(size)}
-        yield about | found | {"of_full": found["bytes_per_transition"] / full}
+        yield about | measurements | {"of_full": measurements["bytes_per_transition"] / full}
 
 
 def _stored(
     folder: Path, level_ids: Sequence[int], arrays: Mapping[str, np.ndarray], encoding: Encoding
 ) -> dict[str, Any]:
-    """What all of these take as one shard in this folder."""
+    """Write all trajectories as one shard; measure its bytes and rates."""
     paths = (folder / f"{i}.zarr" for i in count())
     written = per_second(lambda: write_shard(next(paths), level_ids, arrays, encoding), len(level_ids))
     shard, rng = Shard(folder / "0.zarr"), np.random.default_rng(0)
@@ -122,13 +124,14 @@ def _stored(
         "bytes_per_transition": stored_bytes(shard.path) / len(level_ids) / RECORD_STEPS,
         "written_per_second": written,
         "read_per_second": {
-            of: per_second(lambda fields=fields: shard.read(batch(), fields), BATCH) for of, fields in FIELDS.items()
+            name: per_second(lambda fields=fields: shard.read(batch(), fields), BATCH)
+            for name, fields in FIELDS.items()
         },
     }
 
 
 def per_second(work: Callable[[], Any], trajectories: int) -> float:
-    """A second of the core's time, of so many trajectories each time; the first time is not counted."""
+    """Return trajectories per second of CPU time; `work` handles `trajectories` a call, the first is not timed."""
     work()
     start, times = time.process_time(), 0
     while (taken := time.process_time() - start) < SECONDS:
@@ -137,13 +140,13 @@ def per_second(work: Callable[[], Any], trajectories: int) -> float:
     return trajectories * times / taken
 
 
-def row(of: Mapping[str, Any]) -> list[str]:
+def row(result: Mapping[str, Any]) -> list[str]:
     return [
-        of["size"],
-        f"{of['trajectories']:,}",
-        of["density"],
-        f"{of['bytes_per_transition']:.1f}",
-        f"{of['of_full']:.0%}",
-        str(of["published"] or "-"),
-        *(f"{rate:,.0f}" for rate in (of["written_per_second"], *of["read_per_second"].values())),
+        result["size"],
+        f"{result['trajectories']:,}",
+        result["density"],
+        f"{result['bytes_per_transition']:.1f}",
+        f"{result['of_full']:.0%}",
+        str(result["published"] or "-"),
+        *(f"{rate:,.0f}" for rate in (result["written_per_second"], *result["read_per_second"].values())),
     ]

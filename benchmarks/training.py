@@ -1,6 +1,6 @@
-"""Where training's time goes: rollout and update of one core alone, and the program that does both in slots.
+"""Time of training: a rollout and an update on one core, and the program that does both in slots.
 
-Levels stay in their slots, without evaluations.
+Levels stay in their slots, and there are no evaluations.
 """
 
 import argparse
@@ -45,21 +45,21 @@ def run(args: argparse.Namespace) -> Report:
         levels = jax.device_get(sample_levels(jnp.arange(experts), SIZES[size]))
         rates = [experts * config.steps_per_update / seconds(call) for call in calls(levels, config)]
         results.append({"size": size, "unit": "env steps/s of one core", **dict(zip(parts, rates, strict=True))})
-    rows = [[of["size"], *(f"{of[name]:,.0f}" for name in parts)] for of in results]
+    rows = [[result["size"], *(f"{result[name]:,.0f}" for name in parts)] for result in results]
     table = Table(("size", "rollout", "update", "both, in slots"), rows, "Env steps/s of one core, the defaults")
     return Report("Rollout and update apart", results, [table])
 
 
 def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
-    """A rollout, an update, and both: functions without arguments, one after another."""
+    """Yield functions without arguments that run a rollout, an update, and both."""
     count = levels.role.shape[-1]
     queue = endless_queue(levels, config)
     slots, _ = update_slots(empty_slots(count, queue, config), queue, config)
     experts, levels = slots.slot.training.train_state, jax.tree.map(jnp.asarray, levels)
-    experts = jax.tree.map(jnp.copy, experts)  # `advance` uses its slots up
+    experts = jax.tree.map(jnp.copy, experts)  # `update_slots` donates its slots
     lanes, network = config.environments * count, network_of(levels.size, config)
-    no = jnp.zeros(lanes, bool)
-    manner = ActionRule(no, jnp.zeros(lanes), no, jnp.zeros((256, len(CHOICES), count), jnp.int8))
+    off = jnp.zeros(lanes, bool)
+    manner = Manner(off, jnp.zeros(lanes), off, jnp.zeros((256, len(CHOICES), count), jnp.int8))
     keys, acting = jax.random.split(jax.random.key(0), count), start(repeat(levels, config.environments))
     ours = config.horizon, DEFAULT_RULES
     act = jax.jit(lambda params, acting: rollout(network, params, levels, acting, keys, manner, *ours))
@@ -74,7 +74,7 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
 
     @jax.jit
     def update(experts):
-        one = lambda given: ppo.update(given[0], given[1], network, given[2], given[3], config)
+        one = lambda inputs: ppo.update(inputs[0], inputs[1], network, inputs[2], inputs[3], config)
         return jax.lax.map(one, (experts, keys, constants, rows))
 
     yield partial(update, experts)
@@ -88,7 +88,7 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Median of REPEATS calls."""
+    """Return the median seconds of REPEATS calls."""
     jax.block_until_ready(call())
     taken = []
     for _ in range(REPEATS):

@@ -38,7 +38,7 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> Report:
-    trained = train(given) if args.variant else None
+    trained = train(args) if args.variant else None
     results = read(args.results)
     named = {each.header.name: each for each in results}
     if missing := [name for name in args.groups if name not in named]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from benchmarks.fidelity import SizeReport, compare, p_value, summary, table, summarise
+from benchmarks.fidelity import SizeReport, compare, p_value, summarise, summary, table
 from benchmarks.statistics import holm
 
 RNG = np.random.default_rng(0)

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import handmade
-from benchmarks.handmade import KINDS, PIXELS, PPO_TOLD, labelled, ppo, totals, write_sheet
+from benchmarks.handmade import KINDS, PIXELS, PPO_COLUMNS, labelled, ppo, totals, write_sheet
 from levelproof.configs.compose import compose_job
 from levelproof.levelgen.files.level_file import LevelFile, write_level_file
 from levelproof.levelgen.level import SIZES
@@ -35,7 +35,7 @@ def test_each_level_has_its_row_and_each_size_its_sum(tmp_path: Path, monkeypatc
     by_ppo = ppo(origins, tmp_path / "kept")
     monkeypatch.setattr(handmade, "label", None)
     assert ppo(origins, tmp_path / "kept") == by_ppo, "what is known is not trained again"
-    assert [[of[name] is not None for name in PPO_TOLD] for of in by_ppo] == [[False, True], [False, False]]
+    assert [[of[name] is not None for name in PPO_COLUMNS] for of in by_ppo] == [[False, True], [False, False]]
     results = [of | of_ppo for of, of_ppo in zip(results, by_ppo, strict=True)]
     ((size, levels, with_witness, by_ppo, _, *sums),) = totals(results)
     assert (size, levels, with_witness, by_ppo, sums) == ("s", "2", "1", "1", ["0"] * len(KINDS))

@@ -37,7 +37,7 @@ def reports() -> list[tuple[int, float, int]]:
 
 @pytest.fixture(scope="module")
 def result(levels: Level, reports) -> UnitResult:
-    return label(levels, IDS, BUDGET, untouched(WHOLE), tell=lambda *now: reports.append(now))
+    return label(levels, IDS, BUDGET, untouched(WHOLE), report=lambda *now: reports.append(now))
 
 
 def test_run_returns_consistent_verdicts(result: UnitResult) -> None:
