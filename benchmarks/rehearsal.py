@@ -256,8 +256,8 @@ def run(args: argparse.Namespace) -> Report:
             f"{levels:,} levels, by the scheduler of `generate` under a simulated clock, in units of its default size: "
             f"20 to 60 s of a worker, at most {MOST * UNTIMED} levels and a quarter of a worker's share; a "
             f"level takes the time of one of {len(seconds):,} measured levels, {seconds.mean():.3g} core-seconds on "
-            f"average{scaled}. On average, a machine of 64 cores or 8 GPUs is taken away with notice after a day, or as "
-            f"named, and dies without notice after 30 days; another replaces it {REPLACEMENT / 60:.0f} minutes "
+            f"average{scaled}. On average, a machine of 64 cores or 8 GPUs is taken away with notice after a day, or "
+            f"as named, and dies without notice after 30 days; another replaces it {REPLACEMENT / 60:.0f} minutes "
             "later. Processes crash once a week; 1% of workers are five times slower. That a GPU equals 20 "
             "cores is assumed, not measured.",
             "*levels a unit*: on average. *busy*: share of the workers' time, from joining to leaving, that went into "

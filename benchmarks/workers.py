@@ -1,11 +1,10 @@
-"""How much faster two workers are than one, on two cores; and what the driver needs for a thousand of them.
+"""Speedup of two workers over one, on two cores; and the driver's cost for a thousand workers.
 
-The first is the same job with `workers=1` and `workers=2`, in turns, from when its first worker has begun until
-everything is committed: the start of Ray and of Python is not in it, loading compiled programs and the end, when one
-worker has nothing left, are. What two cores can give is measured beside it: a worker's loop alone, without Ray and
-without a driver, in one process and in two at once that share nothing; that they slow each other down is the machine's
-doing. The last is the scheduler alone, with workers that are simulated: as many seconds of its own, and bytes, as it
-takes to hand out all units and hear all reports.
+The speedup is of the same job with `workers=1` and `workers=2`, in turns, from the start of the first worker until all
+is committed. That excludes the start of Ray and Python, but includes loading compiled programs and the tail, when one
+worker is idle. Its upper bound is measured beside it: a worker's loop without Ray or a driver, in one process and in
+two at once, which only the shared machine slows down. The driver's cost is the scheduler's alone, with simulated
+workers: its seconds and bytes for handing out all units and handling all reports.
 """
 
 import argparse
@@ -33,15 +32,15 @@ from levelproof.pipeline.store.split import writing
 
 UNIT = 32  # levels
 WORKERS, UNITS = 1_000, (2_000, 20_000, 200_000)  # simulated
-SECONDS = 6.0  # that a simulated unit takes, on average; of each worker a rate of its own, so that some are slow
+SECONDS = 6.0  # mean time of a simulated unit; every worker has its own rate
 POLL = 0.25  # s
-PATIENCE = 600.0  # s that a process waits for another to load its programs
-BESIDE = 8  # units of the job that a process works through alone, after one that loads its programs
-SPREAD = 0.5  # of the logarithm of those rates
+LOAD_TIMEOUT = 600.0  # s that a process waits until the other has loaded its programs
+TIMED_UNITS = 8  # units that a process times, after one that loads its programs
+SPREAD = 0.5  # standard deviation of the logarithm of workers' rates
 
 
 class Timed(Scheduler):
-    """Knows when the first worker began."""
+    """Scheduler that notes when its first worker joined."""
 
     began = 0.0
 
@@ -53,30 +52,30 @@ class Timed(Scheduler):
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", default="s", help="default: s")
     parser.add_argument("--budget", default="64k", help="default: 64k")
-    parser.add_argument("--levels", type=int, default=1024, help="of the job; default: 1024")
-    parser.add_argument("--repeats", type=int, default=2, help="pairs of runs; default: 2, 0: the scheduler alone")
+    parser.add_argument("--levels", type=int, default=1024, help="levels of the job; default: 1024")
+    parser.add_argument("--repeats", type=int, default=2, help="pairs of runs; default: 2; 0: only the scheduler")
 
 
 def run(args: argparse.Namespace) -> Report:
     simulated = [simulate(units) for units in UNITS]
-    words = [f"size={args.size}", f"budget={args.budget}", f"levels={args.levels}", "first_level=1000000"]
-    pairs = [tuple(args.levels / seconds_of(words, workers) for workers in (1, 2)) for _ in range(args.repeats)]
+    settings = [f"size={args.size}", f"budget={args.budget}", f"levels={args.levels}", "first_level=1000000"]
+    pairs = [tuple(args.levels / seconds_of(settings, workers) for workers in (1, 2)) for _ in range(args.repeats)]
     ratios = [two / one for one, two in pairs]
-    shared = [tuple(beside(words, processes) for processes in (1, 2)) for _ in range(2 * args.repeats)]
-    most = [2 * one / two for one, two in shared]
-    results = [{"workers": WORKERS, **of} for of in simulated]
+    shared = [tuple(side_by_side(settings, processes) for processes in (1, 2)) for _ in range(2 * args.repeats)]
+    bounds = [2 * one / two for one, two in shared]
+    results = [{"workers": WORKERS, **result} for result in simulated]
     results += [{"size": args.size, "budget": args.budget, "one": one, "two": two} for one, two in pairs]
     results += [{"size": args.size, "budget": args.budget, "alone": one, "beside": two} for one, two in shared]
     rows = [[f"{one:.2f}", f"{two:.2f}", f"{two / one:.2f}"] for one, two in pairs]
-    apart = [[f"{one:.1f}", f"{two:.1f}", f"{of:.2f}"] for (one, two), of in zip(shared, most, strict=True)]
+    apart = [[f"{one:.1f}", f"{two:.1f}", f"{result:.2f}"] for (one, two), result in zip(shared, bounds, strict=True)]
     of_driver = [
         [
-            f"{of['units']:,}",
-            f"{1e6 * of['seconds'] / of['units']:.0f}",
-            f"{of['share']:.1%}",
-            f"{of['bytes'] / 1e6:.1f}",
+            f"{result['units']:,}",
+            f"{1e6 * result['seconds'] / result['units']:.0f}",
+            f"{result['share']:.1%}",
+            f"{result['bytes'] / 1e6:.1f}",
         ]
-        for of in simulated
+        for result in simulated
     ]
     return Report(
         title="One worker, two workers, a thousand",
@@ -84,49 +83,49 @@ def run(args: argparse.Namespace) -> Report:
         tables=[
             Table(("levels/s, one worker", "two workers", "ratio"), rows, f"A job of {args.levels} levels of size "
                   f"{args.size}, {args.budget} env steps each, on two cores"),
-            Table(("s, one process", "each of two at once", "two for one"), apart, f"{BESIDE} units of the job in "
+            Table(("s, one process", "each of two at once", "two for one"), apart, f"{TIMED_UNITS} units of the job in "
                   "processes that share nothing but the machine"),
             Table(
-                ("units", "µs of the driver a unit", "of one core, while they work", "most MB"),
+                ("units", "driver, µs per unit", "share of one core", "peak MB"),
                 of_driver,
                 f"The scheduler with {WORKERS:,} simulated workers, units of {UNIT} levels and {SECONDS:.0f} s",
             ),
         ],
         notes=[
             f"Two workers are {np.median(ratios):.2f} times as fast as one, two processes that share nothing "
-            f"{np.median(most):.2f} times (medians)."
+            f"{np.median(bounds):.2f} times (medians)."
         ]
         if ratios
         else [],
     )  # fmt: skip
 
 
-def seconds_of(words: Sequence[str], workers: int) -> float:
-    """Of a job with so many workers, in a process of its own."""
+def seconds_of(settings: Sequence[str], workers: int) -> float:
+    """Return the seconds of a job with `workers` workers, in its own process."""
     with tempfile.TemporaryDirectory() as out:
-        (seconds,) = told_by(work, [([*words, f"workers={workers}", f"out={out}"],)])
+        (seconds,) = values_of(work, [([*settings, f"workers={workers}", f"out={out}"],)])
     return seconds
 
 
-def told_by(target: Callable[..., None], each: Sequence[tuple[Any, ...]]) -> list[float]:
-    """What processes tell that run at once, one with each of these arguments."""
+def values_of(target: Callable[..., None], each: Sequence[tuple[Any, ...]]) -> list[float]:
+    """Run `target` in concurrent processes, one for each tuple of arguments; return their values."""
     context = multiprocessing.get_context("spawn")
-    told = context.SimpleQueue()
-    processes = [context.Process(target=target, args=(*arguments, told)) for arguments in each]
+    values = context.SimpleQueue()
+    processes = [context.Process(target=target, args=(*arguments, values)) for arguments in each]
     for process in processes:
         process.start()
     for process in processes:
         process.join()
     if any(process.exitcode for process in processes):
         raise Failure("A process of this benchmark failed: see above.")
-    return [told.get() for _ in processes]
+    return [values.get() for _ in processes]
 
 
-def work(words: Sequence[str], told: Any) -> None:
-    """The job, as `levelproof generate` does it."""
+def work(settings: Sequence[str], values: Any) -> None:
+    """Do the job as `levelproof generate` does; put its seconds."""
     from levelproof.pipeline.jobs import cluster
 
-    job = compose_job(words)
+    job = compose_job(settings)
     count = len(job.level_ids)
     with stoppable() as stop, writing(job, print) as (split, _), Path("/dev/null").open("w") as nowhere:
         scheduler = Timed(plan_units(job.level_ids, [], STRETCH), count, job.levels_per_unit, timed=True)
@@ -138,31 +137,31 @@ def work(words: Sequence[str], told: Any) -> None:
                 board.ended(outcome.unit, outcome.summary)
 
         cluster.run(job, split, scheduler, settle, board, stop)
-        told.put(time.monotonic() - scheduler.began)
+        values.put(time.monotonic() - scheduler.began)
 
 
-def beside(words: Sequence[str], processes: int) -> float:
-    """Seconds of each of so many processes at once, on average, each on a core of its own."""
-    ready = multiprocessing.get_context("spawn").Barrier(processes, timeout=PATIENCE)
+def side_by_side(settings: Sequence[str], processes: int) -> float:
+    """Return the mean seconds of concurrent processes, each on its own core."""
+    ready = multiprocessing.get_context("spawn").Barrier(processes, timeout=LOAD_TIMEOUT)
     with tempfile.TemporaryDirectory() as folder:
-        each = [([*words, f"out={folder}/{core}"], core, ready) for core in own_cores()[:processes]]
-        return float(np.mean(told_by(work_alone, each)))
+        each = [([*settings, f"out={folder}/{core}"], core, ready) for core in own_cores()[:processes]]
+        return float(np.mean(values_of(work_alone, each)))
 
 
-def work_alone(words: Sequence[str], core: int, ready: Any, told: Any) -> None:
-    """The job's first units, by a worker's loop that nobody drives."""
+def work_alone(settings: Sequence[str], core: int, ready: Any, values: Any) -> None:
+    """Do the job's first units by a worker's loop without a driver; put their seconds."""
     prepare_jax(core)
-    from levelproof.pipeline.jobs.worker import Worker  # imports what reads the settings just made
+    from levelproof.pipeline.jobs.worker import Worker  # imports modules that read these settings
 
-    job = compose_job(words)
-    first, *units = islice(plan_units(job.level_ids, [], job.levels_per_unit), 1 + BESIDE)
+    job = compose_job(settings)
+    first, *units = islice(plan_units(job.level_ids, [], job.levels_per_unit), 1 + TIMED_UNITS)
     with writing(job, print) as (split, _):
         worker = Worker(job, split)
         finish(worker, [first])
         ready.wait()
-        begun = time.monotonic()
+        start = time.monotonic()
         finish(worker, units)
-        told.put(time.monotonic() - begun)
+        values.put(time.monotonic() - start)
 
 
 def finish(worker: Any, units: list[WorkUnit]) -> None:
@@ -175,29 +174,29 @@ def finish(worker: Any, units: list[WorkUnit]) -> None:
 
 
 def require_done(outcomes: Sequence[UnitOutcome]) -> None:
-    """Raises Failure where an attempt has failed: its seconds would count for nothing."""
+    """Raise Failure if an attempt failed, as its seconds would not count."""
     for outcome in outcomes:
         if not outcome.summary:
             raise Failure(outcome.reason)
 
 
 def simulate(units: int) -> dict[str, float]:
-    """What the scheduler takes for so many units of WORKERS workers, one of which dies for every thousand units."""
+    """Measure the scheduler on `units` units of WORKERS workers, one of which dies per thousand units."""
     seconds, simulated = schedule(units)
-    tracemalloc.start()  # by itself: it slows everything down
+    tracemalloc.start()  # in a run of its own, because tracing is slow
     schedule(units)
-    most = tracemalloc.get_traced_memory()[1]
+    peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    return {"units": units, "seconds": seconds, "bytes": most, "share": seconds / simulated}
+    return {"units": units, "seconds": seconds, "bytes": peak, "share": seconds / simulated}
 
 
 def schedule(units: int) -> tuple[float, float]:
-    """Seconds of the scheduler, and seconds that pass for the workers."""
+    """Return the scheduler's seconds, and the simulated seconds of the job."""
     rng, levels = np.random.default_rng(0), units * UNIT
     rates = np.exp(rng.normal(0, SPREAD, WORKERS)) * UNIT / SECONDS  # levels/s
     scheduler = Scheduler(plan_units(range(levels), [], UNIT), levels, UNIT)
-    done, worked, now, share_at = np.zeros(WORKERS), 0.0, 0.0, 0.0  # levels since its last unit ended
-    events = [(float(of), worker) for worker, of in enumerate(rng.random(WORKERS))]
+    done, worked, now, share_at = np.zeros(WORKERS), 0.0, 0.0, 0.0  # levels since each worker's last unit ended
+    events = [(float(first), worker) for worker, first in enumerate(rng.random(WORKERS))]
     heapq.heapify(events)
     for _, worker in events:
         scheduler.join(worker, 0.0)
@@ -217,7 +216,7 @@ def schedule(units: int) -> tuple[float, float]:
             scheduler.join(worker, now)
         else:
             scheduler.report(worker, Round(ended, {}, wants=UNIT // 4 if len(running) - len(ended) < 2 else 0), now)
-        if now >= share_at:  # as the driver, which looks several times a second
+        if now >= share_at:  # as the driver does, several times a second
             share_at = now + POLL
             scheduler.share()
         scheduler.order(worker, now)

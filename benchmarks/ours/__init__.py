@@ -1,1 +1,1 @@
-"""Our side of benchmarks, as the reference's side is: processes of their own."""
+"""Our side of benchmarks, which runs in its own processes, as the reference's side does."""

@@ -1,4 +1,4 @@
-"""Our side of `python -m benchmarks experts`: one process of it. Experts train as in `levelproof generate`."""
+"""Our side of `python -m benchmarks experts`: one process, which trains experts as `levelproof generate` does."""
 
 import argparse
 from dataclasses import replace
@@ -31,7 +31,7 @@ def main() -> None:
     from levelproof.levelgen.batching import take
     from levelproof.levelgen.task.rules import TaskParams
 
-    jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
+    jax.config.update("jax_enable_compilation_cache", False)  # compiling is timed
     no_evaluation = {"attempts": 1, "sticky_attempts": 0, "moved_attempts": 0}
     config = replace(REFERENCE.expert, environments=args.environments, horizon=args.horizon, **no_evaluation)
     rules = TaskParams(dense_reward_scale=config.dense_reward_scale)
@@ -40,21 +40,21 @@ def main() -> None:
     batches = [np.minimum(np.arange(i, i + slots), args.count - 1) for i in range(0, args.count, slots)]
 
     def train(updates: int, batches: list[np.ndarray]) -> list[tuple[Training, float]]:
-        """Fresh experts, a batch of them after another: what they have become, and their goals."""
+        """Train fresh experts, batch after batch; return their training states and goals reached."""
         everyone = jax.device_get(endless_queue(levels, config))
         return [train_batch(of_batch(everyone, batch), updates) for batch in batches]
 
     def of_batch(queue: LevelQueue, batch: np.ndarray) -> LevelQueue:
         begun, pending = jax.tree.map(lambda x: x[batch], (queue.begun, queue.pending))
-        some = take(queue.levels, batch), queue.level_ids[batch], np.arange(len(batch)), np.int32(len(batch))
-        return jax.device_put(LevelQueue(*some, begun, pending))
+        fields = take(queue.levels, batch), queue.level_ids[batch], np.arange(len(batch)), np.int32(len(batch))
+        return jax.device_put(LevelQueue(*fields, begun, pending))
 
     def train_batch(queue: LevelQueue, updates: int) -> tuple[Training, float]:
         now, goals, ended = empty_slots(slots, queue, config), 0.0, np.zeros(slots)
         for _ in range(updates):
-            now, seen = update_slots(now, queue, config, rules)
+            now, report = update_slots(now, queue, config, rules)
             before, ended = ended, np.asarray(now.slot.training.progress.episodes)
-            goals += float((np.nan_to_num(np.asarray(seen.share)) * (ended - before)).sum())
+            goals += float((np.nan_to_num(np.asarray(report.share)) * (ended - before)).sum())
         return now.slot.training, goals
 
     cold, _ = timed(lambda: train(1, batches[:1]))

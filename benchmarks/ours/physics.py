@@ -1,4 +1,4 @@
-"""Our side of `python -m benchmarks physics`: one process, which steps blocks of lanes that stay in a core's cache."""
+"""Our side of `python -m benchmarks physics`: one process, which steps blocks of lanes that fit a core's cache."""
 
 import argparse
 
@@ -24,7 +24,7 @@ def main() -> None:
     from benchmarks.levels import load_levels
     from levelproof.levelgen.task import rules as task
 
-    jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
+    jax.config.update("jax_enable_compilation_cache", False)  # compiling is timed
 
     def rollout(level, now, actions):
         def act(now, action):
@@ -37,7 +37,7 @@ def main() -> None:
     levels = load_levels(args.levels, args.first, args.lanes)
     actions = np.load(args.actions)[:, :, args.first : args.first + args.lanes]
     size = min(args.block, args.lanes)
-    # the last block is filled up with its last lane, so that one program serves all
+    # pad the last block with its last lane, so that one program serves all
     cut = [np.minimum(np.arange(i, i + size), args.lanes - 1) for i in range(0, args.lanes, size)]
     blocks = [jax.tree.map(lambda x, at=at: jax.numpy.asarray(x[..., at]), (levels, actions)) for at in cut]
     worlds = [task.reset(level) for level, _ in blocks]
@@ -48,7 +48,7 @@ def main() -> None:
         out = [compiled(level, now, action) for (level, action), now in zip(blocks, worlds, strict=True)]
         return jax.block_until_ready(out)
 
-    worlds = [now for now, _ in play()]  # the first run touches memory
+    worlds = [now for now, _ in play()]  # the first run faults memory in
 
     def run() -> dict:
         nonlocal worlds

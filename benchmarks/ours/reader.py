@@ -1,4 +1,4 @@
-"""Our side of `python -m benchmarks reader`: random batches of a split, every field, one after another for a while."""
+"""Our side of `python -m benchmarks reader`: random batches of a split, with every field."""
 
 import argparse
 import json
@@ -20,13 +20,13 @@ def main() -> None:
     start = time.perf_counter()
     data = levelproof.open(args.split)
     batches = data.batches(args.batch, seed=0, fields=["record", "level"], observation=None, epochs=None)
-    following = lambda: next(batches)
-    following()
+    next_batch = lambda: next(batches)
+    next_batch()
     first = time.perf_counter() - start
     for _ in range(WARM):
-        following()
+        next_batch()
     arrays = lambda batch: [x for x in jax.tree.leaves(batch) if isinstance(x, np.ndarray)]
-    print(json.dumps({"first": first} | rates(following, arrays, args.batch, args.seconds)))
+    print(json.dumps({"first": first} | rates(next_batch, arrays, args.batch, args.seconds)))
 
 
 if __name__ == "__main__":

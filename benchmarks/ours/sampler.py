@@ -1,4 +1,4 @@
-"""Our side of `python -m benchmarks sampler`: its first call, and its rate afterwards."""
+"""Our side of `python -m benchmarks sampler`: seconds of the first call, and the rate afterwards."""
 
 import argparse
 import json

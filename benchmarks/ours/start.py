@@ -1,4 +1,4 @@
-"""The start of `levelproof generate` with these settings, until its first unit could begin."""
+"""Run `levelproof generate` with the command line's settings until its first unit could begin."""
 
 import sys
 
@@ -16,4 +16,4 @@ def begin(*_: object) -> None:
 if __name__ == "__main__":
     inline.run = begin  # type: ignore[assignment]
     generate(compose_job(["executor=inline", *sys.argv[1:]]), [], Console(stderr=True))
-    sys.exit("Nothing was left to do.")
+    sys.exit("Every level is already there: nothing would start.")

@@ -1,5 +1,5 @@
-"""How far our physics is from the reference's, and why.
+"""The benchmark `parity`: how far our physics differs from the reference's, and why.
 
-campaign.py says where worlds come from (scenes.py has the adversarial ones), onestep.py and episodes.py compare the
-engines (engines.py), causes.py explains, report.py makes tables.
+campaign.py collects worlds (scenes.py makes the adversarial ones), onestep.py and episodes.py compare the engines
+(engines.py), causes.py explains differences, and report.py makes tables.
 """

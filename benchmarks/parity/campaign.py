@@ -1,4 +1,4 @@
-"""The parity campaign of one size: where its states and episodes come from."""
+"""The parity campaign of one size: its states and episodes, and their sources."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -26,9 +26,9 @@ from levelproof.pipeline.errors import UserError
 SAMPLED, HANDMADE = "sampled", "handmade"
 ADVERSARIAL_SHARE, HANDMADE_SHARE = 0.4, 0.2  # of the states; the others come from sampled levels
 HANDMADE_EPISODES = 0.2  # of the episodes
-TIMES = (0, 1, 2, 4, 8, 16, 32, 47)  # env steps at which scenes are looked at
-SHORT = TIMES[-1] + 1  # env steps that scenes are played
-Tick = Callable[..., None]  # (what a block was, blocks that nobody knew of)
+TIMES = (0, 1, 2, 4, 8, 16, 32, 47)  # env steps at which scenes are compared
+SHORT = TIMES[-1] + 1  # env steps of a scene
+Tick = Callable[..., None]  # (description of the finished block, number of blocks added)
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,16 @@ def campaign(
     level_file: Path | None = None,
     keep: Path | None = None,
 ) -> SizeReport:
-    """Run it. Sizes without a name have no handmade levels and no episodes.
+    """Run the campaign of one size. Sizes without a name have no handmade levels and no episodes.
 
     Args:
-        python: of the reference's environment.
+        python: the reference's interpreter.
         size: see `levelgen.level.size_of`.
-        states: to take one step from, at least about so many.
-        episodes: pairs of levels and actions.
-        board: shows how far it is.
-        level_file: sampled levels as the reference's arrays; by default it samples them.
-        keep: folder where the reference's answers are kept, so that only our side has to run again.
+        states: approximate minimum number of states to step from.
+        episodes: number of pairs of levels and actions.
+        board: shows progress.
+        level_file: sampled levels as the reference's arrays; None: sample them.
+        keep: folder that keeps the reference's answers, so that only our side runs again.
 
     Raises:
         UserError: the levels of `level_file` are of another size.
@@ -77,7 +77,7 @@ def campaign(
 
 
 def _sampled(python: Path, size: str, level_file: Path | None) -> Level:
-    """Of the reference where it has the size, else ours: which levels is all the same to both."""
+    """Load levels that the reference sampled; sample ours if it lacks the size. Either kind serves the comparison."""
     if level_file is None and size not in SIZES:
         return jax.device_get(sample_levels(jnp.arange(oracle.LEVELS), size_of(size)))
     path = level_file or oracle.sampled_levels(python, size)
@@ -90,7 +90,7 @@ def _sampled(python: Path, size: str, level_file: Path | None) -> Level:
 
 
 def _pairs(sampled: Level, names: list[str], handmade: Level, count: int) -> Pool:
-    """Levels for episodes, every fifth a handmade one; their actions' first step."""
+    """Choose levels and actions for episodes; every fifth level is handmade."""
     drawn = max(1, round(count * HANDMADE_EPISODES))
     crafted, random = np.arange(drawn) % len(names), np.arange(count - drawn) % sampled.role.shape[-1]
     origin = [f"{names[k]} (actions {lane})" for lane, k in enumerate(crafted)]
@@ -104,12 +104,12 @@ def _pairs(sampled: Level, names: list[str], handmade: Level, count: int) -> Poo
 
 
 def _episodes(reference: Reference, pairs: Pool, states: int, tick: Tick) -> tuple[list[Pool], list[Block]]:
-    """Play the pairs, and pick states along them."""
+    """Play the pairs; pick states along the reference's rollouts."""
     rng, pools, parts = np.random.default_rng(0), [], []
     shares = {HANDMADE: HANDMADE_SHARE, SAMPLED: 1 - ADVERSARIAL_SHARE - HANDMADE_SHARE}
     for lanes in blocks(len(pairs), BLOCK):
         block = pairs.lanes(lanes)
-        count = int(lanes[-1] - lanes[0]) + 1  # the last block is filled up
+        count = int(lanes[-1] - lanes[0]) + 1  # the last block is padded
         parts.append(play_block(block, count, reference, tick))
         for scene, share in shares.items():
             chosen = np.flatnonzero([name == scene for name in block.scene[:count]])
@@ -121,18 +121,20 @@ def _episodes(reference: Reference, pairs: Pool, states: int, tick: Tick) -> tup
 
 
 def _scenes(reference: Reference, sampled: Level, states: int, with_sampled: bool, tick: Tick) -> Pool:
-    """States of adversarial scenes along short rollouts, their starts included.
+    """Pick states of adversarial scenes along short rollouts, starts included.
 
-    Nobody is green, blue or red there: what touches at its start would end each episode at once.
+    All bodies are plain: others that touch at the start would end each episode at once.
     """
     rng = np.random.default_rng(1)
     each = ceil(states * ADVERSARIAL_SHARE / len(SCENES) / len(TIMES))
-    there = sampled.role.shape[-1]
-    some = lambda count: lanes_of(sampled, rng.permutation(np.resize(np.arange(there), max(there, count)))[:count])
-    levels = {name: change(some(each), rng) for name, change in SCENES.items()}
+    available = sampled.role.shape[-1]
+    chosen = lambda count: lanes_of(
+        sampled, rng.permutation(np.resize(np.arange(available), max(available, count)))[:count]
+    )
+    levels = {name: change(chosen(each), rng) for name, change in SCENES.items()}
     if with_sampled:
         count = ceil(states * (1 - ADVERSARIAL_SHARE) / len(TIMES))
-        levels[SAMPLED] = some(count)
+        levels[SAMPLED] = chosen(count)
     scene = [name for name, level in levels.items() for _ in range(level.role.shape[-1])]
     origin = [f"{name} {lane}" for lane, name in enumerate(scene)]
     level = joined([*levels.values()])

@@ -1,10 +1,10 @@
-"""Why a state is off: is it rounding, and what amplifies it.
+"""Why a state is off: whether rounding explains it, and what amplifies the rounding.
 
-Both engines compute in single precision, in another order of additions. So a state that is off is stepped again from
-COPIES neighbours, every number of it moved by at most one unit in its last place (then by more: MOVES). Where our own
-results reach as far as the reference's, number by number, no engine in single precision can be asked for more. What
-amplifies the last bit is named by what else the neighbours do (contacts that come and go, normals that turn), by what
-happens without the joints' limits, and by what holds the body that is off.
+Both engines compute in single precision, but add in different orders. So a state that is off is stepped again from
+COPIES neighbours, every number perturbed by at most one unit in its last place (then by more: MOVES). If our own
+results spread as far as the reference's, number by number, no engine in single precision can do better. The amplifier
+is named by what else differs among the neighbours (contacts that come and go, normals that turn), by what happens
+without the joints' limits, and by what holds the body that is off.
 """
 
 from collections.abc import Callable
@@ -24,9 +24,9 @@ from levelproof.physics.types import State
 
 COPIES = BLOCK  # neighbours, the state itself first
 MOVES = (1, 4, 16)  # units in the last place
-BROKEN = 1e6  # rad or m; a world with such numbers has broken down
-TURNED = 1e-3  # of a unit normal, or m of a contact point: more than rounding does to a well-defined one
-SMALL = 60.0  # 1/(kg m^2); a body with more inverse inertia is spun by small changes of impulses
+BROKEN = 1e6  # rad or m; a world with larger numbers has broken down
+TURNED = 1e-3  # change of a unit normal, or of a contact point, m; exceeds rounding of a well-defined one
+SMALL = 60.0  # 1/(kg m^2); small changes of impulses spin a body with more inverse inertia
 DEEP = 0.1  # m of overlap
 RESTING = 0.01  # rad/s
 SPINNING = 5.0  # rad/s
@@ -53,11 +53,11 @@ UNNAMED = "rounding of no named kind"
 
 @dataclass(frozen=True)
 class Cause:
-    """What was found out about one state."""
+    """Why one state is off."""
 
-    explained: bool  # our neighbours reach as far as the reference
+    explained: bool  # our neighbours spread as far as the reference
     name: str
-    moved: int  # units in the last place that it took
+    moved: int  # units in the last place by which neighbours were perturbed
     spread: float  # of the neighbours' motion
 
 
@@ -69,33 +69,33 @@ class Neighbours(NamedTuple):
 
 
 def find_cause(step: Step, level: Level, action: Int[np.ndarray, "6 1"], theirs: Stepped) -> Cause:
-    """Of one state that is off.
+    """Find the cause of one state that is off.
 
     Args:
         step: our physics step of BLOCK lanes.
         level: one lane, stepped from its `state`.
-        theirs: what the reference made of it, one lane.
+        theirs: the reference's result, one lane.
     """
-    *less, most = MOVES
-    for moved in less:
-        seen = neighbours(step, level, action, moved)
-        if reached(seen.after.state, theirs.state):
-            return Cause(True, name_cause(step, seen, action, theirs), moved, spread(seen.after.state))
-    seen = neighbours(step, level, action, most)
-    explained = reached(seen.after.state, theirs.state) or is_broken(level.state, theirs.state)
-    return Cause(explained, name_cause(step, seen, action, theirs), most, spread(seen.after.state))
+    *earlier, most = MOVES
+    for moved in earlier:
+        copies = neighbours(step, level, action, moved)
+        if reached(copies.after.state, theirs.state):
+            return Cause(True, name_cause(step, copies, action, theirs), moved, spread(copies.after.state))
+    copies = neighbours(step, level, action, most)
+    explained = reached(copies.after.state, theirs.state) or is_broken(level.state, theirs.state)
+    return Cause(explained, name_cause(step, copies, action, theirs), most, spread(copies.after.state))
 
 
 def neighbours(step: Step, level: Level, action: Int[np.ndarray, "6 1"], most: int) -> Neighbours:
-    """Worlds near to that of one lane, after a step."""
+    """Step worlds near that of one lane."""
     level = near_worlds(level, most)
     return Neighbours(level, step(level, np.repeat(action, COPIES, -1)))
 
 
 def near_worlds(level: Level, most: int) -> Level:
-    """One lane with every float of its state moved by at most `most` units in its last place; beyond 1, its model too.
+    """Perturb every float of a lane's state by at most `most` units in its last place; above 1, of its model too.
 
-    The world itself is the first lane of COPIES.
+    The first of the COPIES lanes is the world itself.
     """
     level = lanes_of(level, np.zeros(COPIES, int))
     moved = nudged_tree((level.state, level.model), np.random.default_rng(0), most)
@@ -108,7 +108,7 @@ def _first_stays(old: np.ndarray, new: np.ndarray) -> np.ndarray:
 
 
 def reached(ours: State, theirs: State) -> bool:
-    """Whether each of the reference's numbers lies among our neighbours', or no farther out than these spread."""
+    """Whether each number of the reference lies among our neighbours', or no farther outside than these spread."""
     for name, far in evolving_gaps(ours, theirs).items():
         x, y = getattr(ours, name), getattr(theirs, name)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -123,23 +123,23 @@ def is_broken(*states: State) -> bool:
 
 
 def spread(states: State) -> float:
-    """Of neighbours: the widest range of any place or speed."""
+    """Return the widest range of any position or speed among neighbours."""
     with np.errstate(invalid="ignore", over="ignore"):
         return float(max(np.ptp(getattr(states, name), axis=-1).max() for name in MOTION))
 
 
-def name_cause(step: Step, seen: Neighbours, action: Int[np.ndarray, "6 1"], theirs: Stepped) -> str:
-    """The first kind that fits, decisions by the last bit before what merely amplifies."""
-    before = lanes_of(seen.level, [0])
-    ours = lanes_of(seen.after, [0])
+def name_cause(step: Step, copies: Neighbours, action: Int[np.ndarray, "6 1"], theirs: Stepped) -> str:
+    """Name the first kind that fits: decisions by the last bit before mere amplifiers."""
+    before = lanes_of(copies.level, [0])
+    ours = lanes_of(copies.after, [0])
     if is_broken(before.state, theirs.state, ours.state):
         return BROKEN_WORLD
     if (ours.state.contact_active != theirs.state.contact_active).any():
         return TOUCHING
     bodies = Bodies.off(before, ours, theirs)
     return (
-        _flipped_contact(before, bodies, seen.after, theirs)
-        or _limit(step, seen, action, bodies)
+        _flipped_contact(before, bodies, copies.after, theirs)
+        or _limit(step, copies, action, bodies)
         or _deep(before, bodies, ours)
         or _held(before, bodies)
     )
@@ -147,10 +147,10 @@ def name_cause(step: Step, seen: Neighbours, action: Int[np.ndarray, "6 1"], the
 
 @dataclass(frozen=True)
 class Bodies:
-    """What the difference is about, in one world."""
+    """The bodies and contacts that a difference involves, in one world."""
 
     worst: int  # the movable body that is off most
-    group: Bool[np.ndarray, " body"]  # those it touches or is joined to, over others too
+    group: Bool[np.ndarray, " body"]  # those it touches or is joined to, directly or through others
     contacts: Bool[np.ndarray, " contact"]  # those that act on the group
 
     @staticmethod
@@ -158,13 +158,13 @@ class Bodies:
         model, movable = before.model, (before.model.inverse_mass != 0)[:, 0]
         a, b = contact_bodies(before.size)
         gaps = evolving_gaps(ours.state, theirs.state)
-        by_thing = lambda names: np.max([gaps[name].reshape(len(gaps[name]), -1).max(-1) for name in names], 0)
-        apart = by_thing(MOTION)
+        largest_of = lambda names: np.max([gaps[name].reshape(len(gaps[name]), -1).max(-1) for name in names], 0)
+        apart = largest_of(MOTION)
         if apart.max() <= OFF:  # impulses only
-            for ends, gap in ((a, by_thing(CONTACT_IMPULSES)), (b, by_thing(CONTACT_IMPULSES))):
+            for ends, gap in ((a, largest_of(CONTACT_IMPULSES)), (b, largest_of(CONTACT_IMPULSES))):
                 np.maximum.at(apart, ends, gap)
             for ends in (model.joint_a[:, 0], model.joint_b[:, 0]):
-                np.maximum.at(apart, ends, by_thing(JOINT_IMPULSES))
+                np.maximum.at(apart, ends, largest_of(JOINT_IMPULSES))
         worst = int(np.argmax(np.where(movable, apart, -1)))
         active = (ours.state.contact_active | theirs.state.contact_active)[:, 0]
         acts = active & model.collides[a, b, 0]
@@ -180,7 +180,7 @@ class Bodies:
 
 
 def _flipped_contact(before: Level, bodies: Bodies, after: Stepped, theirs: Stepped) -> str | None:
-    """A contact that is found otherwise by some neighbour, or by the reference."""
+    """Blame a contact that some neighbour or the reference finds differently."""
     everyone = jax.tree.map(lambda x, y: np.concatenate([x, y], -1), after, theirs)
     active = everyone.state.contact_active
     a, b = contact_bodies(before.size)
@@ -192,34 +192,34 @@ def _flipped_contact(before: Level, bodies: Bodies, after: Stepped, theirs: Step
         slid = np.ptp(everyone.point, axis=-1).max(1) > TURNED
     pairs = pairs_of(before.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
-    number = np.arange(len(a))
+    index = np.arange(len(a))
     kinds = (
-        (SEPARATING_AXIS, turned & (number < 2 * n)),
-        (DEEPEST_VERTEX, slid & (number < 2 * n)),
-        (NEAREST_EDGE, (turned | slid) & (number >= 2 * n) & (number < 2 * n + m)),
-        (CENTRES, turned & (number >= 2 * n + m)),
+        (SEPARATING_AXIS, turned & (index < 2 * n)),
+        (DEEPEST_VERTEX, slid & (index < 2 * n)),
+        (NEAREST_EDGE, (turned | slid) & (index >= 2 * n) & (index < 2 * n + m)),
+        (CENTRES, turned & (index >= 2 * n + m)),
     )
-    return next((name for name, found in kinds if (found & bodies.contacts).any()), None)
+    return next((name for name, flips in kinds if (flips & bodies.contacts).any()), None)
 
 
-def _limit(step: Step, seen: Neighbours, action: np.ndarray, bodies: Bodies) -> str | None:
-    """Joints beyond their limits, if the neighbours come together without them."""
-    model, state = seen.level.model, seen.level.state
+def _limit(step: Step, copies: Neighbours, action: np.ndarray, bodies: Bodies) -> str | None:
+    """Blame joints beyond their limits, if neighbours stay together without these limits."""
+    model, state = copies.level.model, copies.level.state
     a, b = model.joint_a[:, 0], model.joint_b[:, 0]
     angle = (state.rotation[b] - state.rotation[a] - model.joint_rotation)[:, 0]
     beyond = (angle <= model.joint_min[:, 0]) | (angle >= model.joint_max[:, 0])
     held = (model.joint_active & ~model.joint_fixed & model.joint_limited)[:, 0] & (bodies.group[a] | bodies.group[b])
     if not (held & beyond).any():
         return None
-    free = replace(seen.level, model=replace(model, joint_limited=model.joint_limited & ~(held & beyond)[:, None]))
-    if spread(step(free, np.repeat(action, COPIES, -1)).state) > spread(seen.after.state) / 10:
+    free = replace(copies.level, model=replace(model, joint_limited=model.joint_limited & ~(held & beyond)[:, None]))
+    if spread(step(free, np.repeat(action, COPIES, -1)).state) > spread(copies.after.state) / 10:
         return None
     turning = np.abs(state.angular_velocity[b] - state.angular_velocity[a])[held & beyond, 0]
     return LIMIT_AT_REST if turning.min() < RESTING else LIMIT
 
 
 def _deep(before: Level, bodies: Bodies, ours: Stepped) -> str | None:
-    """Overlaps whose undoing takes impulses that are large beside what they leave."""
+    """Blame deep overlaps, whose correction takes impulses that are large beside the remaining motion."""
     pairs = pairs_of(before.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
     a, b = contact_bodies(before.size)
@@ -233,7 +233,7 @@ def _deep(before: Level, bodies: Bodies, ours: Stepped) -> str | None:
 
 
 def _held(before: Level, bodies: Bodies) -> str:
-    """What holds the body that is off, and how it moves."""
+    """Blame what holds the body that is off, or its motion."""
     model, worst = before.model, bodies.worst
     a, b = contact_bodies(before.size)
     acts = bodies.contacts & model.collides[a, b, 0]

@@ -1,4 +1,4 @@
-"""How far one physics step of ours is from the reference's, field by field."""
+"""Differences of one physics step between our engine and the reference, field by field."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from benchmarks.parity.worlds import contact_bodies
 from levelproof.levelgen.level import Level
 from levelproof.physics.types import State
 
-OFF = 1e-3  # a state with a larger difference is looked into
+OFF = 1e-3  # a state with a larger difference is investigated
 MOTION = ("position", "rotation", "velocity", "angular_velocity")
 CONTACT_IMPULSES = ("contact_normal_impulse", "contact_tangent_impulse")
 JOINT_IMPULSES = ("joint_impulse", "joint_angular_impulse")
@@ -30,27 +30,27 @@ UNITS = {
 
 
 class Distances(NamedTuple):
-    """Largest difference of each field in each lane, and in how many contacts the two differ."""
+    """Largest difference of each field in each lane, and the number of contacts active in one engine only."""
 
     by_field: dict[str, Float[np.ndarray, " lane"]]
     contacts: Float[np.ndarray, " lane"]
 
     @property
     def motion(self) -> Float[np.ndarray, " lane"]:
-        """Of any place or speed."""
+        """Largest difference of any position or speed."""
         return np.max([self.by_field[name] for name in MOTION], 0)
 
     @property
     def off(self) -> Bool[np.ndarray, " lane"]:
-        """States to look into: what the next step starts from differs, be it by a contact."""
+        """States to investigate: numbers or contacts that the next step starts from differ."""
         evolving = [self.by_field[name] for name in (*MOTION, *CONTACT_IMPULSES, *JOINT_IMPULSES)]
         return (np.max(evolving, 0) > OFF) | (self.contacts > 0)
 
 
 def distances(level: Level, ours: Stepped, theirs: Stepped) -> Distances:
-    """After a step of these levels.
+    """Compare both engines after a step of these levels.
 
-    Where both find a contact that does something, its geometry counts. What inactive actuators are told is nobody's.
+    Geometry counts for contacts that act in both engines; control counts for active actuators.
     """
     fields = {name: largest(gap) for name, gap in evolving_gaps(ours.state, theirs.state).items()}
     both = ours.state.contact_active & theirs.state.contact_active & level.model.collides[contact_bodies(level.size)]
@@ -63,21 +63,21 @@ def distances(level: Level, ours: Stepped, theirs: Stepped) -> Distances:
 
 
 def evolving_gaps(ours: State, theirs: State) -> dict[str, Float[np.ndarray, "... lane"]]:
-    """Difference of every number that evolves, in the units of UNITS; lanes of either may broadcast.
+    """Compare every number that evolves, in UNITS; the lanes of either may broadcast.
 
-    Impulses of contacts that do not touch are nobody's: the reference leaves old numbers there.
+    Impulses of contacts that do not touch are ignored: the reference leaves old numbers there.
     """
     gaps = {name: gap(getattr(ours, name), getattr(theirs, name)) for name in MOTION}
     touching = ours.contact_active | theirs.contact_active
     for name in (*CONTACT_IMPULSES, *JOINT_IMPULSES):
-        there = getattr(theirs, name)
-        apart = gap(getattr(ours, name), there) / (1 + np.abs(np.nan_to_num(there)))
+        reference = getattr(theirs, name)
+        apart = gap(getattr(ours, name), reference) / (1 + np.abs(np.nan_to_num(reference)))
         gaps[name] = np.where(touching, apart, 0) if name in CONTACT_IMPULSES else apart
     return gaps
 
 
 def gap(a: ArrayLike, b: ArrayLike) -> Float[np.ndarray, "..."]:
-    """|a - b|; equal where both are no number, infinite where one is."""
+    """Return |a - b|: 0 where both are NaN, infinite where one is."""
     a, b = np.asarray(a), np.asarray(b)
     same = (a == b) | (np.isnan(a) & np.isnan(b))
     with np.errstate(invalid="ignore", over="ignore"):
@@ -85,5 +85,5 @@ def gap(a: ArrayLike, b: ArrayLike) -> Float[np.ndarray, "..."]:
 
 
 def largest(values: np.ndarray) -> Float[np.ndarray, " lane"]:
-    """By lane; 0 of nothing."""
+    """Return the maximum of each lane; 0 for empty arrays."""
     return values.reshape(-1, values.shape[-1]).max(0, initial=0)

@@ -1,4 +1,4 @@
-"""Both engines behind the same three questions: one physics step, one env step, an episode under given actions."""
+"""Both engines behind one interface: a physics step, an env step, or an episode under given actions."""
 
 import hashlib
 import json
@@ -32,17 +32,17 @@ GEOMETRY = {"normal": "normal", "penetration": "penetration", "point": "collisio
 
 
 class Stepped(NamedTuple):
-    """After one physics step."""
+    """Results of one physics step."""
 
     state: State
     normal: Float[np.ndarray, "contact 2 lane"]
     penetration: Float[np.ndarray, "contact lane"]
     point: Float[np.ndarray, "contact 2 lane"]
-    control: Float[np.ndarray, "actuator lane"]  # what the action told joints, then thrusters, to do
+    control: Float[np.ndarray, "actuator lane"]  # of joints, then thrusters, from the action
 
 
 class Played(NamedTuple):
-    """Env steps with automatic reset, and the state before each action where it was asked for."""
+    """Env steps with automatic reset; if recorded, the state before each action."""
 
     reward: Float[np.ndarray, "step lane"]
     done: Bool[np.ndarray, "step lane"]
@@ -50,7 +50,7 @@ class Played(NamedTuple):
 
     @property
     def states(self) -> State:
-        """The record that was asked for."""
+        """The record, which must have been requested."""
         assert self.record is not None
         return self.record
 
@@ -72,90 +72,90 @@ def _act(level: Level, now: TaskState, action: Int[Array, "6 lane"]):
 
 
 def step_ours(level: Level, action: Int[np.ndarray, "6 lane"], params: Params = RULES.physics) -> Stepped:
-    """One physics step of every lane."""
+    """Take one physics step in every lane."""
     state, manifold, motor, thrust = jax.device_get(_one_step(level, action, params))
     control = np.concatenate([np.broadcast_to(x, (len(x), action.shape[-1])) for x in (motor, thrust)])
     return Stepped(state, manifold.normal, manifold.penetration, manifold.point, control)
 
 
 def env_step_ours(level: Level, action: Int[np.ndarray, "6 lane"]) -> State:
-    """One env step of every lane, without reset."""
+    """Take one env step in every lane, without reset."""
     return jax.device_get(_env_step(level, action))
 
 
 def play_ours(level: Level, start: State, action: Int[np.ndarray, "step 6 lane"], record: bool) -> Played:
-    """Episodes from `start`, which resets lead to the level's own state."""
+    """Play episodes from `start`; resets lead to the level's own state."""
     level = jax.tree.map(jnp.asarray, level)
     lanes = action.shape[-1]
     now = TaskState(start, jnp.zeros(lanes, jnp.int32), jnp.full(lanes, task.NO_DISTANCE, jnp.float32))
-    told, states = [], []
+    answer, states = [], []
     for one in action:
         if record:
             states.append(jax.tree.map(np.asarray, now.state))
         now, outcome = _act(level, now, one)
-        told.append((np.asarray(outcome.reward), np.asarray(outcome.done)))
-    reward, done = (np.stack(x) for x in zip(*told, strict=True))
+        answer.append((np.asarray(outcome.reward), np.asarray(outcome.done)))
+    reward, done = (np.stack(x) for x in zip(*answer, strict=True))
     return Played(reward, done, jax.tree.map(lambda *xs: np.stack(xs, -2), *states) if record else None)
 
 
 @dataclass
 class Reference:
-    """The reference for worlds of one size: its process, which starts when it is first asked something new."""
+    """The reference for worlds of one size; its process starts at the first request without a cached answer."""
 
     size: str
     process: Process
-    folder: Path  # of the arrays of the question under way
-    keep: Path | None  # folder of answers to questions asked before
-    awake: bool = False
+    folder: Path  # of the arrays of the current request
+    keep: Path | None  # folder of cached answers
+    running: bool = False
 
     @staticmethod
     @contextmanager
     def of(python: Path, size: str, keep: Path | None = None) -> Iterator["Reference"]:
-        """Its process lives as long as the context."""
+        """Run the reference in the `with` block."""
         cache = cache_folder() / "reference-jax"
         for folder in filter(None, (cache, keep)):
             folder.mkdir(parents=True, exist_ok=True)
         command = [python, oracle.SCRIPTS / "parity.py", "--size", size, "--cache", cache]
         with ExitStack() as stack, tempfile.TemporaryFile("w+") as errors, tempfile.TemporaryDirectory() as folder:
-            process = Process([str(word) for word in command], oracle.environment(), stack, errors)
+            process = Process([str(argument) for argument in command], oracle.environment(), stack, errors)
             yield Reference(size, process, Path(folder), keep)
 
     def handmade(self) -> tuple[list[str], Level]:
-        """Names and worlds of the handmade levels of this size; impulses they were saved with included."""
-        told, fields = self._ask("handmade")
-        return told["names"], level_from_kinetix(fields)
+        """Return names and worlds of the handmade levels of this size, with the impulses stored in them."""
+        answer, fields = self._ask("handmade")
+        return answer["names"], level_from_kinetix(fields)
 
     def step(self, level: Level, action: Int[np.ndarray, "6 lane"]) -> Stepped:
-        """One physics step of every lane."""
+        """Take one physics step in every lane."""
         fields = self._ask("step", (level, level.state, action))[1]
         normal, penetration, point = (self._contacts(fields, name) for name in GEOMETRY.values())
         return Stepped(state_from_kinetix(fields), normal, penetration, point, np.moveaxis(fields["control"], 0, -1))
 
     def play(self, level: Level, start: State, action: Int[np.ndarray, "step 6 lane"], record: bool) -> Played:
-        """As `play_ours`, but resets lead to `start`."""
+        """Play episodes as `play_ours` does, but resets lead to `start`."""
         fields = self._ask("play", (level, start, action), record=record)[1]
-        told = fields.pop("reward"), fields.pop("done")
-        return Played(*told, record_from_kinetix(fields) if record else None)
+        answer = fields.pop("reward"), fields.pop("done")
+        return Played(*answer, record_from_kinetix(fields) if record else None)
 
     def _ask(
         self, what: str, worlds: tuple[Level, State, np.ndarray] | None = None, **more: bool
     ) -> tuple[dict, dict[str, np.ndarray]]:
-        """What it answers, and the arrays it writes."""
+        """Return the answer to a request, and the arrays that come with it."""
         request = {"do": what, **more}
         fields = {} if worlds is None else _fields(*worlds)
-        kept = self.keep and self.keep / f"{self.size}-{what}-{_digest(request, fields)}.npz"
-        out = kept or self.folder / "out.npz"
-        told = out.with_suffix(".json")
-        if not (kept and told.is_file()):
-            told.write_text(json.dumps(self._answer(request, fields, out)))
+        path = self.keep and self.keep / f"{self.size}-{what}-{_digest(request, fields)}.npz"
+        out = path or self.folder / "out.npz"
+        answer = out.with_suffix(".json")
+        if not (path and answer.is_file()):
+            answer.write_text(json.dumps(self._answer(request, fields, out)))
         with np.load(out) as file:
-            return json.loads(told.read_text()), {name: file[name] for name in file.files}
+            return json.loads(answer.read_text()), {name: file[name] for name in file.files}
 
     def _answer(self, request: dict[str, Any], fields: dict[str, np.ndarray], out: Path) -> dict:
-        if not self.awake:
+        if not self.running:
             self.process.start()
             self.process.answer()
-            self.awake = True
+            self.running = True
         worlds = self.folder / "in.npz"
         np.savez(worlds, **fields)  # pyright: ignore[reportArgumentType]
         self.process.send(json.dumps(request | {"worlds": str(worlds), "out": str(out)}))
@@ -163,20 +163,20 @@ class Reference:
 
     @staticmethod
     def _contacts(fields: dict[str, np.ndarray], name: str) -> np.ndarray:
-        """In our numbering: first points of polygon pairs, second points, circle-polygon, circle-circle."""
+        """Reorder contacts as ours: first points of polygon pairs, second points, circle-polygon, circle-circle."""
         polygon, *others = (fields[f"{kind}/{name}"] for kind in MANIFOLDS)
         return np.moveaxis(np.concatenate([polygon[:, :, 0], polygon[:, :, 1], *others], 1), 0, -1)
 
 
 def _fields(level: Level, start: State, actions: np.ndarray) -> dict[str, np.ndarray]:
-    """Worlds and actions as the reference reads them."""
+    """Convert worlds and actions to the reference's arrays."""
     lanes = actions.shape[-1]
     fields = state_to_kinetix(level, start, np.zeros(lanes, np.int32), np.full(lanes, -1, np.float32))
     return {"actions": actions, **fields}
 
 
 def _digest(request: dict[str, Any], fields: dict[str, np.ndarray]) -> str:
-    """Of a question, and of the script that answers it."""
+    """Hash a request and the script that answers it."""
     text = hashlib.sha256(json.dumps(request).encode())
     text.update((oracle.SCRIPTS / "parity.py").read_bytes())
     text.update("\n".join(oracle.REQUIREMENTS).encode())

@@ -1,8 +1,8 @@
-"""Whole episodes: the same levels and actions in both engines, and why outcomes part.
+"""Whole episodes: the same levels and actions in both engines, and why outcomes differ.
 
-Contacts are chaotic: a difference in the last bit grows by each of them. So each engine also plays against itself, from
-starts in which every place of a movable body is moved by at most one unit in its last place. How often the reference
-parts from itself is what any other engine has to expect.
+Contacts are chaotic: each of them amplifies a difference in the last bit. So each engine also plays against itself,
+from starts in which every number of a movable body is perturbed by at most one unit in its last place. How often the
+reference disagrees with itself is what any other engine must expect.
 """
 
 from collections.abc import Callable
@@ -22,8 +22,8 @@ from levelproof.levelgen.level import Level
 from levelproof.physics.types import State
 
 STEPS = 256  # env steps; by then every first episode has ended
-TARGETS = {"s": 0.97, "m": 0.95, "l": 0.9}  # share of the pairs with the same outcome
-COPIES = 32  # starts near to that of a pair that parts, itself included
+TARGETS = {"s": 0.97, "m": 0.95, "l": 0.9}  # minimum share of pairs with equal outcomes
+COPIES = 32  # starts near that of a pair whose outcomes differ, itself included
 FIRST_OFF = (1e-4, 1e-2)  # m, rad
 
 NEAR_STARTS_PART = "starts one unit in the last place away part as well"
@@ -55,9 +55,9 @@ class Parted:
     origin: str
     ours: str
     theirs: str
-    first_off: list[int | None]  # env step from which on places differ by each of FIRST_OFF
-    at_contact: bool  # contacts came, went or differed in that step
-    near_starts: int  # of COPIES - 1 starts near to it, how many have another outcome in our engine
+    first_off: list[int | None]  # env step from which on positions differ by each of FIRST_OFF
+    at_contact: bool  # whether contacts came, went or differed in the first of these steps
+    near_starts: int  # number of COPIES - 1 near starts with another outcome in our engine
     step_off: float  # largest difference of an env step of ours from the reference's states
     reason: str
 
@@ -67,10 +67,10 @@ class Episodes:
     """The pairs of one size."""
 
     pairs: int
-    touched: int  # that end by touching blue or red in the reference, not by time
-    same: float  # share with the same outcome in both engines
-    same_touched: float | None  # of those that end by touching
-    reference_itself: float  # share with the same outcome in the reference from a start one last place away
+    touched: int  # number that end by touching blue or red in the reference
+    same: float  # share with equal outcomes in both engines
+    same_touched: float | None  # likewise, of those that end by touching
+    reference_itself: float  # share with equal outcomes in the reference from a near start
     ours_itself: float
     target: float | None
     parted: list[Parted]
@@ -79,7 +79,7 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Block:
-    """What a block of pairs gave."""
+    """Results of a block of pairs."""
 
     theirs: Outcome
     same: Bool[np.ndarray, " pair"]
@@ -95,14 +95,14 @@ def outcome(played: Played) -> Outcome:
 
 
 def near(level: Level, rng: np.random.Generator) -> State:
-    """The initial state with every number of movable bodies at most one unit in its last place away."""
+    """Perturb the initial state: every number of movable bodies by at most one unit in its last place."""
     free, moved = movable(level), nudged_tree(level.state, rng)
     keep = lambda old, new: np.where(free if old.ndim == 2 else free[:, None], new, old)
     return replace(level.state, **{name: keep(getattr(level.state, name), getattr(moved, name)) for name in MOTION})
 
 
 def play_block(pairs: Pool, count: int, reference: Reference, tick: Callable[[str], None]) -> Block:
-    """BLOCK pairs, of which the first `count` are to be looked at."""
+    """Play BLOCK pairs and compare the first `count`."""
     level, action = pairs.level, pairs.action
     other = near(level, np.random.default_rng(0))
     theirs = reference.play(level, level.state, action, record=True)
@@ -149,7 +149,7 @@ def summed(size: str, parts: list[Block]) -> Episodes:
 
 
 def _part(pair: Pool, lane: int, ours: State, theirs: State, a: Outcome, b: Outcome, near_starts: int) -> Parted:
-    """Look into a pair, given records of its block, [..., step, lane]."""
+    """Investigate a pair, given records of its block, [..., step, lane]."""
     until = int(min(a.step[lane], b.step[lane])) + 1  # states before each action of both first episodes
     first, at_contact = _first_off(*(_until(states, lane, until) for states in (ours, theirs)))
     step_off, explained = _steps(pair.level, _until(theirs, lane, int(b.step[lane]) + 1), pair.action)
@@ -173,41 +173,41 @@ def _part(pair: Pool, lane: int, ours: State, theirs: State, a: Outcome, b: Outc
 
 
 def _until(states: State, lane: int, end: int) -> State:
-    """States of one lane before each of its first `end` actions, as lanes."""
+    """Return the states of one lane before each of its first `end` actions, as lanes."""
     return jax.tree.map(lambda x: np.ascontiguousarray(x[..., :end, lane]), states)
 
 
 def _first_off(ours: State, theirs: State) -> tuple[list[int | None], bool]:
-    """When places first differ by FIRST_OFF, and whether a contact came, went or differed in the first such step."""
+    """Return when positions first differ by FIRST_OFF, and whether a contact came, went or differed at the first."""
     apart = np.maximum(*(largest(gap(getattr(ours, name), getattr(theirs, name))) for name in MOTION[:2]))
     first = [int(np.argmax(apart > limit)) if (apart > limit).any() else None for limit in FIRST_OFF]
     if first[0] is None:
         return first, False
-    x, y, at = ours.contact_active, theirs.contact_active, first[0]
-    before = max(at - 1, 0)
-    events = (x[:, at] != y[:, at]) | (x[:, at] != x[:, before]) | (y[:, at] != y[:, before])
+    x, y, step = ours.contact_active, theirs.contact_active, first[0]
+    before = max(step - 1, 0)
+    events = (x[:, step] != y[:, step]) | (x[:, step] != x[:, before]) | (y[:, step] != y[:, before])
     return first, bool(events.any())
 
 
 def _near_starts(level: Level, action: np.ndarray, lanes: np.ndarray, ours: Outcome) -> list[int]:
-    """For each lane, how many of COPIES - 1 near starts have another outcome than `ours`."""
+    """Count for each lane how many of COPIES - 1 near starts have another outcome than `ours`."""
     counts, rng, per_block = [], np.random.default_rng(1), BLOCK // COPIES
     for first in range(0, len(lanes), per_block):
-        some = lanes[first : first + per_block]
-        lane = np.resize(np.repeat(some, COPIES), BLOCK)
+        chosen = lanes[first : first + per_block]
+        lane = np.resize(np.repeat(chosen, COPIES), BLOCK)
         copies = lanes_of(level, lane)
         played = play_ours(copies, near(copies, rng), action[:, :, lane], record=False)
         other = ~outcome(played).same(Outcome(ours.step[lane], ours.reward[lane]))
-        counts += other.reshape(-1, COPIES)[: len(some), 1:].sum(1).tolist()
+        counts += other.reshape(-1, COPIES)[: len(chosen), 1:].sum(1).tolist()
     return counts
 
 
 def _steps(level: Level, states: State, action: np.ndarray) -> tuple[float, bool]:
-    """Largest difference of our env steps from the reference's states, and whether neighbours there reach as far.
+    """Take our env step from each state of the reference; return the largest difference, and if rounding explains it.
 
     Args:
         level: one lane.
-        states: of the reference, one env step a lane; at most BLOCK.
+        states: the reference's, one env step a lane; at most BLOCK.
         action: [step, 6, 1].
     """
     count = states.rotation.shape[-1]
@@ -222,6 +222,6 @@ def _steps(level: Level, states: State, action: np.ndarray) -> tuple[float, bool
     if apart[worst] <= OFF:
         return float(apart[worst]), True
     action_there = np.repeat(action[lane[worst]], BLOCK, 1)
-    world, there = lanes_of((worlds, lanes_of(states, lane + 1)), [worst])
-    reaches = (reached(env_step_ours(near_worlds(world, most), action_there), there) for most in MOVES)
-    return float(apart[worst]), any(reaches) or is_broken(there)
+    world, theirs = lanes_of((worlds, lanes_of(states, lane + 1)), [worst])
+    reaches = (reached(env_step_ours(near_worlds(world, most), action_there), theirs) for most in MOVES)
+    return float(apart[worst]), any(reaches) or is_broken(theirs)

@@ -22,12 +22,12 @@ DEFECT_OFF = (1e-4, 1e-2)
 
 @dataclass(frozen=True)
 class Pool:
-    """Worlds, one a lane: each level starts in its state. With one action, or with those of many steps."""
+    """Worlds, one per lane, in their levels' initial states, with one action each or one per step."""
 
     level: Level
     action: Int[np.ndarray, "*step 6 lane"]
     scene: list[str]
-    origin: list[str]  # where the world comes from, for people
+    origin: list[str]  # the world's source, for messages
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -52,15 +52,15 @@ class FieldRow:
 
 @dataclass(frozen=True)
 class SceneRow:
-    """Differences of any place or speed over the states of a scene."""
+    """Largest differences of positions and speeds over the states of a scene."""
 
     scene: str
     states: int
     within: list[float]  # share of the states within each of LIMITS
     median: float
     largest: float
-    other_contacts: int  # states in which another contact is active
-    off: int  # states to look into
+    other_contacts: int  # number of states whose active contacts differ
+    off: int  # number of states to investigate
 
 
 @dataclass(frozen=True)
@@ -69,31 +69,31 @@ class OffState:
 
     scene: str
     origin: str
-    by: dict[str, float]  # the fields that are off
+    by: dict[str, float]  # differences of the fields that are off
     other_contacts: int
     cause: str
     explained: bool
-    moved: int  # units in the last place by which our neighbours had to be moved
-    spread: float  # of the neighbours' places and speeds
-    motion: float  # largest difference of a place or speed
+    moved: int  # units in the last place by which our neighbours were perturbed
+    spread: float  # of the neighbours' positions and speeds
+    motion: float  # largest difference of a position or speed
 
 
 @dataclass(frozen=True)
 class DefectRow:
-    """What the fix of the padding defect changes in places and speeds after one step of ours."""
+    """Changes of positions and speeds after one step of ours if the padding defect is fixed."""
 
     states: int
-    differ: list[int]  # by more than each of DEFECT_OFF
+    differ: list[int]  # number of states that differ by more than each of DEFECT_OFF
     largest: float
 
 
 @dataclass(frozen=True)
 class OneStep:
-    """The campaign of one size."""
+    """One-step results of one size."""
 
     states: int
     fields: list[FieldRow]
-    scenes: list[SceneRow]  # the last one is all of them
+    scenes: list[SceneRow]  # the last row covers all scenes
     off: list[OffState]
     causes: dict[str, int]
     defect: DefectRow
@@ -105,7 +105,7 @@ def pool_of(pools: Sequence[Pool]) -> Pool:
 
 
 def distinct(pool: Pool) -> Pool:
-    """Each world once: a level that ends at once comes back again and again."""
+    """Drop duplicate worlds: a level whose episode ends at once returns to its start again and again."""
     leaves = [np.asarray(x).reshape(-1, len(pool)).T for x in jax.tree.leaves((pool.level, pool.action))]
     worlds = (b"".join(np.ascontiguousarray(x[lane]).tobytes() for x in leaves) for lane in range(len(pool)))
     first: dict[bytes, int] = {}
@@ -115,22 +115,22 @@ def distinct(pool: Pool) -> Pool:
 
 
 def picked(played: Pool, record: State, times: Int[np.ndarray, "pick lane"]) -> Pool:
-    """The states at `times` of lanes that were played: actions [step, 6, lane], record [..., step, lane]."""
+    """Pick the states at `times` of played lanes: actions [step, 6, lane], record [..., step, lane]."""
     lane, time = np.broadcast_to(np.arange(times.shape[1]), times.shape).ravel(), times.ravel()
-    of = played.lanes(lane)
+    chosen = played.lanes(lane)
     return Pool(
-        level=starting_in(of.level, jax.tree.map(lambda x: x[..., time, lane], record)),
-        action=np.take_along_axis(of.action, time[None, None], 0)[0],
-        scene=of.scene,
-        origin=[f"{name}, env step {at}" for name, at in zip(of.origin, time, strict=True)],
+        level=starting_in(chosen.level, jax.tree.map(lambda x: x[..., time, lane], record)),
+        action=np.take_along_axis(chosen.action, time[None, None], 0)[0],
+        scene=chosen.scene,
+        origin=[f"{name}, env step {step}" for name, step in zip(chosen.origin, time, strict=True)],
     )
 
 
 def one_step(pool: Pool, step_theirs: Step, tick: Callable[[str], None]) -> OneStep:
-    """Step the pool in both engines, and find out why states are off."""
+    """Step the pool in both engines; find the causes of states that are off."""
     parts, off, defect = [], [], []
     for lanes in blocks(len(pool), BLOCK):
-        block, count = pool.lanes(lanes), int(lanes[-1] - lanes[0]) + 1  # the last block is filled up
+        block, count = pool.lanes(lanes), int(lanes[-1] - lanes[0]) + 1  # the last block is padded
         theirs, ours = step_theirs(block.level, block.action), step_ours(block.level, block.action)
         fixed = step_ours(block.level, block.action, replace(RULES.physics, faithful_padding=False))
         apart = distances(block.level, ours, theirs)
@@ -157,7 +157,7 @@ def one_step(pool: Pool, step_theirs: Step, tick: Callable[[str], None]) -> OneS
 
 
 def _look_into(state: Pool, theirs: Stepped, apart: Distances) -> OffState:
-    """Of a pool of one."""
+    """Investigate a pool of one state."""
     cause = find_cause(step_ours, state.level, state.action, theirs)
     return OffState(
         scene=state.scene[0],

@@ -1,4 +1,4 @@
-"""What people see while the campaign runs, on stderr: a bar on a terminal, plain lines now and then elsewhere."""
+"""Progress of the campaign on stderr: a bar on a terminal, otherwise a plain line every LINE_EVERY seconds."""
 
 import time
 from contextlib import AbstractContextManager, nullcontext
@@ -10,7 +10,7 @@ LINE_EVERY = 30.0  # s between plain lines
 
 
 class Board:
-    """Counts blocks of worlds."""
+    """Progress display that counts blocks of worlds."""
 
     def __init__(self, console: Console) -> None:
         self._console, self._line_at = console, 0.0
@@ -23,12 +23,12 @@ class Board:
         return self._bar if self._console.is_terminal else nullcontext()
 
     def more(self, blocks: int) -> None:
-        """There are so many more blocks to do."""
+        """Add blocks to the total."""
         self._blocks += blocks
         self._show("starting")
 
     def tick(self, what: str, more: int = 0) -> None:
-        """A block is done; of `more` nobody knew."""
+        """Count a finished block; add `more` blocks to the total."""
         self._done, self._blocks = self._done + 1, self._blocks + more
         self._show(what)
 

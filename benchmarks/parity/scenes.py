@@ -1,6 +1,6 @@
-"""Adversarial scenes: sampled levels changed into what an engine finds hardest.
+"""Adversarial scenes: sampled levels changed into cases that are hardest for an engine.
 
-Each scene is a function (levels, rng) -> levels over all lanes, numpy on the host. SCENES names them.
+Each scene is a function (levels, rng) -> levels over all lanes, numpy on the host; SCENES lists them.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ Change = Callable[[Level, np.random.Generator], Level]
 
 
 def inside(level: Level, rng: np.random.Generator) -> Level:
-    """Circles with their centres inside polygons, the floor and (rarely) the other scenery included."""
+    """Put circles' centres inside polygons, including the floor and (rarely) the other scenery."""
     position = level.state.position.copy()
     for circle in range(level.size.polygons, level.size.bodies):
         weight = np.ones(level.size.polygons)
@@ -33,14 +33,14 @@ def inside(level: Level, rng: np.random.Generator) -> Level:
 
 
 def overlap(level: Level, rng: np.random.Generator) -> Level:
-    """Movable bodies moved deep into other bodies; no joints in half of the lanes."""
+    """Move bodies deep into other bodies; drop the joints of half of the lanes."""
     position = _on_others(level, rng)
     position += np.where(movable(level)[:, None], rng.normal(0, 0.05, position.shape), 0)
     return _moved(_loose(level, rng.random(level.role.shape[-1]) < 0.5), position)
 
 
 def coincident(level: Level, rng: np.random.Generator) -> Level:
-    """Movable bodies whose centres are exactly those of others, with equal angles in half of the lanes."""
+    """Move bodies exactly onto the centres of others, with equal angles in half of the lanes."""
     upright = movable(level) & (rng.random(level.role.shape[-1]) < 0.5)
     state = replace(level.state, rotation=np.where(upright, np.float32(0), level.state.rotation))
     level = _loose(replace(level, state=state), rng.random(level.role.shape[-1]) < 0.5)
@@ -48,7 +48,7 @@ def coincident(level: Level, rng: np.random.Generator) -> Level:
 
 
 def triangles(level: Level, rng: np.random.Generator) -> Level:
-    """Movable polygons without their fourth vertices; masses follow."""
+    """Cut movable polygons to triangles and update their masses."""
     model, n = level.model, level.size.polygons
     cut = movable(level)[:n] & (rng.random(model.n_vertices.shape) < 0.9)
     centred = model.vertices - model.vertices[:, :3].mean(1, keepdims=True)
@@ -59,7 +59,7 @@ def triangles(level: Level, rng: np.random.Generator) -> Level:
 
 
 def fast(level: Level, rng: np.random.Generator) -> Level:
-    """Bodies at 100 m/s, or at the bound of their spin."""
+    """Throw bodies at up to 100 m/s, or at the bound of their spin."""
     shape = level.role.shape
     angle, quick = rng.uniform(-np.pi, np.pi, shape), rng.random(shape) < 0.5
     speed = np.where(quick, 100.0, rng.exponential(10, shape))
@@ -69,7 +69,7 @@ def fast(level: Level, rng: np.random.Generator) -> Level:
 
 
 def bounce(level: Level, rng: np.random.Generator) -> Level:
-    """High restitution, friction of none or much, every collision mode, other gravities."""
+    """Use high restitution, no or much friction, every collision mode, and random gravity."""
     shape = level.role.shape
     mode = np.where(level.model.collision_mode == 2, 2, rng.choice([0, 1, 1, 1, 2], shape)).astype(np.int32)
     pull = rng.normal([[0], [-6]], 4, level.model.gravity.shape) * (rng.random(shape[-1]) < 0.7)
@@ -84,7 +84,7 @@ def bounce(level: Level, rng: np.random.Generator) -> Level:
 
 
 def stacks(level: Level, rng: np.random.Generator) -> Level:
-    """Upright bodies piled on the floor, each exactly touching the one below; nothing is joined."""
+    """Pile upright bodies on the floor, each exactly touching the one below, without joints."""
     level = _loose(level, np.ones(level.role.shape[-1], bool))
     free, lanes = movable(level), level.role.shape[-1]
     position, rotation = level.state.position.copy(), np.where(free, np.float32(0), level.state.rotation)
@@ -102,9 +102,9 @@ def stacks(level: Level, rng: np.random.Generator) -> Level:
 
 
 def chains(level: Level, rng: np.random.Generator) -> Level:
-    """All movable bodies of a lane joined one to the next while joints last; half of the chains hang from the ceiling.
+    """Chain the movable bodies of a lane while joints last; half of the chains hang from the ceiling.
 
-    Joints left over close loops. Anchors meet along the chain, not in the loops.
+    Spare joints close loops. Anchors coincide along the chain, but not in the loops.
     """
     model, state, lanes = level.model, level.state, level.role.shape[-1]
     free = movable(level)
@@ -115,7 +115,7 @@ def chains(level: Level, rng: np.random.Generator) -> Level:
     anchor_a, anchor_b = (rng.normal(0, 0.15, model.joint_anchor_a.shape) for _ in "ab")
     a, b, active = np.array(model.joint_a), np.array(model.joint_b), np.zeros_like(model.joint_active)
     for joint in range(level.size.joints):
-        along = joint + 1 < count + hangs  # a next body is there
+        along = joint + 1 < count + hangs  # whether there is a next body
         index = joint - hangs  # of body a in the order; -1: the ceiling
         loop = rng.integers(0, np.maximum(count - 1, 1))
         first = np.where(along, index, loop)
@@ -146,13 +146,13 @@ def chains(level: Level, rng: np.random.Generator) -> Level:
 
 
 def limits(level: Level, rng: np.random.Generator) -> Level:
-    """Chains in half of the lanes; every joint is at a limit, or a little beyond; strong motors."""
+    """Chain half of the lanes; put every joint at a limit or slightly beyond; use strong motors."""
     chained, lanes = chains(level, rng), level.role.shape[-1]
     half = np.arange(lanes) % 2 == 0
     level = _where(half, chained, level)
     model, shape = level.model, level.model.joint_active.shape
     turned = _angle(level.state, model.joint_a, model.joint_b) - model.joint_rotation
-    turned += rng.choice([0.0, 0.0, 0.05, -0.05], shape)  # exactly at it, or beyond
+    turned += rng.choice([0.0, 0.0, 0.05, -0.05], shape)  # exactly at the limit, or beyond
     narrow, low = rng.choice([0.0, 0.1, 0.5], shape), rng.random(shape) < 0.5
     changes = {
         "joint_min": np.where(low, turned, turned - narrow),
@@ -171,7 +171,7 @@ def limits(level: Level, rng: np.random.Generator) -> Level:
 
 
 def fixed(level: Level, rng: np.random.Generator) -> Level:
-    """Every joint is fixed, at an angle a little off the present one."""
+    """Fix every joint at an angle slightly off the present one."""
     model = level.model
     rotation = _angle(level.state, model.joint_a, model.joint_b) + rng.normal(0, 0.1, model.joint_a.shape)
     ones = np.ones(model.joint_fixed.shape, bool)
@@ -179,7 +179,7 @@ def fixed(level: Level, rng: np.random.Generator) -> Level:
 
 
 def inactive(level: Level, rng: np.random.Generator) -> Level:
-    """Bodies, joints and thrusters switched off at random, whatever holds on to them."""
+    """Deactivate bodies, joints and thrusters at random, whatever is attached to them."""
     off = lambda x, share: x & (rng.random(x.shape) >= share)
     active = np.where(movable(level), off(level.model.active, 0.4), level.model.active)
     model = replace(
@@ -198,12 +198,12 @@ SCENES: dict[str, Change] = {
 
 
 def movable(level: Level) -> Bool[np.ndarray, "body lane"]:
-    """Active bodies of finite mass."""
+    """Return the mask of active bodies of finite mass."""
     return np.asarray(level.model.active) & (np.asarray(level.model.inverse_mass) != 0)
 
 
 def with_masses(level: Level, where: Bool[np.ndarray, "body lane"]) -> Level:
-    """Masses and inertias from shapes and densities where asked."""
+    """Recompute masses and inertias from shapes and densities where `where` is set."""
     model = level.model
     area = np.concatenate([polygon_area(model.vertices, model.n_vertices), circle_area(model.radius)])
     turning = np.concatenate([polygon_inertia(model.vertices, model.n_vertices), circle_inertia(model.radius)])
@@ -219,13 +219,13 @@ def with_masses(level: Level, where: Bool[np.ndarray, "body lane"]) -> Level:
 
 
 def _chosen(rng: np.random.Generator, weight: ArrayLike) -> np.ndarray:
-    """A row for each lane, with chances in proportion to [row, lane] weights."""
+    """Draw a row for each lane, with probabilities proportional to weights [row, lane]."""
     share = np.cumsum(np.asarray(weight), 0)
     return (rng.random(share.shape[-1]) * share[-1] >= share).sum(0).clip(max=len(share) - 1)
 
 
 def _at(x: ArrayLike, body: ArrayLike) -> np.ndarray:
-    """x[body[lane], ..., lane]."""
+    """Return x[body[lane], ..., lane]."""
     body = np.asarray(body)
     return np.moveaxis(np.asarray(x)[body, ..., np.arange(len(body))], 0, -1)
 
@@ -236,7 +236,7 @@ def _turned(angle: ArrayLike, vector: np.ndarray) -> np.ndarray:
 
 
 def _point_in(level: Level, polygon: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A random point in a polygon of each lane, m; near the room where the polygon is scenery."""
+    """Return a random point in a polygon of each lane, m, clipped to the world with a margin."""
     corners, count = _at(level.model.vertices, polygon), _at(level.model.n_vertices, polygon)
     weight = rng.exponential(1, (len(corners), len(polygon))) * (np.arange(len(corners))[:, None] < count)
     local = (corners * (weight / weight.sum(0))[:, None]).sum(0)
@@ -245,7 +245,7 @@ def _point_in(level: Level, polygon: np.ndarray, rng: np.random.Generator) -> np
 
 
 def _on_others(level: Level, rng: np.random.Generator) -> np.ndarray:
-    """Each movable body at the place of another one that stays, or at a place shared by several."""
+    """Return positions: most movable bodies move onto one other body of their lane."""
     free, position = movable(level), level.state.position
     stays = _chosen(rng, free + 1e-9)
     target = np.where(rng.random(free.shape) < 0.6, stays, np.arange(len(free))[:, None])
@@ -257,7 +257,7 @@ def _moved(level: Level, position: np.ndarray) -> Level:
 
 
 def _loose(level: Level, lanes: np.ndarray) -> Level:
-    """Without joints, in these lanes."""
+    """Drop the joints of these lanes."""
     model = replace(level.model, joint_active=level.model.joint_active & ~lanes)
     apart = ~np.eye(level.size.bodies, dtype=bool)[..., None]
     return replace(level, model=replace(model, collides=np.where(lanes, apart, model.collides)))
@@ -274,7 +274,7 @@ def _thrown(level: Level, velocity: np.ndarray, spin: np.ndarray) -> Level:
 
 
 def _upright_reach(level: Level) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest point of each body about its centre at angle 0, m."""
+    """Return the lowest and highest point of each body about its centre at angle 0, m."""
     model = level.model
     used = np.arange(model.vertices.shape[1])[:, None] < np.asarray(model.n_vertices)[:, None]
     y = model.vertices[:, :, 1]
@@ -283,10 +283,10 @@ def _upright_reach(level: Level) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _angle(state: State, a: ArrayLike, b: ArrayLike) -> np.ndarray:
-    """Of body b relative to body a, rad."""
-    of = lambda body: np.take_along_axis(np.asarray(state.rotation), np.asarray(body), 0)
-    return of(b) - of(a)
+    """Return the angle of body b relative to body a, rad."""
+    rotation = lambda body: np.take_along_axis(np.asarray(state.rotation), np.asarray(body), 0)
+    return rotation(b) - rotation(a)
 
 
-def _where(lanes: np.ndarray, yes: Level, no: Level) -> Level:
-    return jax.tree.map(lambda x, y: np.where(lanes, x, y).astype(np.asarray(y).dtype), yes, no)
+def _where(lanes: np.ndarray, chosen: Level, other: Level) -> Level:
+    return jax.tree.map(lambda x, y: np.where(lanes, x, y).astype(np.asarray(y).dtype), chosen, other)

@@ -1,1 +1,1 @@
-"""What runs in the reference's own interpreter, and the plain files that both sides share."""
+"""Scripts for the reference's own interpreter, and plain modules that both sides import."""

@@ -1,8 +1,8 @@
 # pyright: reportMissingImports=false
 """The reference's side of `python -m benchmarks reader`: its own trajectory manager on an exported folder.
 
-It reads 500 batches ahead if nobody takes them. Here somebody always does, so that its queue is empty, its rate is what
-it can sustain, and its memory stays small.
+The manager reads up to 500 batches ahead. Here the caller takes batches as fast as they come, so that the queue stays
+empty, the rate is sustainable, and memory stays small.
 """
 
 import argparse
@@ -16,18 +16,18 @@ import numpy as np
 WARM = 24  # batches before the clock starts
 
 
-def rates(following: Callable[[], Any], arrays: Callable[[Any], list], batch: int, seconds: float) -> dict[str, float]:
-    """Trajectories a second and, as `core_...`, a second of a core: as they come, and with every array copied."""
+def rates(next_batch: Callable[[], Any], arrays: Callable[[Any], list], batch: int, seconds: float) -> dict[str, float]:
+    """Measure trajectories/s and, as `core_...`, per second of CPU time: as read, and with every array copied."""
 
     def rate(use: Callable[[Any], object]) -> tuple[float, float]:
-        start, used, count = time.perf_counter(), time.process_time(), 0
+        start, cpu_start, count = time.perf_counter(), time.process_time(), 0
         while time.perf_counter() - start < seconds:
-            use(following())
+            use(next_batch())
             count += batch
-        return count / (time.perf_counter() - start), count / (time.process_time() - used)
+        return count / (time.perf_counter() - start), count / (time.process_time() - cpu_start)
 
     (plain, of_core), (copied, copied_of_core) = (
-        rate(use) for use in (lambda found: found, lambda found: [np.ascontiguousarray(x) for x in arrays(found)])
+        rate(use) for use in (lambda x: x, lambda x: [np.ascontiguousarray(array) for array in arrays(x)])
     )
     return {"rate": plain, "core_rate": of_core, "copied": copied, "core_copied": copied_of_core}
 

@@ -1,7 +1,7 @@
 # pyright: reportMissingImports=false
 """The reference's side of `python -m benchmarks experts`, inside its own environment.
 
-One run trains fresh experts (ppo.py) for a number of updates. What they solve is measured by solved.py.
+One run trains fresh experts (ppo.py) for a number of updates; solved.py measures what they solve.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def main() -> None:
         return first, jax.jit(jax.vmap(trainer.update)).lower(first(keys, levels), levels).compile()
 
     seconds, (first, compiled) = timed(compile_both)
-    jax.block_until_ready(compiled(first(keys, levels), levels))  # the first run touches memory
+    jax.block_until_ready(compiled(first(keys, levels), levels))  # the first run faults memory in
 
     def train():
         learner, ends = first(keys, levels), []

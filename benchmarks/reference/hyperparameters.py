@@ -1,6 +1,6 @@
-"""The hyperparameters of the PPO that the reference's users would write today for one level.
+"""Hyperparameters of the PPO that the reference's users would write today for one level.
 
-By the names of `experts.config.ExpertConfig`. Standard library only: both sides read it.
+Named as in `experts.config.ExpertConfig`. Imports the standard library only, because both sides import it.
 """
 
 from typing import NamedTuple

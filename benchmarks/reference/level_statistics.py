@@ -1,7 +1,7 @@
-"""Statistics of levels: named samples of numbers, the same for the reference's levels and for ours.
+"""Statistics of levels: named samples of numbers, defined equally for the reference's levels and ours.
 
-Levels come as plain arrays by the reference's own names, level axis first (`levelgen.files.kinetix.state_to_kinetix`
-gives ours that way). Imports nothing of ours: it runs in the reference's environment too.
+Levels are plain arrays by the reference's names, level axis first (`levelgen.files.kinetix.state_to_kinetix` converts
+ours). Imports nothing of ours, because it also runs in the reference's environment.
 """
 
 import numpy as np
@@ -9,17 +9,17 @@ import numpy as np
 SCENERY = 4
 GREEN, BLUE, RED = 1, 2, 3
 FLOOR_TOP, SIDE = 0.4, 5.0
-NOT_THERE = -1  # for what a level lacks
+NOT_THERE = -1  # value of what a level lacks
 
 
 def statistics(fields):
-    """{name: 1-D array of values}; bodies and joints of all levels are pooled where the name begins with theirs."""
+    """Return {name: 1-D array of values}; the name's first word says whether values are per level, body, joint, ...."""
     bodies = _bodies(fields)
     return _level(fields, bodies) | _body(bodies) | _joint(fields, bodies) | _thruster(fields, bodies)
 
 
 def _bodies(fields):
-    """Polygons, then circles, level axis first."""
+    """Concatenate polygons and circles, level axis first."""
     both = {
         name: np.concatenate([fields[f"polygon/{name}"], fields[f"circle/{name}"]], 1)
         for name in ("active", "position", "rotation", "inverse_mass", "inverse_inertia", "friction", "collision_mode")
@@ -28,7 +28,7 @@ def _bodies(fields):
     levels, polygons = fields["polygon/active"].shape
     circles = fields["circle/active"].shape[1]
     both["is_polygon"] = np.broadcast_to(np.arange(polygons + circles) < polygons, (levels, polygons + circles))
-    both["movable"] = both["active"] & (np.arange(polygons + circles) >= SCENERY)  # of the level, not scenery
+    both["movable"] = both["active"] & (np.arange(polygons + circles) >= SCENERY)  # a body of the level, not scenery
     both["fixed"] = both["movable"] & (both["inverse_mass"] == 0)
     half = np.abs(fields["polygon/vertices"]).max(2)
     both["half"] = np.concatenate([half, np.zeros((levels, circles, 2))], 1)
@@ -59,16 +59,16 @@ def _level(fields, b):
         "level largest joined group": (~fields["collision_matrix"]).sum(2).max(1),
     }
     for name, number in (("green", GREEN), ("blue", BLUE)):
-        at = goal[number]
-        some = at.any(1)
+        chosen = goal[number]
+        exists = chosen.any(1)
         s |= {
-            f"level {name} bodies": at.sum(1),
-            f"level {name} place": np.where(some, at.argmax(1), NOT_THERE),
-            f"level {name} is polygon": np.where(some, (at & polygon).any(1), NOT_THERE),
-            f"level {name} is fixed": np.where(some, (at & b["fixed"]).any(1), NOT_THERE),
-            f"level {name} x": (at * b["position"][..., 0]).sum(1)[some],
-            f"level {name} y": (at * b["position"][..., 1]).sum(1)[some],
-            f"level {name} joints": _joints_of(fields, at)[some],
+            f"level {name} bodies": chosen.sum(1),
+            f"level {name} place": np.where(exists, chosen.argmax(1), NOT_THERE),
+            f"level {name} is polygon": np.where(exists, (chosen & polygon).any(1), NOT_THERE),
+            f"level {name} is fixed": np.where(exists, (chosen & b["fixed"]).any(1), NOT_THERE),
+            f"level {name} x": (chosen * b["position"][..., 0]).sum(1)[exists],
+            f"level {name} y": (chosen * b["position"][..., 1]).sum(1)[exists],
+            f"level {name} joints": _joints_of(fields, chosen)[exists],
         }
     both = goal[GREEN].any(1) & goal[BLUE].any(1)
     centre = {n: (goal[n][..., None] * b["position"]).sum(1) for n in goal}
@@ -77,13 +77,13 @@ def _level(fields, b):
 
 
 def _joints_of(fields, chosen):
-    """Active joints that end at the chosen bodies."""
+    """Count active joints on the chosen bodies."""
     ends = [np.take_along_axis(chosen, fields[f"joint/{end}_index"], 1) for end in "ab"]
     return (fields["joint/active"] & (ends[0] | ends[1])).sum(1)
 
 
 def _overlaps(b):
-    """Pairs of movable bodies that overlap, and bodies that leave the world or touch the floor."""
+    """Count overlapping pairs of movable bodies, and bodies beyond the walls or in the floor."""
     polygons = b["corners"].shape[1]
     there = b["movable"]
     pairs = [(i, j) for i in range(SCENERY, polygons) for j in range(i + 1, polygons)]
@@ -110,7 +110,7 @@ def _overlaps(b):
 
 
 def _separation(b, i, j):
-    """Whether rectangles i and j overlap (separating axes)."""
+    """Whether rectangles i and j overlap, by separating axes."""
     overlap = np.ones(len(b["corners"]), bool)
     for body in (i, j):
         for turn in (0, np.pi / 2):
@@ -122,7 +122,7 @@ def _separation(b, i, j):
 
 
 def _gap(b, polygon, point):
-    """Distance of a point from a rectangle, zero inside."""
+    """Return the distance of a point from a rectangle, zero inside."""
     local = _turn(point - b["position"][:, polygon], -b["rotation"][:, polygon])
     return np.linalg.norm(np.maximum(np.abs(local) - b["half"][:, polygon], 0), axis=-1)
 
@@ -168,21 +168,22 @@ def _body(b):
 def _joint(fields, b):
     active = fields["joint/active"]
     j = {name: fields[f"joint/{name}"][active] for name in _JOINT}
-    of = {end: {name: _of(b[name], fields[f"joint/{end}_index"])[active] for name in _ENDS} for end in "ab"}
+    ends = {end: {name: _take(b[name], fields[f"joint/{end}_index"])[active] for name in _ENDS} for end in "ab"}
     turns, driven = ~j["is_fixed_joint"], j["motor_on"]
-    wheel = ~(of["a"]["is_polygon"] & of["b"]["is_polygon"])
-    world = [of[end]["position"] + _turn(j[f"{end}_relative_pos"], of[end]["rotation"]) for end in "ab"]
-    difference = of["b"]["rotation"] - of["a"]["rotation"]
+    wheel = ~(ends["a"]["is_polygon"] & ends["b"]["is_polygon"])
+    world = [ends[end]["position"] + _turn(j[f"{end}_relative_pos"], ends[end]["rotation"]) for end in "ab"]
+    difference = ends["b"]["rotation"] - ends["a"]["rotation"]
     limited = j["motor_has_joint_limits"]
-    cover = [_depth(of[end], j[f"{end}_relative_pos"]) for end in "ab"]
-    scale = [np.where(wheel[:, None], 1.0, of[end]["half"]) for end in "ab"]
+    cover = [_depth(ends[end], j[f"{end}_relative_pos"]) for end in "ab"]
+    scale = [np.where(wheel[:, None], 1.0, ends[end]["half"]) for end in "ab"]
     s = {
         "joint place": np.nonzero(active)[1],
-        "joint kinds": of["a"]["is_polygon"] * 2 + of["b"]["is_polygon"],
+        "joint kinds": ends["a"]["is_polygon"] * 2 + ends["b"]["is_polygon"],
         "joint first body is first": j["a_index"] < j["b_index"],
         "joint to scenery": (j["a_index"] < SCENERY) | (j["b_index"] < SCENERY),
-        "joint to a fixed body": of["a"]["fixed"] | of["b"]["fixed"],
-        "joint roles": np.minimum(of["a"]["role"], of["b"]["role"]) * 4 + np.maximum(of["a"]["role"], of["b"]["role"]),
+        "joint to a fixed body": ends["a"]["fixed"] | ends["b"]["fixed"],
+        "joint roles": np.minimum(ends["a"]["role"], ends["b"]["role"]) * 4
+        + np.maximum(ends["a"]["role"], ends["b"]["role"]),
         "joint gap": (np.abs(world[0] - world[1]).max(-1) > 1e-4),
         "joint fixed": ~turns,
         "joint rotation error": np.abs(j["rotation"] - np.where(turns, 0, difference)) > 1e-4,
@@ -203,9 +204,9 @@ def _joint(fields, b):
         "joint y": world[0][:, 1],
         "joint depth in first": cover[0][~wheel],
         "joint depth in second": cover[1][~wheel],
-        "joint depth under a wheel": np.where(of["a"]["is_polygon"], *cover)[wheel],
-        "joint wheel radius": np.maximum(of["a"]["radius"], of["b"]["radius"])[wheel],
-        "joint mass ratio": _ratio(of["a"]["inverse_mass"], of["b"]["inverse_mass"]),
+        "joint depth under a wheel": np.where(ends["a"]["is_polygon"], *cover)[wheel],
+        "joint wheel radius": np.maximum(ends["a"]["radius"], ends["b"]["radius"])[wheel],
+        "joint mass ratio": _ratio(ends["a"]["inverse_mass"], ends["b"]["inverse_mass"]),
     }
     for place, end in enumerate("ab"):
         share = (j[f"{end}_relative_pos"] / np.maximum(scale[place], 1e-9))[~wheel]
@@ -218,19 +219,19 @@ _JOINT += ("motor_speed", "motor_power", "motor_has_joint_limits", "min_rotation
 _ENDS = ("is_polygon", "fixed", "role", "position", "rotation", "half", "radius", "inverse_mass")
 
 
-def _of(values, index):
-    """values (level, body, ...) at body numbers (level, joint)."""
+def _take(values, index):
+    """Take values (level, body, ...) at body indices (level, joint)."""
     spread = index.reshape(*index.shape, *[1] * (values.ndim - 2))
     return np.take_along_axis(values, np.broadcast_to(spread, (*index.shape, *values.shape[2:])), 1)
 
 
 def _depth(body, anchor):
-    """Distance of an anchor from the nearest side of a rectangle."""
+    """Return the distance of an anchor from the nearest side of a rectangle."""
     return (body["half"] - np.abs(anchor)).min(-1)
 
 
 def _ratio(a, b):
-    """The smaller over the larger, where neither is zero."""
+    """Return the smaller over the larger of two values, where neither is zero."""
     a, b = (x[(a > 0) & (b > 0)] for x in (a, b))
     return np.minimum(a, b) / np.maximum(a, b)
 
@@ -238,7 +239,7 @@ def _ratio(a, b):
 def _thruster(fields, b):
     active = fields["thruster/active"]
     t = {name: fields[f"thruster/{name}"][active] for name in ("relative_position", "rotation", "power")}
-    body = {name: _of(b[name], fields["thruster/object_index"])[active] for name in _ENDS}
+    body = {name: _take(b[name], fields["thruster/object_index"])[active] for name in _ENDS}
     position = t["relative_position"]
     cross = position[:, 0] * np.sin(t["rotation"]) - position[:, 1] * np.cos(t["rotation"])
     inward = position[:, 0] * np.cos(t["rotation"]) + position[:, 1] * np.sin(t["rotation"]) < 0

@@ -1,10 +1,10 @@
 # pyright: reportMissingImports=false
-"""The reference opens level files and plays them. Runs inside its own environment.
+"""Open level files with the reference and play them. Runs inside the reference's own environment.
 
     python benchmarks/reference/levels.py OUT.npz STEPS FILE...
 
 The files are of one size. OUT has, by the reference's own names: `state/NAME` (STEPS + 1, level, ...), the states
-before each action and the last one; `action`, `reward`, `done` and `goal` (STEPS, level, ...), of sticky random
+before each action and the last one; `action`, `reward`, `done` and `goal` (STEPS, level, ...), under sticky random
 actions without reset.
 """
 

@@ -1,8 +1,8 @@
 # pyright: reportMissingImports=false
-"""The reference's side of `python -m benchmarks parity`, inside its own environment: it plays and steps given worlds.
+"""The reference's side of `python -m benchmarks parity`, inside its own environment: it steps and plays worlds.
 
-Answers requests (see serve.py), each with the name of a file to write, `out`:
-    handmade  the levels of that size that come with the reference
+Answers requests (see serve.py), each of which names the file `out` to write:
+    handmade  the reference's handmade levels of this size
     play      env steps from the worlds of a file under its `actions` (step, 6, lane), with automatic reset
     step      one physics step from each world of a file under its `actions` (6, lane)
 """
@@ -54,16 +54,16 @@ def main() -> None:
         return load_levels(request["worlds"], args.size, 0, lanes), np.moveaxis(actions, -2, -1)
 
     def play(request):
-        """Writes `reward`, `done` (step, lane), and if asked to `record` what evolves before each action."""
+        """Write `reward`, `done` (step, lane) and, with `record`, what evolves before each action."""
         level, actions = worlds(request)
-        state, record, told = level, [], []
+        state, record, outcomes = level, [], []
         for action in actions:
             if request["record"]:
                 record.append(part(state, EVOLVING))
             state, reward, done = act(state, level, action)
-            told.append((np.asarray(reward), np.asarray(done)))
-        reward, done = map(np.stack, zip(*told, strict=True))
-        fields = {name: np.stack([at[name] for at in record]) for name in EVOLVING} if record else {}
+            outcomes.append((np.asarray(reward), np.asarray(done)))
+        reward, done = map(np.stack, zip(*outcomes, strict=True))
+        fields = {name: np.stack([fields[name] for fields in record]) for name in EVOLVING} if record else {}
         np.savez(request["out"], reward=reward, done=done, **fields)  # pyright: ignore[reportArgumentType]
         return {}
 
@@ -73,8 +73,8 @@ def main() -> None:
         np.savez(request["out"], control=np.asarray(control), **part(after, EVOLVING + GEOMETRY))  # pyright: ignore[reportArgumentType]
         return {}
 
-    does = {"handmade": lambda request: handmade(args.size, request["out"]), "play": play, "step": one_step}
-    answer({}, lambda request: does[request["do"]](request))
+    handlers = {"handmade": lambda request: handmade(args.size, request["out"]), "play": play, "step": one_step}
+    answer({}, lambda request: handlers[request["do"]](request))
 
 
 def part(state, names: list[str]) -> dict[str, np.ndarray]:
@@ -83,7 +83,7 @@ def part(state, names: list[str]) -> dict[str, np.ndarray]:
 
 
 def handmade(size: str, out: str) -> dict:
-    """Every level of the size's folder, as plain arrays."""
+    """Write every handmade level of the size as plain arrays."""
     from kinetix.util.saving import BASE_DIR, load_from_json_file
 
     files = sorted((Path(BASE_DIR) / size).glob("*.json"))

@@ -1,8 +1,8 @@
 # pyright: reportMissingImports=false
 """The reference's side of `python -m benchmarks physics`, inside its own environment.
 
-Env steps under given actions with automatic reset to the same level; the observation is not asked for, so XLA
-leaves it out. One run starts where the last one ended.
+Env steps under given actions with automatic reset to the same level. The observation is unused, so XLA omits it. A run
+starts where the last one ended.
 """
 
 import argparse
@@ -35,9 +35,9 @@ def main() -> None:
     block = min(args.block, args.lanes)
     cut = [np.minimum(np.arange(i, i + block), args.lanes - 1) for i in range(0, args.lanes, block)]
     worlds = load_levels(args.levels, args.size, args.first, args.lanes)
-    levels = [jax.tree.map(lambda x, at=at: x[at], worlds) for at in cut]
-    given_actions = np.moveaxis(np.load(args.actions), 1, 2)[:, args.first : args.first + args.lanes]
-    actions = [jnp.asarray(given_actions[:, at]) for at in cut]
+    levels = [jax.tree.map(lambda x, lanes=lanes: x[lanes], worlds) for lanes in cut]
+    all_actions = np.moveaxis(np.load(args.actions), 1, 2)[:, args.first : args.first + args.lanes]
+    actions = [jnp.asarray(all_actions[:, lanes]) for lanes in cut]
     keys = jax.random.split(jax.random.PRNGKey(0), block)
     step = jax.vmap(env.step, in_axes=(0, 0, 0, None, 0))
 
@@ -51,17 +51,17 @@ def main() -> None:
 
     seconds, compiled = timed(lambda: jax.jit(rollout).lower(levels[0], levels[0], actions[0]).compile())
 
-    def play(now: list) -> list:
-        return jax.block_until_ready([compiled(*block) for block in zip(levels, now, actions, strict=True)])
+    def play(states: list) -> list:
+        return jax.block_until_ready([compiled(*block) for block in zip(levels, states, actions, strict=True)])
 
-    now = [state for state, _ in play(levels)]  # the first run touches memory
+    states = [state for state, _ in play(levels)]  # the first run faults memory in
 
     def run() -> dict:
-        nonlocal now
-        seconds, out = timed(lambda: play(now))
-        now = [state for state, _ in out]
+        nonlocal states
+        seconds, out = timed(lambda: play(states))
+        states = [state for state, _ in out]
         reward, done, goal = (sum(float(totals[k]) for _, totals in out) for k in range(3))
-        finite = all(bool(np.isfinite(np.asarray(state.polygon.position)).all()) for state in now)
+        finite = all(bool(np.isfinite(np.asarray(state.polygon.position)).all()) for state in states)
         return {"seconds": seconds, "reward": reward, "done": done, "goal": goal, "finite": finite}
 
     serve({"compile_seconds": seconds}, run)

@@ -1,7 +1,7 @@
 # pyright: reportMissingImports=false
 """The PPO that the reference's users would write today, inside the reference's own environment.
 
-One agent per level, in the manner of PureJaxRL, with our experts' network; to be vmapped over levels. Importing it
+One agent per level, in the style of PureJaxRL, with our experts' network; vmap it over levels. Importing this module
 starts JAX: pin the process first (world.stay_on).
 """
 
@@ -22,7 +22,7 @@ from world import static_of
 
 
 class Learner(NamedTuple):
-    """One level's expert and its episodes under way."""
+    """One level's expert and its running episodes."""
 
     params: Any
     optimiser: Any
@@ -32,7 +32,7 @@ class Learner(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """Of one env step of each environment, and what the policy thought of it."""
+    """One env step of each environment, with the policy's log probability and value."""
 
     observation: Any
     action: Any
@@ -43,7 +43,7 @@ class Transition(NamedTuple):
 
 
 class Network(nn.Module):
-    """Log probabilities of each entry's choices, and the value."""
+    """Network that returns log probabilities of each entry's choices, and the value."""
 
     @nn.compact
     def __call__(self, x):
@@ -53,7 +53,7 @@ class Network(nn.Module):
 
 
 def trunk(x):
-    """Layers of the network whose call this is in."""
+    """Apply hidden layers, which belong to the calling module."""
     for _ in range(PPO.depth):
         x = nn.tanh(nn.Dense(PPO.width, kernel_init=nn.initializers.orthogonal(2**0.5))(x))
     return x
@@ -67,7 +67,7 @@ optimiser = optax.chain(
 
 @dataclass(frozen=True)
 class Trainer:
-    """Programs of one level and its expert."""
+    """Training programs of one level's expert."""
 
     env: Any
     rules: Any
@@ -82,15 +82,15 @@ class Trainer:
         return Trainer(env, rules, environments, horizon)
 
     def start(self, key, level) -> Learner:
-        of_network, of_worlds, kept = jax.random.split(key, 3)
-        observation, worlds = self.reset(of_worlds, level, self.environments)
-        params = network.init(of_network, observation)
-        return Learner(params, optimiser.init(params), worlds, observation, kept)
+        network_key, worlds_key, learner_key = jax.random.split(key, 3)
+        observation, worlds = self.reset(worlds_key, level, self.environments)
+        params = network.init(network_key, observation)
+        return Learner(params, optimiser.init(params), worlds, observation, learner_key)
 
     def update(self, learner: Learner, level):
-        """(Learner, (ended, reached the goal)), flags [horizon, environment]."""
-        key, of_rollout, of_epochs = jax.random.split(learner.key, 3)
-        learner, transitions, goals = self.rollout(learner, level, of_rollout)
+        """Roll out and update; return the learner and flags (ended, reached the goal) [horizon, environment]."""
+        key, rollout_key, epochs_key = jax.random.split(learner.key, 3)
+        learner, transitions, goals = self.rollout(learner, level, rollout_key)
         gain = advantages(transitions, network.apply(learner.params, learner.observation)[1])
         samples = self.horizon * self.environments
         flat = jax.tree.map(lambda x: x.reshape(samples, *x.shape[2:]), (transitions, gain))
@@ -101,37 +101,40 @@ class Trainer:
             return jax.lax.scan(learn, carry, cut)
 
         carry = (learner.params, learner.optimiser)
-        (params, state), _ = jax.lax.scan(epoch, carry, jax.random.split(of_epochs, PPO.epochs))
+        (params, state), _ = jax.lax.scan(epoch, carry, jax.random.split(epochs_key, PPO.epochs))
         return learner._replace(params=params, optimiser=state, key=key), (transitions.done, goals)
 
     def evaluate(self, learner: Learner, level, key, attempts: int, steps: int):
-        """(actions [step, attempt, 6], ended, reached the goal); attempt 0 takes the most probable actions."""
+        """Play attempts; return actions [step, attempt, 6] and flags (ended, reached the goal).
+
+        Attempt 0 takes the most probable actions.
+        """
 
         def act(carry, key):
             worlds, observation = carry
-            of_action, of_world = jax.random.split(key)
+            action_key, world_key = jax.random.split(key)
             parts, _ = network.apply(learner.params, observation)
-            action = draw(of_action, parts).at[0].set(jnp.stack([part[0].argmax() for part in parts]))
-            seen, worlds, _, done, info = self.step(of_world, worlds, action, level, attempts)
-            return (worlds, seen), (action, done, done & info["GoalR"])
+            action = draw(action_key, parts).at[0].set(jnp.stack([part[0].argmax() for part in parts]))
+            observed, worlds, _, done, info = self.step(world_key, worlds, action, level, attempts)
+            return (worlds, observed), (action, done, done & info["GoalR"])
 
-        of_worlds, of_steps = jax.random.split(key)
-        observation, worlds = self.reset(of_worlds, level, attempts)
-        return jax.lax.scan(act, (worlds, observation), jax.random.split(of_steps, steps))[1]
+        worlds_key, steps_key = jax.random.split(key)
+        observation, worlds = self.reset(worlds_key, level, attempts)
+        return jax.lax.scan(act, (worlds, observation), jax.random.split(steps_key, steps))[1]
 
     def rollout(self, learner: Learner, level, key):
         def act(carry, key):
             worlds, observation = carry
-            of_action, of_world = jax.random.split(key)
+            action_key, world_key = jax.random.split(key)
             parts, value = network.apply(learner.params, observation)
-            action = draw(of_action, parts)
-            seen, worlds, reward, done, info = self.step(of_world, worlds, action, level, self.environments)
+            action = draw(action_key, parts)
+            observed, worlds, reward, done, info = self.step(world_key, worlds, action, level, self.environments)
             transition = Transition(observation, action, log_probability(parts, action), value, reward, done)
-            return (worlds, seen), (transition, (done & info["GoalR"]))
+            return (worlds, observed), (transition, (done & info["GoalR"]))
 
         keys = jax.random.split(key, self.horizon)
-        (worlds, observation), (seen, goals) = jax.lax.scan(act, (learner.worlds, learner.observation), keys)
-        return learner._replace(worlds=worlds, observation=observation), seen, goals
+        (worlds, observation), (observed, goals) = jax.lax.scan(act, (learner.worlds, learner.observation), keys)
+        return learner._replace(worlds=worlds, observation=observation), observed, goals
 
     def reset(self, key, level, count: int):
         return jax.vmap(self.env.reset, in_axes=(0, None, None))(jax.random.split(key, count), self.rules, level)
@@ -150,25 +153,25 @@ def log_probability(parts, action):
     return sum(jnp.take_along_axis(part, action[..., i : i + 1], -1)[..., 0] for i, part in enumerate(parts))
 
 
-def advantages(seen: Transition, last_value):
-    """Generalised advantages of a rollout, [horizon, environment]."""
+def advantages(observed: Transition, last_value):
+    """Compute generalised advantages of a rollout, [horizon, environment]."""
 
-    def back(carry, now):
-        advantage, following = carry
-        alive = 1.0 - now.done
-        surprise = now.reward + PPO.discount * following * alive - now.value
+    def back(carry, transition):
+        advantage, next_value = carry
+        alive = 1.0 - transition.done
+        surprise = transition.reward + PPO.discount * next_value * alive - transition.value
         advantage = surprise + PPO.discount * PPO.gae_lambda * alive * advantage
-        return (advantage, now.value), advantage
+        return (advantage, transition.value), advantage
 
-    return jax.lax.scan(back, (jnp.zeros_like(last_value), last_value), seen, reverse=True)[1]
+    return jax.lax.scan(back, (jnp.zeros_like(last_value), last_value), observed, reverse=True)[1]
 
 
 def loss(params, batch):
-    seen, gain = batch
-    parts, value = network.apply(params, seen.observation)
-    ratio = jnp.exp(log_probability(parts, seen.action) - seen.log_probability)
-    target = seen.value + gain
-    near = seen.value + jnp.clip(value - seen.value, -PPO.clip, PPO.clip)
+    observed, gain = batch
+    parts, value = network.apply(params, observed.observation)
+    ratio = jnp.exp(log_probability(parts, observed.action) - observed.log_probability)
+    target = observed.value + gain
+    near = observed.value + jnp.clip(value - observed.value, -PPO.clip, PPO.clip)
     error = 0.5 * jnp.maximum(jnp.square(value - target), jnp.square(near - target)).mean()
     gain = (gain - gain.mean()) / (gain.std() + 1e-8)
     surrogate = jnp.minimum(ratio * gain, jnp.clip(ratio, 1 - PPO.clip, 1 + PPO.clip) * gain).mean()

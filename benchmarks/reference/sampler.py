@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false
-"""The reference's side of `python -m benchmarks sampler`: its first call, and its rate afterwards."""
+"""The reference's side of `python -m benchmarks sampler`: seconds of the first call, and the rate afterwards."""
 
 import argparse
 import json
@@ -7,7 +7,7 @@ import json
 from serve import timed
 from world import BATCH, keys_of, sampler
 
-FEW = 2  # batches where the sampler is slow
+FEW = 2  # batches of m and l, where the sampler is slow
 
 
 def main() -> None:
@@ -21,7 +21,7 @@ def main() -> None:
     sample, keys = sampler(args.size), keys_of(0, args.levels)
     first, _ = timed(lambda: jax.block_until_ready(sample(keys[0])))
     keys = keys if args.size == "s" else keys[:FEW]
-    seconds, _ = timed(lambda: [jax.block_until_ready(sample(some)) for some in keys])
+    seconds, _ = timed(lambda: [jax.block_until_ready(sample(batch)) for batch in keys])
     print(json.dumps({"first": first, "rate": len(keys) * BATCH / seconds}))
 
 

@@ -1,7 +1,6 @@
-"""A contestant's half of a bench: a process that gets ready, then runs once for every line it reads.
+"""A benchmark process's side of the protocol: it gets ready, then runs once for every line on standard input.
 
-Standard library only: the reference's scripts run in an environment that has nothing of ours, and import this file
-as their neighbour.
+Imports the standard library only, because the reference's scripts import this file in an environment without ours.
 """
 
 import json
@@ -9,25 +8,25 @@ import sys
 import time
 from collections.abc import Callable
 
-MARK = "@"  # before our lines; libraries may print what they like
+MARK = "@"  # prefix of our lines; libraries may print others
 
 
 def serve(ready: dict, run: Callable[[], dict]) -> None:
-    """Say what getting ready gave, then what each run gave, until the input ends."""
+    """Print the facts `ready`, then those of a run for each line of input."""
     _say(ready)
     for _ in sys.stdin:
         _say(run())
 
 
 def answer(ready: dict, do: Callable[[dict], dict]) -> None:
-    """The same for requests: each line read is one, as JSON, and `do` makes its answer."""
+    """Print the facts `ready`, then the answer of `do` to each line of input, a JSON request."""
     _say(ready)
     for line in sys.stdin:
         _say(do(json.loads(line)))
 
 
 def timed(action: Callable):
-    """(seconds, result)."""
+    """Call `action`; return (seconds, result)."""
     start = time.perf_counter()
     result = action()
     return time.perf_counter() - start, result

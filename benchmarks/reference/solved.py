@@ -2,10 +2,10 @@
 """The reference's side of `python -m benchmarks solved --variant original`, inside its own environment.
 
 Trains and evaluates the experts of ppo.py. Answers requests (see serve.py):
-    begin     fresh experts for the levels of the file `levels`, with their `level_id`
-    update    one update of all of them
-    evaluate  writes to the file `out` what training and then an evaluation showed, level axis first, and answers with
-              the core-seconds since `begin`
+    begin     make fresh experts for the levels of the file `levels`, which has their `level_id`
+    update    update all experts once
+    evaluate  write flags of training and of an evaluation to the file `out`, level axis first; answer with the
+              core-seconds since `begin`
 """
 
 import argparse
@@ -19,10 +19,10 @@ from world import load_levels, stay_on
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--size", required=True)
-    parser.add_argument("--width", type=int, required=True, help="levels side by side; a file may have fewer")
+    parser.add_argument("--width", type=int, required=True, help="levels trained side by side; a file may have fewer")
     parser.add_argument("--environments", type=int, required=True)
     parser.add_argument("--horizon", type=int, required=True)
-    parser.add_argument("--attempts", type=int, required=True, help="of an evaluation")
+    parser.add_argument("--attempts", type=int, required=True, help="attempts of an evaluation")
     parser.add_argument("--steps", type=int, required=True, help="env steps of an attempt")
     parser.add_argument("--cache", required=True, help="folder for compiled code")
     parser.add_argument("--core", type=int)
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 class Batch:
-    """Levels and their experts, side by side."""
+    """Levels and their experts, trained side by side."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         import jax
@@ -52,7 +52,7 @@ class Batch:
         )
 
     def answer(self, request: dict) -> dict:
-        if not self.compiled:  # which is not measured
+        if not self.compiled:  # so that compiling is not timed
             self.begin(request["levels"])
             self.update()
             self.results()
@@ -85,7 +85,7 @@ class Batch:
         self.seen.append([np.asarray(x) for x in flags])
 
     def results(self) -> dict[str, np.ndarray]:
-        """Flags of training (level, env step, environment); actions and flags of evaluation (level, step, attempt)."""
+        """Return flags of training (level, env step, environment), actions and flags of evaluation (level, step, attempt)."""
         trained = (np.concatenate(x, 1) for x in zip(*self.seen, strict=True))
         evaluated = (np.asarray(x) for x in self.evaluate_all(self.learner, self.levels, self.of_evaluation))
         names = ("trained_done", "trained_goal", "action", "done", "goal")

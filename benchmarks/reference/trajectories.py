@@ -1,12 +1,11 @@
 # pyright: reportMissingImports=false
-"""The reference plays levels and writes what it saw as its reader wants it, with its own zarr. Runs inside its own
-environment.
+"""Play levels with the reference and write them in its reader's format. Runs inside the reference's own environment.
 
     python benchmarks/reference/trajectories.py OUT LEVELS.npz --size s --levels 512 --solved 4 --others 2
 
-LEVELS.npz is as `world.py` writes it. The actions are random and sticky, and every level starts again when an episode
-ends. OUT is a zarr v2 group of two arrays, of which the second has other chunks and another compressor. Kept are the
-first trajectories in which every episode that ends reaches the goal, and the first others.
+LEVELS.npz comes from `world.py`. Actions are random and sticky, and every level resets when an episode ends. OUT is a
+zarr v2 group of two arrays, the second with other chunks and another compressor. It gets the first trajectories in which
+every finished episode reaches the goal, and the first others.
 """
 
 import argparse
@@ -28,7 +27,7 @@ STEPS = 256
 
 
 def play(size, levels, actions):
-    """States before each action, and whether it ended the episode and in the goal, all (level, time, ...)."""
+    """Return states before each action, and whether it ended the episode, and in the goal; all (level, time, ...)."""
     static, params = static_env_params_from_size(size), EnvParams()
     env = make_kinetix_env(ActionType.MULTI_DISCRETE, ObservationType.SYMBOLIC_FLAT, None, params, static, True)
     step = jax.vmap(env.step, (None, 0, 0, None, 0))
@@ -42,16 +41,16 @@ def play(size, levels, actions):
 
 
 def trajectories(size, states, actions, done):
-    """Structures of 85 fields, (level, time)."""
+    """Return structured records of 85 fields, (level, time)."""
     static = static_env_params_from_size(size)
     first = jax.tree.map(lambda x: jnp.asarray(x[:, 0]), states)
     mask = np.asarray(get_valid_action_mask(first, static, jnp.asarray(actions[:, 0])))
     fields = {f"env_state/{name}": values for name, values in flatten(states).items()}
     fields |= {"action": actions, "done": done, "action_mask": np.repeat(mask[:, None], STEPS, 1)}
-    made = np.zeros(done.shape, [(name, x.dtype, (1, *x.shape[2:])) for name, x in fields.items()])
+    records = np.zeros(done.shape, [(name, x.dtype, (1, *x.shape[2:])) for name, x in fields.items()])
     for name, values in fields.items():
-        made[name][:, :, 0] = values
-    return made
+        records[name][:, :, 0] = values
+    return records
 
 
 def main():
@@ -66,15 +65,15 @@ def main():
     actions = np.moveaxis(sticky_actions(STEPS, args.levels), 1, 2)  # (time, level, 6)
     states, done, goal = play(args.size, levels, jnp.asarray(actions))
     good = done.any(1) & (goal | ~done).all(1)
-    kept = np.concatenate([np.flatnonzero(good)[: args.solved], np.flatnonzero(~good)[: args.others]])
-    assert len(kept) == args.solved + args.others, f"{good.sum()} levels of {args.levels} are solved"
-    made = trajectories(
-        args.size, jax.tree.map(lambda x: x[kept], states), np.moveaxis(actions, 1, 0)[kept], done[kept]
+    chosen = np.concatenate([np.flatnonzero(good)[: args.solved], np.flatnonzero(~good)[: args.others]])
+    assert len(chosen) == args.solved + args.others, f"{good.sum()} levels of {args.levels} are solved"
+    records = trajectories(
+        args.size, jax.tree.map(lambda x: x[chosen], states), np.moveaxis(actions, 1, 0)[chosen], done[chosen]
     )
-    group, half = zarr.open_group(args.out, mode="w"), len(kept) // 2
-    write: Any = group.array  # of zarr 2, which the reference has
-    write("first", made[:half], chunks=(4, STEPS))
-    write("second", made[half:], chunks=(2, 100), compressor=Blosc("zstd", 9, shuffle=0))
+    group, half = zarr.open_group(args.out, mode="w"), len(chosen) // 2
+    write: Any = group.array  # zarr 2, which the reference has
+    write("first", records[:half], chunks=(4, STEPS))
+    write("second", records[half:], chunks=(2, 100), compressor=Blosc("zstd", 9, shuffle=0))
 
 
 if __name__ == "__main__":

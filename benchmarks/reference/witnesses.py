@@ -1,11 +1,10 @@
 # pyright: reportMissingImports=false
-"""The reference opens level files and plays their witnesses. Runs inside its own environment.
+"""Open level files with the reference and play their witnesses. Runs inside the reference's own environment.
 
     python benchmarks/reference/witnesses.py OUT.npz ACTIONS.npz FOLDER
 
-FOLDER has level files of one size, in the order of their names. ACTIONS.npz has `action` (kind, 256, level, 6): of
-each level as many witnesses as there are kinds. OUT.npz has `reached` (kind, level): whether its first episode ended
-in the goal.
+FOLDER has level files of one size, in the order of their names. ACTIONS.npz has `action` (kind, 256, level, 6): a
+witness of each kind for every level. OUT.npz has `reached` (kind, level): whether the first episode ended in the goal.
 """
 
 import sys
@@ -32,8 +31,8 @@ def main(out, actions, folder):
         _, state, _, done, info = step(jax.random.PRNGKey(0), state, action, params)
         return (state, over | done, reached | (info["GoalR"] & done & ~over)), None
 
-    no = jnp.zeros(len(opened), bool)
-    play = jax.jit(lambda action: jax.lax.scan(act, (state, no, no), action)[0][2])
+    none = jnp.zeros(len(opened), bool)
+    play = jax.jit(lambda action: jax.lax.scan(act, (state, none, none), action)[0][2])
     with np.load(actions) as file:
         np.savez(out, reached=np.stack([play(kind) for kind in file["action"]]))
 

@@ -1,8 +1,8 @@
 # pyright: reportMissingImports=false
-"""Worlds of the reference, inside its own environment: built from plain arrays, sampled, and written to plain arrays.
+"""Worlds of the reference, inside its own environment: sampled, and converted from and to plain arrays.
 
 Files are .npz with one array per path of the reference's state (`polygon/position`), level axis first, as
-`levelgen.files.kinetix` reads them. Imports the reference and nothing of ours.
+`levelgen.files.kinetix` reads them. Imports the reference, but nothing of ours.
 """
 
 import argparse
@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-# As ours runs (pipeline/runtime.py), so that neither side has an advantage
+# equal to our settings (pipeline/runtime.py), so that neither side has an advantage
 SINGLE_THREAD = "--xla_cpu_multi_thread_eigen=false --xla_cpu_prefer_vector_width=512"
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-BATCH = 512  # levels sampled at a time: the memory of the sampler grows with them
+BATCH = 512  # levels sampled at a time; bounds the sampler's memory
 
 
 def stay_on(core: int | None) -> None:
-    """One thread on one core; None: all cores, XLA's own threads. Before JAX is imported."""
+    """Run one thread on one core; None: XLA's own threads on all cores. Call it before importing JAX."""
     if core is not None:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SINGLE_THREAD}".strip()
         os.environ.update(dict.fromkeys(THREADS, "1"))
@@ -28,7 +28,7 @@ def stay_on(core: int | None) -> None:
 
 
 def flatten(state, prefix: str = "") -> dict[str, np.ndarray]:
-    """A state as {path: array}."""
+    """Convert a state to {path: array}."""
     fields = {}
     for field in dataclasses.fields(state):
         value = getattr(state, field.name)
@@ -40,7 +40,7 @@ def flatten(state, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def static_of(size: str):
-    """The reference's static parameters of `s`, `m`, `l` or of `POLYGONS-CIRCLES-JOINTS-THRUSTERS`."""
+    """Return the reference's static parameters of `s`, `m`, `l` or of `POLYGONS-CIRCLES-JOINTS-THRUSTERS`."""
     from kinetix.environment import static_env_params_from_size
 
     if "-" not in size:
@@ -50,7 +50,7 @@ def static_of(size: str):
 
 
 def load_levels(path: str, size: str, first: int, count: int):
-    """Levels `first` to `first + count - 1` of a file, going round where it has fewer."""
+    """Load levels `first` to `first + count - 1` of a file; indices wrap around."""
     import jax
     import jax.numpy as jnp
     from kinetix.environment.utils import create_empty_env
@@ -76,7 +76,7 @@ def load_levels(path: str, size: str, first: int, count: int):
 
 
 def sampler(size: str):
-    """The reference's random distribution: a compiled function of keys (level, 2) to levels, level axis first."""
+    """Return the reference's sampler: a compiled function from keys (level, 2) to levels, level axis first."""
     import jax
     from kinetix.environment import EnvParams, static_env_params_from_size
     from kinetix.environment.ued.ued import make_reset_fn_sample_kinetix_level
@@ -85,14 +85,14 @@ def sampler(size: str):
 
 
 def keys_of(seed: int, count: int):
-    """Keys of at least so many levels, (batch, BATCH, 2)."""
+    """Return keys for at least `count` levels, (batch, BATCH, 2)."""
     import jax
 
     return jax.random.split(jax.random.PRNGKey(seed), -(-count // BATCH) * BATCH).reshape(-1, BATCH, 2)
 
 
 def sample_levels(size: str, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Levels of the reference's random distribution, as {path: array}."""
+    """Sample levels of the reference's random distribution, as {path: array}."""
     sample = sampler(size)
     parts = [flatten(sample(keys)) for keys in keys_of(seed, count)]
     return {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}

@@ -1,1 +1,1 @@
-"""How many levels experts solve: our defaults, variants of them, and the reference's PPO."""
+"""The benchmark `solved`: levels solved by our defaults, by variants of them, and by the reference's PPO."""

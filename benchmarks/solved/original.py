@@ -1,7 +1,7 @@
 """The variant `original`: our levels in the reference's own environment, trained by its users' PPO.
 
-A process of the reference's Python (benchmarks/reference/solved.py) trains and evaluates; what an evaluation says
-of a level is judged here, as for every variant. Witnesses are not replayed: they hold in the reference's physics.
+A process of the reference's Python (benchmarks/reference/solved.py) trains and evaluates. Its evaluations are judged
+here, as for every variant, but witnesses are not replayed: they hold in the reference's physics only.
 """
 
 import json
@@ -30,27 +30,27 @@ from levelproof.pipeline.jobs.schedule import Summary, WorkUnit
 from levelproof.pipeline.runtime import cache_folder, prepare_jax
 from levelproof.pipeline.store.provenance import device, versions
 
-WIDTH = 8  # levels that the reference trains side by side; empty places of a last batch are not charged
+WIDTH = 8  # levels that the reference trains side by side; empty slots of a last batch are not charged
 
 
-def work(core: int, header: Header, variant: Variant, tasks: Any, told: Any) -> None:
-    """One process, as `measure.work`; the reference's shares its core."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the first process ends the others
+def work(core: int, header: Header, variant: Variant, tasks: Any, messages: Any) -> None:
+    """Train units until none is left, as `measure.work` does; the reference's process shares the core."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the main process ends the others
     prepare_jax(core)
     try:
         python = oracle.oracle_python()
         made_with = {**versions(), "reference": oracle.versions(python)}
         with started(python, core, header, variant.procedure.expert) as reference:
             while (unit := tasks.get()) is not None:
-                rows, summary = train(reference, header, variant.procedure.expert, unit, told.put)
-                told.put(Trained(unit, rows, summary, made_with, device()))
+                rows, summary = train(reference, header, variant.procedure.expert, unit, messages.put)
+                messages.put(Trained(unit, rows, summary, made_with, device()))
     except LevelproofError as error:
-        told.put(error)
+        messages.put(error)
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The reference's process, and the folder of arrays that go there and back."""
+    """The reference's process, and the folder through which arrays are exchanged."""
 
     process: Process
     folder: Path
@@ -62,15 +62,15 @@ class Reference:
 
 @contextmanager
 def started(python: Path, core: int, header: Header, config: ExpertConfig) -> Iterator[Reference]:
-    """The process lives as long as the context.
+    """Run the reference's process in the `with` block.
 
     Raises:
-        Failure: it ends early.
+        Failure: the process ends early.
     """
-    words = ["--size", header.size, "--width", WIDTH, "--core", core, "--cache", cache_folder() / "reference-jax"]
-    words += ["--environments", config.environments, "--horizon", config.horizon]
-    words += ["--attempts", config.attempts, "--steps", RECORD_STEPS]
-    command = [str(word) for word in (python, oracle.SCRIPTS / "solved.py", *words)]
+    arguments = ["--size", header.size, "--width", WIDTH, "--core", core, "--cache", cache_folder() / "reference-jax"]
+    arguments += ["--environments", config.environments, "--horizon", config.horizon]
+    arguments += ["--attempts", config.attempts, "--steps", RECORD_STEPS]
+    command = [str(argument) for argument in (python, oracle.SCRIPTS / "solved.py", *arguments)]
     with ExitStack() as stack, tempfile.TemporaryFile("w+") as errors, tempfile.TemporaryDirectory() as folder:
         process = Process(command, oracle.environment(), stack, errors)
         process.start()
@@ -79,9 +79,13 @@ def started(python: Path, core: int, header: Header, config: ExpertConfig) -> It
 
 
 def train(
-    reference: Reference, header: Header, config: ExpertConfig, unit: WorkUnit, tell: Callable[[Progress], None]
+    reference: Reference,
+    header: Header,
+    config: ExpertConfig,
+    unit: WorkUnit,
+    report_progress: Callable[[Progress], None],
 ) -> tuple[list[dict[str, Any]], Summary]:
-    """Lines of a unit's levels. Those that need no expert are decided here, and cost nothing.
+    """Train a unit's levels; return their lines. Levels that need no expert are decided here, at no cost.
 
     Raises:
         Failure: the reference's process ended.
@@ -97,23 +101,23 @@ def train(
     ids, updates = np.asarray(unit.level_ids, np.int32), config.updates_in(header.budget)
     levels = sample_levels(jnp.asarray(ids), size_of(header.size))
     before, failed = decide(levels, DEFAULT_RULES)
-    left = np.array([i for i, verdict in enumerate(before) if verdict is None], int)
+    undecided = np.array([i for i, verdict in enumerate(before) if verdict is None], int)
     rows = [row_of(int(i), verdict, 0.0) for i, verdict in zip(ids, before, strict=True) if verdict]
     known_before, solved = len(rows), 0
-    for first in range(0, len(left), WIDTH):
-        batch = left[first : first + WIDTH]
+    for first in range(0, len(undecided), WIDTH):
+        batch = undecided[first : first + WIDTH]
 
         def report(share: float, first: int = first, count: int = len(batch), solved: int = solved) -> None:
             through = first + share * count
             steps = round(through * updates) * config.steps_per_update
-            tell(Progress(unit, (steps, known_before + through, solved)))
+            report_progress(Progress(unit, (steps, known_before + through, solved)))
 
         seconds, seen = train_batch(reference, take(levels, batch), ids[batch], updates, report)
-        verdicts = [judged(of, config, bool(failed[i])) for i, of in zip(batch, seen, strict=True)]
+        verdicts = [judged(shown, config, bool(failed[i])) for i, shown in zip(batch, seen, strict=True)]
         rows += [row_of(int(ids[i]), verdict, seconds / WIDTH) for i, verdict in zip(batch, verdicts, strict=True)]
         solved += sum(verdict.label is Label.SOLVED for verdict in verdicts)
     steps, evaluated = updates * config.steps_per_update, config.attempts * RECORD_STEPS
-    spent = EnvSteps(trained=len(left) * steps, evaluated=len(left) * evaluated)
+    spent = EnvSteps(trained=len(undecided) * steps, evaluated=len(undecided) * evaluated)
     summary = Summary(len(ids), solved, spent)
     return sorted(rows, key=lambda row: row["level_id"]), summary
 
@@ -125,10 +129,10 @@ def train_batch(
     updates: int,
     report: Callable[[float], None],
 ) -> tuple[float, list[dict[str, Shaped[np.ndarray, "..."]]]]:
-    """Core-seconds of the batch, and what the reference's process shows of each level (see `judged`).
+    """Train and evaluate a batch; return its core-seconds and each level's arrays (see `judged`).
 
     Raises:
-        Failure: it ended.
+        Failure: the reference's process ended.
     """
     from levelproof.levelgen.files.kinetix import state_to_kinetix
     from levelproof.levelgen.task.rules import NO_DISTANCE
@@ -147,13 +151,13 @@ def train_batch(
 
 
 def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, failed_by_noop: bool) -> Verdict:
-    """The verdict on a level, by the rules for our own experts.
+    """Judge a level by the rules for our own experts.
 
     Args:
-        seen: what the reference's process wrote of it: of training `trained_done` and `trained_goal` (env step,
-            environment), of the evaluation `action` (step, attempt, 6), `done` and `goal` (step, attempt).
-        config: of its expert.
-        failed_by_noop: whether doing nothing lets green touch red.
+        seen: arrays from the reference's process: `trained_done` and `trained_goal` (env step, environment) of
+            training; `action` (step, attempt, 6), `done` and `goal` (step, attempt) of the evaluation.
+        config: the expert's configuration.
+        failed_by_noop: whether green touches red if nothing acts.
     """
     import jax
     import jax.numpy as jnp
@@ -183,7 +187,7 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
 
 
 def first_success(goal: Bool[np.ndarray, "step environment"]) -> int:
-    """Env steps of training until then, those of all environments."""
+    """Return the env steps of training, over all environments, until the first success."""
     from levelproof.experts.training.progress import NEVER
 
     reached = goal.any(1)

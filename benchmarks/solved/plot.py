@@ -1,7 +1,7 @@
-"""How the unsolved share falls with budget: a plot, and its numbers.
+"""The unsolved share by budget: a plot and a table.
 
-A level counts as solved from the env steps at which it left its slot as solved. A run with a smaller budget solves a
-few levels more than that: its experts are evaluated when their budget ends, however seldom they have succeeded.
+A level counts as solved from the env steps at which it left its slot as solved. A run with that budget solves a few
+levels more: its experts are evaluated when the budget ends, however rarely they have succeeded.
 """
 
 from collections.abc import Sequence
@@ -15,17 +15,17 @@ from benchmarks.solved.results import Results, count, share
 from benchmarks.solved.tables import order
 from benchmarks.statistics import wilson
 
-FROM = 4_000  # env steps where the axis begins
-POINTS = 120  # of a curve; more would not show
+MIN_STEPS = 4_000  # env steps where the axis begins
+POINTS = 120  # of a curve; more would be invisible
 MARKS = (64_000, 256_000, 1_000_000, 4_000_000)
 TICKS = (4_000, 16_000, *MARKS)
-COLOURS = ("#2a85c7", "#d55e00", "#009e73", "#b3679b", "#b8860b")  # all show on white and on black
-GREY = "#7d8590"  # of axes and text: so does it
+COLOURS = ("#2a85c7", "#d55e00", "#009e73", "#b3679b", "#b8860b")  # visible on white and on black
+GREY = "#7d8590"  # for axes and text; visible on white and on black
 
 
-def tells(results: Results) -> bool:
-    """Whether it has a curve: not where every level had its whole budget, nor where the budget ends before the axis."""
-    return results.header.stops_early and bool(results.trained) and results.header.budget > FROM
+def has_curve(results: Results) -> bool:
+    """Whether results have a curve: levels may leave early, and the budget reaches the axis."""
+    return results.header.stops_early and bool(results.trained) and results.header.budget > MIN_STEPS
 
 
 def ordered(results: Sequence[Results]) -> list[Results]:
@@ -33,20 +33,20 @@ def ordered(results: Sequence[Results]) -> list[Results]:
 
 
 def unsolved(results: Results, within: float) -> int:
-    """Levels with an expert that have not left their slots as solved after so many env steps."""
+    """Count levels with an expert that have not left their slots as solved within `within` env steps."""
     return len(results.trained) - len(results.solved(within))
 
 
 def curve(results: Results) -> tuple[list[float], list[int]]:
-    """Env steps, from the axis' begin to the budget, and the levels that are unsolved there."""
+    """Return env steps, from the start of the axis to the budget, and the number of unsolved levels at each."""
     budget = results.header.budget
-    even = np.geomspace(FROM, budget, POINTS)[1:-1].tolist()
-    steps = [float(FROM), *sorted({*even, *(float(mark) for mark in MARKS if mark < budget)}), float(budget)]
+    even = np.geomspace(MIN_STEPS, budget, POINTS)[1:-1].tolist()
+    steps = [float(MIN_STEPS), *sorted({*even, *(float(mark) for mark in MARKS if mark < budget)}), float(budget)]
     return steps, [unsolved(results, x) for x in steps]
 
 
 def names(results: Sequence[Results]) -> list[str]:
-    """What tells the files apart."""
+    """Return the shortest labels that distinguish the results."""
     single = len({each.header.variant for each in results}) == 1
     text = lambda each: f"size {each.header.size}" + ("" if single else f", {each.header.variant}")
     short = [text(each) for each in results]
@@ -57,7 +57,7 @@ def names(results: Sequence[Results]) -> list[str]:
 
 
 def table(results: Sequence[Results]) -> Table:
-    """The unsolved share at the marks and at the end."""
+    """Tabulate the unsolved share at the marks and at the budget."""
     marks = sorted({mark for each in results for mark in (*MARKS, each.header.budget) if mark <= each.header.budget})
     rows = []
     for name, each in zip(names(results), results, strict=True):
@@ -69,7 +69,7 @@ def table(results: Sequence[Results]) -> Table:
 
 
 def draw(results: Sequence[Results], out: Path) -> None:
-    """The plot, as SVG without a background."""
+    """Write the plot as SVG without a background."""
     import matplotlib
 
     matplotlib.use("svg")
@@ -85,7 +85,7 @@ def draw(results: Sequence[Results], out: Path) -> None:
     for i, (name, each) in enumerate(zip(names(results), results, strict=True)):
         draw_curve(axes, each, name, COLOURS[i % len(COLOURS)])
     end = max(each.header.budget for each in results)
-    axes.set(xscale="log", xlim=(FROM, end * 1.05), ylim=(0, None))
+    axes.set(xscale="log", xlim=(MIN_STEPS, end * 1.05), ylim=(0, None))
     axes.set(xlabel="training env steps of a level", ylabel="levels not yet solved")
     axes.xaxis.set_major_locator(FixedLocator([tick for tick in TICKS if tick <= end]))
     axes.xaxis.set_minor_locator(NullLocator())
@@ -100,10 +100,10 @@ def draw(results: Sequence[Results], out: Path) -> None:
 
 
 def draw_curve(axes: Any, results: Results, name: str, colour: str) -> None:
-    """The unsolved share of a variant, its interval, and its marks."""
-    levels, (steps, left) = len(results.trained), curve(results)
-    low, high = zip(*(wilson(k, levels) for k in left), strict=True)
+    """Draw the unsolved share of a variant, with its interval and marks."""
+    levels, (steps, remaining) = len(results.trained), curve(results)
+    low, high = zip(*(wilson(k, levels) for k in remaining), strict=True)
     axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
-    axes.plot(steps, [k / levels for k in left], color=colour, linewidth=1.6, label=name)
+    axes.plot(steps, [k / levels for k in remaining], color=colour, linewidth=1.6, label=name)
     marks = [mark for mark in MARKS if mark <= results.header.budget]
     axes.plot(marks, [unsolved(results, x) / levels for x in marks], "o", color=colour, markersize=4)

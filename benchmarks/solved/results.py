@@ -1,4 +1,4 @@
-"""What is known of each level: a row for each size, budget, variant and level, in one parquet file."""
+"""Results of every level: a row per size, budget, variant and level, in one parquet file."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from levelproof.experts.labels import TRAINED, Label
 from levelproof.pipeline.errors import UserError
 
 FILE = Path(__file__).parents[1] / "results" / "solved.parquet"
-SIZES = ("s", "m", "l")  # in this order; others follow
+SIZES = ("s", "m", "l")  # in this order; custom sizes follow
 WORD = pa.dictionary(pa.int32(), pa.string())
 SCHEMA = pa.schema(
     [
@@ -30,12 +30,12 @@ SCHEMA = pa.schema(
         ("evaluation_steps", pa.int64()),  # env steps, as the next two; null: not counted
         ("scout_steps", pa.int64()),
         ("search_steps", pa.int64()),
-        ("witness", WORD),  # where it comes from; null: there is none, or it was not noted
-        # of sampled first episodes: in attempts after training, in older rows in the last evaluation; null: none ended
+        ("witness", WORD),  # its source; null: no witness, or not recorded
+        # of sampled first episodes after training (older rows: in the last evaluation); null: none ended
         ("success_rate", pa.float64()),
-        ("most_probable_succeeds", pa.bool_()),  # in the last evaluation; null: it was not noted
+        ("most_probable_succeeds", pa.bool_()),  # in the last evaluation; null: not recorded
         ("steps_to_goal", pa.int32()),  # env steps of the witness's first episode; null: no witness
-        ("core_seconds", pa.float64()),  # without compiling, and without slots and rows that are empty at the end
+        ("core_seconds", pa.float64()),  # excludes compiling, and slots that are empty at the end
         ("settings", WORD),  # of the procedure, as JSON
         ("versions", WORD),  # as JSON
         ("device", WORD),
@@ -51,7 +51,7 @@ OF_RUN = ("versions", "device", "date")
 
 @dataclass(frozen=True)
 class Header:
-    """What the levels of a variant, size and budget have in common and what their results depend on."""
+    """What levels of a variant, size and budget share, and their results depend on."""
 
     variant: str
     size: str
@@ -60,12 +60,12 @@ class Header:
 
     @property
     def name(self) -> str:
-        """`s-64k-default`."""
+        """Name of the group, such as `s-64k-default`."""
         return f"{self.size}-{count(self.budget)}-{self.variant}"
 
     @property
     def stops_early(self) -> bool:
-        """Whether `env_steps` tells when a level was solved."""
+        """Whether `env_steps` says when a level was solved."""
         return self.config["stop"]["rule"] != Rule.BUDGET
 
 
@@ -82,16 +82,16 @@ class Results:
         return {level_id: row for level_id, row in self.rows.items() if row["label"] in TRAINED}
 
     def solved(self, within: float = math.inf) -> set[int]:
-        """Levels that left their slots as solved after at most so many env steps."""
+        """Return the levels that left their slots as solved within `within` env steps."""
         rows = self.trained.items()
         return {level_id for level_id, row in rows if row["label"] == Label.SOLVED and row["env_steps"] <= within}
 
 
 def read(file: Path = FILE) -> list[Results]:
-    """All that is known; nothing where there is no file.
+    """Read all results; none if the file does not exist.
 
     Raises:
-        UserError: the file is none of ours.
+        UserError: the file has another format.
     """
     if not file.exists():
         return []
@@ -99,27 +99,27 @@ def read(file: Path = FILE) -> list[Results]:
         lines = pq.read_table(file, schema=SCHEMA).to_pylist()
     except (OSError, pa.ArrowException) as error:
         raise UserError(f"{file} is not a file that `python -m benchmarks solved` has written ({error}).") from None
-    found: dict[tuple[str, int, str], Results] = {}
+    groups: dict[tuple[str, int, str], Results] = {}
     for line in lines:
         key = line["size"], line["budget"], line["variant"]
-        if key not in found:
-            found[key] = Results(Header(key[2], key[0], key[1], json.loads(line["settings"])), {})
-        found[key].rows[line["level_id"]] = {name: line[name] for name in (*OF_LEVEL, *OF_RUN)}
-    return list(found.values())
+        if key not in groups:
+            groups[key] = Results(Header(key[2], key[0], key[1], json.loads(line["settings"])), {})
+        groups[key].rows[line["level_id"]] = {name: line[name] for name in (*OF_LEVEL, *OF_RUN)}
+    return list(groups.values())
 
 
 def merge(new: Results, file: Path = FILE) -> None:
-    """Put levels in, in the place of what was known of them; other settings take the place of the whole header's."""
+    """Merge results into the file, level by level; results from other settings replace the whole group."""
     with alone(file.with_suffix(".lock")):
-        known = {results.header.name: results for results in read(file)}
-        old = known.get(new.header.name)
-        kept = old.rows if old and old.header == new.header else {}
-        known[new.header.name] = Results(new.header, kept | new.rows)
-        write(known.values(), file)
+        merged = {results.header.name: results for results in read(file)}
+        old = merged.get(new.header.name)
+        unreplaced = old.rows if old and old.header == new.header else {}
+        merged[new.header.name] = Results(new.header, unreplaced | new.rows)
+        write(merged.values(), file)
 
 
 def write(results: Iterable[Results], file: Path) -> None:
-    """All that is known, in an order of its own: the same results are the same file."""
+    """Write all results in a fixed order, so that equal results make equal files."""
     lines = [
         {"size": h.size, "budget": h.budget, "variant": h.variant, "level_id": level_id}
         | {"settings": json.dumps(h.config), **row}
@@ -138,29 +138,29 @@ def by_size(size: str) -> tuple[int, str]:
 
 
 def made(results: Sequence[Results]) -> str:
-    """When and on what, in a sentence."""
-    told: dict[str, Mapping[str, None]] = {
+    """Say in a sentence when, where and with which versions results were made."""
+    runs: dict[str, Mapping[str, None]] = {
         name: dict.fromkeys(row[name] for each in results for row in each.rows.values()) for name in OF_RUN
     }
     stacks: dict[str, dict[str, None]] = {}
-    for stack in map(json.loads, told["versions"]):
+    for stack in map(json.loads, runs["versions"]):
         reference = {f"reference: {name}": x for name, x in stack.pop("reference", {}).items()}
         for name, x in (stack | reference).items():
             stacks.setdefault(name, {})[str(x)] = None
-    dates = sorted(told["date"])
+    dates = sorted(runs["date"])
     when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}" if dates else ""
     stack = ", ".join(f"{name} {' and '.join(x)}" for name, x in stacks.items())
-    return f"{when}, on {', '.join(told['device'])}; {stack}"
+    return f"{when}, on {', '.join(runs['device'])}; {stack}"
 
 
 def mean(values: Sequence[float | None]) -> float | None:
-    """Of those that are there."""
-    there = [value for value in values if value is not None]
-    return sum(there) / len(there) if there else None
+    """Return the mean of the values that are not None."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
 
 
 def share(successes: int, trials: int) -> str:
-    """`41.2% (37.0 to 45.5)`: with its 95% interval."""
+    """Format a share with its 95% interval, such as `41.2% (37.0 to 45.5)`."""
     if not trials:
         return "-"
     low, high = wilson(successes, trials)
@@ -168,7 +168,7 @@ def share(successes: int, trials: int) -> str:
 
 
 def count(number: float) -> str:
-    """`64k`, `1M`, `1.5M`."""
+    """Format a count, such as `64k`, `1M` or `1.5M`."""
     for scale, letter in ((1_000_000, "M"), (1_000, "k")):
         if number >= scale:
             return f"{number / scale:.4g}{letter}"

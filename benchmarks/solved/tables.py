@@ -10,7 +10,7 @@ from benchmarks.solved.variants import VARIANTS
 from benchmarks.statistics import mcnemar
 from levelproof.experts.labels import BY_EXPERT
 
-QUARTER = "alone"  # the variant whose quarter of the budget is compared with the reference's whole
+QUARTER = "alone"  # the variant compared with the reference also at a quarter of the budget
 HEAD = (
     "variant", "undecided levels", "solved (95% interval)", "by an expert's own witness",
     "an expert reaches the goal by itself", "at a quarter of the budget", "env steps a level",
@@ -20,21 +20,21 @@ PAIRED_HEAD = ("variant", "against", "levels of both", "only the first solves", 
 
 
 def tables(results: Sequence[Results]) -> list[Table]:
-    """For each size and budget the variants, and the pairs of them."""
+    """Make the tables of each size and budget: its variants, and pairs of them."""
     groups: dict[tuple[str, int], list[Results]] = {}
     for each in sorted(results, key=order):
         groups.setdefault((each.header.size, each.header.budget), []).append(each)
-    made = []
+    result = []
     for (size, budget), group in groups.items():
         title = f"**Size {size}, {count(budget)} env steps**, {ids_of(group)}"
-        made.append(Table(HEAD, [line(each) for each in group], title))
+        result.append(Table(HEAD, [line(each) for each in group], title))
         if pairs := paired(group):
-            made.append(Table(PAIRED_HEAD, pairs, "Level by level"))
-    return made
+            result.append(Table(PAIRED_HEAD, pairs, "Level by level"))
+    return result
 
 
 def variants_of(results: Sequence[Results]) -> str:
-    """What they are, as a list."""
+    """List the variants with their descriptions."""
     names = {each.header.variant for each in results}
     return "\n".join(f"- `{name}`: {each.text}" for name, each in VARIANTS.items() if name in names)
 
@@ -51,7 +51,7 @@ def ids_of(group: Sequence[Results]) -> str:
 
 
 def line(results: Results) -> list[str]:
-    """A variant's row."""
+    """Make a variant's row."""
     header, trained, solved = results.header, results.trained, results.solved()
     rows = [trained[level_id] for level_id in solved]
     seconds = sum(row["core_seconds"] for row in results.rows.values())
@@ -73,24 +73,24 @@ def line(results: Results) -> list[str]:
 
 
 def reaches(row: Mapping[str, Any]) -> bool | None:
-    """Whether the expert of a solved level reaches the goal by itself, be the witness its own or not; None: unknown."""
+    """Whether the expert of a solved level reaches the goal by itself, whoever found the witness; None: unknown."""
     if row["witness"] in BY_EXPERT or (row["success_rate"] or 0) > 0:
         return True
     return row["most_probable_succeeds"]
 
 
 def known_share(facts: Sequence[bool | None]) -> str:
-    """How many are true, where all are known."""
+    """Format the share of true facts; - if any is unknown."""
     return f"{sum(map(bool, facts)) / len(facts):.1%}" if facts and None not in facts else "-"
 
 
 def steps_of(row: Mapping[str, Any]) -> int:
-    """Env steps that a level took: of training, of its evaluations and of looking before."""
+    """Return a level's env steps: of training, evaluations, scouting and search."""
     return sum(row[name] or 0 for name in ("env_steps", "evaluation_steps", "scout_steps", "search_steps"))
 
 
 def paired(group: Sequence[Results]) -> list[list[str]]:
-    """A row for each variant and each one it is compared with, where both are there."""
+    """Make a row for each variant and each other one it is compared with, if both have results."""
     by_name, lines = {each.header.variant: each for each in group}, []
     for name, one in by_name.items():
         against = VARIANTS[name].against if name in VARIANTS else ()
@@ -104,7 +104,7 @@ def paired(group: Sequence[Results]) -> list[list[str]]:
 
 
 def discordant(one: Results, other: Results, solved: set[int]) -> list[str]:
-    """Levels that both tried, that only one solved, and p."""
+    """Count levels that both tried, and that only one solved; append p."""
     both = one.trained.keys() & other.trained.keys()
     solved, theirs = solved & both, other.solved() & both
     p = mcnemar(len(solved - theirs), len(theirs - solved))

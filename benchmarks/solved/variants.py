@@ -1,4 +1,4 @@
-"""What is compared: the reference's PPO, there and here, our procedures, and experts alone with one thing changed."""
+"""Variants compared: the reference's PPO on both engines, our procedures, and experts alone with one change."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,15 +11,15 @@ from levelproof.experts.procedure import Procedure
 
 PUBLISHED = compose_job(["procedure=published"]).procedure
 ALONE = replace(PUBLISHED, stop=StopConfig(rule=Rule.SOLVED))
-# Other defaults of ours do not change the reference. Its evaluation is ours, so that both are judged alike.
+# Independent of our defaults; evaluated as ours, so that both are judged alike.
 REFERENCE = replace(PUBLISHED, expert=replace(PUBLISHED.expert, **PPO._asdict(), rehearsals=0, persistence=0.0))
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Settings under a name."""
+    """Settings of one way to solve levels."""
 
-    text: str  # what it is, in a line
+    text: str  # description, one line
     procedure: Procedure
     against: tuple[str, ...] = ("alone",)  # variants it is compared with, level by level
     original: bool = False  # trained and evaluated by the reference's side, in its own environment
@@ -38,7 +38,7 @@ def stop(text: str, **changed: Any) -> Variant:
 
 
 def without(text: str, **changed: Any) -> Variant:
-    """The default procedure with something changed."""
+    """Make a variant of the default procedure with the given changes."""
     return Variant(text, replace(Procedure(), **changed), ("default",))
 
 
@@ -50,7 +50,7 @@ VARIANTS: Mapping[str, Variant] = {
         original=True,
     ),
     "reference": Variant("the reference's hyperparameters, the whole budget for every level", REFERENCE, ()),
-    "published": procedure("published", "nobody looks before, the whole budget for every level", "reference"),
+    "published": procedure("published", "no search before, the whole budget for every level", "reference"),
     "default": procedure("default", "a search, experts from a success", "published", "reference", "alone"),
     "label": procedure("label", "a short search, no experts", "default"),
     "masters": procedure("masters", "experts that succeed in 8 of 8 attempts", "default"),
@@ -69,7 +69,7 @@ VARIANTS: Mapping[str, Variant] = {
     "successes_4": stop("alone, solved when 4 attempts of an evaluation succeed", successes=4),
     "successes_8": stop("alone, solved when 8 attempts of an evaluation succeed", successes=8),
     "shortest": expert("alone, the shortest success of any attempt is the witness", witness=Choice.SHORTEST),
-    "entity": expert("alone, the network on sets of things", network=Network.ENTITY),
-    "halving": stop("alone, a level also leaves at a rung where its learning does not move", rule=Rule.HALVING,
+    "entity": expert("alone, the network on sets of entities", network=Network.ENTITY),
+    "halving": stop("alone, a level also leaves at a rung where its learning stalls", rule=Rule.HALVING,
                     first_rung=16_384),
 }  # fmt: skip

@@ -230,8 +230,8 @@ def test_unsolved_falls_with_budget(ours: Results, theirs: Results) -> None:
     assert left == sorted(left, reverse=True)
     assert [plot.unsolved(ours, x) for x in (1_999, 2_000, 15_999, 16_000, 63_999)] == [9, 8, 7, 6, 4]
     assert cells(plot.table([ours]).markdown(), "size s")[1:] == ["9", share(3, 9)]
-    assert plot.tells(ours)
-    assert not plot.tells(theirs), "the whole budget for every level tells no curve"
+    assert plot.has_curve(ours)
+    assert not plot.has_curve(theirs), "the whole budget for every level tells no curve"
 
 
 def test_names_tell_curves_apart(ours: Results) -> None:
