@@ -88,13 +88,13 @@ def play_ours(level: Level, start: State, action: Int[np.ndarray, "step 6 lane"]
     level = jax.tree.map(jnp.asarray, level)
     lanes = action.shape[-1]
     now = TaskState(start, jnp.zeros(lanes, jnp.int32), jnp.full(lanes, task.NO_DISTANCE, jnp.float32))
-    answer, states = [], []
+    outcomes, states = [], []
     for one in action:
         if record:
             states.append(jax.tree.map(np.asarray, now.state))
         now, outcome = _act(level, now, one)
-        answer.append((np.asarray(outcome.reward), np.asarray(outcome.done)))
-    reward, done = (np.stack(x) for x in zip(*answer, strict=True))
+        outcomes.append((np.asarray(outcome.reward), np.asarray(outcome.done)))
+    reward, done = (np.stack(x) for x in zip(*outcomes, strict=True))
     return Played(reward, done, jax.tree.map(lambda *xs: np.stack(xs, -2), *states) if record else None)
 
 
@@ -134,8 +134,8 @@ class Reference:
     def play(self, level: Level, start: State, action: Int[np.ndarray, "step 6 lane"], record: bool) -> Played:
         """Play episodes as `play_ours` does, but resets lead to `start`."""
         fields = self._ask("play", (level, start, action), record=record)[1]
-        answer = fields.pop("reward"), fields.pop("done")
-        return Played(*answer, record_from_kinetix(fields) if record else None)
+        outcome = fields.pop("reward"), fields.pop("done")
+        return Played(*outcome, record_from_kinetix(fields) if record else None)
 
     def _ask(
         self, what: str, worlds: tuple[Level, State, np.ndarray] | None = None, **more: bool
@@ -145,11 +145,11 @@ class Reference:
         fields = {} if worlds is None else _fields(*worlds)
         path = self.keep and self.keep / f"{self.size}-{what}-{_digest(request, fields)}.npz"
         out = path or self.folder / "out.npz"
-        answer = out.with_suffix(".json")
-        if not (path and answer.is_file()):
-            answer.write_text(json.dumps(self._answer(request, fields, out)))
+        answer_file = out.with_suffix(".json")
+        if not (path and answer_file.is_file()):
+            answer_file.write_text(json.dumps(self._answer(request, fields, out)))
         with np.load(out) as file:
-            return json.loads(answer.read_text()), {name: file[name] for name in file.files}
+            return json.loads(answer_file.read_text()), {name: file[name] for name in file.files}
 
     def _answer(self, request: dict[str, Any], fields: dict[str, np.ndarray], out: Path) -> dict:
         if not self.running:

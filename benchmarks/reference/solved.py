@@ -85,7 +85,7 @@ class Batch:
         self.seen.append([np.asarray(x) for x in flags])
 
     def results(self) -> dict[str, np.ndarray]:
-        """Return flags of training (level, env step, environment), actions and flags of evaluation (level, step, attempt)."""
+        """Return training flags (level, env step, environment), evaluation actions and flags (level, step, attempt)."""
         trained = (np.concatenate(x, 1) for x in zip(*self.seen, strict=True))
         evaluated = (np.asarray(x) for x in self.evaluate_all(self.learner, self.levels, self.of_evaluation))
         names = ("trained_done", "trained_goal", "action", "done", "goal")

@@ -4,8 +4,8 @@
     python benchmarks/reference/trajectories.py OUT LEVELS.npz --size s --levels 512 --solved 4 --others 2
 
 LEVELS.npz comes from `world.py`. Actions are random and sticky, and every level resets when an episode ends. OUT is a
-zarr v2 group of two arrays, the second with other chunks and another compressor. It gets the first trajectories in which
-every finished episode reaches the goal, and the first others.
+zarr v2 group of two arrays, the second with other chunks and another compressor. It gets the first trajectories in
+which every finished episode reaches the goal, and the first others.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Levels in which green can only fall: what is said of them holds under random play, and any doubt says nothing."""
+"""Levels in which green can only fall: bounds hold under random play, and a failed premise proves nothing."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +19,7 @@ LANES = 256
 
 
 def falling(thrust: float = 0.45) -> Level:
-    """A ball above a red floor, whose thrusters lift half of its weight and push it to the right; a goal far away."""
+    """A ball above a red floor; thrusters lift half of its weight and push it right; the goal is far away."""
     level = world(
         bars=[((1.0, 4.0), (0.3, 0.2), 0.4), ((4.0, 3.0), (0.2, 0.2), 0.0)],
         bar_role=Role.RED,
@@ -32,11 +32,11 @@ def falling(thrust: float = 0.45) -> Level:
     return level
 
 
-def test_red_comes_first_whatever_is_done() -> None:
-    """In as many env steps as it says, within what it says, and never the goal."""
+def test_fall_bounds_what_random_play_does() -> None:
+    """Episodes end within the bound on env steps and the reach, and never in the goal."""
     level = falling()
-    what = fall(level, DEFAULT_RULES)
-    assert what
+    proof = fall(level, DEFAULT_RULES)
+    assert proof
     ring = arena(level, LANES, (0.05, 0.3))
 
     @jax.jit
@@ -45,22 +45,22 @@ def test_red_comes_first_whatever_is_done() -> None:
             after = act(ring, walk, persistent(walk.action, bits, ring), DEFAULT_RULES)
             return after, (walk.ended, after.state.position[BALL])
 
-        bits = jax.random.bits(jax.random.key(0), (what.env_steps, 6, LANES))
-        end, (over, place) = jax.lax.scan(one, fresh_walk(ring.lanes), bits)
-        return end.ended, end.reached, over, place
+        bits = jax.random.bits(jax.random.key(0), (proof.env_steps, 6, LANES))
+        end, (ended_at, place) = jax.lax.scan(one, fresh_walk(ring.lanes), bits)
+        return end.ended, end.reached, ended_at, place
 
-    ended, reached, over, place = map(np.asarray, played())
+    ended, reached, ended_at, place = map(np.asarray, played())
     assert ended.all()
     assert not reached.any()
-    x, radius = place[:, 0][~over], 0.2
-    assert what.reach[0] <= x.min() - radius
-    assert x.max() + radius <= what.reach[1]
-    assert what.reach[1] - (x.max() + radius) < 0.5, "some lanes go nearly as far"
-    assert what.lift < what.weight
+    x, radius = place[:, 0][~ended_at], 0.2
+    assert proof.reach[0] <= x.min() - radius
+    assert x.max() + radius <= proof.reach[1]
+    assert proof.reach[1] - (x.max() + radius) < 0.5, "some lanes go nearly as far"
+    assert proof.lift < proof.weight
 
 
 def shelf(level: Level) -> None:
-    """Something that is not red, on its way."""
+    """Put a body that is not red in its way."""
     level.role[FIXED_POLYGONS], level.state.position[FIXED_POLYGONS, :, 0] = Role.PLAIN, (2.0, 1.0)
 
 
@@ -81,7 +81,7 @@ def held(level: Level) -> None:
 
 
 def aside(level: Level) -> None:
-    """A thruster that turns it, and so may lift with both."""
+    """Make a thruster turn the ball, so that both may lift it."""
     level.model.inverse_inertia[BALL] = 100.0
     level.model.thruster_position[:, 1] = 0.2
     level.model.thruster_power[:] *= 1.9
@@ -92,19 +92,19 @@ def box(level: Level) -> None:
 
 
 @pytest.mark.parametrize("change", [shelf, moving, thrown, plain, held, aside, box])
-def test_every_doubt_says_nothing(change: Callable[[Level], None]) -> None:
+def test_fall_returns_none_if_a_premise_fails(change: Callable[[Level], None]) -> None:
     level = falling()
     change(level)
     assert fall(level, DEFAULT_RULES) is None
 
 
-def test_what_may_rise_is_no_fall() -> None:
+def test_fall_returns_none_if_thrusters_can_lift_green() -> None:
     assert fall(falling(thrust=1.01), DEFAULT_RULES) is None
     strong = replace(DEFAULT_RULES.physics, thruster_power=DEFAULT_RULES.physics.thruster_power * 3)
     assert fall(falling(), replace(DEFAULT_RULES, physics=strong)) is None
 
 
-def test_a_red_shelf_only_ends_it_sooner() -> None:
+def test_fall_ignores_red_bodies_in_the_way() -> None:
     level = falling()
     shelf(level)
     level.role[FIXED_POLYGONS] = Role.RED

@@ -1,4 +1,4 @@
-"""The benchmark of handmade levels, on a level of our own: no reference is needed to see what it tells."""
+"""The benchmark of handmade levels, on levels of our own, so that no reference is needed."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ TRIVIAL, UNSOLVABLE = 1, 16
 
 
 @pytest.mark.campaign
-def test_each_level_has_its_row_and_each_size_its_sum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_labelled_lists_each_level_and_totals_sum_each_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, level_id in {"falls": TRIVIAL, "hopeless": UNSOLVABLE}.items():
         level = jax.tree.map(np.asarray, sample_levels([level_id], SIZES["s"]))
         write_level_file(LevelFile(level, TaskParams()), tmp_path / f"{name}.json")
@@ -29,13 +29,13 @@ def test_each_level_has_its_row_and_each_size_its_sum(tmp_path: Path, monkeypatc
     results, pictures = labelled(job, origins)
     write_sheet(pictures, tmp_path / "sheet.png")
     with Image.open(tmp_path / "sheet.png") as sheet:
-        assert sheet.width == PIXELS, "of the one that has a witness"
-    assert {of["level"]: of["label"] for of in results} == {"falls": "trivial", "hopeless": "unsolvable"}
-    assert all(of[kind] == 0 for of in results for kind in KINDS)
+        assert sheet.width == PIXELS, "only the level with a witness has a picture"
+    assert {result["level"]: result["label"] for result in results} == {"falls": "trivial", "hopeless": "unsolvable"}
+    assert all(result[kind] == 0 for result in results for kind in KINDS)
     by_ppo = ppo(origins, tmp_path / "kept")
     monkeypatch.setattr(handmade, "label", None)
-    assert ppo(origins, tmp_path / "kept") == by_ppo, "what is known is not trained again"
-    assert [[of[name] is not None for name in PPO_COLUMNS] for of in by_ppo] == [[False, True], [False, False]]
-    results = [of | of_ppo for of, of_ppo in zip(results, by_ppo, strict=True)]
+    assert ppo(origins, tmp_path / "kept") == by_ppo, "known results are not trained again"
+    assert [[result[name] is not None for name in PPO_COLUMNS] for result in by_ppo] == [[False, True], [False, False]]
+    results = [result | of_ppo for result, of_ppo in zip(results, by_ppo, strict=True)]
     ((size, levels, with_witness, by_ppo, _, *sums),) = totals(results)
     assert (size, levels, with_witness, by_ppo, sums) == ("s", "2", "1", "1", ["0"] * len(KINDS))

@@ -1,4 +1,4 @@
-"""The split that `python -m benchmarks manifest` makes is one, and the commands that it times work on it."""
+"""The split that `python -m benchmarks manifest` makes is valid, and the timed commands work on it."""
 
 import subprocess
 import sys
@@ -13,13 +13,13 @@ from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.manifest import read_manifest
 
 
-def test_its_split_is_sealed_and_like_a_real_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_made_split_is_sealed_and_resembles_a_real_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark, "ROWS", 900)
     benchmark.made_split(tmp_path, 2000)
-    split, said = tmp_path / "128k" / "s", list[str]()
-    clean(split, said.append)
+    split, messages = tmp_path / "128k" / "s", list[str]()
+    clean(split, messages.append)
     manifest = read_manifest(split)
-    assert not said
+    assert not messages
     assert [(fragment.rows, fragment.sealed) for fragment in manifest.fragments] == [
         (900, True),
         (900, True),
@@ -33,11 +33,11 @@ def test_its_split_is_sealed_and_like_a_real_one(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.campaign
-def test_it_times_every_command(tmp_path: Path) -> None:
-    """By a process of its own: what a process starts has that one's memory for a moment, and it counts."""
-    words = [sys.executable, "-m", "benchmarks", "manifest", "--levels", "3000", "--split", str(tmp_path)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+def test_manifest_benchmark_times_every_command(tmp_path: Path) -> None:
+    """Runs in its own process, because a forked child briefly has its parent's memory, which counts."""
+    command = [sys.executable, "-m", "benchmarks", "manifest", "--levels", "3000", "--split", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert all(
-        f"| levelproof {word} |" in done.stdout for word in ("status", "inspect", "generate, until the first unit")
+        f"| levelproof {name} |" in done.stdout for name in ("status", "inspect", "generate, until the first unit")
     )

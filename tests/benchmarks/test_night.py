@@ -1,4 +1,4 @@
-"""A long run, on a small scale."""
+"""The long run, on a small scale."""
 
 import os
 import subprocess
@@ -13,15 +13,15 @@ from tests.pace import wait_until
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_memory_of_a_process_and_those_below_it() -> None:
+def test_memory_of_counts_a_process_and_its_descendants() -> None:
     child = "x = bytes([1]) * 50_000_000; input()"
     script = f"import subprocess, sys; subprocess.run([sys.executable, '-c', '{child}'])"
     process = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE)
     try:
         wait_until(lambda: memory_of(process.pid)["ray"] >= 40_000_000, 30, "its child takes too little memory")
-        found = memory_of(process.pid)
-        assert 1_000_000 < found["driver"] < 40_000_000 < found["ray"]
-        assert (found["workers"], found["worker_count"]) == (0, 0)
+        measured = memory_of(process.pid)
+        assert 1_000_000 < measured["driver"] < 40_000_000 < measured["ray"]
+        assert (measured["workers"], measured["worker_count"]) == (0, 0)
     finally:
         process.communicate(b"\n")
     assert memory_of(process.pid)["driver"] == 0
@@ -30,13 +30,15 @@ def test_memory_of_a_process_and_those_below_it() -> None:
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_it_is_made_sealed_and_verified(tmp_path: Path) -> None:
-    words = ["night", "--levels", "256", "--budget", "4k", "--every", "0.5", "--out", str(tmp_path / "data")]
-    report = run(parser("night").parse_args(words))
-    (found,) = report.results
-    assert found["files"] == sum(path.is_file() for path in (tmp_path / "data").rglob("[!.]*")) - 1  # without events
-    assert {sample["step"] for sample in found["samples"]} == {"generate", "seal", "verify"}
-    assert min(found["memory"].values()) > 0
+def test_night_generates_seals_and_verifies(tmp_path: Path) -> None:
+    arguments = ["night", "--levels", "256", "--budget", "4k", "--every", "0.5", "--out", str(tmp_path / "data")]
+    report = run(parser("night").parse_args(arguments))
+    (measured,) = report.results
+    assert (
+        measured["files"] == sum(path.is_file() for path in (tmp_path / "data").rglob("[!.]*")) - 1
+    )  # without the event log
+    assert {sample["step"] for sample in measured["samples"]} == {"generate", "seal", "verify"}
+    assert min(measured["memory"].values()) > 0
     for name, draw in report.plots.items():
         draw(tmp_path / name)
         assert (tmp_path / name).stat().st_size > 1000

@@ -1,4 +1,4 @@
-"""Races: their arithmetic, their processes, and both run for real at tiny sizes."""
+"""Races: arithmetic, processes, and real runs at tiny sizes."""
 
 import argparse
 import json
@@ -37,7 +37,7 @@ class TestArithmetic:
         assert len({share.core for share in split}) == len(split)
 
     def test_actions_are_sticky_and_cover_their_choices(self) -> None:
-        assert actions.CHOICES == CHOICES, "what the reference's scripts think"
+        assert actions.CHOICES == CHOICES, "as the reference's scripts have it"
         action = sticky_actions(200, 50)
         assert action.shape == (200, 6, 50)
         for entry, choices in enumerate(CHOICES):
@@ -47,7 +47,7 @@ class TestArithmetic:
         np.testing.assert_allclose(changes, expected, rtol=0.1)
         np.testing.assert_array_equal(action, sticky_actions(200, 50))
 
-    def test_levels_go_round(self, level_file) -> None:
+    def test_load_levels_wraps_around(self, level_file) -> None:
         levels = load_levels(str(level_file), 14, 4)
         whole = load_levels(str(level_file), 0, 16)
         for part in ("role", "density", "motor_binding"):
@@ -60,7 +60,7 @@ class TestArithmetic:
 
         return [score(OURS, [90, 110, 100], 5), score("slow", [3, 4, 9], 20), score("fast", [10, 11, 9], 30)]
 
-    def test_the_reference_counts_at_its_best(self) -> None:
+    def test_summary_takes_the_references_faster_way(self) -> None:
         result = summary("s", {"lanes": 8}, self.scores())
         assert (result.ours, result.reference, result.ratio) == (100, 10, 10)
         assert result.reference_way == "fast"
@@ -68,19 +68,19 @@ class TestArithmetic:
         assert result.compile_ratio == 0.25
         assert result.goal_share == {OURS: 0.75, "slow": 0.75, "fast": 0.75}
 
-    def test_tables(self) -> None:
+    def test_tables_have_rates_and_details(self) -> None:
         results = [summary("s", {"lanes": 8}, self.scores())]
         assert race.rates(results).rows == [["s", "100", "4", "25", "10", "10"]]
         assert race.details(results).rows[0] == ["s", OURS, "90 to 110", "5.0", "75.0%"]
 
-    def test_what_is_not_finite_is_a_fault(self, monkeypatch) -> None:
+    def test_run_reports_non_finite_numbers_as_fault(self, monkeypatch) -> None:
         scores = self.scores()
         scores[0].finite = False
         monkeypatch.setattr(race, "compete", lambda *_: scores)
         monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
         monkeypatch.setattr(oracle, "versions", lambda _: {"jax": "0"})
-        given = argparse.Namespace(size=["s"], repeats=1)
-        assert "of size s is not finite" in race.run("A race", given, lambda _: [], {}).fault
+        args = argparse.Namespace(size=["s"], repeats=1)
+        assert "of size s is not finite" in race.run("A race", args, lambda _: [], {}).fault
 
 
 class TestProcesses:
@@ -93,7 +93,7 @@ class TestProcesses:
         environment = dict(os.environ) | {"PYTHONPATH": str(ROOT)}
         return Entry(name, [[sys.executable, "-c", program] for program in programs], environment, steps=100)
 
-    def test_they_run_in_turns_and_together(self, tmp_path, capsys) -> None:
+    def test_compete_runs_entries_in_turns_and_processes_together(self, tmp_path, capsys) -> None:
         def program(name: str, seconds: float) -> str:
             log = f"open({str(tmp_path / 'log')!r}, 'a').write({name!r})"
             answer = {"seconds": seconds, "goal": 1, "done": 2, "finite": True}
@@ -109,11 +109,11 @@ class TestProcesses:
         assert "a: compiling" in capsys.readouterr().err
 
     @pytest.mark.parametrize("program", ["raise SystemExit('no such thing')", "import sys; sys.exit('no such thing')"])
-    def test_one_that_dies_is_told(self, program) -> None:
+    def test_compete_reports_a_process_that_dies_early(self, program) -> None:
         with pytest.raises(Failure, match=r"ended early \(no such thing\)"):
             compete([self.entry("a", program)], repeats=1)
 
-    def test_one_that_dies_while_it_runs_is_told(self) -> None:
+    def test_compete_reports_a_process_that_dies_in_a_run(self) -> None:
         program = f"{self.HEAD}serve({{'compile_seconds': 0}}, lambda: 1 / 0)"
         with pytest.raises(Failure, match="ZeroDivisionError"):
             compete([self.entry("a", program)], repeats=1)
@@ -121,35 +121,37 @@ class TestProcesses:
 
 class TestInput:
     @pytest.mark.parametrize(
-        "words", [["physics", "--lanes", "0"], ["experts", "--levels", "-1"], ["physics", "--repeats", "0"]]
+        "arguments", [["physics", "--lanes", "0"], ["experts", "--levels", "-1"], ["physics", "--repeats", "0"]]
     )
-    def test_counts_start_at_one(self, words, capsys) -> None:
-        assert main(words) == Exit.INPUT
-        assert re.search(r"--\w+ is -?\d: it has to be at least 1\.$", capsys.readouterr().err)
+    def test_check_rejects_counts_below_one(self, arguments, capsys) -> None:
+        assert main(arguments) == Exit.INPUT
+        assert re.search(r"--\w+ is -?\d, but must be at least 1\.$", capsys.readouterr().err)
 
-    @pytest.mark.parametrize("words", [[], ["nothing"], ["physics", "--size", "xl"], ["physics", "--lanes", "many"]])
-    def test_unknown_words(self, words) -> None:
+    @pytest.mark.parametrize(
+        "arguments", [[], ["nothing"], ["physics", "--size", "xl"], ["physics", "--lanes", "many"]]
+    )
+    def test_main_rejects_unknown_arguments(self, arguments) -> None:
         with pytest.raises(SystemExit) as error:
-            main(words)
+            main(arguments)
         assert error.value.code == Exit.INPUT
 
-    def test_a_level_file_that_is_not_there(self, capsys) -> None:
+    def test_check_rejects_a_missing_level_file(self, capsys) -> None:
         assert main(["physics", "--level-file", "nowhere.npz"]) == Exit.INPUT
-        assert "There is no file nowhere.npz" in capsys.readouterr().err
+        assert "The file nowhere.npz does not exist" in capsys.readouterr().err
 
-    def test_a_python_that_is_not_there(self, monkeypatch) -> None:
+    def test_oracle_python_rejects_a_missing_program(self, monkeypatch) -> None:
         monkeypatch.setenv(oracle.PYTHON_VARIABLE, "/nowhere/python")
-        with pytest.raises(UserError, match="is no program"):
+        with pytest.raises(UserError, match="is not a program"):
             oracle.oracle_python()
 
-    def test_a_python_without_the_reference(self, monkeypatch, level_file, capsys) -> None:
-        """The reference's process says what it lacks; ours is not blamed."""
+    def test_versions_names_the_missing_package(self, monkeypatch, level_file, capsys) -> None:
+        """The message is the reference's process's, which lacks the package."""
         monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
         with pytest.raises(Failure, match=r"kinetix"):
             oracle.versions(oracle.oracle_python())
 
-    def test_no_network_is_told(self, monkeypatch, tmp_path, capsys) -> None:
-        """A real environment is made; its pip finds nothing."""
+    def test_oracle_python_reports_a_missing_network(self, monkeypatch, tmp_path, capsys) -> None:
+        """Make a real environment whose pip cannot reach an index."""
         monkeypatch.delenv(oracle.PYTHON_VARIABLE, raising=False)
         monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path))
         for name, value in {
@@ -168,28 +170,28 @@ class TestInput:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ["physics", "--lanes", "6", "--steps", "4", "--block", "4"],
         ["experts", "--levels", "2", "--environments", "4", "--horizon", "8", "--updates", "1"],
     ],
     ids=["physics", "experts"],
 )
-def test_a_tiny_bench_for_real(reference, level_file, words) -> None:
-    """As a user types it, on one core where the system can, so that the reference has one way to run."""
+def test_tiny_race_runs_for_real(reference, level_file, arguments) -> None:
+    """Run as a user would, pinned to one core if possible, so that the reference has one way to run."""
     pin = f"hasattr(os, 'sched_setaffinity') and os.sched_setaffinity(0, {{{own_cores()[0]}}})"
     code = f"import os, sys; {pin}; from benchmarks.__main__ import main; sys.exit(main())"
-    command = [sys.executable, "-c", code, *words, "--repeats", "2", "--level-file", str(level_file), "--json"]
+    command = [sys.executable, "-c", code, *arguments, "--repeats", "2", "--level-file", str(level_file), "--json"]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
     assert done.returncode == Exit.DONE, done.stderr
-    told = json.loads(done.stdout)
-    assert told["bench"] == words[0]
-    assert told["ours"] > 0
-    assert told["reference"] > 0
-    assert told["ratio"] == pytest.approx(told["ours"] / told["reference"], rel=0.01)
-    assert told["finite"] is True
-    assert told["reference_way"].startswith("reference, ")
-    assert len(told["runs"][OURS]) == 2
-    assert told["versions"]["reference"]["kinetix-env"] == "3.0.2"
-    assert all(seconds > 0 for seconds in told["compile_seconds"].values())
+    document = json.loads(done.stdout)
+    assert document["bench"] == arguments[0]
+    assert document["ours"] > 0
+    assert document["reference"] > 0
+    assert document["ratio"] == pytest.approx(document["ours"] / document["reference"], rel=0.01)
+    assert document["finite"] is True
+    assert document["reference_way"].startswith("reference, ")
+    assert len(document["runs"][OURS]) == 2
+    assert document["versions"]["reference"]["kinetix-env"] == "3.0.2"
+    assert all(seconds > 0 for seconds in document["compile_seconds"].values())

@@ -1,4 +1,4 @@
-"""The benchmark of solved levels: the file, tables and plots of made-up results, and a real run."""
+"""The benchmark of solved levels: file, tables and plots of synthetic results, and a real run."""
 
 import json
 import sys
@@ -48,7 +48,7 @@ def row(level_id: int, label: str, env_steps: int, steps: int | None = None) -> 
 
 @pytest.fixture
 def ours() -> Results:
-    """Ten levels: a trivial one, one left of the axis' begin, five solved soon or late, three never."""
+    """Ten levels: one trivial, one solved before the axis starts, five solved later, three never."""
     steps = (2_000, 5_000, 16_000, 16_001, 40_000, 64_000)
     rows = [row(FIRST, "trivial", 0, 3)]
     rows += [row(FIRST + i, "solved", x, 10 * i) for i, x in enumerate(steps, 1)]
@@ -58,7 +58,7 @@ def ours() -> Results:
 
 @pytest.fixture
 def theirs() -> Results:
-    """The same levels; one solved that ours did not solve, four not solved that ours did."""
+    """The same levels; one that ours did not solve is solved, four that ours solved are not."""
     labels = [
         "trivial",
         "unsolved",
@@ -75,23 +75,23 @@ def theirs() -> Results:
 
 
 def cells(text: str, start: str) -> list[str]:
-    """Of the line of a Markdown table that starts so."""
+    """Return the cells of the Markdown table row that starts with `start`."""
     (line,) = [line for line in text.splitlines() if line.startswith(f"| {start} |")]
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-def test_shares() -> None:
+def test_share_and_mcnemar_match_known_values() -> None:
     assert share(0, 0) == "-"
     assert share(1, 2) == "50.0% (9.5 to 90.5)"
     assert mcnemar(0, 0) == 1
     assert mcnemar(4, 1) == mcnemar(1, 4) == pytest.approx(0.375)
 
 
-def test_counts() -> None:
+def test_count_shortens_numbers() -> None:
     assert [count(x) for x in (500, 4_000, 64_000, 1_000_000, 1_500_000)] == ["500", "4k", "64k", "1M", "1.5M"]
 
 
-def test_an_ablation_changes_one_thing() -> None:
+def test_variants_change_one_thing() -> None:
     for name, variant in VARIANTS.items():
         assert set(variant.against) <= set(VARIANTS) - {name}
         for base in ("alone", "default"):
@@ -105,21 +105,21 @@ def test_an_ablation_changes_one_thing() -> None:
     assert (reference.stop.rule, reference.search.env_steps) == (Rule.BUDGET, 0)
 
 
-def test_the_original_is_judged_as_its_reimplementation() -> None:
-    there, here = VARIANTS["original"], VARIANTS["reference"]
-    expert = replace(there.procedure.expert, sticky_attempts=8, moved_attempts=8)
-    assert replace(there.procedure, expert=expert) == here.procedure
+def test_original_equals_reference_except_extra_attempts() -> None:
+    original_variant, reference_variant = VARIANTS["original"], VARIANTS["reference"]
+    expert = replace(original_variant.procedure.expert, sticky_attempts=8, moved_attempts=8)
+    assert replace(original_variant.procedure, expert=expert) == reference_variant.procedure
 
 
 def text_of(results: list[Results]) -> str:
     return "\n\n".join(table.markdown() for table in tables.tables(results))
 
 
-def test_table(ours: Results, theirs: Results) -> None:
+def test_tables_have_variants_and_pairs(ours: Results, theirs: Results) -> None:
     text = text_of([theirs, ours])
     assert "**Size s, 64k env steps**, levels 1,000,000 to 1,000,009:" in text
     mean_steps = (2_000 + 5_000 + 16_000 + 16_001 + 40_000 + 4 * 64_000) / 9
-    of_ours = [
+    expected = [
         "`alone`",
         "9 of 10",
         share(6, 9),
@@ -132,7 +132,7 @@ def test_table(ours: Results, theirs: Results) -> None:
         "35",
     ]
     solved, paired = text.split("Level by level:")
-    assert cells(solved, "`alone`") == of_ours
+    assert cells(solved, "`alone`") == expected
     assert cells(solved, "`reference`")[1:5] == ["9 of 10", share(3, 9), "100.0%", "100.0%"]
     assert cells(paired, "`alone`")[1:] == ["`reference`", "9", "4", "1", "0.38"]
     assert cells(paired, "`alone`, a quarter of the budget")[1:] == ["`reference`", "9", "3", "3", "1"]
@@ -140,8 +140,8 @@ def test_table(ours: Results, theirs: Results) -> None:
     assert text.index("| `reference` |") < text.index("| `alone` |")
 
 
-def test_an_expert_may_reach_the_goal_where_the_witness_is_the_search_s(ours: Results) -> None:
-    """By its sampled actions or its most probable ones; where it is not known of all, no share is."""
+def test_tables_count_experts_that_reach_the_goal_beside_a_search_witness(ours: Results) -> None:
+    """Sampled or most probable actions count; the share is unknown if any level's is."""
     (i, other), rows = [*ours.solved()][:2], dict(ours.rows)
     rows[i] = rows[i] | {"witness": "search", "success_rate": 0.0}
 
@@ -159,23 +159,23 @@ def test_an_expert_may_reach_the_goal_where_the_witness_is_the_search_s(ours: Re
     assert shares() == ["-", "100.0%"]
 
 
-def test_a_variant_is_compared_with_several(ours: Results, theirs: Results) -> None:
+def test_tables_pair_a_variant_with_several(ours: Results, theirs: Results) -> None:
     rows = [row(FIRST + 1, "solved", 63_488, 5), row(FIRST + 9, "unsolved", 63_488)]
-    there = Results(header("original"), dict(rows))
-    paired = text_of([ours, theirs, there]).split("Level by level:")[1]
+    third = Results(header("original"), dict(rows))
+    paired = text_of([ours, theirs, third]).split("Level by level:")[1]
     assert cells(paired, "`original` | `reference`")[2:] == ["2", "1", "0", "1"]
     assert cells(paired, "`alone` | `original`")[2:] == ["2", "0", "0", "1"]
     assert cells(paired, "`alone` | `reference`")[2:] == ["9", "4", "1", "0.38"]
     assert cells(paired, "`alone`, a quarter of the budget | `original`")[2:] == ["2", "0", "0", "1"]
 
 
-def test_pairs_are_of_the_levels_that_both_tried(ours: Results) -> None:
+def test_tables_pair_levels_that_both_tried(ours: Results) -> None:
     text = text_of([ours, Results(header("width_32"), dict([row(FIRST + 1, "unsolved", 64_000)]))])
     assert cells(text.split("Level by level:")[1], "`width_32`")[1:] == ["`alone`", "1", "0", "1", "1"]
 
 
 class TestFile:
-    def test_levels_join_those_that_are_there(self, tmp_path: Path, ours: Results, theirs: Results) -> None:
+    def test_merge_joins_levels_and_is_deterministic(self, tmp_path: Path, ours: Results, theirs: Results) -> None:
         file = tmp_path / "solved.parquet"
         assert read(file) == []
         merge(theirs, file)
@@ -186,9 +186,9 @@ class TestFile:
         merge(ours, file)
         again = file.read_bytes()
         merge(ours, file)
-        assert file.read_bytes() == again != first, "the same results are the same file"
+        assert file.read_bytes() == again != first, "equal results make equal files"
 
-    def test_other_settings_take_the_place_of_all(self, tmp_path: Path, ours: Results) -> None:
+    def test_merge_replaces_results_from_other_settings(self, tmp_path: Path, ours: Results) -> None:
         file = tmp_path / "solved.parquet"
         merge(ours, file)
         settings = ours.header.config | {"stop": {"rule": "halving"}}
@@ -196,8 +196,8 @@ class TestFile:
         merge(other, file)
         assert read(file) == [other]
 
-    def test_what_was_not_noted_then_is_unknown(self, tmp_path: Path, ours: Results) -> None:
-        """A file without a column that came later."""
+    def test_read_fills_missing_columns_with_none(self, tmp_path: Path, ours: Results) -> None:
+        """The file lacks a column that was added later."""
         file = tmp_path / "solved.parquet"
         merge(ours, file)
         pq.write_table(pq.read_table(file).drop_columns(["most_probable_succeeds"]), file)
@@ -205,13 +205,13 @@ class TestFile:
         assert back.header == ours.header
         assert all(row["most_probable_succeeds"] is None for row in back.rows.values())
 
-    def test_something_else_is_told(self, tmp_path: Path) -> None:
+    def test_read_rejects_a_file_it_did_not_write(self, tmp_path: Path) -> None:
         file = tmp_path / "solved.parquet"
         file.write_text("no parquet")
         with pytest.raises(UserError, match="is not a file that"):
             read(file)
 
-    def test_the_committed_results_are_all_there(self) -> None:
+    def test_read_finds_all_committed_results(self) -> None:
         results = read()
         shown = {(each.header.size, each.header.variant) for each in results}
         assert shown >= {
@@ -222,29 +222,29 @@ class TestFile:
         assert "on cpu: AMD EPYC; levelproof" in made(results)
 
 
-def test_unsolved_falls_with_budget(ours: Results, theirs: Results) -> None:
-    steps, left = plot.curve(ours)
-    assert (steps[0], left[0]) == (4_000, 8)
-    assert (steps[-1], left[-1]) == (64_000, 3)
+def test_curve_falls_with_budget(ours: Results, theirs: Results) -> None:
+    steps, remaining = plot.curve(ours)
+    assert (steps[0], remaining[0]) == (4_000, 8)
+    assert (steps[-1], remaining[-1]) == (64_000, 3)
     assert steps == sorted(set(steps))
-    assert left == sorted(left, reverse=True)
+    assert remaining == sorted(remaining, reverse=True)
     assert [plot.unsolved(ours, x) for x in (1_999, 2_000, 15_999, 16_000, 63_999)] == [9, 8, 7, 6, 4]
     assert cells(plot.table([ours]).markdown(), "size s")[1:] == ["9", share(3, 9)]
     assert plot.has_curve(ours)
-    assert not plot.has_curve(theirs), "the whole budget for every level tells no curve"
+    assert not plot.has_curve(theirs), "levels that use the whole budget have no curve"
 
 
-def test_names_tell_curves_apart(ours: Results) -> None:
+def test_names_distinguish_curves(ours: Results) -> None:
     halving, long = (replace(ours, header=h) for h in (header("halving"), header(budget=1_000_000)))
     assert plot.names([ours, halving]) == ["size s, alone", "size s, halving"]
     assert plot.names([ours, long]) == ["size s, 64k", "size s, 1M"]
 
 
-def test_plot(ours: Results, tmp_path: Path) -> None:
+def test_draw_is_deterministic_and_small(ours: Results, tmp_path: Path) -> None:
     out, again = tmp_path / "one.svg", tmp_path / "two.svg"
     plot.draw([ours], out)
     plot.draw([ours], again)
-    assert out.read_bytes() == again.read_bytes(), "the same results give the same plot"
+    assert out.read_bytes() == again.read_bytes(), "equal results make equal plots"
     assert out.stat().st_size < 40_000
     texts = {
         "".join(text.itertext()) for text in ElementTree.parse(out).getroot().iter("{http://www.w3.org/2000/svg}text")
@@ -262,15 +262,15 @@ def test_plot(ours: Results, tmp_path: Path) -> None:
         (["--jobs", "4000"], "cores"),
     ],
 )
-def test_a_mistake_gets_a_sentence(
+def test_main_explains_invalid_arguments(
     arguments: list[str], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["solved", "--variant", "alone", *arguments, "--results", str(tmp_path / "none.parquet")]
-    assert main(words) == Exit.INPUT
+    arguments = ["solved", "--variant", "alone", *arguments, "--results", str(tmp_path / "none.parquet")]
+    assert main(arguments) == Exit.INPUT
     assert sentence in capsys.readouterr().err
 
 
-def test_results_that_are_not_there(tmp_path: Path, ours: Results, capsys: pytest.CaptureFixture[str]) -> None:
+def test_main_explains_missing_results(tmp_path: Path, ours: Results, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "solved.parquet"
     assert main(["solved", "--results", str(file)]) == Exit.INPUT
     merge(ours, file)
@@ -281,7 +281,7 @@ def test_results_that_are_not_there(tmp_path: Path, ours: Results, capsys: pytes
     assert (group["with_expert"], group["solved"], group["core_seconds"]) == (9, 6, 15)
 
 
-def test_a_line_that_was_cut_off_is_done_again(tmp_path: Path) -> None:
+def test_rows_in_removes_an_incomplete_line(tmp_path: Path) -> None:
     scratch = tmp_path / "scratch.jsonl"
     lines = [json.dumps({"level_id": i, "label": "solved"}) + "\n" for i in (4, 7)]
     scratch.write_text("".join(lines)[:-9])
@@ -290,7 +290,7 @@ def test_a_line_that_was_cut_off_is_done_again(tmp_path: Path) -> None:
     assert rows_in(tmp_path / "none.jsonl") == {}
 
 
-def test_results_under_other_settings_are_left_alone(tmp_path: Path, ours: Results) -> None:
+def test_measure_keeps_results_from_other_settings(tmp_path: Path, ours: Results) -> None:
     file = tmp_path / "solved.parquet"
     merge(ours, file)
     other = replace(ours.header, config={"expert": {}, "stop": {"rule": "solved"}})
@@ -299,20 +299,20 @@ def test_results_under_other_settings_are_left_alone(tmp_path: Path, ours: Resul
 
 
 @pytest.mark.campaign
-def test_a_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process dies, which leaves the lines of units that were done; the next run trains the others only."""
+def test_measure_resumes_a_stopped_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dead process leaves the lines of finished units; the next run trains only the others."""
     variant, file, scratch = (
         Variant("small", untouched(StopConfig(rule=Rule.SOLVED), SMALL)),
         tmp_path / "solved.parquet",
         tmp_path / "scratch.jsonl",
     )
-    of = Header("small", "s", 4_096, plain(variant.procedure))
+    header_ = Header("small", "s", 4_096, plain(variant.procedure))
     monkeypatch.setattr(measuring, "scratch_of", lambda _: scratch)
     level_id, before = row(FIRST, "solved", 7, 7)
     scratch.write_text(json.dumps({"level_id": level_id} | before) + "\n")
-    measure(of, variant, range(FIRST, FIRST + 4), 1, work, file=file)
+    measure(header_, variant, range(FIRST, FIRST + 4), 1, work, file=file)
     (results,) = read(file)
-    assert results.header == of
+    assert results.header == header_
     assert list(results.rows) == list(range(FIRST, FIRST + 4))
     assert results.rows[FIRST] == before
     assert not scratch.exists()
@@ -322,12 +322,12 @@ def test_a_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert trained["env_steps"] <= 4_096
         assert trained["core_seconds"] > 0
     assert results.trained, "some of these levels should get an expert"
-    measure(of, variant, range(FIRST, FIRST + 4), 1, work, file=file)  # nothing left to do
+    measure(header_, variant, range(FIRST, FIRST + 4), 1, work, file=file)  # nothing is missing
     assert read(file) == [results]
 
 
 def shown(ends: dict[int, list[tuple[int, bool]]], first_goal: tuple[int, int] | None) -> dict[str, np.ndarray]:
-    """What the reference's process writes of a level: the episodes' ends of each attempt, a success of training."""
+    """Make the arrays that the reference's process writes, from attempts' episode ends and a training success."""
     config = VARIANTS["original"].procedure.expert
     training = np.zeros((2, 2 * config.horizon, config.environments), bool)
     if first_goal is not None:
@@ -343,13 +343,13 @@ def shown(ends: dict[int, list[tuple[int, bool]]], first_goal: tuple[int, int] |
     )
 
 
-def test_the_reference_is_judged_as_we_are() -> None:
-    """An attempt succeeds when an episode ended and all that ended reached the goal; the first one is the witness."""
+def test_judged_applies_our_rules_to_the_reference() -> None:
+    """An attempt succeeds if an episode ended and all that ended reached the goal; the first success is the witness."""
     config = VARIANTS["original"].procedure.expert
     ends = {0: [(9, True), (19, False)], 3: [(29, True), (49, True)], 5: [(4, True)], 6: [(255, False)]}
     verdict = original.judged(shown(ends, (66, 5)), config, False)
     assert (verdict.label, verdict.witness, verdict.steps_to_goal) == (Label.SOLVED, Source.SAMPLED, 30)
-    assert verdict.success_rate == pytest.approx(2 / 7), "two of seven sampled attempts, by their first episodes"
+    assert verdict.success_rate == pytest.approx(2 / 7), "two of seven sampled attempts succeed in their first episodes"
     assert not verdict.most_probable_succeeds
     assert "all 2 of its finished episodes" in verdict.label_reason
     assert verdict.steps_to_first_success == 67 * config.environments
@@ -357,7 +357,7 @@ def test_the_reference_is_judged_as_we_are() -> None:
     assert np.isnan(verdict.sticky_success_rate)
 
 
-def test_a_level_without_a_good_attempt_is_unsolved() -> None:
+def test_judged_is_unsolved_without_a_successful_attempt() -> None:
     config = VARIANTS["original"].procedure.expert
     verdict = original.judged(shown({0: [(9, True), (19, False)]}, None), config, False)
     assert (verdict.label, verdict.witness, verdict.steps_to_goal) == (Label.UNSOLVED, None, None)
@@ -366,37 +366,37 @@ def test_a_level_without_a_good_attempt_is_unsolved() -> None:
     assert original.judged(shown({2: [(0, True)]}, None), config, False).label is Label.SOLVED
 
 
-def test_without_the_reference_there_is_a_sentence(
+def test_main_explains_a_missing_reference(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv(oracle.PYTHON_VARIABLE, sys.executable)
     file = tmp_path / "solved.parquet"
-    words = ["solved", "--variant", "original", "--levels", "2", "--jobs", "1", "--results", str(file)]
-    assert main(words) == Exit.FAILED
+    arguments = ["solved", "--variant", "original", "--levels", "2", "--jobs", "1", "--results", str(file)]
+    assert main(arguments) == Exit.FAILED
     assert "Cannot ask the reference for its version" in capsys.readouterr().err
     assert not file.exists()
 
 
 @pytest.mark.campaign
-def test_the_original_runs(tmp_path: Path, reference: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two updates of a level that gets an expert; its neighbour needs none."""
+def test_original_trains_a_level(tmp_path: Path, reference: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train a level for two updates; its neighbour needs no expert."""
     variant, file = VARIANTS["original"], tmp_path / "solved.parquet"
     monkeypatch.setattr(measuring, "scratch_of", lambda _: tmp_path / "scratch.jsonl")
-    of = Header("original", "s", 2 * 2_048, plain(variant.procedure))
-    wanted = range(FIRST + 9, FIRST + 11)
-    measure(of, variant, wanted, 1, original.work, file=file)
+    header_ = Header("original", "s", 2 * 2_048, plain(variant.procedure))
+    level_ids = range(FIRST + 9, FIRST + 11)
+    measure(header_, variant, level_ids, 1, original.work, file=file)
     (results,) = read(file)
     ours = next(each for each in read() if each.header.name == "s-64k-reference")
-    assert list(results.rows) == list(wanted)
-    assert results.trained.keys() == ours.trained.keys() & set(wanted)
-    assert 0 < len(results.trained) < len(wanted), "one of these levels should get an expert, and one none"
-    for level_id, found in results.rows.items():
-        assert json.loads(found["versions"])["reference"]["kinetix-env"] == "3.0.2"
+    assert list(results.rows) == list(level_ids)
+    assert results.trained.keys() == ours.trained.keys() & set(level_ids)
+    assert 0 < len(results.trained) < len(level_ids), "one of these levels should get an expert, and one none"
+    for level_id, result in results.rows.items():
+        assert json.loads(result["versions"])["reference"]["kinetix-env"] == "3.0.2"
         if level_id not in results.trained:
-            assert found["label"] == ours.rows[level_id]["label"]
-            assert found["core_seconds"] == 0
+            assert result["label"] == ours.rows[level_id]["label"]
+            assert result["core_seconds"] == 0
             continue
-        assert found["env_steps"] == 2 * 2_048
-        assert (found["label"] == "solved") == (found["steps_to_goal"] is not None)
-        assert (found["steps_to_goal"] or 1) <= RECORD_STEPS
-        assert found["core_seconds"] > 0
+        assert result["env_steps"] == 2 * 2_048
+        assert (result["label"] == "solved") == (result["steps_to_goal"] is not None)
+        assert (result["steps_to_goal"] or 1) <= RECORD_STEPS
+        assert result["core_seconds"] > 0

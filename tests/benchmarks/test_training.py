@@ -1,4 +1,4 @@
-"""The benchmarks of training still fit the code: every timed call runs and gives finite numbers."""
+"""The benchmarks of training: every timed call runs and gives finite numbers."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ CONFIG = ExpertConfig(
 )
 
 
-def test_rollout_update_and_both() -> None:
+def test_calls_give_finite_numbers() -> None:
     levels = jax.device_get(sample_levels(np.arange(2), SIZES["s"]))
     (acting, seen, value), expert, report = (jax.device_get(call()) for call in training.calls(levels, CONFIG))
     for x in jax.tree.leaves((acting.world.state, seen.reward, value, expert)):
@@ -26,7 +26,7 @@ def test_rollout_update_and_both() -> None:
     assert (report.mode == Mode.TRAIN).all()
 
 
-def test_networks_train(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rates_cover_every_network(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"REPEATS": 1, "UPDATES": 1, "SLOTS": 2}.items():
         monkeypatch.setattr(networks, name, value)
     for kind in Network:
