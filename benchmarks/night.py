@@ -145,8 +145,8 @@ def parts_of(split: Path) -> dict[str, int]:
     return {"fragments": len([*split.glob("manifest/[!.]*")]), "shards": len([*split.glob("shards/*")])}
 
 
-def _levelproof(*words: str) -> str:
-    command = [sys.executable, "-m", "levelproof", *words]
+def _levelproof(*arguments: str) -> str:
+    command = [sys.executable, "-m", "levelproof", *arguments]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=dict(oracle.our_environment()))
     return done.stdout
 

@@ -115,9 +115,9 @@ def folders_of(size: str) -> dict[str, Path]:
     return folders
 
 
-def _levelproof(*words: object) -> None:
+def _levelproof(*arguments: object) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "levelproof", *map(str, words)],
+        [sys.executable, "-m", "levelproof", *map(str, arguments)],
         env=oracle.our_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False,
     )  # fmt: skip
     if done.returncode:
