@@ -254,7 +254,7 @@ def run(args: argparse.Namespace) -> Report:
         tables=[Table(head, [row(result) for result in results])],
         notes=[
             f"{levels:,} levels, by the scheduler of `generate` under a simulated clock, in units of its default size: "
-            f"20 to 60 s of a worker, at most {MOST * UNTIMED} levels and a quarter of a worker's share; a "
+            f"20 to 60 s of a worker, at most {MAX_FACTOR * UNTIMED} levels and a quarter of a worker's share; a "
             f"level takes the time of one of {len(seconds):,} measured levels, {seconds.mean():.3g} core-seconds on "
             f"average{scaled}. On average, a machine of 64 cores or 8 GPUs is taken away with notice after a day, or "
             f"as named, and dies without notice after 30 days; another replaces it {REPLACEMENT / 60:.0f} minutes "

@@ -59,7 +59,7 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
     experts = jax.tree.map(jnp.copy, experts)  # `update_slots` donates its slots
     lanes, network = config.environments * count, network_of(levels.size, config)
     off = jnp.zeros(lanes, bool)
-    manner = Manner(off, jnp.zeros(lanes), off, jnp.zeros((256, len(CHOICES), count), jnp.int8))
+    manner = ActionRule(off, jnp.zeros(lanes), off, jnp.zeros((256, len(CHOICES), count), jnp.int8))
     keys, acting = jax.random.split(jax.random.key(0), count), start(repeat(levels, config.environments))
     ours = config.horizon, DEFAULT_RULES
     act = jax.jit(lambda params, acting: rollout(network, params, levels, acting, keys, manner, *ours))
