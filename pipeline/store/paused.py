@@ -230,7 +230,7 @@ def _head_in(data: bytes, size: int, path: Path) -> _Head:
         whole = head.start + int(fields["bytes"])
         if not all(type(level_id) is int and first <= level_id <= last for level_id in head.level_ids):
             raise ValueError
-    except (ValueError, LookupError, TypeError, RecursionError):
+    except (ValueError, LookupError, TypeError, OverflowError, RecursionError):
         raise _DamagedError("its first line is invalid") from None
     if size != whole:
         raise _DamagedError("it is cut off, or too long")

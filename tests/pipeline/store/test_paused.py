@@ -1,5 +1,6 @@
 """Saved experts in training: restored bit for bit, and removed only if damaged or finished."""
 
+import json
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,6 +28,7 @@ from tests.pipeline.servers import Server, bucket_of, serving
 
 JOB = made_job("data", "budget=5k")
 UNIT = unit_name(3, 7)
+HOLE = 2**40  # bytes
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +154,7 @@ def test_prune_removes_and_reports_a_damaged_checkpoint(split: Path) -> None:
         whole[1:],
         whole + b"x",
         whole.replace(b'"levels": [3', b'"levels": [9'),
+        whole.replace(b'"bytes": ', b'"bytes": 1e999, "was": '),
     ):
         path.write_bytes(damaged)
         (said,) = pruned(split, 7)
@@ -168,6 +171,11 @@ def test_prune_reads_heads_alone(split: Path) -> None:
     assert pruned(split, 7) == []
     assert path.exists()
     assert load_paused(split, range(8), JOB) == {}, "its bytes have changed"
+    size = json.loads(whole[len(store.MAGIC) + 2 : head])["bytes"]
+    path.write_bytes(whole[:head].replace(b'"bytes": %d' % size, b'"bytes": %d' % HOLE))
+    os.truncate(path, path.stat().st_size + HOLE)
+    assert pruned(split, 7) == [], "no machine has memory for all of it"
+    assert path.exists()
 
 
 def test_prune_keeps_a_checkpoint_of_another_version(split: Path) -> None:
