@@ -248,7 +248,7 @@ def _parsed(data: bytes) -> dict[str, Any]:
     """Parse a lock file; the writer of an invalid one is unknown."""
     try:
         found = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         found = None
     return found if isinstance(found, dict) else {"writer": "unknown"}
 

@@ -421,8 +421,9 @@ def test_is_leased_compares_no_clocks(
         assert not is_written(THERE, said.append)
         put(THERE / WRITER_LOCK, left_by_a_killed_writer())
         assert not is_written(THERE, said.append)
-        put(THERE / WRITER_LOCK, json.dumps({"writer": "a folder's, copied here"}).encode())
-        assert not is_written(THERE, said.append)
+        for text in (json.dumps({"writer": "a folder's, copied here"}).encode(), b"[" * leases.MAX_BYTES):
+            put(THERE / WRITER_LOCK, text)
+            assert not is_written(THERE, said.append)
         assert not said, "each of these is known at once"
         put(THERE / WRITER_LOCK, left_by_a_killed_writer(within="another machine"))
         patched.setattr(leases, "WATCH", 0.3)
