@@ -3,13 +3,14 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,12 @@ from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.objects import get, put, remove, require_conditions
 from levelproof.pipeline.store.publish import ended
+from levelproof.pipeline.verify import verify
 from tests.pace import patience, wait_until
 from tests.pipeline.command import ROOT, TINY, run
 from tests.pipeline.command import here as command
 from tests.pipeline.driver import LEVELS, SPLIT, UNIT, commit_made, drive, require_same_content
+from tests.pipeline.made import honest_split
 from tests.pipeline.servers import AZURE_KEY, AZURE_NAME, Answer, Server, azure_process, bucket_of, s3_process, serving
 from tests.pipeline.servers import before as before_it
 
@@ -393,10 +396,44 @@ def test_lease_survives_lost_responses_to_renewals(server: Server, monkeypatch: 
     assert get(THERE / WRITER_LOCK).data == b"{}"
 
 
+def test_verify_finds_missing_levels_after_a_kill_in_a_store_whose_clock_is_ahead(
+    server: Server, tmp_path: Path
+) -> None:
+    split = honest_split(tmp_path / "s3/bucket/data", unit=2, units=2)
+    for path in [*split.glob(f"*/{unit_name(2, 3)}*")]:
+        path.unlink() if path.is_file() else shutil.rmtree(path)
+    with on_a_day("Fri, 01 Jan 2038 00:00:00 GMT", tmp_path / "s3") as patched:
+        put(THERE / WRITER_LOCK, left_by_a_killed_writer(within="another machine"))
+        patched.setattr(leases, "SIGHT", 0.3)
+        patched.setattr(verify, "prepare_jax", lambda: None)  # JAX keeps the cache folder of these tests
+        done = command(["verify", str(THERE), "--json"], tmp_path)
+    assert done.returncode == 1, done.stdout
+    told = json.loads(done.stdout)
+    assert told["missing"] == [[2, 3]]
+    assert [of["what"] for of in told["wrong"]] == [
+        "The last command wanted levels 2 to 3, and no fragment has them."
+    ], "nothing else is wrong"
+
+
 def await_renewals(count: Callable[[], int], more: int) -> None:
     """Wait until `count` has risen by `more`."""
     before = count()
     wait_until(lambda: count() >= before + more, 60, "no renewal")
+
+
+@contextmanager
+def on_a_day(day: str, folder: Path) -> Iterator[pytest.MonkeyPatch]:
+    """Serve a folder by a clock that says this day, in place of the server before."""
+    bucket = bucket_of(folder)
+
+    def on_that_day(*request: Any) -> Answer:
+        answer = bucket(*request)
+        return answer._replace(headers=answer.headers | {"Last-Modified": day})
+
+    with serving(on_that_day) as other, pytest.MonkeyPatch.context() as patched:
+        patched.setenv("AWS_ENDPOINT_URL", other.url)
+        forget()
+        yield patched
 
 
 @pytest.mark.parametrize("day", ["Thu, 01 Jan 1981 00:00:00 GMT", "Fri, 01 Jan 2038 00:00:00 GMT"])
@@ -406,15 +443,8 @@ def test_is_leased_compares_no_clocks(
     """Neither the store's, which dates the lease by `day`, nor this machine's."""
     monkeypatch.setattr(leases, "RENEWAL", 0.1)
     monkeypatch.setattr(leases, "NOTICE", 0.0)
-    bucket, said = bucket_of(tmp_path / "s3"), list[str]()
-
-    def on_that_day(*request: Any) -> Answer:
-        answer = bucket(*request)
-        return answer._replace(headers=answer.headers | {"Last-Modified": day})
-
-    with serving(on_that_day) as other, pytest.MonkeyPatch.context() as patched:
-        patched.setenv("AWS_ENDPOINT_URL", other.url)
-        forget()
+    said = list[str]()
+    with on_a_day(day, tmp_path / "s3") as patched:
         assert not is_written(THERE, said.append)
         with leases.leased(THERE, print):
             assert is_written(THERE, print)
