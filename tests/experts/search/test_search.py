@@ -110,6 +110,13 @@ def test_result_depends_on_the_level_alone() -> None:
         same(alone, jax.tree.map(lambda x, some=some: x[some], found()))
 
 
+def test_flag_of_the_caller_leaves_a_search_unchanged() -> None:
+    one = np.array([VALLEY])
+    with jax.threefry_partitionable(False):
+        under_flag = search(take(levels(), one), IDS[one], CONFIG, DEFAULT_RULES)
+    same(under_flag, search(take(levels(), one), IDS[one], CONFIG, DEFAULT_RULES))
+
+
 def test_units_share_search_slots() -> None:
     """Later levels enter the search slots that others leave; each gives its own result."""
     searching, units = Searching(CONFIG, DEFAULT_RULES), [np.arange(3), np.arange(3, 4), np.arange(4, len(KINDS))]
