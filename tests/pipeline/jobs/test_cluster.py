@@ -138,6 +138,51 @@ def test_late_worker_commits_only_for_its_own_driver(tmp_path: Path) -> None:
     assert not fragment_paths(split)
 
 
+# A command on a machine where JAX would take a GPU if it were asked. Its worker tells where JAX computes.
+ON_WHAT = """
+import sys
+from pathlib import Path
+from rich.console import Console
+from levelproof.pipeline.jobs import cluster
+from levelproof.pipeline.jobs.progress import Board, Tally
+from levelproof.pipeline.jobs.schedule import Round, Scheduler, UnitOutcome, WorkUnit
+from levelproof.pipeline.stopping import Stop
+from tests.pipeline.made import made_job
+
+class Telling(cluster.WorkerActor):
+    def work(self, order, seconds):
+        import jax
+
+        told = f"{jax.config.jax_platforms} {[device.platform for device in jax.devices()]}"
+        return Round([UnitOutcome(unit, reason=told) for unit in order.units], {}, 0)
+
+def settle(outcomes):
+    for outcome in outcomes:
+        sys.exit(outcome.reason)
+
+cluster.WorkerActor = Telling
+board = Board(Tally(2, 0, 0), Console(stderr=True))
+job, scheduler = made_job("data", "unit=2", "workers=1"), Scheduler([WorkUnit((0, 1))], 2)
+cluster.run(job, Path("data"), scheduler, settle, board, Stop())
+"""
+
+
+@pytest.mark.slow
+def test_a_worker_uses_the_cpu_where_jax_prefers_a_gpu() -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
+    environment |= {"JAX_PLATFORMS": "cuda,cpu", "RAY_raylet_start_wait_time_s": str(int(patience(COMMAND_SECONDS)))}
+    done = subprocess.run(
+        [sys.executable, "-c", ON_WHAT],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=patience(COMMAND_SECONDS),
+        check=False,
+    )
+    assert done.stderr.splitlines()[-1] == "cpu ['cpu']", done.stderr
+
+
 def test_with_absolute_paths_resolves_every_path() -> None:
     """Workers run in another folder than the command."""
     job = with_absolute_paths(made_job("data", "continue_from=data/5k/s"))
