@@ -95,7 +95,7 @@ def _settings_of(cls: type, defaults: Mapping[str, Any], path: str) -> Iterator[
         if name in presets():
             yield Setting(name, default_presets()[name], meaning, dict.fromkeys(presets()[name], ""), group)
     if not path:
-        meaning, names = "preset of scout, search, expert and stop settings", presets()["procedure"]
+        meaning, names = "preset of search, expert and stop settings", presets()["procedure"]
         yield Setting("procedure", default_presets()["procedure"], meaning, dict.fromkeys(names, ""), JOB)
     for nested, name in groups:
         yield from _settings_of(nested, defaults, name)
