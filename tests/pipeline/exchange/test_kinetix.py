@@ -112,7 +112,7 @@ def test_export_kinetix_creates_the_folder_atomically(
     assert here(command, tmp_path).returncode == 0
     assert names_before == [[".k."]], "killed before its last step, it leaves no k"
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "k").rglob("*")}
-    assert_refused(here(command, tmp_path), 2, "something at k already", "-o")
+    assert_refused(here(command, tmp_path), 2, "k already exists", "-o")
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "k").rglob("*")}
     (tmp_path / "file").write_text("")
     assert_refused(here([*command[:-1], "file/k"], tmp_path), 2, "Cannot write file/k")
