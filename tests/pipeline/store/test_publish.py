@@ -411,7 +411,7 @@ def test_verify_finds_missing_levels_after_a_kill_in_a_store_whose_clock_is_ahea
     told = json.loads(done.stdout)
     assert told["missing"] == [[2, 3]]
     assert [of["what"] for of in told["wrong"]] == [
-        "The last command wanted levels 2 to 3, and no fragment has them."
+        "The last command requested levels 2 to 3, but no fragment has them."
     ], "nothing else is wrong"
 
 
