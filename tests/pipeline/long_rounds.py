@@ -9,6 +9,9 @@ from levelproof.pipeline import stopping
 from levelproof.pipeline.cli import main as cli
 from levelproof.pipeline.jobs import cluster
 
+HOURS = 1e4  # s
+
 if __name__ == "__main__":
-    cluster.ROUND = stopping.GRACE = stopping.LAST = 1e4
+    cluster.until_report = lambda *_: HOURS
+    stopping.GRACE = stopping.LAST = HOURS
     sys.exit(cli.main(sys.argv[1:]))

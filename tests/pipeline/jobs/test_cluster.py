@@ -277,8 +277,8 @@ def test_run_survives_machines_that_join_and_leave(tmp_path: Path) -> None:
     memory: dict[str, Any] = {"object_store_memory": 80 * 2**20}
     machines = Cluster(initialize_head=True, head_node_args=memory | {"num_cpus": 0, "include_dashboard": False})
     try:
-        alone = "search.env_steps=0"  # so that experts leave levels to go on with
-        endless = ("generate", "levels=1k", "unit=1", "budget=5k", "keep_experts=true", *alone)
+        alone = "search.env_steps=0"  # so that experts leave levels to continue
+        endless = ("generate", "levels=1k", "unit=1", "budget=5k", "keep_experts=true", alone)
         process = start(endless, tmp_path, address=str(machines.address))
         until((tmp_path / SPLIT / JOB).exists, process)
         first = machines.add_node(num_cpus=1, **memory)
