@@ -188,7 +188,8 @@ class Environment:
         self, key: Key[Array, ""], params: EnvParams | None = None, override_reset_state: EnvState | None = None
     ) -> tuple[Any, EnvState]:
         """Start an episode: return its observation and state."""
-        return single(self._reset_lanes)(*self._restart(key, params, override_reset_state, 0))
+        levels, index, override = self._restart(key, params, override_reset_state, 0)
+        return single(self._reset_lanes)(levels, index, (override, jnp.asarray(index)))
 
     @partial(jax.jit, static_argnums=0)
     def step(
@@ -216,13 +217,13 @@ class Environment:
         if not self.auto_reset:
             return self.step_env(key, state, action, params)
         table, index, override = self._restart(key, params, override_reset_state, state.episode + 1)
-        return single(self._step_lanes)(table, index, (override, *_detached(state, action)))
+        return single(self._step_lanes)(table, index, (override, jnp.asarray(index), *_detached(state, action)))
 
     def step_env(self, key: Key[Array, ""], state: EnvState, action: Array, params: EnvParams | None = None) -> Step:
         """Take one env step without reset."""
         del key, params  # env steps are deterministic
         self._check(action)
-        return single(self._step_lanes)((), 0, (None, *_detached(state, action)))
+        return single(self._step_lanes)((), 0, (None, None, *_detached(state, action)))
 
     def _check(self, action: Array) -> None:
         """Raise ValueError if the action's shape does not fit the action type."""
@@ -266,19 +267,22 @@ class Environment:
         levels = (params or self.default_params).levels
         return levels, _draw_level(key, episode, levels.state.rotation.shape[-1]), None
 
-    def _reset_lanes(self, levels: Any, index: Int[Array, " lane"], override: EnvState | None) -> tuple[Any, EnvState]:
-        state = _first_state(levels, index, 0, override)
+    def _reset_lanes(
+        self, levels: Any, row: Int[Array, " lane"], inputs: tuple[EnvState | None, Array]
+    ) -> tuple[Any, EnvState]:
+        override, index = inputs
+        state = _first_state(levels, row, index, 0, override)
         return self._observe(state), state
 
-    def _step_lanes(self, levels: Any, index: Int[Array, " lane"], inputs: tuple[Any, EnvState, Array]) -> Step:
+    def _step_lanes(self, levels: Any, row: Int[Array, " lane"], inputs: tuple[Any, Any, EnvState, Array]) -> Step:
         """Take one env step in every lane; reset if there are levels or an override state.
 
         Args:
             levels: as `_restart` returns them; () for no reset.
-            index: as `_restart` returns it.
-            inputs: (override state or None, state, action).
+            row: of the level to reset to. Where the caller maps over `params`, `levels` holds those of all lanes.
+            inputs: (override state or None, index that `_restart` returned, state, action).
         """
-        override, state, action = inputs
+        override, index, state, action = inputs
         driven = CONTROLS[self.action_type](state.level, action)
         now, result, closing, _ = task.advance_driven(state.level, state.now, driven, self.rules)
         after = state.with_task_state(now)
@@ -287,7 +291,7 @@ class Environment:
         if self.final_observation:
             info["final_observation"] = self._observe(after)
         if override is not None or isinstance(levels, Level):
-            restart = _first_state(levels, index, state.episode + 1, override)
+            restart = _first_state(levels, row, index, state.episode + 1, override)
             after = jax.tree.map(lambda fresh, x: jnp.where(result.done, fresh, x), restart, after)
         return self._observe(after), after, result.reward, result.done, info
 
@@ -309,11 +313,16 @@ def _draw_level(key: Key[Array, ""], episode: Int[Array, ""] | int, count: int) 
 
 
 def _first_state(
-    levels: Any, index: Int[Array, " lane"], episode: Int[Array, " lane"] | int, override: EnvState | None
+    levels: Any,
+    row: Int[Array, " lane"],
+    index: Int[Array, " lane"],
+    episode: Int[Array, " lane"] | int,
+    override: EnvState | None,
 ) -> EnvState:
+    """Start an episode of the level in `row`, which the episode's own `params.levels` has at `index`."""
     if override is not None:
         return override
-    return EnvState.start(jax.tree.map(lambda x: x[..., index], levels), index, episode)
+    return EnvState.start(jax.tree.map(lambda x: x[..., row], levels), index, episode)
 
 
 def _space_of_entities(observation: Any, size: Size) -> Dict:
