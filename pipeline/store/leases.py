@@ -23,6 +23,7 @@ from typing import IO, Any
 from levelproof.pipeline.errors import Failure, LevelproofError, UserError
 from levelproof.pipeline.store.disk import NotRegular, regular, to_drive
 from levelproof.pipeline.store.layout import WRITER_LOCK
+from levelproof.pipeline.store.machine import boot_id
 from levelproof.pipeline.store.objects import Version, get, put_if
 from levelproof.pipeline.store.remote import as_typed, is_remote
 
@@ -33,7 +34,6 @@ NOTICE = 2.0  # s of waiting before the user is told the reason
 POLL = 0.5  # s between polls
 MAX_BYTES = 2**16  # of a lock file
 RENEWALS = "renewals"  # key of leases alone: a folder's lock, which may be copied to a store, does not have it
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # differs between machines, and after each boot
 
 _served: dict[Path, str] = {}  # by split: token of the writer for whom this process works
 
@@ -259,7 +259,7 @@ def _here() -> str:
     Machines may share a host name, and outside of containers all of them have the same namespace number.
     """
     try:
-        return f"{BOOT_ID.read_text().strip()} {os.readlink('/proc/self/ns/pid')}"
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}" if (boot := boot_id()) else ""
     except OSError:
         return ""
 

@@ -16,9 +16,10 @@ from functools import cache
 from pathlib import Path
 from tempfile import gettempdir, mkdtemp
 
+from levelproof.pipeline.store.machine import boot_id
+
 PREFIX = "levelproof-scratch-"
 LOCK, FILES = "lock", "files"
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 MAX_ABOUT = 2**12  # bytes of a lock file
 
 
@@ -112,18 +113,17 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def _machine() -> dict[str, str]:
-    """Identify this machine: host names are not unique, the boot id differs after each boot."""
-    try:
-        boot = BOOT_ID.read_text().strip()
-    except OSError:
-        boot = ""
-    return {"host": socket.gethostname(), "boot": boot}
+    return {"host": socket.gethostname(), "boot": boot_id()}
 
 
 def _is_here(about: bytes) -> bool:
-    """Whether a lock file names this machine."""
+    """Whether a lock file names this machine, by its boot; by its host's name, which others may have, only without one.
+
+    Folders from before a reboot stay: another machine of this name may have them.
+    """
     try:
         theirs = json.loads(about)
     except ValueError:
         return False
-    return isinstance(theirs, dict) and any(own and theirs.get(name) == own for name, own in _machine().items())
+    own, name = _machine(), "boot" if boot_id() else "host"
+    return isinstance(theirs, dict) and bool(own[name]) and theirs.get(name) == own[name]

@@ -19,7 +19,7 @@ import pytest
 
 from levelproof.pipeline.errors import Failure, StoreFailure, UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
-from levelproof.pipeline.store import leases, remote
+from levelproof.pipeline.store import leases, machine, remote
 from levelproof.pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
 from levelproof.pipeline.store.layout import FRAGMENT, WRITER_LOCK, data_paths, new_attempt, unit_name
 from levelproof.pipeline.store.leases import Lease, LeaseLost
@@ -372,7 +372,7 @@ def test_lease_of_a_dead_process_is_taken_at_once_on_its_machine_only(
         put(THERE / WRITER_LOCK, left_by_a_killed_writer())
         with monkeypatch.context() as elsewhere:
             (tmp_path / "boot_id").write_text(boot_id or "")
-            elsewhere.setattr(leases, "BOOT_ID", tmp_path / ("boot_id" if boot_id else "none"))
+            elsewhere.setattr(machine, "BOOT_ID", tmp_path / ("boot_id" if boot_id else "none"))
             said.clear()
             Lease(THERE, said.append).release()
         (sentence,) = said

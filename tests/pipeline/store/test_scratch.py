@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from levelproof.pipeline.store import machine
 from levelproof.pipeline.store import scratch as module
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.scratch import FILES, LOCK, PREFIX, scratch
@@ -120,6 +121,7 @@ def test_sweep_keeps_folders_not_of_a_dead_local_process(
     os.mkfifo(pipe)
     left(parent / f"{PREFIX}other", {"host": "another", "boot": "another"})
     left(parent / f"{PREFIX}nameless", {"host": "", "boot": ""})
+    left(parent / f"{PREFIX}namesake", {"host": socket.gethostname(), "boot": "another"})
     (left(parent / f"{PREFIX}lockless") / LOCK).unlink()
     left(parent / "levelproof-data")
     before = {path: path.is_symlink() or [*path.rglob("*")] for path in parent.iterdir()}
@@ -138,11 +140,18 @@ def test_sweep_keeps_folders_of_other_users(parent: Path) -> None:
     assert (folder / FILES / "file").exists()
 
 
-def test_sweep_removes_half_made_folders_and_those_before_a_reboot(parent: Path) -> None:
+def test_sweep_goes_by_the_host_name_where_boots_have_no_id(parent: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "BOOT_ID", parent / "none")
+    other = left(parent / f"{PREFIX}other", {"host": "another", "boot": ""})
+    left(parent / f"{PREFIX}own")
+    with scratch() as folder:
+        assert {*parent.iterdir()} == {other, folder.parent}
+
+
+def test_sweep_removes_half_made_folders(parent: Path) -> None:
     (parent / f"{PREFIX}empty").mkdir()
     (parent / f"{PREFIX}unlocked").mkdir()
     (parent / f"{PREFIX}unlocked" / LOCK).touch()
-    left(parent / f"{PREFIX}restarted", {"host": socket.gethostname(), "boot": "an earlier one"})
     with scratch() as folder:
         assert [*parent.iterdir()] == [folder.parent]
 
