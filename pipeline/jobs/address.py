@@ -1,10 +1,10 @@
-"""The Ray cluster that RAY_ADDRESS names. Knows nothing of Ray."""
+"""The Ray cluster that RAY_ADDRESS names, and sentences on why Ray does not start. Knows nothing of Ray."""
 
 import os
 import re
 import socket
 
-from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.errors import Failure, UserError
 
 CONNECT_SECONDS = 5.0  # s within which a cluster must accept a connection
 
@@ -32,3 +32,18 @@ def no_cluster(reason: str) -> UserError:
         f"There is no Ray cluster at RAY_ADDRESS={ray_address()} ({reason.rstrip('.')}): "
         "start one with `ray start --head`, correct the address, or unset it to use this machine."
     )
+
+
+def cannot_start(error: Exception) -> Exception:
+    """Return the error for the user in place of that of `ray.init`; the same one if its cause is unknown."""
+    reason = (str(error).strip().splitlines() or ["no message"])[0]
+    if isinstance(error, ConnectionError):
+        return no_cluster(reason)
+    if isinstance(error, TimeoutError) or type(error) is Exception:  # Ray's time-outs are of either type
+        return Failure(
+            f"Ray cannot start ({reason.rstrip('.')}): run the same command again when this machine is less busy, or "
+            "with executor=inline."
+        )
+    if isinstance(error, OSError):
+        return Failure(f"Ray cannot start ({error}): fix that, or set RAY_TMPDIR to another folder.")
+    return error

@@ -31,7 +31,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy, Place
 from levelproof.configs.schema import JobConfig
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure
-from levelproof.pipeline.jobs.address import no_cluster, ray_address, require_reachable
+from levelproof.pipeline.jobs.address import cannot_start, ray_address, require_reachable
 from levelproof.pipeline.jobs.likeness import Program, mismatch, program_of, with_absolute_paths
 from levelproof.pipeline.jobs.meters import Meters
 from levelproof.pipeline.jobs.places import bytes_of_worker, memory_to_reserve, shortage, workers_by_machine
@@ -47,6 +47,7 @@ OBJECT_STORE = 80 * 2**20  # bytes; close to Ray's minimum, because only summari
 POLL = 0.25  # s between progress updates, whether a worker has reported or not
 RESCAN = 5.0  # s between checks for machines that joined or left the cluster
 GPU_PATIENCE = 10.0  # s to wait for a free GPU before workers use CPU cores
+PROBE_PATIENCE = 120.0  # s to wait for a process that tries a GPU; it imports JAX
 PATIENCE = 60.0  # s without any worker before the driver says why
 STARTS = 3  # failed starts in a row after which a worker is given up
 MAX_SILENT = 1800.0  # s without a report after which a worker is given up; a large program compiles for minutes
@@ -367,10 +368,8 @@ def connected() -> Iterator[None]:
     with redirect_stdout(io.StringIO()):  # Ray prints a long text on each worker's death
         try:
             ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
-        except ConnectionError as error:
-            raise no_cluster(str(error).strip().splitlines()[0]) from error
-        except OSError as error:
-            raise Failure(f"Ray cannot start ({error}): fix that, or set RAY_TMPDIR to another folder.") from error
+        except Exception as error:
+            raise cannot_start(error) from error
         try:
             yield
         finally:
@@ -387,7 +386,9 @@ def _why_no_gpu() -> str:
             return f"after {duration(GPU_PATIENCE)} of waiting, others still hold all of them"
         strategy = PlacementGroupSchedulingStrategy(group)
         probe = ray.remote(num_cpus=0, num_gpus=1, max_calls=1, scheduling_strategy=strategy)(jax_sees_a_gpu)
-        return "" if ray.get(probe.remote()) else NO_GPU
+        return "" if ray.get(probe.remote(), timeout=PROBE_PATIENCE) else NO_GPU
+    except RayError as error:  # also after the time-out
+        return f"the cluster has one, but no answer came from it ({str(error).strip().splitlines()[-1].rstrip('.')})"
     finally:
         remove_placement_group(group)
 

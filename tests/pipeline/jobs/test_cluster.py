@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from urllib.request import urlopen
 import pytest
 from rich.console import Console
 
-from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs import cluster
 from levelproof.pipeline.jobs.address import require_reachable
 from levelproof.pipeline.jobs.likeness import mismatch, program_of, with_absolute_paths
@@ -73,6 +74,36 @@ def test_generate_names_an_unreachable_cluster(tmp_path: Path) -> None:
 def test_generate_names_a_ray_folder_that_is_not_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_TMPDIR", "/proc/sys/ray")
     assert_refused(run(SETTINGS, tmp_path), 1, "Ray cannot start", "/proc/sys/ray", "RAY_TMPDIR")
+
+
+@pytest.mark.parametrize("kind", [Exception, TimeoutError])  # types that Ray raises
+def test_connected_explains_a_ray_that_starts_too_slowly(kind: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    def init(**_: Any) -> None:
+        raise kind("The current node timed out during startup. This could happen because some of the raylet failed.")
+
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(cluster.ray, "init", init)
+    sentence = r"cannot start \(The current node timed out .*is less busy, .*=inline\.$"
+    with pytest.raises(Failure, match=sentence), cluster.connected():
+        pass
+
+
+@pytest.mark.slow
+def test_workers_do_without_a_gpu_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 1}')
+    monkeypatch.setenv("RAY_raylet_start_wait_time_s", str(int(patience(COMMAND_SECONDS))))
+    cases = (  # lambdas, because Ray sends them by value
+        (lambda: time.sleep(600), 1.0, "timed out"),
+        (lambda: os.abort(), patience(COMMAND_SECONDS), "died"),
+    )
+    with cluster.connected():
+        for probe, seconds, reason in cases:
+            monkeypatch.setattr(cluster, "jax_sees_a_gpu", probe)
+            monkeypatch.setattr(cluster, "PROBE_PATIENCE", seconds)
+            why = cluster._why_no_gpu()
+            assert why.startswith("the cluster has one, but no answer came from it (")
+            assert reason in why
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:99999", "a..b:6379"])
